@@ -14,9 +14,10 @@ more than two voxels from anything that any frame of the recording shows. Each l
 
 Rows are means over the starts, after each view: *rank* correlation of the expected with the true gain over frames that
 were not taken; *chosen*, the true gain of the best of them by expectation, of the largest there is; *phantom*, share of
-the expected area; the kinds, as shares of it; *covered*, the share that `Covered` expects to be seen, beside what is
-*seen*; *promised* and *found*, the area that was expected of the frame that was taken and that its image added, in
-squared scene units.
+the expected area; the kinds, as shares of it; *covered*, the share that `Covered` expects to be seen; *promised* and
+*found*, the area that was expected of the frame that was taken and that its image added, in squared scene units;
+*seen*, the share of the voxels, and *area*, of a known mesh what the frames truly show, of what all of them show. Last
+comes what was seen when `Covered(0.9)` would have ended.
 """
 
 import argparse
@@ -27,20 +28,22 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from recordings import Recorded, of_bunny, of_mesh, study_of
+from recordings import Recorded, area_shown, of_bunny, of_mesh, study_of
 from scipy.spatial import cKDTree
 from scipy.stats import spearmanr
 
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.planning.loop import Loop, Step
+from jaxnbv.planning.loop import Loop
+from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning import pixel_area, scan
 from jaxnbv.scanning.looks import STEEP
 from jaxnbv.studies.recorded import NEW_AREA, RecordedStudy, frame_of_box
 from jaxnbv.tasks.coverage import Unseen, seen_share
 
 KINDS = ("cut", "empty", "silent", "unseen")
-COLUMNS = ("rank", "chosen", "phantom", *KINDS, "covered", "promised", "found", "seen")
+COLUMNS = ("rank", "chosen", "phantom", *KINDS, "covered", "promised", "found", "seen", "area")
+_ENOUGH = 0.9
 
 
 class Case:
@@ -51,6 +54,9 @@ class Case:
         self.recording = self.study.recording
         frame = frame_of_box(self.study.box)
         self.voxel = frame.scale * self.study.voxel
+        area = None if recorded.mesh is None else area_shown(recorded)
+        # What no frame shows counts for nothing.
+        self.area = None if area is None else area[:, area.any(axis=0)]
         self.shown = cKDTree(np.asarray(frame.to_scene(jnp.asarray(self.recording.voxels))))
 
     def rows(self, start: int) -> Iterable[list[float]]:
@@ -64,18 +70,19 @@ class Case:
         for step in itertools.islice(loop.steps(study.sensor(scene), first), study.views):
             taken.append(study.frame_of(step.view.pose))
             row = [np.nan] * len(COLUMNS)
-            row[-1] = float(recording.shown[taken].any(axis=0).mean())
+            row[-2] = float(recording.shown[taken].any(axis=0).mean())
+            if self.area is not None:
+                row[-1] = float(self.area[taken].any(axis=0).mean())
             if before is not None:
-                row[-3:-1] = before[0], float(_new_area(step.view.scan, step.view.pose, study, before[1]))
-            if len(taken) < study.views:
-                inputs = loop.inputs()
-                unseen = planner.acquisition.context(inputs)
-                before = float(loop.propose().value), unseen
-                row[:-3] = self._judge(inputs.surfaces, unseen, step, taken)
+                row[-4:-2] = before[0], float(_new_area(step.view.scan, step.view.pose, study, before[1]))
+            inputs = loop.inputs()
+            unseen = planner.acquisition.context(inputs)
+            before = float(loop.propose().value), unseen
+            row[:-4] = self._judge(inputs, unseen, taken)
             yield row
 
-    def _judge(self, surfaces, unseen: Unseen, step: Step, taken: list[int]) -> list[float]:
-        recording, camera = self.recording, self.study.imagined_camera
+    def _judge(self, inputs: StepInputs, unseen: Unseen, taken: list[int]) -> list[float]:
+        recording, camera, surfaces = self.recording, self.study.imagined_camera, inputs.surfaces
         areas, points = _expected(surfaces, unseen, camera, recording.poses)
         expected = np.asarray(areas.sum(axis=-1).mean(axis=0))
         known = recording.shown[taken].any(axis=0)
@@ -90,7 +97,7 @@ class Case:
         kinds = self._kinds(places[phantom], taken)
         share = weights[phantom].sum() / max(weights.sum(), 1e-9)
         of_kind = [weights[phantom][kinds == kind].sum() / max(weights[phantom].sum(), 1e-9) for kind in range(4)]
-        covered = float(seen_share(unseen, surfaces, camera, recording.poses))
+        covered = float(seen_share(unseen, surfaces, camera, recording.poses, inputs.observations.poses))
         return [rank, chosen, share, *of_kind, covered]
 
     def _kinds(self, places: np.ndarray, taken: list[int]) -> np.ndarray:
@@ -131,8 +138,15 @@ def _new_area(seen: PointCloud, pose: Pose, study: RecordedStudy, unseen: Unseen
 
 
 def measured(case: Case, starts: int) -> np.ndarray:
-    """(views, columns), the mean over starts."""
-    return np.mean([list(case.rows(start)) for start in range(starts)], axis=0)
+    """(starts, views, columns)."""
+    return np.array([list(case.rows(start)) for start in range(starts)])
+
+
+def at_the_end(rows: np.ndarray) -> np.ndarray:
+    """What was seen, by voxels and by area, when so much was expected to be: (episodes that came so far, 2)."""
+    enough = rows[..., COLUMNS.index("covered")] >= _ENOUGH
+    ended = enough.any(axis=1)
+    return rows[ended, enough[ended].argmax(axis=1)][:, -2:]
 
 
 def main() -> None:
@@ -157,9 +171,14 @@ def main() -> None:
         # Each has a box of its own, and so programs of its own: those of twenty do not fit in memory's map.
         jax.clear_caches()
         tables.append(measured(Case(recorded, args.views), args.starts))
-        _show(recorded.name, tables[-1])
+        _show(recorded.name, np.mean(tables[-1], axis=0))
+    episodes = np.concatenate(tables)
     if len(tables) > 1:
-        _show(f"mean of {len(tables)}", np.mean(tables, axis=0))
+        _show(f"mean of {len(tables)}", np.mean(episodes, axis=0))
+    ended = at_the_end(episodes)
+    print(f"\nCovered({_ENOUGH}) ends {len(ended)} of {len(episodes)} episodes; seen by then, in percent:")
+    for name, values in zip(COLUMNS[-2:], 100 * ended.T, strict=True):
+        print(f"{name:>6}: mean {values.mean():.1f}, least {values.min():.1f}, largest {values.max():.1f}")
 
 
 def _show(name: str, table: np.ndarray) -> None:

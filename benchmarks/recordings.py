@@ -17,11 +17,13 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+import trimesh
 from PIL import Image
 
 import jaxnbv as nbv
 from jaxnbv.geometry.pose import fibonacci_sphere
 from jaxnbv.planning.loop import Loop
+from jaxnbv.readers.recorded import RecordedFrames
 from jaxnbv.scanning import TriangleMesh
 from jaxnbv.scanning.sensors import Setting, fitted
 from jaxnbv.studies.engine.results import interval
@@ -40,12 +42,17 @@ _FAR, _BUNNY_PIXELS = 1.0, 600.0
 
 
 class Recorded(NamedTuple):
-    """A recording: its name, its folder, and the box that a study is to look at, with what is upward in its world."""
+    """A recording: its name, its folder, and the box that a study is to look at, with what is upward in its world.
+
+    - `mesh`: of the object, in the recording's world; None where it is not known.
+    """
 
     name: str
     folder: Path
     box: tuple[float, ...] | None = None
     up: tuple[float, float, float] | None = None
+    mesh: TriangleMesh | None = None
+    mesh: trimesh.Trimesh | None = None
 
 
 def of_mesh(file: Path, folder: Path, above: bool) -> Recorded:
@@ -58,7 +65,8 @@ def of_mesh(file: Path, folder: Path, above: bool) -> Recorded:
     # The table's noise stays below the box.
     room = np.array([[-0.03, -0.03, 0.02 if above else -0.03], [0.03, 0.03, 0.03]])
     box = tuple((corners + _SIDE * room).reshape(-1).tolist())
-    recorded = Recorded(f"{file.stem}, {'above' if above else 'around'}", folder, box)
+    known = trimesh.Trimesh(np.asarray(frame.to_world(mesh.vertices)), mesh.faces, process=False)
+    recorded = Recorded(f"{file.stem}, {'above' if above else 'around'}", folder, box, mesh=known)
     if (folder / "frames.json").exists():
         return recorded
     if above:
@@ -123,6 +131,31 @@ def _write(folder: Path, images: list[np.ndarray], matrices: np.ndarray, intrins
         frames.append({"depth": name, "pose": matrix.tolist()})
     said = {"intrinsics": intrinsics.tolist(), "depth_scale": _UNIT, "frames": frames}
     (folder / "frames.json").write_text(json.dumps(said))
+
+
+def area_shown(recorded: Recorded, count: int = 20_000) -> np.ndarray:
+    """Which of some points, uniform by area on the known mesh and within the box, each frame shows: (frames, points).
+
+    The study's voxels tell less than was seen: one that the surface only cuts at a corner has few pixels of each frame.
+    """
+    assert recorded.mesh is not None
+    assert recorded.box is not None
+    mesh = trimesh.Trimesh(recorded.mesh.vertices, recorded.mesh.faces, process=False)
+    points, faces = trimesh.sample.sample_surface(mesh, count, seed=0)
+    inside = np.all((points >= recorded.box[:3]) & (points <= recorded.box[3:]), axis=1)
+    points, normals = points[inside], mesh.face_normals[faces[inside]]
+    middle = np.array([320.0, 240.0])
+    shown = []
+    for matrix in RecordedFrames(str(recorded.folder)).matrices:
+        offset = points - matrix[:3, 3]
+        away = np.linalg.norm(offset, axis=1)
+        directions, local = offset / away[:, None], offset @ matrix[:3, :3]
+        within = np.all(np.abs(600.0 * local[:, :2]) <= middle * local[:, 2:], axis=1)
+        facing = -np.sum(directions * normals, axis=1) >= math.cos(_CAMERA.max_incidence)
+        hits = recorded.mesh.trace(np.broadcast_to(matrix[:3, 3], offset.shape), directions)
+        met = np.linalg.norm(np.asarray(hits.points) - matrix[:3, 3], axis=1)
+        shown.append(within & facing & (np.abs(met - away) < 2e-3 * away))
+    return np.array(shown)
 
 
 def study_of(recorded: Recorded, views: int) -> RecordedStudy:

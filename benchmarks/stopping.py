@@ -16,21 +16,22 @@ import functools
 import json
 from pathlib import Path
 
-import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
 import jaxnbv as nbv
-from jaxnbv.acquisition import inputs_of
 from jaxnbv.networks import part_segmenter, pretrained_classifier
 from jaxnbv.networks.categories import CATEGORIES
+from jaxnbv.planning.episode import Episode
 from jaxnbv.planning.loop import view_keys
 from jaxnbv.planning.stopping import Covered, Found, StopContext, Sure
+from jaxnbv.scanning import GridSurface
+from jaxnbv.scanning.visibility import sees, spread_points
 from jaxnbv.storage.files import write_text
 from jaxnbv.studies.engine.results import interval
 from jaxnbv.studies.scenes import Framing, Split, hidden_view, part_scene, pyramid_scene
-from jaxnbv.tasks.coverage import cells_shown
 
 SIDE = Framing.WHOLE.longest_side
 FIRST = nbv.look_at((0.8, 0.9, 2.2))
@@ -73,6 +74,8 @@ def measured(task: str, index: int) -> dict:
         surface, first, category = nbv.SDFSurface(thing.solid), FIRST, CATEGORIES[int(thing.category)].name
     planner = planner_for(task, category)
     episode = nbv.simulate(planner, surface, first, VIEWS[task], key, progress=False)
+    if task == "coverage":
+        shown, areas = truly_shown(thing.solid, planner, episode)
     right, ends = [], {name: VIEWS[task] for name in RULES[task]}
     for count, observations in enumerate(episode.observations(), start=1):
         if task == "class":
@@ -82,9 +85,7 @@ def measured(task: str, index: int) -> dict:
             counts = planner.acquisition.answer(observations.cloud).values
             right.append(float((counts[np.asarray(thing.parts)] >= 60).all()))
         else:
-            unseen = planner.acquisition.context(inputs_of(observations))
-            new, shown = _cells(surface, unseen, planner.sampler.grid, planner.camera, planner.search.poses_around())
-            right.append(1.0 - float(new / shown))
+            right.append(float(areas[shown[:count].any(axis=0)].sum() / areas.sum()))
         poses = tuple(view.pose for view in episode.views[:count])
         sample_key, *_ = view_keys(key, count)
         surfaces = functools.cache(functools.partial(planner.sampler.sample, observations, sample_key))
@@ -95,7 +96,20 @@ def measured(task: str, index: int) -> dict:
     return {"right": right, "ends": ends}
 
 
-_cells = eqx.filter_jit(cells_shown)
+def truly_shown(solid, planner: nbv.Planner, episode: Episode) -> tuple[np.ndarray, np.ndarray]:
+    """Which points of the true surface each view shows, of those that a candidate shows; and their areas."""
+    grid = planner.sampler.grid
+    nodes = np.stack(np.meshgrid(*3 * [grid.axis], indexing="ij"), axis=-1).reshape(-1, 3)
+    values = jax.lax.map(solid, jnp.asarray(nodes, jnp.float32), batch_size=65_536)
+    surface = GridSurface.from_values(values.reshape(3 * (grid.resolution,)), 0.0, grid)
+    points = spread_points(surface, 20_000)
+    poses = jax.tree.map(lambda *rows: jnp.stack(rows), *(view.pose for view in episode.views))
+    views, candidates = (
+        np.asarray(sees(surface, planner.camera, given, points, grid.spacing))
+        for given in (poses, planner.search.poses_around())
+    )
+    any_shown = candidates.any(axis=0)
+    return views & any_shown, np.asarray(points.areas)[any_shown]
 
 
 def table(task: str, records: list[dict]) -> str:

@@ -46,13 +46,14 @@ class PoseList(eqx.Module):
         """Whether each of a batch of poses equals one of the list, to 1e-3 in position and viewing direction."""
         near = jnp.linalg.norm(poses.position[:, None] - self.rows.position[None], axis=-1) < _SAME
         aligned = jnp.linalg.norm(poses.forward[:, None] - self.rows.forward[None], axis=-1) < _SAME
-        return jnp.any(near & aligned & self._is_filled, axis=1)
+        return jnp.any(near & aligned & self.is_filled, axis=1)
 
     def distance(self, poses: Pose) -> Float[Array, " poses"]:
         """Distance from each of a batch of positions to the nearest of the list; infinite if it is empty."""
         distance = jnp.linalg.norm(poses.position[:, None] - self.rows.position[None], axis=-1)
-        return jnp.min(jnp.where(self._is_filled, distance, jnp.inf), axis=1)
+        return jnp.min(jnp.where(self.is_filled, distance, jnp.inf), axis=1)
 
     @property
-    def _is_filled(self) -> Bool[Array, " room"]:
+    def is_filled(self) -> Bool[Array, " room"]:
+        """Which rows hold a pose of the list."""
         return jnp.arange(self.room) < self.count

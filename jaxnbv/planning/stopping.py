@@ -225,8 +225,8 @@ class Found(StopRule):
 
 
 class Covered(StopRule):
-    """Stop once this share of what the candidates can show is expected to have been seen: of the cells of the grid in
-    which they would show the sampled surfaces, those in which nothing is new to `NewSurface`.
+    """Stop once this share of what the candidates can show is expected to have been seen: of the area of the sampled
+    surfaces that they would show, what a view that was taken shows and `NewSurface` does not take for new.
 
     - `share`: within (0, 1].
     - `size`: of `NewSurface`, in world units in a session; by default that of the acquisition, or of `NewSurface()`.
@@ -261,7 +261,8 @@ def expected_coverage(context: StopContext, new: NewSurface) -> float:
         surfaces = observations.looks.measurable(surfaces, observations.poses)
     poses = planner.search.poses_around()
     barrier = barrier_of(planner.obstacles, planner.camera, poses)
-    return float(seen_share(context_of(new, observations), surfaces, planner.camera, poses, barrier))
+    unseen = context_of(new, observations)
+    return float(seen_share(unseen, surfaces, planner.camera, poses, observations.poses, barrier))
 
 
 class Identified(StopRule):

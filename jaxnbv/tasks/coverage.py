@@ -4,7 +4,7 @@ from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from jaxnbv.acquisition import Acquisition, ImaginedView
 from jaxnbv.checks import check_fields, require
@@ -12,15 +12,18 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.neighbours import DistanceField, nearest_squared_distance, spacing
 from jaxnbv.geometry.pose import Pose
+from jaxnbv.geometry.pose_list import PoseList
 from jaxnbv.sampler import StepInputs
-from jaxnbv.scanning import Grid, GridSurface, Looks, Surface, pixel_area, scan
+from jaxnbv.scanning import GridSurface, Looks, pixel_area
 from jaxnbv.scanning.looks import STEEP
-from jaxnbv.scanning.metrics import GRAZING
+from jaxnbv.scanning.visibility import sees, spread_points
 from jaxnbv.sharding import on_cpu, shared_map
 from jaxnbv.utility import Quantity
 
 # Scene units: s without looks.
 _SIZE = 0.05
+# By which the share that was seen is told, of each sample: to a percent.
+_POINTS = 1024
 
 
 def _many() -> int:
@@ -127,36 +130,35 @@ def seen_share(
     surfaces: GridSurface,
     camera: Camera,
     poses: Pose,
+    taken: PoseList,
     barrier: Float[Array, "poses rays"] | None = None,
 ) -> Float[Array, ""]:
-    """The share of what a camera can see of the sampled surfaces from some poses together that is not new: of the cells
-    of their grid, each of which counts once, however many poses see it.
+    """The share, by area, that has been seen of what a camera sees of the sampled surfaces from some poses together.
+    A point has been seen if it is not new and, where looks are kept, a view that was taken shows it: what is near to
+    what was measured may lie round an edge.
 
-    - `barrier`: see `scan`.
+    - `taken`: where views were taken.
+    - `barrier`: of `poses`, see `scan`.
     """
-    counts = shared_map(cells_shown, surfaces, unseen, surfaces.grid, camera, poses, barrier)
-    new, shown = jnp.sum(counts, axis=0)
-    return 1.0 - new / jnp.maximum(shown, 1)
+    areas = shared_map(_areas_shown, surfaces, unseen, camera, poses, taken, barrier)
+    seen, shown = jnp.sum(areas, axis=0)
+    return jnp.where(shown > 0, seen / jnp.where(shown > 0, shown, 1.0), 1.0)
 
 
-def cells_shown(
-    surface: Surface,
+def _areas_shown(
+    surface: GridSurface,
     unseen: Unseen,
-    grid: Grid,
     camera: Camera,
     poses: Pose,
-    barrier: Float[Array, "poses rays"] | None = None,
-) -> Int[Array, "2"]:
-    """How many cells of a grid hold surface that some poses show and that is new; and how many hold any that they show,
-    but at a grazing angle."""
-    scans = scan(surface, camera, poses, barrier)
-    offset = scans.points - poses.position[:, None]
-    cosine = jnp.abs(jnp.sum(offset * scans.normals, axis=-1)) / jnp.linalg.norm(offset, axis=-1)
-    points, measured = scans.points.reshape(-1, 3), (scans.mask & (cosine >= GRAZING)).reshape(-1)
-
-    def number(kept):
-        cell = jnp.where(kept[:, None], grid.cell_of(points), grid.resolution)
-        found = jnp.zeros((grid.resolution,) * 3, bool).at[tuple(cell.T)].set(True, mode="drop")
-        return jnp.sum(found)
-
-    return jnp.stack([number(measured & (unseen(points) > 0)), number(measured)])
+    taken: PoseList,
+    barrier: Float[Array, "poses rays"] | None,
+) -> Float[Array, "2"]:
+    """The area of one sample that was seen, and that the poses show."""
+    points = spread_points(surface, _POINTS)
+    tolerance = surface.grid.spacing
+    shown = jnp.any(sees(surface, camera, poses, points, tolerance, barrier), axis=0)
+    seen = unseen(points.points) <= 0
+    if isinstance(unseen.seen, Looks):
+        own = sees(surface, unseen.seen.camera, taken.rows, points, tolerance)
+        seen &= jnp.any(own & taken.is_filled[:, None], axis=0)
+    return jnp.stack([jnp.sum(points.areas, where=seen & shown), jnp.sum(points.areas, where=shown)])

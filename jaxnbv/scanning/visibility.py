@@ -1,0 +1,105 @@
+"""Points that are spread evenly over a sampled surface, and which of them a camera sees from a pose."""
+
+import math
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.scanning import tracing
+from jaxnbv.scanning.grid import GridSurface
+from jaxnbv.scanning.metrics import GRAZING
+from jaxnbv.scanning.scanner import Surface
+
+# Poses at once.
+_POSES = 32
+
+
+class SurfacePoints(NamedTuple):
+    """Points of a surface, in scene units.
+
+    - `points`, `normals`: the normals are unit and point outward.
+    - `areas`: how much of the surface each point stands for, in squared scene units; zero of a surface without points.
+    """
+
+    points: Float[Array, "n 3"]
+    normals: Float[Array, "n 3"]
+    areas: Float[Array, " n"]
+
+
+@eqx.filter_jit
+def spread_points(surface: GridSurface, count: int) -> SurfacePoints:
+    """Points where edges of the grid meet a surface: one of every so many edges, in the order of the grid.
+
+    A plane with the unit normal n meets |n_x| + |n_y| + |n_z| edges for each square of the grid's spacing, so that each
+    of these edges stands for the inverse of this many squares (Cauchy and Crofton's formula).
+
+    - `count`: of the points; a surface that meets fewer edges has some of them several times.
+    """
+    values, grid = surface.values, surface.grid
+    inside = values <= 0
+    # The last node along an axis has no neighbour ahead.
+    crossed = [jnp.pad(jnp.diff(inside, axis=axis), [(0, int(own == axis)) for own in range(3)]) for axis in range(3)]
+    reached = jnp.cumsum(jnp.stack(crossed).reshape(-1))
+    # Every so many-th would fall into step with the rows of the grid.
+    apart = jax.random.uniform(jax.random.key(0), (count,))
+    ranks = (jnp.arange(count) + apart) / count * reached[-1]
+    edge = jnp.searchsorted(reached, ranks, side="right").clip(0, reached.size - 1)
+    axis, *node = jnp.unravel_index(edge, (3, *values.shape))
+    ahead = jnp.eye(3, dtype=node[0].dtype)[axis]
+    at, beyond = jnp.stack(node, axis=-1), jnp.stack(node, axis=-1) + ahead
+    low, high = values[tuple(at.T)], values[tuple(beyond.T)]
+    way = jnp.where(low == high, 0.5, low / jnp.where(low == high, 1.0, low - high))
+    place = at + way[:, None] * ahead
+    field = tracing.Field(values.reshape(-1), surface.distance.reshape(-1), grid.resolution)
+    gradient = jnp.stack(tracing.smooth_gradient(field, list(place.T)), axis=-1)
+    length = jnp.linalg.norm(gradient, axis=-1, keepdims=True)
+    normals = gradient / jnp.where(length > 0, length, 1.0)
+    edges = jnp.sum(jnp.abs(normals), axis=-1)
+    each = grid.spacing**2 * reached[-1] / count
+    areas = jnp.where(edges > 0, each / jnp.where(edges > 0, edges, 1.0), 0.0)
+    return SurfacePoints(grid.spacing * place - grid.half_extent, normals, areas)
+
+
+def sees(
+    surface: Surface,
+    camera: Camera,
+    poses: Pose,
+    points: SurfacePoints,
+    tolerance: float,
+    barrier: Float[Array, "poses rays"] | None = None,
+) -> Bool[Array, "poses n"]:
+    """Which points of a surface a camera sees from each of some poses: they lie within its image and its range, face it
+    at no grazing angle, and nothing is before them.
+
+    - `tolerance`: how far before a point its ray may meet the surface, in scene units.
+    - `barrier`: see `scan`.
+    """
+
+    def from_pose(given: tuple[Pose, Float[Array, " rays"] | None]) -> Bool[Array, " n"]:
+        pose, barrier = given
+        offset = points.points - pose.position
+        away = jnp.linalg.norm(offset, axis=-1)
+        directions = offset / jnp.where(away > 0, away, 1.0)[:, None]
+        local = jnp.matmul(offset, pose.rotation, precision="highest")
+        depth = local[:, 2]
+        inside = (depth > 0) & (depth >= camera.nearest)
+        if camera.farthest is not None:
+            inside &= depth <= camera.farthest
+        column, row = jnp.floor(camera.to_pixels(local[:, :2] / jnp.where(inside, depth, 1.0)[:, None])).T
+        inside &= (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        cosine = -jnp.sum(directions * points.normals, axis=-1)
+        inside &= cosine >= max(GRAZING, math.cos(camera.max_incidence))
+        hits = surface.trace(jnp.broadcast_to(pose.position, offset.shape), directions)
+        inside &= hits.mask & (jnp.linalg.norm(hits.points - pose.position, axis=-1) >= away - tolerance)
+        if barrier is None:
+            return inside
+        pixel = jnp.where(inside, row * camera.width + column, 0).astype(jnp.int32)
+        return inside & (away < barrier[pixel])
+
+    # All rays through one sample march together, and stay in a CPU's cache.
+    return jax.lax.map(from_pose, (poses, barrier), batch_size=_POSES)
