@@ -1,11 +1,13 @@
 """Which parts of known size fit what was seen, and how they lie: a search in which no part crowds out another.
 
-Every part is tried in many placements; its best few are refined by Gauss-Newton steps on the misfit E of
-`registration`, and the best of these again, on more points, together with the hypotheses of the view before. So a part
-never loses its place to look-alikes, and time grows linearly with the number of parts.
+Every part is tried in many placements, and its best few are refined by Gauss-Newton steps on the misfit E of
+`registration`; the best of these that lie apart are refined again, on more points, together with the hypotheses of the
+view before. Where any part came to stand then, all of them are tried. So a part never loses its place to look-alikes,
+nor misses one that a look-alike has; and time grows linearly with the number of parts.
 """
 
 import dataclasses
+import math
 from typing import Any
 
 import equinox as eqx
@@ -23,8 +25,11 @@ from jaxnbv.surfaces.shape_bank import ShapeBank
 NUM_HYPOTHESES = 32
 # Each rotation is tried in so many places.
 _PLACES = 4
-# How many of each part are refined, by how many points and steps: of all tried, and of the best of these.
-_COARSE, _FINE = (10, 48, 5), (4, 128, 10)
+# How many of each part are refined, by how many points and steps: of all tried, and of the best of these. Then so many
+# placements are tried with all parts, and the best few refined by so many steps more.
+_COARSE, _FINE, _SHARED, _LAST = (10, 48, 5), (4, 128, 10), 16, 3
+# Placements that differ by less than this are one to begin with: the cosine of a turn, and scene units.
+_TURN, _MOVE = math.cos(math.radians(15.0)), 0.15
 # How far a part may reach beyond the box, and how far two placed parts may differ that count as one: scene units.
 _ROOM, SAME = 0.2, 0.03
 _NUM_PROBES, _FEW_RAYS = 4096, 1024
@@ -50,11 +55,18 @@ def search_parts(
     """
     prior = Prior(poses, box, is_true_size=True)
     few, some = seen.first(_COARSE[1]), seen.first(_FINE[1])
-    starts = tried(bank, prior, _starts(bank, prior, seen, num_starts), few)
-    coarse = refined(bank, prior, _best_of_each(starts, len(bank), _COARSE[0]), few, _COARSE[2])
-    fine = _best_of_each(coarse, len(bank), _FINE[0])
-    fine = jax.tree.map(lambda *rows: jnp.concatenate(rows), fine, before)
-    last = refined(bank, prior, fine, some, _FINE[2])
+    starts = _of_each(tried(bank, prior, _starts(bank, prior, seen, num_starts), few), len(bank))
+    best = jax.vmap(lambda own: own.best(_COARSE[0]))(starts)
+    coarse = refined(bank, prior, _flat(best), few, _COARSE[2])
+    fine = _flat(jax.vmap(lambda own: _apart(own, _FINE[0]))(_of_each(coarse, len(bank))))
+    fine = refined(bank, prior, jax.tree.map(lambda *rows: jnp.concatenate(rows), fine, before), some, _FINE[2])
+    everywhere = jax.tree.map(lambda rows: jnp.stack(len(bank) * [rows]), _apart(fine, _SHARED).placement)
+    exchanged = _of_each(judged(bank, prior, tried(bank, prior, everywhere, some), some), len(bank))
+    split = len(fine.misfit) - NUM_HYPOTHESES
+    own, kept = (jax.tree.map(lambda rows: rows[part], fine) for part in (slice(split), slice(split, None)))  # noqa: B023
+    both = jax.tree.map(lambda *rows: jnp.concatenate(rows, axis=1), _of_each(own, len(bank)), exchanged)
+    both = jax.vmap(lambda each: _apart(each, _FINE[0]))(both)
+    last = refined(bank, prior, jax.tree.map(lambda *rows: jnp.concatenate(rows), _flat(both), kept), some, _LAST)
     if rays is None:
         last = judged(bank, prior, last, seen)
     else:
@@ -62,12 +74,24 @@ def search_parts(
     return _distinct(bank, box, last.best(2 * NUM_HYPOTHESES)).best(NUM_HYPOTHESES)
 
 
-def _best_of_each(tried: Hypotheses, num_shapes: int, count: int) -> Hypotheses:
-    """The best few of each shape, in whose order the hypotheses are."""
-    misfits = tried.misfit.reshape(num_shapes, -1)
-    _, best = jax.lax.top_k(-misfits, min(count, misfits.shape[1]))
-    rows = (best + misfits.shape[1] * jnp.arange(num_shapes)[:, None]).reshape(-1)
-    return jax.tree.map(lambda leaf: leaf[rows], tried)
+def _of_each(hypotheses: Hypotheses, num_shapes: int) -> Hypotheses:
+    """The hypotheses of each shape along a second axis; they come in the order of the shapes, as many of each."""
+    return jax.tree.map(lambda rows: rows.reshape(num_shapes, -1, *rows.shape[1:]), hypotheses)
+
+
+def _flat(hypotheses: Hypotheses) -> Hypotheses:
+    return jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), hypotheses)
+
+
+def _apart(hypotheses: Hypotheses, count: int) -> Hypotheses:
+    """The best few that are turned or moved from all better ones, whatever their shape; where these are too few, others
+    without end to their misfit."""
+    ordered = hypotheses.best(len(hypotheses.misfit))
+    rotation, shift = ordered.placement.rotation, ordered.placement.shift
+    turn = 0.5 * (jnp.einsum("aij,bij->ab", rotation, rotation, precision="highest") - 1.0)
+    moved = jnp.linalg.norm(shift[:, None] - shift, axis=-1)
+    modes = first_of_each((turn > _TURN) & (moved < _MOVE))
+    return dataclasses.replace(ordered, misfit=jnp.where(modes, ordered.misfit, jnp.inf)).best(count)
 
 
 def _starts(bank: ShapeBank, prior: Prior, seen: Seen, num_starts: int) -> Placement:

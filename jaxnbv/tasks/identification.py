@@ -21,8 +21,10 @@ from jaxnbv.surfaces.part_evidence import KAPPA, MOST, misfit_of, weight_of
 from jaxnbv.surfaces.part_hypotheses import NONE, PartHypotheses, hypotheses_of
 from jaxnbv.utility import Answer, Quantity
 
-# Hypotheses that are imagined, and the nodes along an axis of their surfaces.
-_NUM_IMAGINED, _RESOLUTION = 24, 64
+# Nodes along an axis of the surfaces that are imagined.
+_RESOLUTION = 64
+# What a view tells about how a part lies counts for so much of what it tells about which it is.
+_HOW = 0.1
 # How far each ray goes to a part, the cosine of its incidence, and whether it meets the part.
 _Image: TypeAlias = tuple[Float[Array, "..."], Float[Array, "..."], Bool[Array, "..."]]
 
@@ -32,25 +34,30 @@ class ImaginedParts(eqx.Module):
 
     - `surfaces`: of the likeliest hypotheses; `weights`: theirs, which sum to one.
     - `classes`: (h, c) what each hypothesis counts as, a one in each row.
+    - `how`: what information about how a part lies counts, zero if it does not.
     """
 
     surfaces: GridSurface
     weights: Float[Array, " h"]
     classes: Float[Array, "h c"]
+    how: float
 
 
 class Identify(Acquisition):
-    """Expected information about which part the object is and how it lies, in nats:
+    """Expected information about which part the object is, and then how it lies, in nats:
 
-        alpha(theta) = H(w) - sum_h w_h H(w | z_h),   w_h' | z_h  proportional to  w_h' exp(-kappa L(z_h, z_h'))
+        alpha(theta) = I(c) + 0.1 I(h | c),   I(c) = H(c) - sum_h w_h H(c | z_h),
+        w_h' | z_h  proportional to  w_h' exp(-kappa L(z_h, z_h'))
 
-    over the likeliest hypotheses h of a model that knows parts (`KnownShapes` with a bank at true size), z_h the depth
-    image of h from theta, and L the misfit of images by which the hypotheses are weighed, see `part_evidence`. Every
-    hypothesis is rendered once a pose, and images are compared in pairs. It needs no posterior.
+    over the hypotheses h of a model that knows parts (`KnownShapes` with a bank at true size): c is the name of h, and
+    I(h | c) what a view tells about h beyond c; z_h is the depth image of h from theta, and L the misfit of images by
+    which the hypotheses are weighed, see `part_evidence`. Every hypothesis is rendered once a pose, and images are
+    compared in pairs. It needs no posterior. Information about the name goes first: views that settle how an object
+    lies before they look at what tells the name put that off.
 
-    - `pose`: whether how it lies counts, or the name alone.
+    - `pose`: whether how it lies counts at all.
     - `group`: what each part of the bank counts as where the question is another one, "left" or "right" say:
-      `[name.split("-")[0] for name in bank.names]`.
+      `[name.split("-")[0] for name in bank.names]`. How it lies does not count then.
 
     **Raises:** `ValueError` for a group that is no list of names.
     """
@@ -63,19 +70,19 @@ class Identify(Acquisition):
         check_fields(self)
 
     def context(self, step: StepInputs) -> ImaginedParts:
-        """The likeliest hypotheses as surfaces."""
+        """The hypotheses as surfaces."""
         observations, hypotheses = step.observations, hypotheses_of(step.observations)
         grid = Grid() if observations.grid is None else observations.grid
         grid = Grid(min(_RESOLUTION, grid.resolution), grid.half_extent)
-        shapes = hypotheses.placed.shape[:_NUM_IMAGINED]
-        weights = hypotheses.weights[: len(shapes)]
-        weights = weights / jnp.maximum(jnp.sum(weights), 1e-30)
+        shapes = hypotheses.placed.shape
+        weights = hypotheses.weights[:-1] / jnp.maximum(jnp.sum(hypotheses.weights[:-1]), 1e-30)
+        how = _HOW if self.pose and self.group is None else 0.0
         classes = self._classes(shapes, len(hypotheses.bank))
-        return ImaginedParts(hypotheses.surfaces(grid, len(shapes)), weights, classes)
+        return ImaginedParts(hypotheses.surfaces(grid, len(shapes)), weights, classes, how)
 
     def _classes(self, shapes: Int[Array, " h"], num_parts: int) -> Float[Array, "h c"]:
         if self.group is None:
-            return jnp.eye(len(shapes)) if self.pose else jax.nn.one_hot(shapes, num_parts)
+            return jax.nn.one_hot(shapes, num_parts)
         require(
             len(self.group) == num_parts, f"the group has {len(self.group)} names for {num_parts} parts: give one each"
         )
@@ -98,11 +105,11 @@ class Identify(Acquisition):
         at_once = samples_at_once(camera, poses)
         images = shared_map(_image, context.surfaces, camera, poses, barrier, at_once=at_once)
         by_pose = jax.tree.map(lambda rows: jnp.moveaxis(rows, 1, 0), images)
-        return shared_map(_information, by_pose, context.weights, context.classes, camera)[None]
+        return shared_map(_information, by_pose, context.weights, context.classes, context.how, camera)[None]
 
     @property
     def quantity(self) -> Quantity:
-        meaning = "information about which part it is and how it lies that a view is expected to give."
+        meaning = "information about which part it is, and a tenth of that about how it lies, that a view should give."
         return Quantity("expected information", "nats", meaning)
 
 
@@ -130,9 +137,9 @@ def _image(surface: GridSurface, camera: Camera, poses: Pose, barrier: Float[Arr
 
 
 def _information(
-    images: _Image, weights: Float[Array, " h"], classes: Float[Array, "h c"], camera: Camera
+    images: _Image, weights: Float[Array, " h"], classes: Float[Array, "h c"], how: float, camera: Camera
 ) -> Float[Array, ""]:
-    """The information of one pose, given the images of all hypotheses from there."""
+    """alpha of one pose, given the images of all hypotheses from there."""
 
     reach, _, hits = images
     weight = weight_of(jnp.sum(jnp.where(hits, reach, 0.0)) / jnp.maximum(jnp.sum(hits), 1), camera)
@@ -141,8 +148,14 @@ def _information(
         misfit = weight * jnp.sum(_misfits(image, images), axis=-1)
         return jax.nn.softmax(jnp.log(weights) - KAPPA * misfit)
 
-    left = entropy(jnp.matmul(jax.lax.map(after, images), classes, precision="highest"))
-    return entropy(weights @ classes) - jnp.sum(weights * left)
+    after_each = jax.lax.map(after, images)
+
+    def told(of):
+        left = entropy(jnp.matmul(after_each, of, precision="highest"))
+        return entropy(weights @ of) - jnp.sum(weights * left)
+
+    which = told(classes)
+    return which + how * (told(jnp.eye(len(weights))) - which)
 
 
 def _misfits(image: _Image, others: _Image) -> Float[Array, "h rays"]:

@@ -11,11 +11,11 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 import jaxnbv as nbv
-from jaxnbv.scanning.sdf import Cuboid, Cylinder, Sphere, Translated, Union
+from jaxnbv.scanning.sdf import Cuboid, Cylinder, Difference, Sphere, Translated, Union
 from jaxnbv.surfaces.part_evidence import Rays, evidence
 from jaxnbv.surfaces.part_hypotheses import NONE, PartHypotheses, identify
 from jaxnbv.surfaces.part_pose import object_pose, surface_error, symmetries
-from jaxnbv.surfaces.placement import Placement
+from jaxnbv.surfaces.placement import FreeRotation, Placement
 from jaxnbv.surfaces.registration import Hypotheses, Seen
 from jaxnbv.surfaces.shape_bank import Shape
 
@@ -170,6 +170,31 @@ def test_hypotheses_are_kept_and_the_same_by_the_same_views(seen):
     carried = identify(BANK, nbv.surfaces.FreeRotation(), nbv.Box(), seen[0], again)
     best = float(carried.placed.misfit.min())
     assert best <= float(again.placed.misfit.min()) * 1.1 + 1.0
+
+
+def housing(x, z, radius):
+    """A block with a pocket, in which a pin stands."""
+    block = Difference(
+        Cuboid(np.array([0.75, 1.25, 0.55])),
+        Translated(Cuboid(np.array([0.42, 0.7, 0.3])), np.array([0.15, 0.75, 0.0])),
+    )
+    return Union(block, Translated(Cylinder(radius, 0.25), np.array([0.15 + x, 0.25, z])))
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_where_one_part_may_lie_all_that_look_alike_may(seed):
+    """From below, where no view shows the pin: however a block is turned onto itself, all parts are as likely."""
+    pins = [(-0.25, 0.0, 0.12), (0.25, 0.0, 0.12), (0.0, 0.15, 0.12), (0.0, -0.15, 0.12), (0.0, 0.0, 0.22)]
+    bank = nbv.ShapeBank.of([housing(*pin) for pin in pins], is_true_size=True)
+    turn = Rotation.random(random_state=seed)
+    surface = nbv.SDFSurface(nbv.sdf.Rotated(housing(*pins[seed]), turn.as_matrix().astype(np.float32)))
+    sampler = nbv.SurfaceSampler(grid=GRID, carving=nbv.Carving(nbv.Box.cube(3.2)))
+    observations = observations_of(surface, [turn.apply([0.4, -4.0, 0.9])], sampler)
+    hypotheses = identify(bank, FreeRotation(), nbv.Box.cube(2.9), observations, None)
+    np.testing.assert_allclose(hypotheses.shape_weights, 1.0 / len(pins), atol=0.02)
+    off = (turn.inv() * Rotation.from_matrix(hypotheses.placed.placement.rotation)).magnitude()
+    there = np.asarray(hypotheses.placed.is_mode) & (off < np.radians(3.0))
+    assert set(np.asarray(hypotheses.placed.shape)[there]) == set(range(len(pins)))
 
 
 def test_none_of_these():
