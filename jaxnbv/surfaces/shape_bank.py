@@ -16,6 +16,7 @@ from jaxnbv.checks import InputError, check_type, checked, require, shown
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import fibonacci_sphere
 from jaxnbv.scanning.sdf import Scaled, SignedDistance
+from jaxnbv.surfaces.look_alikes import warn_of_look_alikes
 from jaxnbv.surfaces.mesh_shapes import listed, mesh_paths, shapes_of_meshes
 
 NUM_EXTREMES, _FAR, _STRIDES, _ARRIVED = 128, 4.0, 40, 0.01
@@ -117,7 +118,7 @@ class ShapeBank(eqx.Module):
           longest sides are 2.5.
         - `up`: the meshes' axis that is upward, see `Frame`.
 
-        A `UserWarning` names each mesh that cannot be used and is left out.
+        A `UserWarning` names each mesh that cannot be used and is left out, and parts at true size that are the same.
 
         **Raises:** `ValueError` if none can be used, for another number of names, for numbers out of their ranges, or
         another unit.
@@ -140,6 +141,7 @@ class ShapeBank(eqx.Module):
         if factor is None:
             return bank
         sizes = factor / jnp.cbrt(jnp.linalg.det(from_mesh[:, :3, :3]))
+        warn_of_look_alikes(shapes, bank.names, np.asarray(sizes), stacklevel=3)
         return dataclasses.replace(bank, is_true_size=True)._resized(sizes)
 
     def in_scene(self, frame: Frame) -> "ShapeBank":

@@ -86,6 +86,30 @@ def test_a_bank_keeps_true_sizes(meshes):
     assert without.in_scene(nbv.Frame(scale=8.0)) is without
 
 
+def bracket(hole, middle=(0.0, 0.0, 0.0)):
+    """A block of 40 x 60 x 100 with a pocket at one end, so deep, that no mirror keeps."""
+    block = trimesh.creation.box((40.0, 60.0, 100.0))
+    cut = trimesh.creation.box((20.0, 30.0, hole)).apply_translation((6.0, 5.0, 50.0 - hole / 2.0 + 1e-3))
+    corners = np.concatenate([block.vertices, cut.vertices])
+    # Open where it was cut out: the lid of the cut lies in the face of the block.
+    faces = np.concatenate([block.faces, len(block.vertices) + cut.faces[:, ::-1]])
+    return trimesh.Trimesh(corners, faces).apply_translation(middle)
+
+
+def test_parts_that_are_the_same_are_told():
+    """Moved or drawn along other axes; but not a smaller one, one with a deeper hole, or a mirror image."""
+    own = bracket(30.0)
+    turned = own.copy().apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, (0, 1, 0), (7.0, 1.0, 2.0)))
+    mirrored = own.copy()
+    mirrored.apply_transform(np.diag([1.0, -1.0, 1.0, 1.0]))
+    parts = [own, turned, bracket(30.0, (5.0, 5.0, 5.0)), bracket(45.0), own.copy().apply_scale(0.96), mirrored]
+    names = ["own", "turned", "moved", "deeper", "smaller", "mirrored"]
+    with pytest.warns(UserWarning, match="the same up to") as told:
+        nbv.ShapeBank.from_meshes(parts, names=names, resolution=48, progress=False, scale="mm")
+    pairs = {tuple(str(warning.message).split(" are the same")[0].split(" and ")) for warning in told}
+    assert pairs == {("own", "turned"), ("own", "moved"), ("turned", "moved")}
+
+
 @pytest.mark.parametrize("scale", ["yard", 0.0, -1.0, float("nan")])
 def test_other_units_are_refused(meshes, scale):
     with pytest.raises(nbv.InputError, match="unit"):

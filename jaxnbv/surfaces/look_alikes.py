@@ -1,0 +1,66 @@
+"""Parts of a bank that no scan tells apart: the same surface, at the same size, however it was drawn."""
+
+import itertools
+import warnings
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import map_coordinates
+from scipy.spatial.transform import Rotation
+
+from jaxnbv.surfaces.mesh_shapes import MeshShape
+
+# Places at which signed distances are compared, before those far from the surface are left out; and how many cells of
+# the grid are near.
+_PROBES, _NEAR = 8192, 3.0
+# Turns of a cube onto itself: parts are often drawn along other axes.
+_TURNS = Rotation.create_group("O").as_matrix()
+
+
+def warn_of_look_alikes(
+    shapes: Sequence[MeshShape], names: Sequence[str], sizes: Float[np.ndarray, " k"], stacklevel: int
+) -> None:
+    """A `UserWarning` for each pair of parts that are the same within a cell of their grids, turned by right angles.
+
+    - `sizes`: world units for a unit of each shape.
+    """
+    grids = [_Grid(shape) for shape in shapes]
+    for one, other in itertools.combinations(range(len(shapes)), 2):
+        off = _difference(grids[one], grids[other], float(sizes[other] / sizes[one]))
+        if off < grids[one].spacing:
+            warnings.warn(
+                f"{names[one]} and {names[other]} are the same up to {off * sizes[one]:.2g}: no view will tell them "
+                "apart. Leave one out, or raise the resolution if they differ by a detail that is smaller than a cell",
+                stacklevel=stacklevel + 1,
+            )
+
+
+class _Grid:
+    """The signed distances of a shape as NumPy has them, and half of its sides."""
+
+    def __init__(self, shape: MeshShape):
+        solid = shape.solid
+        self.values, self.low, self.spacing = (np.asarray(each) for each in (solid.values, solid.low, solid.spacing))
+        self.half = np.abs(shape.extremes).max(axis=0)
+
+    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        places = ((points - self.low) / self.spacing).T
+        return map_coordinates(self.values, places, order=1, mode="nearest")
+
+
+def _difference(one: _Grid, other: _Grid, ratio: float) -> float:
+    """How much the distances to two centred shapes differ near the first of them, at most, however the other one is
+    turned by right angles; infinite where their sides differ.
+
+    - `ratio`: how many times as large the other one is as it is drawn.
+    """
+    least, points = np.inf, None
+    for turn in _TURNS:
+        if np.abs(ratio * np.abs(turn) @ other.half - one.half).max() > 0.5 * one.spacing:
+            continue
+        if points is None:
+            drawn = np.random.default_rng(0).uniform(-1.0, 1.0, (_PROBES, 3)) * (one.half + one.spacing)
+            points = drawn[np.abs(one(drawn)) < _NEAR * one.spacing]
+        least = min(least, float(np.abs(one(points) - ratio * other(points @ turn / ratio)).max()))
+    return least
