@@ -12,6 +12,7 @@ import math
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnbv.geometry.camera import Camera
@@ -64,15 +65,18 @@ class Looks(eqx.Module):
         """
         radii = jnp.minimum(radii, self.grid.spacing)
         place = (cloud.points + self.grid.half_extent) / self.grid.spacing
-        low, distance = jnp.floor(place).astype(jnp.int32), self.distance
-        for offset in itertools.product(range(1 - _REACH, _REACH + 1), repeat=3):
-            node = low + jnp.array(offset)
+        low = jnp.floor(place).astype(jnp.int32)
+
+        def near(distance, offset):
+            node = low + offset
             away = jnp.maximum(self.grid.spacing * jnp.linalg.norm(node - place, axis=-1) - radii, 0.0)
             # A negative index would count from the other end.
             there = cloud.mask & jnp.all(node >= 0, axis=-1)
             index = jnp.where(there[:, None], node, self.grid.resolution)
-            distance = distance.at[tuple(index.T)].min(away, mode="drop")
-        return dataclasses.replace(self, distance=distance)
+            return distance.at[tuple(index.T)].min(away, mode="drop"), None
+
+        offsets = np.array(list(itertools.product(range(1 - _REACH, _REACH + 1), repeat=3)))
+        return dataclasses.replace(self, distance=jax.lax.scan(near, self.distance, offsets)[0])
 
     def with_view(
         self,
