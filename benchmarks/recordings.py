@@ -52,7 +52,6 @@ class Recorded(NamedTuple):
     box: tuple[float, ...] | None = None
     up: tuple[float, float, float] | None = None
     mesh: TriangleMesh | None = None
-    mesh: trimesh.Trimesh | None = None
 
 
 def of_mesh(file: Path, folder: Path, above: bool) -> Recorded:
@@ -65,7 +64,7 @@ def of_mesh(file: Path, folder: Path, above: bool) -> Recorded:
     # The table's noise stays below the box.
     room = np.array([[-0.03, -0.03, 0.02 if above else -0.03], [0.03, 0.03, 0.03]])
     box = tuple((corners + _SIDE * room).reshape(-1).tolist())
-    known = trimesh.Trimesh(np.asarray(frame.to_world(mesh.vertices)), mesh.faces, process=False)
+    known = TriangleMesh(np.asarray(frame.to_world(mesh.vertices), np.float64), mesh.faces, nbv.Frame())
     recorded = Recorded(f"{file.stem}, {'above' if above else 'around'}", folder, box, mesh=known)
     if (folder / "frames.json").exists():
         return recorded
