@@ -77,7 +77,8 @@ class Case:
                 row[-4:-2] = before[0], float(_new_area(step.view.scan, step.view.pose, study, before[1]))
             inputs = loop.inputs()
             unseen = planner.acquisition.context(inputs)
-            before = float(loop.propose().value), unseen
+            if len(taken) < study.views:
+                before = float(loop.propose().value), unseen
             row[:-4] = self._judge(inputs, unseen, taken)
             yield row
 
@@ -177,7 +178,10 @@ def main() -> None:
         _show(f"mean of {len(tables)}", np.mean(episodes, axis=0))
     ended = at_the_end(episodes)
     print(f"\nCovered({_ENOUGH}) ends {len(ended)} of {len(episodes)} episodes; seen by then, in percent:")
-    for name, values in zip(COLUMNS[-2:], 100 * ended.T, strict=True):
+    for name, column in zip(COLUMNS[-2:], 100 * ended.T, strict=True):
+        # What is recorded has no known area.
+        if len(values := column[~np.isnan(column)]) == 0:
+            continue
         print(f"{name:>6}: mean {values.mean():.1f}, least {values.min():.1f}, largest {values.max():.1f}")
 
 

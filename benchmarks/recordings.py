@@ -153,7 +153,7 @@ def area_shown(recorded: Recorded, count: int = 20_000) -> np.ndarray:
         facing = -np.sum(directions * normals, axis=1) >= math.cos(_CAMERA.max_incidence)
         hits = recorded.mesh.trace(np.broadcast_to(matrix[:3, 3], offset.shape), directions)
         met = np.linalg.norm(np.asarray(hits.points) - matrix[:3, 3], axis=1)
-        shown.append(within & facing & (np.abs(met - away) < 2e-3 * away))
+        shown.append(within & facing & np.asarray(hits.mask) & (np.abs(met - away) < 2e-3 * away))
     return np.array(shown)
 
 

@@ -7,7 +7,6 @@ nor misses one that a look-alike has; and time grows linearly with the number of
 """
 
 import dataclasses
-import math
 from typing import Any
 
 import equinox as eqx
@@ -19,7 +18,7 @@ from jaxtyping import Array, Float
 from jaxnbv.geometry.volume import Box
 from jaxnbv.surfaces.part_evidence import Rays, evidence
 from jaxnbv.surfaces.placement import Placement, ShapePoses
-from jaxnbv.surfaces.registration import Hypotheses, Prior, Seen, first_of_each, judged, refined, tried
+from jaxnbv.surfaces.registration import Hypotheses, Prior, Seen, first_of_each, judged, refined, tried, turned_alike
 from jaxnbv.surfaces.shape_bank import ShapeBank
 
 NUM_HYPOTHESES = 32
@@ -28,8 +27,8 @@ _PLACES = 4
 # How many of each part are refined, by how many points and steps: of all tried, and of the best of these. Then so many
 # placements are tried with all parts, and the best few refined by so many steps more.
 _COARSE, _FINE, _SHARED, _LAST = (10, 48, 5), (4, 128, 10), 16, 3
-# Placements that differ by less than this are one to begin with: the cosine of a turn, and scene units.
-_TURN, _MOVE = math.cos(math.radians(15.0)), 0.15
+# Placements that are turned alike and moved by less than this are one to begin with: scene units.
+_MOVE = 0.15
 # How far a part may reach beyond the box, and how far two placed parts may differ that count as one: scene units.
 _ROOM, SAME = 0.2, 0.03
 _NUM_PROBES, _FEW_RAYS = 4096, 1024
@@ -62,8 +61,8 @@ def search_parts(
     fine = refined(bank, prior, jax.tree.map(lambda *rows: jnp.concatenate(rows), fine, before), some, _FINE[2])
     everywhere = jax.tree.map(lambda rows: jnp.stack(len(bank) * [rows]), _apart(fine, _SHARED).placement)
     exchanged = _of_each(judged(bank, prior, tried(bank, prior, everywhere, some), some), len(bank))
-    split = len(fine.misfit) - NUM_HYPOTHESES
-    own, kept = (jax.tree.map(lambda rows: rows[part], fine) for part in (slice(split), slice(split, None)))  # noqa: B023
+    own = jax.tree.map(lambda rows: rows[:-NUM_HYPOTHESES], fine)
+    kept = jax.tree.map(lambda rows: rows[-NUM_HYPOTHESES:], fine)
     both = jax.tree.map(lambda *rows: jnp.concatenate(rows, axis=1), _of_each(own, len(bank)), exchanged)
     both = jax.vmap(lambda each: _apart(each, _FINE[0]))(both)
     last = refined(bank, prior, jax.tree.map(lambda *rows: jnp.concatenate(rows), _flat(both), kept), some, _LAST)
@@ -87,10 +86,9 @@ def _apart(hypotheses: Hypotheses, count: int) -> Hypotheses:
     """The best few that are turned or moved from all better ones, whatever their shape; where these are too few, others
     without end to their misfit."""
     ordered = hypotheses.best(len(hypotheses.misfit))
-    rotation, shift = ordered.placement.rotation, ordered.placement.shift
-    turn = 0.5 * (jnp.einsum("aij,bij->ab", rotation, rotation, precision="highest") - 1.0)
+    shift = ordered.placement.shift
     moved = jnp.linalg.norm(shift[:, None] - shift, axis=-1)
-    modes = first_of_each((turn > _TURN) & (moved < _MOVE))
+    modes = first_of_each(turned_alike(ordered.placement.rotation) & (moved < _MOVE))
     return dataclasses.replace(ordered, misfit=jnp.where(modes, ordered.misfit, jnp.inf)).best(count)
 
 

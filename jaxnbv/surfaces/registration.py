@@ -319,9 +319,13 @@ def _newton_step(
 
 def _modes(shape: Int[Array, " h"], rotation: Float[Array, "h 3 3"]) -> Bool[Array, " h"]:
     """Which of the hypotheses, best first, are farther than 15 degrees from all better modes of their shape."""
+    return first_of_each(turned_alike(rotation) & (shape[:, None] == shape))
+
+
+def turned_alike(rotation: Float[Array, "h 3 3"]) -> Bool[Array, "h h"]:
+    """Which rotations are within 15 degrees of each other."""
     trace = jnp.einsum("aij,bij->ab", rotation, rotation, precision="highest")
-    near = (0.5 * (trace - 1.0) > np.cos(np.radians(15.0))) & (shape[:, None] == shape)
-    return first_of_each(near)
+    return 0.5 * (trace - 1.0) > np.cos(np.radians(15.0))
 
 
 def first_of_each(is_same: Bool[Array, "h h"]) -> Bool[Array, " h"]:
