@@ -25,6 +25,7 @@ from .planning.loop import View as View
 from .planning.planner import Planner as Planner
 from .planning.session import NextView as NextView
 from .planning.session import Session as Session
+from .planning.sessions import Sessions as Sessions
 from .planning.simulate import simulate as simulate
 from .planning.stopping import Budget as Budget
 from .planning.stopping import Covered as Covered

@@ -134,7 +134,7 @@ class SurfaceSampler(eqx.Module):
         - `poses`: how the shapes can stand in the scene.
         """
         box = Box() if self.carving is None else bounding_box(self.carving.volume)
-        longest_side = max(high - low for low, high in zip(box.low, box.high, strict=True))
+        longest_side = float(np.max(box.high - box.low))
         own = (self.model.base.truncation,) if isinstance(self.model, ScreenedSPSR) else ()
         return dataclasses.replace(
             self, model=KnownShapes(bank, short_ranged(longest_side, *own), poses, box, self.model)

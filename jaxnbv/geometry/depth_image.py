@@ -160,7 +160,7 @@ def _depths_of(box: Box, pose: Pose) -> tuple[float, float]:
     farthest = float(ahead.max())
     require(
         farthest > 0,
-        f"the box from {box.low} to {box.high} lies behind the camera at {np.asarray(pose.position)}: give the pose "
+        f"the box {box} lies behind the camera at {np.asarray(pose.position)}: give the pose "
         'from camera to world, not its inverse, and its convention, Pose.from_matrix(matrix, "opengl")',
     )
     return max(float(ahead.min()), 1e-3 * farthest), farthest
@@ -199,7 +199,7 @@ def _warn_of_nothing_inside(points: Float[np.ndarray, "valid 3"], inside: Bool[n
     if len(points) and not inside.any():
         low, high = points.min(axis=0), points.max(axis=0)
         warnings.warn(
-            f"none of the {len(points)} points of the depth image lies in the box from {box.low} to {box.high}: they "
+            f"none of the {len(points)} points of the depth image lies in the box {box}: they "
             f"lie from {low} to {high}. Is the pose from camera to world, in the right convention, and the box in its "
             "units?",
             NothingInside,

@@ -128,7 +128,7 @@ def _apply(thing, place, turn, scale: float):
         return Pose(rotation, place(thing.position).astype(thing.position.dtype))
     if isinstance(thing, Box):
         corners = place(np.array([thing.low, thing.high]))
-        return Box(tuple(corners.min(axis=0).tolist()), tuple(corners.max(axis=0).tolist()))
+        return Box(corners.min(axis=0), corners.max(axis=0))
     if isinstance(thing, Camera):
         farthest = None if thing.farthest is None else scale * thing.farthest
         return dataclasses.replace(thing, nearest=scale * thing.nearest, farthest=farthest)

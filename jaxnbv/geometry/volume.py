@@ -22,9 +22,9 @@ _BISECTIONS = 40
 _FAR = 3.0
 
 
-def _corner(values) -> tuple[float, ...]:
+def _corner(values) -> Float[np.ndarray, " 3"]:
     try:
-        return tuple(float(value) for value in values)
+        return np.array([float(value) for value in values])
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"a corner of a box is {shown(values)}; give three numbers") from error
 
@@ -32,29 +32,34 @@ def _corner(values) -> tuple[float, ...]:
 class Box(eqx.Module):
     """The volume between two opposite corners, in scene coordinates. The default holds every scene of `Frame.fit`.
 
+    Its corners are arrays, so that programs that were compiled for one box run for any.
+
     **Raises:** `ValueError` if a side is not positive or a corner not finite.
     """
 
-    low: tuple[float, ...] = eqx.field(static=True, converter=_corner, default=(-1.25, -1.25, -1.25))
-    high: tuple[float, ...] = eqx.field(static=True, converter=_corner, default=(1.25, 1.25, 1.25))
+    low: Float[np.ndarray, "3"] = eqx.field(converter=_corner, default=(-1.25, -1.25, -1.25))
+    high: Float[np.ndarray, "3"] = eqx.field(converter=_corner, default=(1.25, 1.25, 1.25))
 
     def __check_init__(self):
-        sides = [b - a for a, b in zip(self.low, self.high, strict=False)]
+        proper = self.low.shape == self.high.shape == (3,)
         require(
-            len(self.low) == len(self.high) == 3 and all(0 < side < math.inf for side in sides),
-            f"a box from {self.low} to {self.high} has no inside: each of three sides must be positive and finite",
+            proper and all(0 < side < math.inf for side in (self.high - self.low).tolist()),
+            f"a box {self} has no inside: each of three sides must be positive and finite",
         )
+
+    def __str__(self) -> str:
+        low, high = (tuple(np.asarray(corner).tolist()) for corner in (self.low, self.high))
+        return f"from {low} to {high}"
 
     def widened(self, by: float) -> "Box":
         """The box with its faces moved outward, but for the lower one (y is up): what the object stands on is below."""
-        (x, y, z), high = self.low, tuple(high + by for high in self.high)
-        return Box((x - by, y, z - by), high)
+        return Box(self.low - np.array([by, 0.0, by]), self.high + by)
 
     def passed(self, points: Float[np.ndarray, "n 3"], by: float) -> dict[str, float]:
         """The share of some points that lies beyond each face, "+x" say, by more than a length."""
         if len(points) == 0:
             return {}
-        beyond = {"-": points < np.array(self.low) - by, "+": points > np.array(self.high) + by}
+        beyond = {"-": points < self.low - by, "+": points > self.high + by}
         shares = {sign: rows.mean(axis=0) for sign, rows in beyond.items()}
         return {f"{sign}{axis}": float(shares[sign][index]) for index, axis in enumerate("xyz") for sign in shares}
 
@@ -78,8 +83,8 @@ class Box(eqx.Module):
 def ray_interval(
     origin: Sequence[Float[Array, "*#n"]],
     direction: Sequence[Float[Array, "*#n"]],
-    low: Sequence[float],
-    high: Sequence[float],
+    low: Sequence[float] | Float[AnyArray, "3"],
+    high: Sequence[float] | Float[AnyArray, "3"],
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
     """Where rays enter a box and leave it, in lengths of their directions (Kay and Kajiya 1986). A ray that enters
     after it leaves misses the box.
@@ -118,5 +123,5 @@ def bounding_box(volume: Volume) -> Box:
     """The box about a volume's boundary, found along a thousand rays; of a `Box` itself."""
     if isinstance(volume, Box):
         return volume
-    points = boundary_points(volume, 1000)
-    return Box(tuple(jnp.min(points, axis=0).tolist()), tuple(jnp.max(points, axis=0).tolist()))
+    points = np.asarray(boundary_points(volume, 1000), np.float64)
+    return Box(np.min(points, axis=0), np.max(points, axis=0))

@@ -118,7 +118,7 @@ class Session:
         obstacles: Obstacles | None = None,
         progress: bool = True,
     ):
-        self.camera, self.box, self.convention = camera, _box_of(box), convention
+        self.camera, self.box, self.convention = camera, box_of(box), convention
         self.key, self.until, self.progress = jax.random.key(0) if key is None else key, until, progress
         check_key(self.key)
         if up is None:
@@ -470,9 +470,9 @@ def _is_blank(depth: np.ndarray, cloud: PointCloud) -> bool:
     return not bool(np.any(cloud.missed)) or (len(values) == 1 and bool(np.isfinite(values[0])))
 
 
-def _box_of(corners) -> Box:
+def box_of(corners) -> Box:
     """**Raises:** `ValueError` for what is neither a `Box` nor two corners."""
     if isinstance(corners, Box):
         return corners
     require(np.shape(corners) == (2, 3), f"the box is {shown(corners)}; give two corners, (low, high), or a Box")
-    return Box(*(as_numbers(corner, "a corner of the box", np.float64).tolist() for corner in corners))
+    return Box(*(as_numbers(corner, "a corner of the box", np.float64) for corner in corners))

@@ -71,7 +71,7 @@ def warn_of_no_table(up: str, others: tuple[str, ...]) -> None:
 
 def warn_of_inside(box: Box, cameras: Float[np.ndarray, "n 3"], candidates: Float[np.ndarray, "m 3"]) -> None:
     """Warn, of the first camera that stands in the box, if no candidate does. All in world units."""
-    low, high = np.array(box.low), np.array(box.high)
+    low, high = box.low, box.high
     is_inside, any_inside = (np.all((x > low) & (x < high), axis=1) for x in (cameras, candidates))
     if is_inside[-1] and is_inside.sum() == 1 and not any_inside.any():
         warnings.warn(

@@ -51,7 +51,7 @@ def table_under(cloud: PointCloud, box: Box) -> Obstacles | None:
 
     `cloud` is the whole image, not only what lies in the box.
     """
-    low, high = np.array(box.low), np.array(box.high)
+    low, high = box.low, box.high
     side, middle = float((high - low).max()), 0.5 * (low + high)
     image = _points_about(cloud, low, high, side)
     plane = _plane_of_most(image, low[1] - middle[1] - _BELOW * side, high[1] - middle[1])

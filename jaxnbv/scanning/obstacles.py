@@ -38,8 +38,9 @@ class Obstacles(eqx.Module):
     """
 
     solids: tuple[SignedDistance, ...] = ()
-    margin: float = eqx.field(static=True, default=0.03)
-    clearance: float = eqx.field(static=True, default=0.1)
+    # Arrays, so that what was compiled for one scale runs for any.
+    margin: float = eqx.field(converter=np.float64, default=0.03)
+    clearance: float = eqx.field(converter=np.float64, default=0.1)
 
     def __check_init__(self):
         check_fields(self)
@@ -78,6 +79,7 @@ class Obstacles(eqx.Module):
         missed = None if scan.missed is None else scan.missed | own
         return dataclasses.replace(scan.only(~own), missed=missed)
 
+    @eqx.filter_jit
     def within(self, grid: Grid) -> Bool[Array, "g g g"]:
         """The nodes of a grid that lie within an obstacle."""
         axis = jnp.asarray(grid.axis, jnp.result_type(float))

@@ -151,7 +151,7 @@ class RecordedStudy(Study):
     quick: ClassVar[Mapping[str, Any]] = {"num_samples": 4, "grid_resolution": 48, "capacity": 1000}
 
     folder: str = eqx.field(static=True, kw_only=True)
-    box: Box = eqx.field(static=True, kw_only=True)
+    box: Box = eqx.field(kw_only=True)
     voxel: float = eqx.field(static=True, kw_only=True)
     up: tuple[float, float, float] | None = eqx.field(static=True, default=None)
     intrinsics: tuple[float, float, float, float] | None = eqx.field(static=True, default=None)
@@ -169,8 +169,8 @@ class RecordedStudy(Study):
         sensor: dict[str, Any] = {name: options.get(name) for name in ("up", "intrinsics", "depth_scale")}
         frames = RecordedFrames(folder, **sensor)
         corners = options.get("box") or bounds_of(frames)
-        box = Box(tuple(corners[:3]), tuple(corners[3:]))
-        longest = max(high - low for low, high in zip(box.low, box.high, strict=True))
+        box = Box(corners[:3], corners[3:])
+        longest = float(np.max(box.high - box.low))
         settings = dict(cls.quick) if quick else {"num_samples": 8, "grid_resolution": 100, "capacity": 2000}
         study = cls(
             views=views,
@@ -246,7 +246,7 @@ class RecordedStudy(Study):
         """The voxels of the box across its shortest side, those that the frames so far have shown in colour; the way of
         the recorded camera, and where the chosen frames were taken, in their order."""
         recording, held = self.recording, record["methods"]
-        kept = np.sort(np.argsort(np.subtract(self.box.high, self.box.low))[1:])
+        kept = np.sort(np.argsort(self.box.high - self.box.low)[1:])
         voxels, places = recording.voxels[:, kept], recording.places[:, kept]
 
         def tile(axes: Axes, method: str, view: int) -> None:

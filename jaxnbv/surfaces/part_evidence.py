@@ -5,8 +5,9 @@ by how far x is from its surface, and how deep the ray went through it:
 
     L = sum over rays of  l(d(x)) + l(min over the ray of min(d, 0)),   l(r) = log(1 + r^2 / 2 tau^2)
 
-without the first term for a ray that did not meet the object. No term is more than C = l(0.12): what is far off says no
-more than what is off. A ray from which nothing came back counts where it went through a part in space that was seen to
+without the first term for a ray that did not meet the object. No term is more than C = l(4 tau): what is far off says no
+more than what is off. tau is twice the noise of the sights, as their third differences from pixel to pixel show it, or
+0.03 scene units where that is more: by less, a part's surface on its grid is not known. A ray from which nothing came back counts where it went through a part in space that was seen to
 be empty: a sensor may miss a surface. Misfits add up, so that weights sharpen with evidence; but rays side by side err
 together, so the sum is tempered,
 
@@ -33,9 +34,11 @@ from jaxnbv.scanning import Grid
 from jaxnbv.surfaces.registration import Hypotheses
 from jaxnbv.surfaces.shape_bank import ShapeBank
 
-# Scene units.
-_TAU, _FAR = 0.03, 0.12
-MOST = math.log1p(_FAR**2 / (2.0 * _TAU**2))
+# tau at least, in scene units; in standard deviations of the noise; and where misfits end, in tau.
+LEAST_TAU, _TAU_OF_NOISE, _FAR = 0.03, 2.0, 4.0
+MOST = math.log1p(_FAR**2 / 2.0)
+# The standard deviation of a normal distribution in medians of its absolute value.
+_BY_MEDIAN = 1.4826
 # The least stride along a ray, and how many are taken.
 _STRIDE, _NUM_STRIDES = 0.04, 40
 # All views together speak by so many rays, at most.
@@ -55,6 +58,7 @@ class Rays(NamedTuple):
     - `weight`: what each counts: one, or less where rays are closer together than the errors of a surface, and more
       where it stands for others.
     - `empty_nodes`: of `grid`, those that were seen empty.
+    - `tau`: how far a point may lie from the surface that it was measured on, in scene units.
     """
 
     origins: Float[Array, "n 3"]
@@ -64,6 +68,7 @@ class Rays(NamedTuple):
     weight: Float[Array, " n"]
     empty_nodes: Bool[Array, "g g g"]
     grid: Grid
+    tau: Float[Array, ""]
 
     @classmethod
     @eqx.filter_jit
@@ -77,6 +82,7 @@ class Rays(NamedTuple):
         returned = jnp.isfinite(sight) & (sight > 0)
         points = origins + jnp.where(returned, sight, 0.0)[:, None] * directions
         is_object = returned & (looks(points) <= looks.grid.spacing)
+        noise = _noise_of(looks.sight, is_object, looks.camera)
         away = jnp.sum(jnp.where(is_object, sight, 0.0)) / jnp.maximum(jnp.sum(is_object), 1)
 
         enter, leave = ray_interval(list(origins.T), list(directions.T), box.low, box.high)
@@ -99,6 +105,7 @@ class Rays(NamedTuple):
             weight,
             observations.empty_nodes,
             looks.grid,
+            jnp.maximum(LEAST_TAU, _TAU_OF_NOISE * noise),
         )
 
     def first(self, count: int) -> "Rays":
@@ -108,7 +115,18 @@ class Rays(NamedTuple):
             share = jnp.sum(kind) / jnp.maximum(jnp.sum(kind[:count]), 1)
             weight = jnp.where(kind[:count], share * weight, weight)
         origins, directions, sight, is_object = (leaf[:count] for leaf in self[:4])
-        return Rays(origins, directions, sight, is_object, weight, self.empty_nodes, self.grid)
+        return Rays(origins, directions, sight, is_object, weight, self.empty_nodes, self.grid, self.tau)
+
+
+def _noise_of(
+    sight: Float[Array, "views rays"], is_object: Bool[Array, " all_rays"], camera: Camera
+) -> Float[Array, ""]:
+    """The standard deviation of the sights of an object, from differences of the third order along rows and columns,
+    which surfaces that bend little leave at zero; zero where there are none."""
+    images = jnp.where(is_object, sight.reshape(-1), jnp.nan).reshape(-1, camera.height, camera.width)
+    changes = [jnp.diff(images, 3, axis=axis).reshape(-1) for axis in (1, 2)]
+    # The coefficients 1, 3, 3, 1 sum to 20 in squares.
+    return jnp.nan_to_num(_BY_MEDIAN / math.sqrt(20.0) * jnp.nanmedian(jnp.abs(jnp.concatenate(changes))))
 
 
 @eqx.filter_jit
@@ -122,9 +140,9 @@ def evidence(bank: ShapeBank, hypotheses: Hypotheses, rays: Rays) -> tuple[Float
         def distance(x):
             return one.placement.distance(solid, x)
 
-        off = jnp.where(rays.is_object, misfit_of(distance(points)), 0.0)
+        off = jnp.where(rays.is_object, misfit_of(distance(points), rays.tau), 0.0)
         through, counts = _deepest(distance, rays)
-        through = jnp.where(counts, misfit_of(through), 0.0)
+        through = jnp.where(counts, misfit_of(through, rays.tau), 0.0)
         return jnp.sum(rays.weight * jnp.where(rays.sight > 0, off + through, 0.0)), off
 
     misfits, off = jax.lax.map(of_part, hypotheses, batch_size=8)
@@ -140,9 +158,9 @@ def weight_of(away: Float[Array, ""], camera: Camera) -> Float[Array, ""]:
     return away**2 / (across * down * _APART**2)
 
 
-def misfit_of(distance: Float[Array, "*n"]) -> Float[Array, "*n"]:
+def misfit_of(distance: Float[Array, "*n"], tau: Float[Array, ""]) -> Float[Array, "*n"]:
     """l of a length in scene units, at most C."""
-    return jnp.minimum(jnp.log1p(distance**2 / (2.0 * _TAU**2)), MOST)
+    return jnp.minimum(jnp.log1p(distance**2 / (2.0 * tau**2)), MOST)
 
 
 def _deepest(
@@ -154,7 +172,7 @@ def _deepest(
     def stride(state, _):
         along, deepest, place = state
         here = distance(rays.origins + along[:, None] * rays.directions)
-        is_deeper = (along < rays.sight - _TAU) & (here < deepest)
+        is_deeper = (along < rays.sight - rays.tau) & (here < deepest)
         deepest, place = jnp.where(is_deeper, here, deepest), jnp.where(is_deeper, along, place)
         return (along + jnp.maximum(jnp.abs(here), _STRIDE), deepest, place), None
 

@@ -10,7 +10,7 @@ from jaxnbv.checks import InputError
 from jaxnbv.geometry.volume import Box
 from jaxnbv.observations import Observations
 from jaxnbv.scanning import Grid, GridSurface
-from jaxnbv.surfaces.part_evidence import KAPPA, Rays, evidence
+from jaxnbv.surfaces.part_evidence import KAPPA, LEAST_TAU, Rays, evidence
 from jaxnbv.surfaces.part_search import nothing_before, search_parts
 from jaxnbv.surfaces.placement import Placement, ShapePoses
 from jaxnbv.surfaces.registration import NUM_POINTS, Hypotheses, Seen
@@ -29,11 +29,13 @@ class PartHypotheses(eqx.Module):
     - `bank`: at true size, in scene units.
     - `placed`: which part and where; the same part may stand in several places, and equal surfaces count once.
     - `weights`: how likely each is, and last how likely the object is none of the bank's.
+    - `tau`: how far a measured point may lie from the surface, in scene units, see `part_evidence`.
     """
 
     bank: ShapeBank
     placed: Hypotheses
     weights: Float[Array, " h_and_none"]
+    tau: Float[Array, ""]
 
     def surfaces(self, grid: Grid, count: int) -> GridSurface:
         """The first few placed parts as surfaces on a grid, along a leading axis."""
@@ -90,13 +92,15 @@ def _weighted(bank: ShapeBank, placed: Hypotheses, rays: Rays | None) -> PartHyp
     if rays is None:
         # A cloud alone: as if each of the points that were compared were a ray.
         misfit, misfit_of_none = NUM_POINTS * placed.misfit, jnp.asarray(NUM_POINTS * _NONE_MISFIT)
+        tau = jnp.asarray(LEAST_TAU)
     else:
         misfit, misfit_of_none = evidence(bank, placed, rays)
+        tau = rays.tau
     misfit = jnp.where(placed.is_mode, misfit, jnp.inf)
     weights = jax.nn.softmax(-KAPPA * jnp.append(misfit, misfit_of_none))
     order = jnp.argsort(misfit, stable=True)
     placed = jax.tree.map(lambda rows: rows[order], placed)
-    return PartHypotheses(bank, placed, jnp.append(weights[:-1][order], weights[-1]))
+    return PartHypotheses(bank, placed, jnp.append(weights[:-1][order], weights[-1]), tau)
 
 
 @eqx.filter_jit

@@ -65,7 +65,7 @@ def surface_error(hypotheses: PartHypotheses, observations: Observations) -> flo
     covariance = _covariance(shape, placement, Seen.of(observations))
     points = np.asarray(placement.rotation) @ np.asarray(shape.extremes).T + np.asarray(placement.shift)[:, None]
     off, gradient = (
-        np.asarray(rows, np.float64) for rows in _distances(hypotheses, jnp.asarray(points.T, jnp.float32))
+        np.asarray(rows, np.float64) for rows in distances_to(hypotheses, jnp.asarray(points.T, jnp.float32))
     )
     # What moves along the surface does not move it.
     rows = np.concatenate([np.cross(gradient[0], points.T - np.asarray(placement.shift)), -gradient[0]], axis=1)
@@ -75,7 +75,7 @@ def surface_error(hypotheses: PartHypotheses, observations: Observations) -> flo
 
 
 @eqx.filter_jit
-def _distances(
+def distances_to(
     hypotheses: PartHypotheses, points: Float[Array, "p 3"]
 ) -> tuple[Float[Array, "h p"], Float[Array, "h p 3"]]:
     """The distances of points to each hypothesis, and their gradients."""

@@ -147,8 +147,8 @@ def _distinct(bank: ShapeBank, box: Box, hypotheses: Hypotheses) -> Hypotheses:
     """The hypotheses with `is_mode` false, and no misfit that could be best, for all whose surface is that of a better
     one."""
     dtype = hypotheses.misfit.dtype
-    low, high = np.asarray(box.low) - _ROOM, np.asarray(box.high) + _ROOM
-    probes = jnp.asarray(low + (high - low) * np.random.default_rng(0).random((_NUM_PROBES, 3)), dtype)
+    low, high = jnp.asarray(box.low, dtype) - _ROOM, jnp.asarray(box.high, dtype) + _ROOM
+    probes = low + (high - low) * jnp.asarray(np.random.default_rng(0).random((_NUM_PROBES, 3)), dtype)
 
     def distances(one):
         return one.placement.distance(bank.shape(one.shape).solid, probes)

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 from jaxnbv.checks import InputError, check_fields, check_type, is_traced, native, own_settings, require, shown
 from jaxnbv.geometry.cloud import farthest_point_subsample
 from jaxnbv.geometry.farthest_points import farthest_point_indices
-from jaxnbv.geometry.volume import Box, Volume, boundary_points
+from jaxnbv.geometry.volume import Box, Volume, boundary_points, bounding_box
 from jaxnbv.observations import Observations
 from jaxnbv.surfaces.base import HALF_WIDTH
 
@@ -107,7 +107,8 @@ class OutsideBoundary(ValueSource):
             return
         with jax.ensure_compile_time_eval():
             try:
-                farthest = float(jnp.abs(boundary_points(self.volume, self.num_points)).max())
+                about = bounding_box(self.volume)
+                farthest = float(np.abs([about.low, about.high]).max())
                 middle = float(self.volume(jnp.zeros((1, 3)))[0])
             except Exception as error:
                 raise InputError(

@@ -34,12 +34,14 @@ class ImaginedParts(eqx.Module):
 
     - `surfaces`: of the likeliest hypotheses; `weights`: theirs, which sum to one.
     - `classes`: (h, c) what each hypothesis counts as, a one in each row.
+    - `tau`: how far a measured point may lie from the surface, in scene units.
     - `how`: what information about how a part lies counts, zero if it does not.
     """
 
     surfaces: GridSurface
     weights: Float[Array, " h"]
     classes: Float[Array, "h c"]
+    tau: Float[Array, ""]
     how: float
 
 
@@ -78,7 +80,7 @@ class Identify(Acquisition):
         weights = hypotheses.weights[:-1] / jnp.maximum(jnp.sum(hypotheses.weights[:-1]), 1e-30)
         how = _HOW if self.pose and self.group is None else 0.0
         classes = self._classes(shapes, len(hypotheses.bank))
-        return ImaginedParts(hypotheses.surfaces(grid, len(shapes)), weights, classes, how)
+        return ImaginedParts(hypotheses.surfaces(grid, len(shapes)), weights, classes, hypotheses.tau, how)
 
     def _classes(self, shapes: Int[Array, " h"], num_parts: int) -> Float[Array, "h c"]:
         if self.group is None:
@@ -105,7 +107,7 @@ class Identify(Acquisition):
         at_once = samples_at_once(camera, poses)
         images = shared_map(_image, context.surfaces, camera, poses, barrier, at_once=at_once)
         by_pose = jax.tree.map(lambda rows: jnp.moveaxis(rows, 1, 0), images)
-        return shared_map(_information, by_pose, context.weights, context.classes, context.how, camera)[None]
+        return shared_map(_information, by_pose, context, camera)[None]
 
     @property
     def quantity(self) -> Quantity:
@@ -136,16 +138,13 @@ def _image(surface: GridSurface, camera: Camera, poses: Pose, barrier: Float[Arr
     return away, cosine, scans.mask
 
 
-def _information(
-    images: _Image, weights: Float[Array, " h"], classes: Float[Array, "h c"], how: float, camera: Camera
-) -> Float[Array, ""]:
+def _information(images: _Image, context: ImaginedParts, camera: Camera) -> Float[Array, ""]:
     """alpha of one pose, given the images of all hypotheses from there."""
-
-    reach, _, hits = images
+    (reach, _, hits), weights = images, context.weights
     weight = weight_of(jnp.sum(jnp.where(hits, reach, 0.0)) / jnp.maximum(jnp.sum(hits), 1), camera)
 
     def after(image):
-        misfit = weight * jnp.sum(_misfits(image, images), axis=-1)
+        misfit = weight * jnp.sum(_misfits(image, images, context.tau), axis=-1)
         return jax.nn.softmax(jnp.log(weights) - KAPPA * misfit)
 
     after_each = jax.lax.map(after, images)
@@ -154,16 +153,16 @@ def _information(
         left = entropy(jnp.matmul(after_each, of, precision="highest"))
         return entropy(weights @ of) - jnp.sum(weights * left)
 
-    which = told(classes)
-    return which + how * (told(jnp.eye(len(weights))) - which)
+    which = told(context.classes)
+    return which + context.how * (told(jnp.eye(len(weights))) - which)
 
 
-def _misfits(image: _Image, others: _Image) -> Float[Array, "h rays"]:
+def _misfits(image: _Image, others: _Image, tau: Float[Array, ""]) -> Float[Array, "h rays"]:
     """The misfit of each ray where one part is there and others are expected: by how far apart their surfaces are, and
     C where a ray meets one of them only."""
     (reach, _, hits), (expected, cosine, are_expected) = image, others
     both = hits & are_expected
-    apart = misfit_of(jnp.where(both, (reach - expected) * cosine, 0.0))
+    apart = misfit_of(jnp.where(both, (reach - expected) * cosine, 0.0), tau)
     return jnp.where(both, apart, jnp.where(hits ^ are_expected, MOST, 0.0))
 
 

@@ -40,7 +40,7 @@ def test_images_keep_their_pixels(tmp_path):
         assert saved["depth"].dtype == np.uint16
         np.testing.assert_array_equal(saved["matrix"], FIRST)
     config = json.loads((tmp_path / "session.json").read_text())["config"]
-    assert config["box"]["low"] == list(BOX[0])
+    assert config["box"]["low"]["values"] == list(BOX[0])
     assert config["up"] == "z"
 
 

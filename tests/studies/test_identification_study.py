@@ -147,7 +147,7 @@ def hypotheses_of(task, part, turn=None, none=0.0):
     rotation = task.rotation if turn is None else task.rotation @ turn
     placement = Placement(*(jnp.asarray(row, jnp.float32)[None] for row in (rotation, task.shift, np.ones(3))))
     placed = Hypotheses(jnp.asarray([part]), placement, jnp.zeros(1), jnp.ones(1, bool))
-    return PartHypotheses(task.bank, placed, jnp.asarray([1.0 - none, none]))
+    return PartHypotheses(task.bank, placed, jnp.asarray([1.0 - none, none]), jnp.asarray(0.03))
 
 
 def test_what_is_measured_is_right_for_the_truth_and_its_symmetries_alone(folder):
@@ -184,7 +184,7 @@ def test_names_that_are_level_share_what_is_right(folder):
     both = jax.tree.map(lambda row: jnp.concatenate([row, row]), alone.placed)
     both = dataclasses.replace(both, shape=jnp.asarray([(task.part + 1) % 3, task.part]))
     for weights, right in (([0.45, 0.45], 0.5), ([0.4, 0.5], 1.0), ([0.5, 0.4], 0.0)):
-        told = study._told(truth, PartHypotheses(task.bank, both, jnp.asarray([*weights, 0.1])))
+        told = study._told(truth, PartHypotheses(task.bank, both, jnp.asarray([*weights, 0.1]), jnp.asarray(0.03)))
         assert told["right"] == right
 
 

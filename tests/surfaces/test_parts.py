@@ -256,7 +256,7 @@ def test_covariance_of_a_ball():
     """Nothing says how a ball is turned; its place is known as by so many points, each along its normal."""
     observations = observations_of(nbv.SDFSurface(Sphere(0.8)), [(0.0, 0.0, 3.0), (0.0, 0.0, -3.0)], noise=0.02)
     bank = nbv.ShapeBank.of([Sphere(0.8)], is_true_size=True)
-    hypotheses = PartHypotheses(bank, placed([0], [still()]), jnp.array([1.0, 0.0]))
+    hypotheses = PartHypotheses(bank, placed([0], [still()]), jnp.array([1.0, 0.0]), jnp.asarray(0.03))
     covariance = object_pose(hypotheses, observations, nbv.Frame()).covariance
     assert np.diag(covariance)[:3] == pytest.approx(np.pi**2 / 3.0, rel=1e-3)
     # Least squares by the normals of the points. Farthest point sampling prefers those that err most.

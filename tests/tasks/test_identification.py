@@ -27,6 +27,7 @@ def block(height, side):
 BANK = nbv.ShapeBank.of(
     [block(0.05, 0.4), block(0.3, 0.4), block(0.05, -0.4)], ["low", "high", "other"], is_true_size=True
 )
+TAU = jnp.asarray(0.03)
 ABOVE, BELOW = nbv.look_at((0.3, 3.2, 0.4)), nbv.look_at((0.0, -3.2, 0.3))
 
 
@@ -36,7 +37,7 @@ def step(weights, shapes=(0, 1, 2), turns=None):
     placement = Placement(jnp.asarray(turns, jnp.float32), jnp.zeros((count, 3)), jnp.ones((count, 3)))
     placed = Hypotheses(jnp.asarray(shapes), placement, jnp.zeros(count), jnp.ones(count, bool))
     cloud = nbv.PointCloud(jnp.zeros((4, 3)), jnp.ones((4, 3)), jnp.ones(4, bool))
-    hypotheses = PartHypotheses(BANK, placed, jnp.asarray([*weights, 0.0]))
+    hypotheses = PartHypotheses(BANK, placed, jnp.asarray([*weights, 0.0]), TAU)
     observations = Observations.start(cloud, 2, GRID, camera=CAMERA)
     observations = Observations(
         *(getattr(observations, name) for name in ("cloud", "poses", "grid", "looks", "empty_nodes", "obstacle_nodes")),

@@ -1,0 +1,199 @@
+"""Several objects on a table: which pixels are whose, and a session for each."""
+
+import functools
+import warnings
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import jaxnbv as nbv
+from jaxnbv.planning.sessions import clusters
+from jaxnbv.scanning.sdf import Cuboid, Translated, Union
+
+CAMERA = nbv.Camera(height=96, width=128, fov=0.9)
+BOX = ((-0.25, -0.2, 0.002), (0.25, 0.2, 0.2))
+# Half sizes in metres.
+SIZES = {"brick": (0.06, 0.03, 0.03), "cube": (0.035, 0.035, 0.035), "plank": (0.07, 0.035, 0.012)}
+PLACES = {"brick": (-0.12, 0.0, 0.03), "cube": (0.12, 0.03, 0.035)}
+TABLE = Translated(Cuboid(np.array([0.6, 0.6, 0.05])), np.array([0.0, 0.0, -0.05]))
+WORLD = nbv.SDFSurface(
+    functools.reduce(
+        Union, [TABLE, *(Translated(Cuboid(np.array(SIZES[name])), np.array(at)) for name, at in PLACES.items())]
+    ),
+    bounding_radius=2.0,
+)
+BANK = nbv.ShapeBank.of([Cuboid(np.array(size)) for size in SIZES.values()], list(SIZES), is_true_size=True)
+FRONT, BACK = ((0.1, -0.45, 0.35), (0.05, 0.5, 0.3))
+
+
+def at(position):
+    return np.asarray(nbv.look_at(position, up=(0.0, 0.0, 1.0)).matrix, np.float64)
+
+
+@functools.cache
+def image(position):
+    pose = nbv.Pose.from_matrix(at(position))
+    scan = nbv.scan(WORLD, CAMERA, pose)
+    depth = (np.asarray(scan.points, np.float64) - np.asarray(pose.position)) @ np.asarray(pose.forward)
+    noise = 0.0005 * np.random.default_rng(0).standard_normal(depth.shape)
+    return np.where(scan.mask, depth + noise, 0.0).reshape(CAMERA.height, CAMERA.width)
+
+
+def sessions_of(**changes):
+    planner = nbv.Planner.for_parts(BANK)
+    search = nbv.DiscreteSearch(12)
+    planner = nbv.Planner(planner.acquisition, search, planner.camera, planner.sampler, capacity=1000, max_views=4)
+    settings = {"up": "z", "until": nbv.Identified(0.8), "progress": False, **changes}
+    return nbv.Sessions(CAMERA, BOX, planner, **settings)
+
+
+def names_of(sessions):
+    return {number: next(iter(session.identity)) for number, session in sessions.objects.items()}
+
+
+@pytest.fixture(scope="module")
+def looked(tmp_path_factory):
+    """From the front and from behind: from there other faces of both are seen."""
+    folder = tmp_path_factory.mktemp("sessions")
+    sessions = sessions_of(folder=folder)
+    sessions.add(image(FRONT), at(FRONT))
+    first = {number: np.asarray(session.cloud.to_numpy()[0]) for number, session in sessions.objects.items()}
+    sessions.add(image(BACK), at(BACK))
+    return sessions, first, folder
+
+
+def test_each_object_is_a_session_with_its_own_points(looked):
+    _, first, _ = looked
+    assert sorted(first) == [1, 2]
+    middles = sorted(points[:, 0].mean() for points in first.values())
+    assert middles == pytest.approx([-0.12, 0.12], abs=0.03)
+    for points in first.values():
+        assert points[:, 2].min() > 0.0, "no point of the table"
+
+
+def test_another_side_of_an_object_is_no_new_one(looked):
+    sessions, _, _ = looked
+    assert sorted(sessions.objects) == [1, 2]
+    assert all(len(session.views) == 2 for session in sessions.objects.values())
+
+
+def test_each_is_named_and_placed(looked):
+    sessions, first, _ = looked
+    for number, session in sessions.objects.items():
+        name = "brick" if first[number][:, 0].mean() < 0 else "cube"
+        assert next(iter(session.identity)) == name
+        lies = session.object_pose
+        assert lies.name == name
+        np.testing.assert_allclose(lies.matrix[:3, 3], PLACES[name], atol=0.004)
+
+
+def test_an_object_s_box_holds_it_and_no_neighbour(looked):
+    sessions, first, _ = looked
+    for number, session in sessions.objects.items():
+        name = "brick" if first[number][:, 0].mean() < 0 else "cube"
+        size, place = np.array(SIZES[name]), np.array(PLACES[name])
+        assert np.all(session.box.low < place - size)
+        assert np.all(session.box.high > place + size)
+        sides = session.box.high - session.box.low
+        np.testing.assert_allclose(sides, sides[0])
+
+
+def test_the_next_view_is_worth_most_to_all(looked):
+    sessions, _, _ = looked
+    proposals = [session.next().proposal for session in sessions.objects.values()]
+    open_ones = [session.done() is None for session in sessions.objects.values()]
+    counted = [p for p, is_open in zip(proposals, open_ones, strict=True) if is_open] or proposals
+    best = int(np.argmax(sum(np.asarray(proposal.values, np.float64) for proposal in counted)))
+    session = sessions.objects[1]
+    place = session.frame.to_world(proposals[0].candidates[best])
+    np.testing.assert_allclose(sessions.next(), place.matrix, atol=1e-4)
+
+
+def test_it_is_done_once_all_are(looked):
+    sessions, _, _ = looked
+    reasons = [session.done() for session in sessions.objects.values()]
+    assert (sessions.done() is None) == (None in reasons)
+
+
+def test_they_go_on_from_their_folder(looked):
+    sessions, _, folder = looked
+    again = sessions_of(folder=folder)
+    assert names_of(again) == names_of(sessions)
+    for number, session in sessions.objects.items():
+        assert again.objects[number].identity == session.identity
+
+
+def test_labels_say_whose_each_pixel_is(looked):
+    """The numbers are the caller's; zero is none."""
+    sessions, first, _ = looked
+    # Which pixels show them, by the true scene.
+    pose = nbv.Pose.from_matrix(at(FRONT))
+    points = np.asarray(nbv.scan(WORLD, CAMERA, pose).points).reshape(CAMERA.height, CAMERA.width, 3)
+    above = points[..., 2] > 0.004
+    labels = np.where(above, np.where(points[..., 0] < 0, 7, 3), 0)
+    labelled = sessions_of()
+    labelled.add(image(FRONT), at(FRONT), labels=labels)
+    assert sorted(labelled.objects) == [3, 7]
+    by_clusters = {points[:, 0].mean() < 0: points for points in first.values()}
+    for number, is_left in ((7, True), (3, False)):
+        own = np.asarray(labelled.objects[number].cloud.to_numpy()[0])
+        assert len(own) == pytest.approx(len(by_clusters[is_left]), rel=0.1)
+
+
+def test_a_second_object_compiles_nothing(compilations):
+    """Whose box is another."""
+    pose = nbv.Pose.from_matrix(at(FRONT))
+    points = np.asarray(nbv.scan(WORLD, CAMERA, pose).points).reshape(CAMERA.height, CAMERA.width, 3)
+    left = (points[..., 2] > 0.004) & (points[..., 0] < 0)
+    right = (points[..., 2] > 0.004) & (points[..., 0] > 0)
+    sides, count = [], []
+    for mask in (left, right):
+        sessions = sessions_of(obstacles=nbv.Obstacles())
+        sessions.add(image(FRONT), at(FRONT), labels=mask.astype(int))
+        sides.append(sessions.objects[1].box.high - sessions.objects[1].box.low)
+        count.append(len(compilations))
+    assert abs(sides[0][0] - sides[1][0]) > 0.01
+    assert count[1] == count[0] > 0
+
+
+def test_bad_input_is_named():
+    with pytest.raises(nbv.InputError, match="knows no parts"):
+        nbv.Sessions(CAMERA, BOX, nbv.Planner(nbv.Coverage()), up="z")
+    with pytest.raises(nbv.InputError, match="the gap is -1"):
+        sessions_of(gap=-1.0)
+    with pytest.raises(nbv.InputError, match="no image yet"):
+        sessions_of().next()
+    with pytest.raises(nbv.InputError, match="the labels are"):
+        sessions_of().add(image(FRONT), at(FRONT), labels=np.zeros((4, 4), int))
+    with pytest.raises(nbv.InputError, match="shows no object in the box"):
+        sessions_of().add(image(FRONT), at(FRONT), labels=np.zeros((96, 128), int))
+
+
+def test_without_a_table_it_says_so():
+    pose = nbv.Pose.from_matrix(at(FRONT))
+    scan = nbv.scan(WORLD, CAMERA, pose)
+    above = np.asarray(scan.points)[:, 2].reshape(96, 128) > 0.003
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        sessions_of().add(np.where(above, image(FRONT), 0.0), at(FRONT))
+    assert sum("no table under the objects" in str(warning.message) for warning in told) == 1
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 5))
+def test_clusters_against_single_linkage(seed, count):
+    """Points on lines that lie two gaps apart, shuffled; steps along a line are half a gap."""
+    draw = np.random.default_rng(seed)
+    sizes = draw.integers(2, 30, count)
+    lines = [
+        np.column_stack([0.5 * np.arange(size), np.full(size, 3.0 * line), np.zeros(size)])
+        for line, size in enumerate(sizes)
+    ]
+    owner = np.repeat(np.arange(count), sizes)
+    order = draw.permutation(len(owner))
+    found = clusters(np.concatenate(lines)[order], 1.0)
+    # One number a line, and no number twice.
+    pairs = {(int(a), int(b)) for a, b in zip(owner[order], found, strict=True)}
+    assert len(pairs) == count == len({b for _, b in pairs})
+    assert clusters(np.zeros((0, 3)), 1.0).shape == (0,)
