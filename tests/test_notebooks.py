@@ -37,6 +37,7 @@ settings = {
 }
 """,
     "08_objects_you_know.ipynb": f"{SIZES}\nnum_starts = 512",
+    "09_which_part_is_it.ipynb": "pixels, num_candidates, capacity, views = 64, 12, 800, 2",
 }
 
 

@@ -3,6 +3,7 @@
 import functools
 import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -32,13 +33,13 @@ def _corner(values) -> Float[np.ndarray, " 3"]:
 class Box(eqx.Module):
     """The volume between two opposite corners, in scene coordinates. The default holds every scene of `Frame.fit`.
 
-    Its corners are arrays, so that programs that were compiled for one box run for any.
+    - `low`, `high`: three numbers each. They become arrays (3,), so that a program compiled for one box runs for any.
 
     **Raises:** `ValueError` if a side is not positive or a corner not finite.
     """
 
-    low: Float[np.ndarray, "3"] = eqx.field(converter=_corner, default=(-1.25, -1.25, -1.25))
-    high: Float[np.ndarray, "3"] = eqx.field(converter=_corner, default=(1.25, 1.25, 1.25))
+    low: Any = eqx.field(converter=_corner, default=(-1.25, -1.25, -1.25))
+    high: Any = eqx.field(converter=_corner, default=(1.25, 1.25, 1.25))
 
     def __check_init__(self):
         proper = self.low.shape == self.high.shape == (3,)

@@ -118,8 +118,7 @@ class Sessions:
                 self.objects[number] = self._session(number, self._box_about(own))
         require(
             len(self.objects) > 0,
-            f"the image shows no object in the box {self.box}: give a box that holds them, "
-            "in the units of the poses",
+            f"the image shows no object in the box {self.box}: give a box that holds them, in the units of the poses",
         )
         for number, session in self.objects.items():
             session.add(depth, matrix, depth_scale, mask=numbers == number)
@@ -147,10 +146,18 @@ class Sessions:
         folder = None if self._folder is None else self._folder / str(number)
         if folder is not None and folder.exists():
             return Session.load(folder, self._planner, self.until, self._progress)
-        about = {"camera": self.camera, "box": box, "planner": self._planner, "up": self._frame.up}
-        how = {"until": self.until, "obstacles": self._obstacles, "progress": self._progress}
-        key = jax.random.fold_in(self._key, number)
-        return Session(**about, **how, poses=self._poses, folder=folder, key=key)
+        return Session(
+            self.camera,
+            box,
+            self._planner,
+            self._frame.up,
+            self._poses,
+            folder,
+            key=jax.random.fold_in(self._key, number),
+            until=self.until,
+            obstacles=self._obstacles,
+            progress=self._progress,
+        )
 
     def _table_of(self, pixels: np.ndarray, pose: Pose, scale: float) -> Obstacles:
         """What the objects stand on, in world units."""
@@ -197,9 +204,9 @@ class Sessions:
                 _, like = cKDTree(points[own[has_owner]]).query(points[own])
                 owner[own] = owner[own[has_owner]][like]
             elif len(own) >= _FEWEST:
-                number = self._on_a_part(points[own])
-                last = last + 1 if number is None else last
-                owner[own] = last if number is None else number
+                placed = self._on_a_part(points[own])
+                last = last + 1 if placed is None else last
+                owner[own] = last if placed is None else placed
         return owner
 
     def _on_a_part(self, points: Float[np.ndarray, "n 3"]) -> int | None:

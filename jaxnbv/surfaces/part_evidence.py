@@ -5,13 +5,14 @@ by how far x is from its surface, and how deep the ray went through it:
 
     L = sum over rays of  l(d(x)) + l(min over the ray of min(d, 0)),   l(r) = log(1 + r^2 / 2 tau^2)
 
-without the first term for a ray that did not meet the object. No term is more than C = l(4 tau): what is far off says no
-more than what is off. tau is twice the noise of the sights, as their third differences from pixel to pixel show it, or
-0.03 scene units where that is more: by less, a part's surface on its grid is not known. A ray from which nothing came back counts where it went through a part in space that was seen to
-be empty: a sensor may miss a surface. Misfits add up, so that weights sharpen with evidence; but rays side by side err
-together, so the sum is tempered,
+without the first term for a ray that did not meet the object. No term is more than C = l(4 tau): what is far off says
+no more than what is off. tau is twice the noise of the sights, which their third differences from pixel to pixel show,
+and no less than 0.03 scene units, to which a part's surface is known on its grid. A ray from which nothing came back
+counts where it went through a part in space that was seen to be empty: a sensor may miss a surface. Misfits add up, so
+that weights sharpen with evidence; but rays that meet the object closer together than 0.12 err together, and count as
+fewer:
 
-    w_h proportional to exp(-kappa L_h),   w_0 (none of these) to exp(-kappa L_0),   L_0 = sum over rays of e_0 + o,
+    w_h proportional to exp(-L_h),   w_0 (none of these) to exp(-L_0),   L_0 = sum over rays of e_0 + o,
 
 over the rays that met the object, o what the best of all hypotheses leaves of l(d(x)) beyond e_0: a point that none
 explains is none of the object's, of a fifth of the points at most.
@@ -45,7 +46,7 @@ _STRIDE, _NUM_STRIDES = 0.04, 40
 _NUM_RAYS = 4096
 # Rays that are closer together on the object err together: scene units.
 _APART = 0.12
-KAPPA, _NONE_MISFIT = 0.3, 0.2
+_NONE_MISFIT = 0.2
 # The share of the points that met something else, at most.
 _STRAY = 0.2
 

@@ -10,7 +10,7 @@ from jaxnbv.checks import InputError
 from jaxnbv.geometry.volume import Box
 from jaxnbv.observations import Observations
 from jaxnbv.scanning import Grid, GridSurface
-from jaxnbv.surfaces.part_evidence import KAPPA, LEAST_TAU, Rays, evidence
+from jaxnbv.surfaces.part_evidence import LEAST_TAU, Rays, evidence
 from jaxnbv.surfaces.part_search import nothing_before, search_parts
 from jaxnbv.surfaces.placement import Placement, ShapePoses
 from jaxnbv.surfaces.registration import NUM_POINTS, Hypotheses, Seen
@@ -19,8 +19,8 @@ from jaxnbv.surfaces.shape_bank import ShapeBank
 NONE = "none of these"
 # Placements that are tried with each part.
 _NUM_STARTS = 1024
-# E at which a part is as likely as none, where there is a cloud alone.
-_NONE_MISFIT = 0.6
+# Where there is a cloud alone, its points count as so many rays; and E at which a part is as likely as none.
+_NUM_RAYS, _NONE_MISFIT = 0.3 * NUM_POINTS, 0.6
 
 
 class PartHypotheses(eqx.Module):
@@ -90,14 +90,13 @@ def identify(
 @eqx.filter_jit
 def _weighted(bank: ShapeBank, placed: Hypotheses, rays: Rays | None) -> PartHypotheses:
     if rays is None:
-        # A cloud alone: as if each of the points that were compared were a ray.
-        misfit, misfit_of_none = NUM_POINTS * placed.misfit, jnp.asarray(NUM_POINTS * _NONE_MISFIT)
+        misfit, misfit_of_none = _NUM_RAYS * placed.misfit, jnp.asarray(_NUM_RAYS * _NONE_MISFIT)
         tau = jnp.asarray(LEAST_TAU)
     else:
         misfit, misfit_of_none = evidence(bank, placed, rays)
         tau = rays.tau
     misfit = jnp.where(placed.is_mode, misfit, jnp.inf)
-    weights = jax.nn.softmax(-KAPPA * jnp.append(misfit, misfit_of_none))
+    weights = jax.nn.softmax(-jnp.append(misfit, misfit_of_none))
     order = jnp.argsort(misfit, stable=True)
     placed = jax.tree.map(lambda rows: rows[order], placed)
     return PartHypotheses(bank, placed, jnp.append(weights[:-1][order], weights[-1]), tau)

@@ -17,7 +17,7 @@ from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning import Grid, GridSurface, scan
 from jaxnbv.scanning.grid import samples_at_once
 from jaxnbv.sharding import shared_map
-from jaxnbv.surfaces.part_evidence import KAPPA, MOST, misfit_of, weight_of
+from jaxnbv.surfaces.part_evidence import MOST, misfit_of, weight_of
 from jaxnbv.surfaces.part_hypotheses import NONE, PartHypotheses, hypotheses_of
 from jaxnbv.utility import Answer, Quantity
 
@@ -49,7 +49,7 @@ class Identify(Acquisition):
     """Expected information about which part the object is, and then how it lies, in nats:
 
         alpha(theta) = I(c) + 0.1 I(h | c),   I(c) = H(c) - sum_h w_h H(c | z_h),
-        w_h' | z_h  proportional to  w_h' exp(-kappa L(z_h, z_h'))
+        w_h' | z_h  proportional to  w_h' exp(-L(z_h, z_h'))
 
     over the hypotheses h of a model that knows parts (`KnownShapes` with a bank at true size): c is the name of h, and
     I(h | c) what a view tells about h beyond c; z_h is the depth image of h from theta, and L the misfit of images by
@@ -145,7 +145,7 @@ def _information(images: _Image, context: ImaginedParts, camera: Camera) -> Floa
 
     def after(image):
         misfit = weight * jnp.sum(_misfits(image, images, context.tau), axis=-1)
-        return jax.nn.softmax(jnp.log(weights) - KAPPA * misfit)
+        return jax.nn.softmax(jnp.log(weights) - misfit)
 
     after_each = jax.lax.map(after, images)
 

@@ -1,5 +1,6 @@
 """Volumes: box distances against brute force, and points on a volume's boundary."""
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -68,3 +69,17 @@ def test_the_share_of_points_beyond_each_face():
     found = box.passed(points, 0.1)
     assert found == {"-x": 0.0, "+x": 0.25, "-y": 0.25, "+y": 0.0, "-z": 0.0, "+z": 0.25}
     assert box.passed(points[:0], 0.1) == {}
+
+
+def test_a_program_runs_for_any_box():
+    """Without being traced again."""
+    traced = []
+
+    @eqx.filter_jit
+    def middle(box):
+        traced.append(box)
+        return 0.5 * (box.low + box.high)
+
+    for box in (nbv.Box(), OFF_CENTRE):
+        np.testing.assert_allclose(middle(box), 0.5 * (box.low + box.high), atol=1e-6)
+    assert len(traced) == 1

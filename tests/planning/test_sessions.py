@@ -127,7 +127,7 @@ def test_they_go_on_from_their_folder(looked):
 
 def test_labels_say_whose_each_pixel_is(looked):
     """The numbers are the caller's; zero is none."""
-    sessions, first, _ = looked
+    _, first, _ = looked
     # Which pixels show them, by the true scene.
     pose = nbv.Pose.from_matrix(at(FRONT))
     points = np.asarray(nbv.scan(WORLD, CAMERA, pose).points).reshape(CAMERA.height, CAMERA.width, 3)

@@ -30,7 +30,9 @@ def hypotheses(*weights):
     """The slab in two places, then the left cube."""
     shapes, shifts = jnp.array([1, 1, 0]), jnp.array([[0.2, 0.1, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     places = Placement(jnp.tile(jnp.asarray(TURN), (3, 1, 1)), shifts, jnp.ones((3, 3)))
-    return PartHypotheses(BANK, Hypotheses(shapes, places, jnp.arange(3.0), jnp.ones(3, bool)), jnp.array(weights), jnp.asarray(0.03))
+    return PartHypotheses(
+        BANK, Hypotheses(shapes, places, jnp.arange(3.0), jnp.ones(3, bool)), jnp.array(weights), jnp.asarray(0.03)
+    )
 
 
 SLAB = hypotheses(0.5, 0.25, 0.2, 0.05)
