@@ -28,8 +28,8 @@ from jaxnbv.surfaces.part_pose import distances_to
 
 # Points of one object are as near as this to others of it, as a share of the longest side of the box.
 _GAP = 0.02
-# Fewer pixels than these are no object. A cluster is compared with so many of its points.
-_FEWEST, _COMPARED = 50, 256
+# Fewer rays than these are no object. A cluster is compared with so many of its points.
+_FEWEST, _COMPARED = 20, 256
 
 
 class Sessions:
@@ -74,6 +74,9 @@ class Sessions:
         candidates = self._frame.to_world(whole.planner.search.poses_around())
         self._poses = np.asarray(candidates.to_matrix(), np.float64)
         self._folder = None if folder is None else Path(folder)
+        # Numbers of candidates: what `next` gave since the last image, and all that it gave.
+        self._next: int | None = None
+        self._proposed: list[int] = []
         self.objects: dict[int, Session] = {}
         if self._folder is not None:
             stored = sorted(int(path.name) for path in self._folder.glob("[0-9]*") if path.name.isdigit())
@@ -102,8 +105,10 @@ class Sessions:
         pixels = as_numbers(depth, "the depth image", None)
         pose = Pose.from_matrix(as_numbers(matrix, "the matrix of a pose", np.float64))
         pixels = without_sentinels(pixels, self.camera, pose, depth_scale, self.box)
+        stride = stride_of(self.camera)
+        cloud = PointCloud.from_depth(pixels, self.camera, pose, depth_scale, stride)
         if self._obstacles is None:
-            self._obstacles = self._table_of(pixels, pose, depth_scale)
+            self._obstacles = self._table_of(cloud)
         points, inside = self._points(pixels, pose, depth_scale)
         if labels is None:
             numbers = np.zeros(pixels.shape, int)
@@ -112,27 +117,39 @@ class Sessions:
             numbers = as_numbers(labels, "the labels", None)
             proper = numbers.shape == pixels.shape and np.issubdtype(numbers.dtype, np.integer)
             require(proper, f"the labels are {shown(labels)}: give whole numbers, one for each of the image's pixels")
-        for number in np.unique(numbers[numbers > 0]).tolist():
-            own = points[(numbers == number) & inside]
-            if number not in self.objects and len(own) >= _FEWEST:
-                self.objects[number] = self._session(number, self._box_about(own))
+        numbers = np.where(inside, numbers, 0)
+        # What a session would take from the image.
+        rows = slice(stride // 2, None, stride)
+        shown_numbers, counts = np.unique(numbers[rows, rows].reshape(-1)[np.asarray(cloud.mask)], return_counts=True)
+        for number in shown_numbers[counts >= _FEWEST].tolist():
+            if number > 0 and number not in self.objects:
+                self.objects[number] = self._session(number, self._box_about(points[numbers == number]))
         require(
             len(self.objects) > 0,
             f"the image shows no object in the box {self.box}: give a box that holds them, in the units of the poses",
         )
         for number, session in self.objects.items():
-            session.add(depth, matrix, depth_scale, mask=numbers == number)
+            corners = np.stack(np.meshgrid(*zip(session.box.low, session.box.high, strict=True)), axis=-1)
+            # An image says nothing of what is behind the camera.
+            if np.any((corners - np.asarray(pose.position)) @ np.asarray(pose.forward) > 0):
+                session.add(depth, matrix, depth_scale, mask=numbers == number)
+        self._next = None
 
     def next(self) -> Float[np.ndarray, "4 4"]:
-        """Where to take the next image: the pose of most value, summed over the objects for which more are needed.
+        """Where to take the next image: the candidate of most value, in world units and summed over the objects for
+        which more are needed. It is the same until an image is added; what was proposed once is not proposed again.
 
-        **Raises:** `ValueError` before the first image, or as `Session.next` does.
+        **Raises:** `ValueError` before the first image, if all candidates were proposed, or as `Planner.propose` does.
         """
         require(len(self.objects) > 0, "there is no image yet: add one first, sessions.add(depth, matrix)")
-        open_ones = [session for session in self.objects.values() if self.until is None or session.done() is None]
-        proposals = [session.next().proposal for session in open_ones or self.objects.values()]
-        total = np.sum([np.asarray(proposal.values, np.float64) for proposal in proposals], axis=0)
-        return self._poses[int(np.argmax(total))]
+        if self._next is None:
+            open_ones = [session for session in self.objects.values() if self.until is None or session.done() is None]
+            total = np.sum([_values(session) for session in open_ones or self.objects.values()], axis=0)
+            total[self._proposed] = -np.inf
+            require(bool(np.isfinite(total).any()), f"all {len(total)} candidates have been proposed")
+            self._next = int(np.argmax(total))
+            self._proposed.append(self._next)
+        return self._poses[self._next]
 
     def done(self) -> str | None:
         """Why no more images are needed, by the rule that was given, for any of the objects; None while they are."""
@@ -159,9 +176,8 @@ class Sessions:
             progress=self._progress,
         )
 
-    def _table_of(self, pixels: np.ndarray, pose: Pose, scale: float) -> Obstacles:
-        """What the objects stand on, in world units."""
-        cloud = PointCloud.from_depth(pixels, self.camera, pose, scale, stride_of(self.camera))
+    def _table_of(self, cloud: PointCloud) -> Obstacles:
+        """What the objects stand on, in world units; `cloud`: the whole image."""
         table = table_under(self._frame.to_scene(cloud), self._frame.to_scene(self.box))
         if table is None:
             warnings.warn(
@@ -236,6 +252,13 @@ def clusters(points: Float[np.ndarray, "n 3"], gap: float) -> Int[np.ndarray, " 
     near = cKDTree(cells).query_pairs(4.0, output_type="ndarray")
     graph = coo_array((np.ones(len(near), bool), (near[:, 0], near[:, 1])), shape=(len(cells), len(cells)))
     return connected_components(graph, directed=False)[1][cell.reshape(-1)]
+
+
+def _values(session: Session) -> Float[np.ndarray, " candidates"]:
+    """What the candidates are worth for one object, in world units; -inf for those that it rules out."""
+    planner, key = session.planner, jax.random.fold_in(session.key, len(session.views))
+    values = planner.propose(session.observations, key).values
+    return np.asarray(session.frame.length_to_world(values, planner.quantity.length_power), np.float64)
 
 
 def _expected_distance(session: Session, points: Float[np.ndarray, "n 3"]) -> float:

@@ -1,0 +1,140 @@
+"""How sure names may be: right names and their probabilities under a real sensor's noise, with a mount that is off, and
+for objects that are in no file.
+
+    python benchmarks/identification.py --parts FOLDER [--setup whole] [--scenes 8] [--views 2] [--odd]
+        [--noise 1.4] [--mount 0.5] [--others FOLDER | --left-out]
+
+Parts are drawn in metres. Views are drawn at random. Noise is along the rays, in millimetres; normals are off by 8
+degrees. A mount that is off turns every camera by the same angle, in degrees, about an axis of its own. With --others
+the objects are of that folder, none of them in the bank, at 8 to 25 cm; with --left-out each is a part that the bank
+lacks. Scenes of even and of odd numbers share no parts.
+
+Columns, after each view: *right*, percent of likeliest names, "none of these" for what is in no file; *probability* of
+the likeliest name. Below: the expected calibration error over all views, in ten bins.
+"""
+
+import argparse
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.frame import Frame
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.planning.planner import Planner
+from jaxnbv.scanning import TriangleMesh, scan
+from jaxnbv.studies.engine.study import Scene
+from jaxnbv.studies.identification import IDENTIFY, IdentificationStudy
+from jaxnbv.studies.scenes.framing import Setup
+from jaxnbv.studies.scenes.placed_parts import Parts, parts_in, place_part
+from jaxnbv.surfaces.part_hypotheses import NONE
+
+# Longest sides of objects that are in no file, metres; the error of normals, radians; the axis of the mount's error.
+_SIDES, _NORMALS, _AXIS = (0.08, 0.25), 0.15, np.array([0.6, 0.64, 0.48])
+_BINS = 10
+
+
+def other_scene(study: IdentificationStudy, index: int, files: list[Path]) -> Scene:
+    """An object of another folder, placed as the parts are."""
+    random, parts = np.random.default_rng(500 + index), parts_in(study.meshes)
+    file = files[int(random.integers(len(files)))]
+    vertices, faces = (np.asarray(rows) for rows in _arrays(file))
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    vertices = (vertices - 0.5 * (low + high)) / (high - low).max() * random.uniform(*_SIDES)
+    mesh = TriangleMesh(vertices.astype(np.float32), faces.astype(np.int32), Frame())
+    # How it rests is not asked: the hypotheses are of the bank's parts.
+    placed = place_part(
+        Parts(parts.bank, (*parts.meshes, mesh)), len(parts.bank), study.setup, study.key(index, "scene")
+    )
+    return Scene(index, file.stem, placed.mesh, placed)
+
+
+def _arrays(file: Path) -> tuple[np.ndarray, np.ndarray]:
+    mesh = trimesh.load(file, force="mesh")
+    return mesh.vertices, mesh.faces
+
+
+def image_of(study: IdentificationStudy, scene: Scene, pose: Pose, noise: float, mount: float, seed: int):
+    """What a noisy camera sees, and from where it is said to have been."""
+    seen, random = scan(scene.surface, study.camera, pose), np.random.default_rng(seed)
+    mask, place = np.asarray(seen.mask)[:, None], np.asarray(pose.position)
+    rays = np.asarray(seen.points) - place
+    rays = rays / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-9)
+    along = 1e-3 * noise * scene.task.scale * random.standard_normal((len(rays), 1))
+    normals = np.asarray(seen.normals) + _NORMALS * random.standard_normal(rays.shape)
+    rotation = np.asarray(pose.rotation)
+    said = rotation @ Rotation.from_rotvec(np.radians(mount) * _AXIS).as_matrix()
+    moved = said @ rotation.T
+    points = np.where(mask, (np.asarray(seen.points) + along * rays - place) @ moved.T + place, 0.0)
+    normals = normals @ moved.T / np.linalg.norm(normals, axis=1, keepdims=True)
+    sight = np.asarray(seen.sight) + along[:, 0]
+    noisy = {"points": points, "normals": np.where(mask, normals, 0.0), "sight": sight}
+    cloud = dataclasses.replace(seen, **{name: jnp.asarray(rows, jnp.float32) for name, rows in noisy.items()})
+    return cloud, Pose(jnp.asarray(said, jnp.float32), pose.position)
+
+
+def beliefs(
+    study: IdentificationStudy, planner: Planner, scene: Scene, options: argparse.Namespace
+) -> Iterator[dict[str, float]]:
+    """The names after each view."""
+    poses, random = study.candidates.poses(), np.random.default_rng(77 + scene.index)
+    first = int(study.first_view(scene))
+    others = random.choice(np.delete(np.arange(study.num_candidates), first), options.views - 1, replace=False)
+    observations = None
+    for number in [first, *others.tolist()]:
+        pose = jax.tree.map(lambda rows, at=number: rows[at], poses)
+        view: tuple[PointCloud, Pose] = image_of(
+            study, scene, pose, options.noise, options.mount, 1000 * scene.index + number
+        )
+        cloud, said = view
+        if observations is None:
+            observations = planner.init(said, cloud, study.camera)
+        else:
+            observations = planner.observe(observations, said, cloud, study.camera)
+        yield observations.hypotheses.names()
+
+
+def calibration_error(rows: np.ndarray) -> float:
+    """Of probabilities and whether each was right: the mean of their differences over bins, by how many fall there."""
+    bins = np.minimum((_BINS * rows[:, 0]).astype(int), _BINS - 1)
+    return sum(abs(np.sum(rows[bins == one, 0] - rows[bins == one, 1])) for one in range(_BINS)) / len(rows)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--parts", required=True, type=Path)
+    parser.add_argument("--setup", default=Setup.WHOLE, type=Setup, choices=[Setup.WHOLE, Setup.CLOSE_UP])
+    for name, default in {"scenes": 8, "views": 2}.items():
+        parser.add_argument(f"--{name}", default=default, type=int)
+    for name, default in {"noise": 1.4, "mount": 0.0}.items():
+        parser.add_argument(f"--{name}", default=default, type=float)
+    parser.add_argument("--others", type=Path)
+    parser.add_argument("--left-out", action="store_true")
+    parser.add_argument("--odd", action="store_true")
+    options = parser.parse_args()
+    (study,) = IdentificationStudy.configured("known", options.views, False, options.parts, options.setup).values()
+    files = [] if options.others is None else sorted(options.others.rglob("*.glb"))
+    rows = []
+    for index in range(int(options.odd), 2 * options.scenes, 2):
+        scene = other_scene(study, index, files) if files else study.scene(index)
+        planner, name = study.planner(IDENTIFY, scene), NONE if files or options.left_out else scene.name
+        if options.left_out:
+            bank = scene.task.bank.chosen([part for part in range(len(scene.task.bank)) if part != scene.task.part])
+            planner = dataclasses.replace(planner, sampler=study.sampler.with_bank(bank, scene.task.poses))
+        likeliest = [next(iter(belief.items())) for belief in beliefs(study, planner, scene, options)]
+        rows.append([(probability, float(said == name)) for said, probability in likeliest])
+        print(f"{scene.name:24}", *(f"{said} {probability:.2f}" for said, probability in likeliest), flush=True)
+    held = np.array(rows)
+    for title, column in {"right": 1, "probability": 0}.items():
+        print(f"{title:24}", *(f"{100 * value:.0f}" for value in held[..., column].mean(axis=0)))
+    print(f"calibration error {calibration_error(held.reshape(-1, 2)):.3f}")
+
+
+if __name__ == "__main__":
+    main()
