@@ -219,7 +219,7 @@ class Sessions:
             if has_owner.any():
                 _, like = cKDTree(points[own[has_owner]]).query(points[own])
                 owner[own] = owner[own[has_owner]][like]
-            elif len(own) >= _FEWEST:
+            elif len(own) >= _FEWEST * stride_of(self.camera) ** 2:
                 placed = self._on_a_part(points[own])
                 last = last + 1 if placed is None else last
                 owner[own] = last if placed is None else placed

@@ -129,20 +129,21 @@ def test_misfit_of_rays_to_a_ball():
     # The smaller ball is only missed; the larger is gone through as well, up to tau before the hit.
     assert float(misfits[2]) == pytest.approx(each * met, rel=0.02)
     assert each * met < float(misfits[1]) < 2.0 * each * met + 0.1 * met
-    assert float(none) == pytest.approx(0.4 * met, rel=0.01)
+    assert float(none) == pytest.approx(0.25 * met, rel=0.01)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01, 0.05])
 def test_errors_of_points_are_those_of_the_sensor(noise):
-    """tau is two standard deviations of the sights, to a tenth (the median of 400 rays is right to 6 %), and a ball
+    """tau is two standard deviations of the sights, to an eighth (a quartile of 1,500 is right to 4 %), and a ball
     is no other object for its noise."""
     pose = nbv.look_at((0.0, 0.0, 3.0))
-    scan = nbv.scan(nbv.SDFSurface(Sphere(0.8)), CAMERA, pose)
+    camera = nbv.Camera(height=80, width=80, fov=1.0)
+    scan = nbv.scan(nbv.SDFSurface(Sphere(0.8)), camera, pose)
     along = noise * jax.random.normal(jax.random.key(0), scan.sight.shape)
     directions = (scan.points - pose.position) / jnp.linalg.norm(scan.points - pose.position, axis=-1, keepdims=True)
     points = jnp.where(scan.mask[:, None], scan.points + along[:, None] * directions, 0.0)
     scan = dataclasses.replace(scan, points=points, sight=scan.sight + jnp.where(scan.mask, along, 0.0))
-    planner = nbv.Planner(nbv.Coverage(), camera=CAMERA, sampler=nbv.SurfaceSampler(grid=GRID), capacity=512)
+    planner = nbv.Planner(nbv.Coverage(), camera=camera, sampler=nbv.SurfaceSampler(grid=GRID), capacity=512)
     rays = Rays.of(planner.init(pose, scan), nbv.Box())
     assert float(rays.tau) == pytest.approx(max(0.03, 2.0 * noise), rel=0.12)
     bank = nbv.ShapeBank.of([Sphere(0.8), Sphere(1.1)], is_true_size=True)
