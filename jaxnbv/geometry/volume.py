@@ -48,6 +48,9 @@ class Box(eqx.Module):
             f"a box {self} has no inside: each of three sides must be positive and finite",
         )
 
+    def __hash__(self) -> int:
+        return hash((*self.low.tolist(), *self.high.tolist()))
+
     def __str__(self) -> str:
         low, high = (tuple(np.asarray(corner).tolist()) for corner in (self.low, self.high))
         return f"from {low} to {high}"

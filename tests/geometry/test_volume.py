@@ -83,3 +83,8 @@ def test_a_program_runs_for_any_box():
     for box in (nbv.Box(), OFF_CENTRE):
         np.testing.assert_allclose(middle(box), 0.5 * (box.low + box.high), atol=1e-6)
     assert len(traced) == 1
+
+
+def test_equal_boxes_are_one_key():
+    assert {nbv.Box(): 1}[nbv.Box.cube(2.5)] == 1
+    assert nbv.Box() not in {OFF_CENTRE: 1}
