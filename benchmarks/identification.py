@@ -44,10 +44,11 @@ def other_scene(study: IdentificationStudy, index: int, files: list[Path]) -> Sc
     """An object of another folder, placed as the parts are."""
     random, parts = np.random.default_rng(500 + index), parts_in(study.meshes)
     file = files[int(random.integers(len(files)))]
-    vertices, faces = (np.asarray(rows) for rows in _arrays(file))
+    read = trimesh.load(file, force="mesh")
+    vertices = np.asarray(read.vertices)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     vertices = (vertices - 0.5 * (low + high)) / (high - low).max() * random.uniform(*_SIDES)
-    mesh = TriangleMesh(vertices.astype(np.float32), faces.astype(np.int32), Frame())
+    mesh = TriangleMesh(vertices.astype(np.float32), np.asarray(read.faces, np.int32), Frame())
     # How it rests is not asked: the hypotheses are of the bank's parts.
     placed = place_part(
         Parts(parts.bank, (*parts.meshes, mesh)), len(parts.bank), study.setup, study.key(index, "scene")
@@ -55,12 +56,9 @@ def other_scene(study: IdentificationStudy, index: int, files: list[Path]) -> Sc
     return Scene(index, file.stem, placed.mesh, placed)
 
 
-def _arrays(file: Path) -> tuple[np.ndarray, np.ndarray]:
-    mesh = trimesh.load(file, force="mesh")
-    return mesh.vertices, mesh.faces
-
-
-def image_of(study: IdentificationStudy, scene: Scene, pose: Pose, noise: float, mount: float, seed: int):
+def image_of(
+    study: IdentificationStudy, scene: Scene, pose: Pose, noise: float, mount: float, seed: int
+) -> tuple[PointCloud, Pose]:
     """What a noisy camera sees, and from where it is said to have been."""
     seen, random = scan(scene.surface, study.camera, pose), np.random.default_rng(seed)
     mask, place = np.asarray(seen.mask)[:, None], np.asarray(pose.position)
@@ -89,10 +87,8 @@ def beliefs(
     observations = None
     for number in [first, *others.tolist()]:
         pose = jax.tree.map(lambda rows, at=number: rows[at], poses)
-        view: tuple[PointCloud, Pose] = image_of(
-            study, scene, pose, options.noise, options.mount, 1000 * scene.index + number
-        )
-        cloud, said = view
+        seed = 1000 * scene.index + number
+        cloud, said = image_of(study, scene, pose, options.noise, options.mount, seed)
         if observations is None:
             observations = planner.init(said, cloud, study.camera)
         else:

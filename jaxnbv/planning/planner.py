@@ -110,11 +110,6 @@ class Planner(eqx.Module):
         return cls(acquisition, DiscreteSearch(), Camera(height=24, width=32), sampler, capacity=2000)
 
     @property
-    def _draws_samples(self) -> bool:
-        """Whether surfaces on its grid are what views are chosen by: known parts are, in place of samples."""
-        return self.search.uses_samples and not self.acquisition.needs_hypotheses
-
-    @property
     def quantity(self) -> Quantity:
         """What the values of its proposals are."""
         value = self.search.quantity(self.acquisition)
@@ -172,7 +167,8 @@ class Planner(eqx.Module):
                 f"Planner(max_views=...) greater than {room}",
             )
         after = self._with_view(self.sampler.adapt(observations), pose, scan, camera).add_points(scan)
-        if self._draws_samples and not is_traced(after):
+        # Views that are chosen by known parts are chosen by no samples on the grid.
+        if self.search.uses_samples and not self.acquisition.needs_hypotheses and not is_traced(after):
             self.sampler.grid.check(after.cloud)
         return self.sampler.model.observed(after)
 

@@ -8,8 +8,8 @@ from jaxtyping import Float
 
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.volume import Box
+from jaxnbv.planning.table import plane_of
 from jaxnbv.scanning import Obstacles
-from jaxnbv.scanning.sdf import HalfSpace
 
 # Of the points, as for a volume that holds the object: fewer may be stray.
 _STRAY = 0.01
@@ -35,10 +35,7 @@ def warn_of_cut(box: Box, points: Float[np.ndarray, "n 3"], voxel: float, told: 
 
 def warn_of_table(table: Obstacles, frame: Frame) -> None:
     """Warn of a plane that was taken for a table. `table`: one half space, in scene coordinates."""
-    (plane,) = table.solids
-    assert isinstance(plane, HalfSpace)
-    point = frame.to_world(np.asarray(plane.point, np.float64))
-    normal = frame.rotation.T @ np.asarray(plane.normal, np.float64)
+    point, normal = plane_of(table, frame)
     warnings.warn(
         f"the object stands on a plane through {np.round(point, 4).tolist()} with the normal "
         f"{np.round(normal, 3).tolist()}: it is taken for a table and left out. Give obstacles=Obstacles() to keep it",

@@ -20,7 +20,7 @@ from jaxnbv.geometry.volume import Box
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.session import Session, box_of, stride_of
 from jaxnbv.planning.stopping import StopRule
-from jaxnbv.planning.table import table_under
+from jaxnbv.planning.table import plane_of, table_under
 from jaxnbv.scanning import Obstacles
 from jaxnbv.scanning.sdf import HalfSpace
 from jaxnbv.surfaces.part_hypotheses import hypotheses_of
@@ -69,7 +69,7 @@ class Sessions:
         self._frame, self._planner, self._key = whole.frame, planner, whole.key
         self._obstacles, self._progress = obstacles, progress
         self._longest_part = 2.0 * float(jnp.max(jnp.linalg.norm(bank.shapes.extremes, axis=-1)))
-        self._gap = _GAP * 2.5 / self._frame.scale if gap is None else gap
+        self._gap = _GAP * float(np.max(self.box.high - self.box.low)) if gap is None else gap
         require(self._gap > 0, f"the gap is {gap}; it must be positive")
         candidates = self._frame.to_world(whole.planner.search.poses_around())
         self._poses = np.asarray(candidates.to_matrix(), np.float64)
@@ -143,7 +143,7 @@ class Sessions:
         """
         require(len(self.objects) > 0, "there is no image yet: add one first, sessions.add(depth, matrix)")
         if self._next is None:
-            open_ones = [session for session in self.objects.values() if self.until is None or session.done() is None]
+            open_ones = [session for session in self.objects.values() if session.done() is None]
             total = np.sum([_values(session) for session in open_ones or self.objects.values()], axis=0)
             total[self._proposed] = -np.inf
             require(bool(np.isfinite(total).any()), f"all {len(total)} candidates have been proposed")
@@ -186,12 +186,8 @@ class Sessions:
                 stacklevel=4,
             )
             return Obstacles()
-        (plane,) = table.solids
-        assert isinstance(plane, HalfSpace)
-        point = self._frame.to_world(np.asarray(plane.point, np.float64))
-        normal = self._frame.rotation.T @ np.asarray(plane.normal, np.float64)
         lengths = (float(self._frame.length_to_world(length)) for length in (table.margin, table.clearance))
-        return Obstacles((HalfSpace(point, normal),), *lengths)
+        return Obstacles((HalfSpace(*plane_of(table, self._frame)),), *lengths)
 
     def _points(
         self, pixels: np.ndarray, pose: Pose, scale: float

@@ -66,6 +66,14 @@ def table_under(cloud: PointCloud, box: Box) -> Obstacles | None:
     return table if deviation <= _TOLERANCE else None
 
 
+def plane_of(table: Obstacles, frame: Frame) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """A point and the normal, in the world of a frame, of the plane that `table_under` found in the scene."""
+    (plane,) = table.solids
+    assert isinstance(plane, HalfSpace)
+    point, normal = np.asarray(plane.point, np.float64), np.asarray(plane.normal, np.float64)
+    return frame.to_world(point), frame.rotation.T @ normal
+
+
 def other_ups(cloud: PointCloud, box: Box, up: str) -> tuple[str, ...]:
     """The other axes by which there is a table under a box, if one of them were upward. Cloud and box are in world
     units."""

@@ -90,7 +90,7 @@ def test_each_is_named_and_placed(looked):
         np.testing.assert_allclose(lies.matrix[:3, 3], PLACES[name], atol=0.004)
 
 
-def test_an_object_s_box_holds_it_and_no_neighbour(looked):
+def test_an_object_s_box_is_a_cube_that_holds_it(looked):
     sessions, first, _ = looked
     for number, session in sessions.objects.items():
         name = "brick" if first[number][:, 0].mean() < 0 else "cube"
