@@ -69,7 +69,7 @@ def test_a_recorded_part_is_named_and_lies_where_it_does(parts, recording, tmp_p
     assert [line.split()[1] for line in said.splitlines() if line.startswith("frame")] == ["0", "2", "3"]
     assert "bracket" in next(line for line in said.splitlines() if "█" in line)
     assert " mm, " in said
-    answer = json.loads((tmp_path / "identity.json").read_text())
+    answer = json.loads((tmp_path / "identity.json").read_text())["object"]
     assert answer["name"] == "bracket"
     assert sum(answer["names"].values()) == pytest.approx(1.0, abs=1e-5)
     assert answer["names"]["bracket"] > 0.9
@@ -80,6 +80,27 @@ def test_a_recorded_part_is_named_and_lies_where_it_does(parts, recording, tmp_p
     page = (tmp_path / "report.html").read_text()
     assert "Which part is it?" in page
     assert "likeliest part" in page
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:no table is found", "ignore:there is no table under")
+def test_objects_that_masks_show_are_named_apart(parts, recording, tmp_path, capsys):
+    """The bracket alone is masked, and not in every frame."""
+    (tmp_path / "masks").mkdir()
+    for index in (0, 2):
+        pixels = np.asarray(Image.open(recording / f"{index}.png")) > 0
+        Image.fromarray(255 * pixels.astype(np.uint8)).save(tmp_path / "masks" / f"{index}.it.png")
+    asked = ASKED | {"box": (*(CENTRE - 0.08), *(CENTRE + 0.08)), "masks": tmp_path / "masks"}
+    identify(recording=recording, parts=parts, parts_scale="mm", views=4, out=tmp_path, **asked)
+    said = capsys.readouterr().out
+    assert [line.split()[:3] for line in said.splitlines() if line.startswith("frame")] == [
+        ["frame", "0", "it:"],
+        ["frame", "1", "shows"],
+        ["frame", "2", "it:"],
+        ["frame", "3", "shows"],
+    ]
+    assert json.loads((tmp_path / "identity.json").read_text())["it"]["name"] == "bracket"
+    assert (tmp_path / "it" / "report.html").exists()
 
 
 def test_a_pose_is_told_in_the_unit_of_the_world():

@@ -1,4 +1,4 @@
-"""`jaxnbv identify RECORDING`: which of some known parts was recorded, and where it lies."""
+"""`jaxnbv identify RECORDING`: which of some known parts were recorded, and where they lie."""
 
 import dataclasses
 import json
@@ -13,10 +13,15 @@ from jaxnbv.errors import InputError
 from jaxnbv.studies.entries import RECORDING
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from jaxnbv.planning.session import Session
+    from jaxnbv.readers.recorded import RecordedFrames
     from jaxnbv.surfaces.part_pose import ObjectPose
 
 _NAMES_SAID, _BAR = 4, 24
+# A frame of which fewer pixels than this fall into the box shows no object.
+_FEWEST = 20
 _NO_FOLDER = (
     "is a file: identify needs depth images with the poses that they were taken from, since what rays pass through "
     "tells parts apart too. Give the folder of a recording (frames.json, 7-Scenes or TUM RGB-D); or scan a mesh by "
@@ -48,15 +53,28 @@ class IdentifyOptions:
     up: Annotated[
         str, seeing(metavar="AXIS", help="The recording's axis that is upward: x, y or z, or one of these with a -.")
     ] = "z"
+    several: Annotated[
+        bool, asking("--several", help="There are several objects on a table, apart from one another.")
+    ] = False
+    masks: Annotated[
+        Path | None,
+        asking(
+            metavar="FOLDER",
+            help="Images that say which object each pixel shows: FRAME.png with a number a pixel, or FRAME.OBJECT.png, "
+            "a mask for each object.",
+            show_default="none",
+        ),
+    ] = None
     out: Annotated[
-        Path | None, running(metavar="DIR", help="A folder for report.html and identity.json.", show_default="none")
+        Path | None,
+        running(metavar="DIR", help="A folder for identity.json and a report of each object.", show_default="none"),
     ] = None
 
 
 @command(IdentifyOptions, {name: RECORDING[name] for name in ("box", "intrinsics", "depth_scale")})
 def identify(options: IdentifyOptions, box: Any, intrinsics: Any, depth_scale: Any) -> None:
     """Say which part of a folder was recorded and where it lies: names with probabilities after each frame, then the
-    pose in the recording's world.
+    pose in the recording's world. With --several or --masks, this of each object.
 
     Nothing is trained. A part is a mesh at its true size; "none of these" is among the answers.
     """
@@ -72,10 +90,11 @@ def identify(options: IdentifyOptions, box: Any, intrinsics: Any, depth_scale: A
     from jaxnbv.cli.tasks.identification import as_unit, bank_of
     from jaxnbv.planning.planner import Planner
     from jaxnbv.planning.session import Session
+    from jaxnbv.planning.sessions import Sessions
     from jaxnbv.readers.recorded import RecordedFrames
+    from jaxnbv.readers.segmentation import Segmentation
     from jaxnbv.studies.recorded import bounds_of
     from jaxnbv.surfaces import FreeRotation, Upright
-    from jaxnbv.surfaces.part_hypotheses import NONE
 
     frames = RecordedFrames(options.recording, None, intrinsics, depth_scale)
     corners = np.array(box or bounds_of(frames), np.float64).reshape(2, 3)
@@ -83,22 +102,73 @@ def identify(options: IdentifyOptions, box: Any, intrinsics: Any, depth_scale: A
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(options.views, len(frames))).round().astype(int)).tolist()
     planner = Planner.for_parts(bank, Upright() if options.upright else FreeRotation())
     planner = dataclasses.replace(planner, max_views=len(chosen))
-    session = Session(frames.camera, corners, planner, options.up, until=rule(options.until or ()))
+    masks = None if options.masks is None else Segmentation(options.masks, frames.files)
+    kind = Session if masks is None and not options.several else Sessions
+    looked = kind(frames.camera, corners, planner, options.up, until=rule(options.until or ()))
+    names: dict[int, str] = {} if masks is None else masks.names
     for index in chosen:
-        session.add(frames.depth(index), frames.matrices[index], frames.depth_scale)
-        likely = list(session.identity.items())[:_NAMES_SAID]
-        said = ", ".join(f"{name} {100 * probability:.0f} %" for name, probability in likely)
-        typer.echo(f"frame {index:<5} {said}")
-        if (reason := session.done()) is not None:
+        labels = None if masks is None else masks.labels(index)
+        if not _shows(frames, index, corners) or (masks is not None and labels is None):
+            typer.echo(f"frame {index:<5} shows no object in the box")
+            continue
+        image = frames.depth(index), frames.matrices[index], frames.depth_scale
+        if isinstance(looked, Sessions):
+            looked.add(*image, labels=labels)
+        else:
+            looked.add(*image)
+        for name, session in _objects(looked, names).items():
+            likely = ", ".join(f"{part} {100 * share:.0f} %" for part, share in _likely(session))
+            typer.echo(f"frame {index:<5} {f'{name}: ' if name else ''}{likely}")
+        if (reason := looked.done()) is not None:
             typer.echo(f"enough      {reason}")
             break
-    for name, probability in likely:
-        typer.echo(f"{'█' * round(_BAR * probability):{_BAR}} {100 * probability:3.0f} %  {name}")
     # A named unit is one of a world in metres.
-    unit = "m" if isinstance(as_unit(options.parts_scale), str) else session.frame.unit
-    typer.echo("It is most likely none of these." if likely[0][0] == NONE else told(session.object_pose, unit))
+    unit = "m" if isinstance(as_unit(options.parts_scale), str) else None
+    answers = {}
+    for name, session in _objects(looked, names).items():
+        answers[name or "object"] = _say(name, session, unit)
+        if options.out is not None:
+            _write(options.out / name, name or options.recording.resolve().name, session)
     if options.out is not None:
-        _write(options.out, options.recording.resolve().name, session)
+        from jaxnbv.storage.files import write_text
+
+        write_text(options.out / "identity.json", json.dumps(answers, indent=1))
+
+
+def _shows(frames: "RecordedFrames", index: int, corners: "np.ndarray") -> bool:
+    """Whether a frame shows something of a box."""
+    import numpy as np
+
+    depth, matrix = frames.depth_scale * frames.depth(index).reshape(-1, 1), frames.matrices[index]
+    points = depth * np.asarray(frames.camera.pixel_directions(), np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+    inside = (depth[:, 0] > 0) & np.all((points > corners[0]) & (points < corners[1]), axis=-1)
+    return int(inside.sum()) >= _FEWEST
+
+
+def _objects(looked: Any, names: dict[int, str]) -> "dict[str, Session]":
+    """The session of each object by its name: "" for one alone."""
+    several = getattr(looked, "objects", None)
+    if several is None:
+        return {"": looked}
+    return {names.get(number, str(number)): session for number, session in several.items()}
+
+
+def _likely(session: "Session") -> list[tuple[str, float]]:
+    return list(session.identity.items())[:_NAMES_SAID]
+
+
+def _say(name: str, session: "Session", unit: str | None) -> dict[str, Any]:
+    """Print which part an object is and where it lies, and return it as JSON."""
+    from jaxnbv.surfaces.part_hypotheses import NONE
+
+    if name:
+        typer.echo(f"\n{name}")
+    for part, share in _likely(session):
+        typer.echo(f"{'█' * round(_BAR * share):{_BAR}} {100 * share:3.0f} %  {part}")
+    pose, is_none = session.object_pose, next(iter(session.identity)) == NONE
+    typer.echo("It is most likely none of these." if is_none else told(pose, unit or session.frame.unit))
+    held = {of: getattr(pose, of).tolist() for of in ("matrix", "covariance", "alternatives")}
+    return {"names": session.identity, "name": NONE if is_none else pose.name, **held}
 
 
 def told(pose: "ObjectPose", unit: str) -> str:
@@ -120,10 +190,6 @@ def told(pose: "ObjectPose", unit: str) -> str:
 
 
 def _write(folder: Path, title: str, session: "Session") -> None:
-    from jaxnbv.storage.files import write_text
     from jaxnbv.viz import write_report
 
-    page, pose = write_report(session.episode, folder, title=title), session.object_pose
-    held = {name: getattr(pose, name).tolist() for name in ("matrix", "covariance", "alternatives")}
-    write_text(folder / "identity.json", json.dumps({"names": session.identity, "name": pose.name, **held}, indent=1))
-    typer.echo(f"report      {page}")
+    typer.echo(f"report      {write_report(session.episode, folder, title=title)}")

@@ -1,0 +1,76 @@
+"""Which object each pixel of a recording shows, from images beside its frames."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Int
+
+from jaxnbv.checks import InputError, require
+from jaxnbv.errors import optional
+
+_ENDINGS = (".depth.png", ".png", ".tif", ".tiff", ".pgm")
+_BETWEEN = "._-"
+
+
+class Segmentation:
+    """Which object each pixel shows. A folder has, for each frame that shows an object, one of
+
+    - an image of the frame's name with a number for each pixel, zero for none: `000012.png` for `000012.png`;
+    - an image for each object, named by the frame and the object, that is not zero where the object is seen:
+      `000012.cup.png` or `000012_cup.png`.
+
+    `names`: the object of each number.
+
+    **Raises:** `ValueError` if there is no such folder, or it has no image of any frame.
+    """
+
+    def __init__(self, folder: str | Path, frames: tuple[Path, ...]):
+        folder = Path(folder)
+        require(folder.is_dir(), f"there is no folder {folder}: give the one that holds the masks")
+        stems = [_stem(frame) for frame in frames]
+        files = {_stem(file): file for file in sorted(folder.iterdir()) if file.name != _stem(file)}
+        self._files = [_of_frame(stem, files) for stem in stems]
+        objects = sorted({name for held in self._files for name in held if name})
+        self._numbers = {name: number for number, name in enumerate(objects, start=1)}
+        if not any(self._files):
+            raise InputError(
+                f"no image in {folder} belongs to a frame of the recording, such as {frames[0].name}: name them "
+                f"{stems[0]}.png, with a number for each pixel, or {stems[0]}.OBJECT.png, a mask for each object"
+            )
+
+    @property
+    def names(self) -> dict[int, str]:
+        """Where numbers are drawn, these are their own names."""
+        return {number: name for name, number in self._numbers.items()}
+
+    def labels(self, index: int) -> Int[np.ndarray, "height width"] | None:
+        """The number of the object that each pixel of a frame shows, zero for none; None where there is no image.
+
+        **Raises:** `ValueError` for an image that cannot be read, or has several channels.
+        """
+        labels = None
+        for name, file in self._files[index].items():
+            try:
+                pixels = np.asarray(optional("PIL.Image").open(file)).astype(int)
+            except OSError as error:
+                raise InputError(f"cannot read {file} ({error}): write it again") from error
+            require(pixels.ndim == 2, f"{file} has the shape {pixels.shape}: give an image of one channel")
+            own = np.where(pixels > 0, self._numbers[name], 0) if name else pixels
+            labels = own if labels is None else np.where(labels > 0, labels, own)
+        return labels
+
+
+def _stem(file: Path) -> str:
+    ending = next((ending for ending in _ENDINGS if file.name.lower().endswith(ending)), "")
+    return file.name[: len(file.name) - len(ending)]
+
+
+def _of_frame(stem: str, files: dict[str, Path]) -> dict[str, Path]:
+    """The images of a frame by object; "" for one with numbers."""
+    if stem in files:
+        return {"": files[stem]}
+    return {
+        other[len(stem) + 1 :]: file
+        for other, file in files.items()
+        if other.startswith(stem) and len(other) > len(stem) + 1 and other[len(stem)] in _BETWEEN
+    }
