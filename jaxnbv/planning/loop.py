@@ -4,6 +4,7 @@ A simulation, a study and a session at a real sensor drive the same `Loop`, whic
 far: the observations, what was proposed, the keys, the clock and the rule that ends it.
 """
 
+import copy
 import dataclasses
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -125,8 +126,15 @@ class Loop:
         self.views: tuple[View, ...] = ()
         self._observations: Observations | None = None
         self._pending = PoseList.empty(planner.max_views)
-        self._first_view_at = time.monotonic()
+        self._first_view_at: float | None = None
         self._next = _StepState()
+
+    def emptied(self, planner: Planner) -> "Loop":
+        """Without its views, by a planner that may be another: to add them again. The clock goes on."""
+        loop = copy.copy(self)
+        loop.planner, loop.views, loop._observations = planner, (), None
+        loop._pending, loop._next = PoseList.empty(planner.max_views), _StepState()
+        return loop
 
     @property
     def observations(self) -> Observations:
@@ -153,7 +161,7 @@ class Loop:
             observations = self.planner.observe(self._observations, pose, scan, self.camera)
         accepted()
         proposal = self._next.proposal if self._next.is_proposed else None
-        if not self.views:
+        if self._first_view_at is None:
             self._first_view_at = time.monotonic()
         if proposal is not None:
             self._pending = self._pending.append(proposal.pose)
@@ -236,7 +244,7 @@ class Loop:
 
         **Raises:** `ValueError` as `propose` does, where the rule is about the next view.
         """
-        if self.until is None or not self.views:
+        if self.until is None or self._first_view_at is None or not self.views:
             return None
         if not self._next.is_asked:
             key, *_ = view_keys(self.key, len(self.views))

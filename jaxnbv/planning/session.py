@@ -1,7 +1,6 @@
 """A live session: depth images of a real sensor in, where to take the next one out, in the user's own world."""
 
 import dataclasses
-import hashlib
 import math
 import warnings
 from collections.abc import Iterator
@@ -13,19 +12,22 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, PRNGKeyArray, Real
+from jaxtyping import Float, PRNGKeyArray, Real
 from tqdm import tqdm
 
 from jaxnbv.checks import AnyArray, InputError, as_numbers, check_key, checked, own_settings, require, shown
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
-from jaxnbv.geometry.depth_image import NothingInside, without_sentinels
+from jaxnbv.geometry.depth_image import NothingInside
 from jaxnbv.geometry.frame import AXES, Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
 from jaxnbv.observations import Observations
+from jaxnbv.planning.alignment import Alignment
 from jaxnbv.planning.episode import Episode
+from jaxnbv.planning.images import Image, stride_of
 from jaxnbv.planning.loop import STAGES, Loop, View
+from jaxnbv.planning.mount import MountError
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.session_warnings import (
     warn_of_blank,
@@ -48,10 +50,6 @@ from jaxnbv.tasks import NewSurface
 
 _NO_UP = 'say which axis of the world is upward, up="z" for most robots: one of'
 _NO_IMAGE = "the session has no image yet: add one first, session.add(depth, matrix)"
-# A cloud holds some thousands of points; more rays than these only take time.
-_MOST_RAYS = 20_000
-# Entries of two matrices of one pose differ by less, as stored in 32 bits.
-_SAME_PLACE = 1e-5
 # On recordings twice as many showed no more.
 _SAMPLES = 8
 
@@ -59,7 +57,8 @@ _SAMPLES = 8
 class NextView(eqx.Module):
     """Where to take the next image.
 
-    - `matrix`: camera to world, in the convention of the session.
+    - `matrix`: camera to world, in the convention of the session: what to send the camera to. With `correct_mount` it
+      is by so much off as the mount is, so that the camera arrives where it should.
     - `value`: what the search maximises, a length or an area in world units; `standard_error`: of the value, as a mean
       over the posterior samples; None for a search that draws fewer than two.
     - `expected_depth`: what the sensor is expected to see there, in world units and at the planner's resolution: the
@@ -97,6 +96,8 @@ class Session:
     - `convention`: of the matrices' axes, see `Pose.from_matrix`.
     - `key`: of the posterior samples.
     - `until`: when it is done, such as `Sure(0.95) | Budget(seconds=600)`; see `jaxnbv.planning.stopping`.
+    - `correct_mount`: whether poses are corrected by what the images tell of their errors, from the third image on; see
+      `alignment`. By default a warning says once that they are off; with None nothing is looked for.
     - `progress`: whether a bar shows what it is at while it plans.
 
     **Raises:** `ValueError` for a box without inside, no `up`, poses that the search has no use for, or a folder of
@@ -116,6 +117,7 @@ class Session:
         key: PRNGKeyArray | None = None,
         until: StopRule | None = None,
         obstacles: Obstacles | None = None,
+        correct_mount: bool | None = False,
         progress: bool = True,
     ):
         self.camera, self.box, self.convention = camera, box_of(box), convention
@@ -128,18 +130,25 @@ class Session:
         planner = usual_planner() if planner is None else planner
         matrices = None if poses is None else as_numbers(poses, "the poses", np.float64)
         self._bar: tqdm[Any] | None = None
-        self._loop = self._loop_of(self._placed(planner, matrices, obstacles))
+        self._given_planner = self._placed(planner, matrices, obstacles)
+        rays = self.frame.to_scene(self.camera.strided(self.stride))
+        self._loop = Loop(self._given_planner, self.key, self.until, self.frame, rays, begin=self._show)
         self._table: Obstacles | None = None
         self._other_ups: tuple[str, ...] = ()
         self._cut: frozenset[str] = frozenset()
         self._next: NextView | None = None
-        # The images so far by their digests: which they were, and from where.
-        self._taken: dict[bytes, tuple[int, np.ndarray]] = {}
+        self._images: tuple[Image, ...] = ()
+        self.correct_mount, self._mount_error, self._warned_of_mount = (
+            correct_mount,
+            MountError(camera, convention),
+            False,
+        )
         self._folder: RunFolder | None = None
         if folder is not None:
             # What a session is made of, as it was given: `load` makes it again from these.
             config = {"camera": camera, "box": self.box, "planner": planner, "up": up, "poses": matrices}
             config |= {"convention": convention, "key": self.key, "obstacles": obstacles}
+            config |= {"correct_mount": correct_mount}
             self._folder = RunFolder(folder, "session", config)
             self._read(self._folder)
 
@@ -212,6 +221,16 @@ class Session:
         return object_pose(hypotheses_of(self.observations), self.observations, self.frame)
 
     @property
+    @own_settings()
+    def alignment(self) -> Alignment:
+        """How far the images disagree, by the poses as they were given, and which error of the poses explains it. In
+        world units.
+
+        **Raises:** `ValueError` for fewer than two images.
+        """
+        return self._mount_error.alignment(self._images)
+
+    @property
     def episode(self) -> Episode:
         """The session so far, as an episode: in scene coordinates, and with the frame in which it is shown.
 
@@ -252,18 +271,10 @@ class Session:
         first image shows nothing of the box, an earlier image is the same bit for bit though its pose is another, or
         another process has added images to the folder. Nothing is changed then.
         """
-        pixels = as_numbers(depth, "the depth image", None)
-        shows = None if mask is None else np.asarray(mask)
-        if shows is not None:
-            proper = shows.dtype == bool and shows.shape == pixels.shape
-            require(
-                proper, f"the mask is {shown(mask)}: give truths, one for each of the image's {pixels.shape} pixels"
-            )
-        place = as_numbers(matrix, "the matrix of a pose", np.float64)
-        count = len(self.views)
+        image, count = Image.of(depth, matrix, depth_scale, mask), len(self.views)
         with self._alone() as folder:
-            looks_for_table = len(self.views) == 0 and self.planner.obstacles is None
-            self._add(pixels, place, depth_scale, folder, shows)
+            looks_for_table = count == 0 and self.planner.obstacles is None
+            self._add(image, folder)
         if len(self.views) == count:
             warn_of_blank()
             return
@@ -277,6 +288,10 @@ class Session:
         voxel = self.frame.length_to_world(self.planner.sampler.grid.spacing)
         points, _ = self.frame.to_world(self.observations.cloud).to_numpy()
         self._cut = warn_of_cut(self.box, points, voxel, self._cut)
+        if self.correct_mount:
+            self._correct()
+        elif self.correct_mount is not None and not self._warned_of_mount:
+            self._warned_of_mount = self._mount_error.warns(self._images)
 
     @own_settings()
     def next(self) -> NextView:
@@ -323,46 +338,34 @@ class Session:
             obstacles=planner.obstacles if obstacles is None else obstacles.in_scene(self.frame),
         )
 
-    def _loop_of(self, planner: Planner) -> Loop:
-        rays = self.frame.to_scene(self.camera.strided(self.stride))
-        return Loop(planner, self.key, self.until, self.frame, rays, begin=self._show)
-
-    def _add(
-        self,
-        depth: np.ndarray,
-        matrix: np.ndarray,
-        scale: float,
-        folder: RunFolder | None,
-        mask: Bool[np.ndarray, "height width"] | None,
-    ) -> None:
+    def _add(self, image: Image, folder: RunFolder | None) -> None:
         """An image as a view, stored in the folder once the loop accepts it. The first may show what the object stands
         on, by which the planner is another."""
-        index, pose, loop = len(self.views), Pose.from_matrix(matrix, self.convention), self._loop
-        digest = hashlib.sha256(depth.tobytes()).digest()
-        _check_moved(self._taken.get(digest), matrix, depth)
-        pixels = without_sentinels(depth, self.camera, pose, scale, self.box)
-        image, kept = (pixels, self.camera, pose, scale, self.stride), self.box
+        index, loop, kept = len(self.views), self._loop, self.box
+        image.check_moved(self._images)
+        pose = self._mount_error.pose(image, index)
+        clean = image.cleaned(self.camera, pose, self.box)
         if (carving := loop.planner.sampler.carving) is not None:
             kept = carving.with_room(kept, loop.planner.sampler.grid, self.frame)
         with warnings.catch_warnings():
             if index == 0:
                 warnings.simplefilter("error", NothingInside)
             try:
-                cloud = PointCloud.from_depth(*image, kept)
+                cloud = clean.cloud(self.camera, pose, self.stride, kept)
             except NothingInside as problem:
                 raise InputError(f"the first image shows nothing of the box: {problem}") from problem
-        if index > 0 and _is_blank(depth, cloud):
+        if index > 0 and image.is_blank(cloud):
             return
         if index == 0 and loop.planner.obstacles is None:
-            whole = PointCloud.from_depth(*image)
+            whole = clean.cloud(self.camera, pose, self.stride)
             self._table = table_under(self.frame.to_scene(whole), self.frame.to_scene(self.box))
             if self._table is None:
                 self._other_ups = other_ups(whole, self.box, self.frame.up)
             # Without a table there still are the points of D, which cameras keep clear of.
-            loop = self._loop_of(dataclasses.replace(loop.planner, obstacles=self._table or Obstacles()))
-        if mask is not None:
+            loop = loop.emptied(dataclasses.replace(loop.planner, obstacles=self._table or Obstacles()))
+        if image.mask is not None:
             rows = slice(self.stride // 2, None, self.stride)
-            cloud = cloud.only(jnp.asarray(mask[rows, rows].reshape(-1)))
+            cloud = cloud.only(jnp.asarray(image.mask[rows, rows].reshape(-1)))
             shows_any = index > 0 or bool(cloud.mask.any())
             require(shows_any, "the first image shows nothing of the box at the pixels of the mask")
         scan = self.frame.to_scene(cloud)
@@ -373,12 +376,23 @@ class Session:
             if folder is not None:
                 # Planned from images that were deleted since.
                 folder.file("proposal", index + 1).unlink(missing_ok=True)
-                masked = {} if mask is None else {"mask": mask}
-                folder.write("image", index, depth=depth, matrix=matrix, depth_scale=scale, **masked)
+                masked = {} if image.mask is None else {"mask": image.mask}
+                stored = {"depth": image.depth, "matrix": image.matrix, "depth_scale": image.scale}
+                folder.write("image", index, **stored, **masked)
 
         loop.add(self.frame.to_scene(pose), scan, accepted=store)
-        self._loop, self._next = loop, None
-        self._taken[digest] = index, matrix
+        self._loop, self._next, self._images = loop, None, (*self._images, image)
+
+    def _correct(self) -> None:
+        """Add the images again where they tell that cameras were elsewhere."""
+        if not self._mount_error.update(self._images):
+            return
+        images, views = self._images, self.views
+        self._loop, self._images = self._loop.emptied(self._given_planner), ()
+        for image, view in zip(images, views, strict=True):
+            if view.proposal is not None:
+                self._loop.resume(view.proposal)
+            self._add(image, None)
 
     def _read(self, folder: RunFolder) -> None:
         """The images of the folder and the proposals that they followed; the proposal after the last one."""
@@ -389,12 +403,16 @@ class Session:
                 self._loop.resume(stored["proposal"])
                 self._next = self._next_of(stored["proposal"], stored.get("expected_depth"))
             if index < count:
-                image = folder.read("image", index)
-                self._add(image["depth"], image["matrix"], float(image["depth_scale"]), None, image.get("mask"))
+                stored = folder.read("image", index)
+                image = Image.of(stored["depth"], stored["matrix"], float(stored["depth_scale"]), stored.get("mask"))
+                self._add(image, None)
+                if self.correct_mount:
+                    self._correct()
 
     def _next_of(self, proposal: Proposal, expected_depth: np.ndarray | None) -> NextView:
         """A proposal in the user's world."""
-        matrix = np.asarray(self.frame.to_world(proposal.pose).to_matrix(self.convention), np.float64)
+        sent = self._mount_error.sent(self.frame.to_world(proposal.pose))
+        matrix = np.asarray(sent.to_matrix(self.convention), np.float64)
         error = None if proposal.standard_error is None else self._loop.in_world(proposal.standard_error)
         error = error if error is not None and math.isfinite(error) else None
         return NextView(matrix, self._loop.in_world(proposal.value), error, expected_depth, proposal)
@@ -443,31 +461,6 @@ def usual_planner() -> Planner:
     return Planner(
         NewSurface(), DiscreteSearch(), Camera(height=24, width=32), SurfaceSampler(num_samples=_SAMPLES), capacity=2000
     )
-
-
-def stride_of(camera: Camera) -> int:
-    """The stride that leaves as many rays of an image as are worth their time."""
-    return math.ceil(math.sqrt(camera.num_rays / _MOST_RAYS))
-
-
-def _check_moved(earlier: tuple[int, np.ndarray] | None, matrix: np.ndarray, depth: np.ndarray) -> None:
-    """**Raises:** `ValueError` if an image that measured something was added before from another pose."""
-    if earlier is None or not (depth > 0).any():
-        return
-    index, before = earlier
-    require(
-        bool(np.abs(before - matrix).max() <= _SAME_PLACE),
-        f"the image is bit for bit image {index + 1}, which was taken from another pose: it is of an earlier moment "
-        "than its pose. Discard the frames that the driver still holds after a move",
-    )
-
-
-def _is_blank(depth: np.ndarray, cloud: PointCloud) -> bool:
-    """Whether an image measured nothing: no pixel is valid, or all of them have one value and show no surface."""
-    if bool(cloud.mask.any()):
-        return False
-    values = np.unique(depth[depth > 0])
-    return not bool(np.any(cloud.missed)) or (len(values) == 1 and bool(np.isfinite(values[0])))
 
 
 def box_of(corners) -> Box:

@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.volume import Box
+from jaxnbv.planning.alignment import Alignment
 from jaxnbv.planning.table import plane_of
 from jaxnbv.scanning import Obstacles
 
@@ -63,6 +64,26 @@ def warn_of_no_table(up: str, others: tuple[str, ...]) -> None:
         f"{problem}. Give the table as obstacles=Obstacles((sdf.HalfSpace(point, normal),)) in world units, or "
         "obstacles=Obstacles() if there is none",
         stacklevel=_CALLER_OF_ADD,
+    )
+
+
+def warn_of_mount(alignment: Alignment) -> None:
+    """Warn of views that disagree, in world units."""
+    turns, shifts = alignment.errors
+    worst = int(np.nanargmax(alignment.disagreement))
+    off = f"off by {shifts.max():.2g} and {np.degrees(turns.max()):.2g} degrees"
+    use = "Session(correct_mount=True) uses the correction"
+    if not alignment.is_corrected:
+        cause = f"they cannot tell whether the camera's mount is off; {alignment.motion} would"
+    elif alignment.is_mount:
+        more = "" if alignment.is_told else f", and {alignment.motion} would tell it better"
+        cause = f"the camera's mount seems {off}{more}; {use}"
+    else:
+        cause = f"poses seem {off} at most, each in its own way; {use}"
+    warnings.warn(
+        f"the views disagree by {alignment.disagreement[worst]:.2g}, where the sensor's noise is "
+        f"{alignment.noise:.2g}: {cause}",
+        stacklevel=_CALLER_OF_ADD + 1,
     )
 
 

@@ -17,8 +17,10 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.depth_image import without_sentinels
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
+from jaxnbv.planning.images import Image, stride_of
+from jaxnbv.planning.mount import MountError
 from jaxnbv.planning.planner import Planner
-from jaxnbv.planning.session import Session, box_of, stride_of
+from jaxnbv.planning.session import Session, box_of
 from jaxnbv.planning.stopping import StopRule
 from jaxnbv.planning.table import plane_of, table_under
 from jaxnbv.scanning import Obstacles
@@ -68,6 +70,8 @@ class Sessions:
         self.camera, self.box, self.until = camera, box_of(box), until
         self._frame, self._planner, self._key = whole.frame, planner, whole.key
         self._obstacles, self._progress = obstacles, progress
+        self._images: tuple[Image, ...] = ()
+        self._mount_error, self._warned_of_mount = MountError(camera, whole.convention), False
         self._longest_part = 2.0 * float(jnp.max(jnp.linalg.norm(bank.shapes.extremes, axis=-1)))
         self._gap = _GAP * float(np.max(self.box.high - self.box.low)) if gap is None else gap
         require(self._gap > 0, f"the gap is {gap}; it must be positive")
@@ -134,6 +138,8 @@ class Sessions:
             if np.any((corners - np.asarray(pose.position)) @ np.asarray(pose.forward) > 0):
                 session.add(depth, matrix, depth_scale, mask=numbers == number)
         self._next = None
+        self._images = (*self._images, Image.of(depth, matrix, depth_scale, None))
+        self._warned_of_mount = self._warned_of_mount or self._mount_error.warns(self._images)
 
     def next(self) -> Float[np.ndarray, "4 4"]:
         """Where to take the next image: the candidate of most value, in world units and summed over the objects for
@@ -173,6 +179,7 @@ class Sessions:
             key=jax.random.fold_in(self._key, number),
             until=self.until,
             obstacles=self._obstacles,
+            correct_mount=None,
             progress=self._progress,
         )
 

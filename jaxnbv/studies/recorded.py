@@ -19,9 +19,9 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
+from jaxnbv.planning.images import stride_of
 from jaxnbv.planning.loop import Sensor, Step
 from jaxnbv.planning.planner import Planner
-from jaxnbv.planning.session import stride_of
 from jaxnbv.progress import progress_bar
 from jaxnbv.readers.recorded import RecordedFrames
 from jaxnbv.sampler import MODELS, SurfaceSampler

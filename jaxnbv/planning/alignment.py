@@ -1,0 +1,341 @@
+"""Where overlapping views disagree, and the error of the poses that explains it.
+
+A robot knows the poses T_i of its hand, and the camera truly was at T_i X_i. If the camera's mount is off, X_i = X is
+the same for all views; if single poses are off, each view has its own, and X_0 = I. The X_i are those by which
+overlapping views agree best,
+
+    minimise  the sum over points p of view i and their nearest q of view j of  rho(n_q . (T_i X_i p - T_j X_j q)),
+
+rho(r) = c^2 log(1 + r^2 / c^2), n_q the normal at q, all in the cameras' coordinates; and an error that no view tells
+of is small. Neighbours are looked for anew, nearer each time, as the views come to agree (iterative closest points by
+planes, Chen and Medioni 1992). What no view tells of X shows in the smallest eigenvalue of J^T J.
+"""
+
+import itertools
+from collections.abc import Sequence
+from typing import NamedTuple, TypeAlias
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.sparse import coo_array, csr_array
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from jaxnbv.checks import checked, require
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.pose import Pose
+
+# Points of a view that are compared, and pairs of views at most: those of the nearest directions.
+_POINTS, _PAIRS = 800, 48
+# Views that look from farther apart than this share little surface; nor do pairs with fewer neighbours.
+_WIDEST, _FEWEST = np.radians(70.0), 20
+# Two points are of one surface if the cosine of the angle between their normals is larger.
+_ALIKE = 0.7
+# How far apart neighbours may lie, in shares of the distance from the cameras, one round each.
+_REACHES = (0.08, 0.08, 0.08, 0.04, 0.04, 0.04, 0.02, 0.02, 0.01, 0.01)
+# c in medians of the disagreement, and the steps of a round.
+_SCALE, _STEPS = 2.0, 3
+# How large an error is before any view: radians, and shares of the distance from the cameras. Neighbouring points err
+# together: so many count as one.
+_ERROR, _TOGETHER = 0.02, 50
+# The smallest eigenvalue of J^T J in shares of the largest from which on all of X is told: 4e-6 for three views of a
+# shelf from one side, 1e-3 and more where the views told it.
+_TOLD = 3e-4
+# Views that differ by so many times the noise disagree. A correction is used if what it leaves is so many times less.
+_OFF, _LESS = 3.0, 1.5
+_Corrections: TypeAlias = Float[np.ndarray, "views 4 4"]
+
+
+class Alignment(eqx.Module):
+    """How far views disagree, and which error of the poses explains it. Lengths are in the units of the poses.
+
+    - `disagreement`: of each view with those that overlap it, the median distance of a point from the plane at its
+      nearest in another view; `angle`: between their normals, in radians, the median too. With the poses as they were
+      given; NaN for a view that overlaps no other.
+    - `noise`: the median of the same distance between neighbours of one view.
+    - `corrected`: the disagreement that is left with the corrections.
+    - `corrections`: (views, 4, 4), X of each view: its camera was at `matrix @ X`. Identities where the views agree
+      little better with others.
+    - `is_mount`: whether that is one X for all views, the error of the mount; `covariance`: of its turn (a rotation
+      vector, radians) and its shift, in the camera's axes.
+    - `is_told`: whether the views tell all of the mount's error. What they do not tell is taken for zero.
+    - `weakest`: the turn and shift, in radians and lengths, of which the views tell least.
+    - `num_pairs`: how many ordered pairs of views look the same way, nearly.
+    - `distance`: of points from the cameras, the median.
+    """
+
+    disagreement: Float[np.ndarray, " views"]
+    angle: Float[np.ndarray, " views"]
+    noise: float
+    corrected: Float[np.ndarray, " views"]
+    corrections: Float[np.ndarray, "views 4 4"]
+    is_mount: bool
+    covariance: Float[np.ndarray, "6 6"]
+    is_told: bool
+    weakest: Float[np.ndarray, "6"]
+    num_pairs: int
+    distance: float
+
+    @property
+    def disagrees(self) -> bool:
+        """Whether a view disagrees with the others by more than three times the noise, and a correction mends that or
+        the views cannot tell."""
+        is_off = bool(np.any(self.disagreement > _OFF * self.noise))
+        return is_off and (self.is_corrected or not self.is_told)
+
+    @property
+    def is_corrected(self) -> bool:
+        return bool(np.any(self.corrections != np.eye(4)))
+
+    @property
+    def errors(self) -> tuple[Float[np.ndarray, " views"], Float[np.ndarray, " views"]]:
+        """By which angle, in radians, and by which length each camera is off."""
+        return errors_of(self.corrections)
+
+    @property
+    def motion(self) -> str:
+        """The motion of the camera that would tell most of what the views do not.
+
+        A shift, or a turn, along an axis that no motion between the views turns looks the same from all of them.
+        """
+        axis = self.weakest[3:] if np.linalg.norm(self.weakest[3:]) > 0 else self.weakest[:3]
+        is_ahead = abs(axis[2]) > 0.8 * np.linalg.norm(axis)
+        return "a view from another side" if is_ahead else "a view with the camera turned about its optical axis"
+
+
+class _View(NamedTuple):
+    """Points and normals in the camera's coordinates, and the camera's matrix."""
+
+    points: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+    matrix: Float[np.ndarray, "4 4"]
+
+    def placed(self, correction: Float[np.ndarray, "4 4"]) -> tuple[np.ndarray, np.ndarray]:
+        true = self.matrix @ correction
+        return self.points @ true[:3, :3].T + true[:3, 3], self.normals @ true[:3, :3].T
+
+
+class _Matches(NamedTuple):
+    """Neighbours in pairs of views, in the coordinates of their cameras.
+
+    - `views`: which two; `normals`: at the second points; `own_normals`: at the first.
+    """
+
+    views: Int[np.ndarray, "n 2"]
+    first: Float[np.ndarray, "n 3"]
+    second: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+    own_normals: Float[np.ndarray, "n 3"]
+
+
+@checked
+def align_views(clouds: Sequence[PointCloud], poses: Sequence[Pose]) -> Alignment:
+    """Compare overlapping views, and find the error of the camera's mount, or of single poses, by which they disagree.
+
+    - `clouds`: the points and normals of each view, in the coordinates of the poses; what stands around the object
+      helps.
+    - `poses`: from where they were taken, as they are known.
+
+    Where no two views overlap, nothing is told, and what they disagree by is NaN.
+
+    **Raises:** `ValueError` for fewer than two views, an empty one, or other numbers of clouds and poses.
+    """
+    require(len(clouds) == len(poses), f"there are {len(clouds)} clouds and {len(poses)} poses: give a pose for each")
+    require(len(clouds) >= 2, f"there are {len(clouds)} views: only two or more can disagree")
+    views = [_in_camera(cloud, pose) for cloud, pose in zip(clouds, poses, strict=True)]
+    empty = [number for number, view in enumerate(views, start=1) if len(view.points) < 2]
+    require(not empty, f"view {empty[:1]} has no points: leave it out")
+    pairs, away = _pairs(views), float(np.median(np.concatenate([np.linalg.norm(v.points, axis=1) for v in views])))
+    still = np.tile(np.eye(4), (len(views), 1, 1))
+    noise = _noise(views)
+
+    off, angle = _compared(views, pairs, still, away)
+    mount = _solved(views, pairs, still, away, is_mount=True)
+    # In units in which turns and shifts move points alike.
+    unit = np.repeat([1.0, away], 3)
+    matches = _matched(views, pairs, mount, _REACHES[-1] * away)
+    _, rows = _linearised(views, matches, mount, is_mount=True)
+    values, vectors = np.linalg.eigh((rows.T @ rows).toarray() * np.outer(unit, unit))
+    is_told = bool(values[0] > _TOLD * values[-1])
+    corrections, is_mount, left = still, True, off
+    after, _ = _compared(views, pairs, mount, away)
+    if _is_plausible(mount, away) and _LESS * _median(after) < _median(off):
+        corrections, left = mount, after
+    if len(views) > 2 and np.any(left > _OFF * noise):
+        each = _solved(views, pairs, corrections, away, is_mount=False)
+        after, _ = _compared(views, pairs, each, away)
+        if _is_plausible(each, away) and _LESS * np.nanmax(after) < np.nanmax(left):
+            corrections, is_mount, left = each, False, after
+    # Where nothing is told, an error is as large as it was thought to be before any view.
+    error = _TOGETHER * (1.4826 * np.nan_to_num(_median(left))) ** 2
+    covariance = (vectors / (values / max(error, 1e-30) + _ERROR**-2)) @ vectors.T
+    return Alignment(
+        off,
+        angle,
+        noise,
+        left,
+        corrections,
+        is_mount,
+        covariance * np.outer(unit, unit),
+        is_told,
+        unit * vectors[:, 0],
+        len(pairs),
+        away,
+    )
+
+
+def _in_camera(cloud: PointCloud, pose: Pose) -> _View:
+    """Some of a view's points, at random."""
+    points, normals = (rows.astype(np.float64) for rows in cloud.to_numpy())
+    rows = np.random.default_rng(0).permutation(len(points))[:_POINTS]
+    matrix = np.asarray(pose.to_matrix(), np.float64)
+    return _View((points[rows] - matrix[:3, 3]) @ matrix[:3, :3], normals[rows] @ matrix[:3, :3], matrix)
+
+
+def _pairs(views: Sequence[_View]) -> list[tuple[int, int]]:
+    """Ordered pairs of views that may show the same surface, those of the nearest directions first."""
+    angles = {
+        (i, j): float(Rotation.from_matrix(a.matrix[:3, :3].T @ b.matrix[:3, :3]).magnitude())
+        for (i, a), (j, b) in itertools.permutations(enumerate(views), 2)
+    }
+    return [pair for pair, angle in sorted(angles.items(), key=lambda item: item[1]) if angle < _WIDEST][:_PAIRS]
+
+
+def _matched(
+    views: Sequence[_View], pairs: Sequence[tuple[int, int]], corrections: _Corrections, reach: float
+) -> _Matches:
+    """Each point of the first view of a pair with its nearest in the second, within reach and turned alike."""
+    placed = [view.placed(correction) for view, correction in zip(views, corrections, strict=True)]
+    trees = [cKDTree(points) for points, _ in placed]
+    rows = [(np.zeros((0, 2), int), *[np.zeros((0, 3))] * 4)]
+    for i, j in pairs:
+        (points, normals), (_, others) = placed[i], placed[j]
+        distance, nearest = trees[j].query(points, distance_upper_bound=reach)
+        own = np.flatnonzero(np.isfinite(distance))
+        own = own[np.sum(normals[own] * others[nearest[own]], axis=1) > _ALIKE]
+        if len(own) >= _FEWEST:
+            other, one, two = nearest[own], views[i], views[j]
+            both = np.tile([i, j], (len(own), 1))
+            rows.append((both, one.points[own], two.points[other], two.normals[other], one.normals[own]))
+    return _Matches(*map(np.concatenate, zip(*rows, strict=True)))
+
+
+def _is_plausible(corrections: _Corrections, away: float) -> bool:
+    """Whether points move by no more than neighbours were looked for."""
+    turn, shift = errors_of(corrections)
+    return bool(np.max(away * turn + shift) < _REACHES[0] * away)
+
+
+def errors_of(corrections: _Corrections) -> tuple[Float[np.ndarray, " views"], Float[np.ndarray, " views"]]:
+    """The angle and the length of each correction."""
+    return Rotation.from_matrix(corrections[:, :3, :3]).magnitude(), np.linalg.norm(corrections[:, :3, 3], axis=1)
+
+
+def _solved(
+    views: Sequence[_View], pairs: Sequence[tuple[int, int]], start: _Corrections, away: float, is_mount: bool
+) -> _Corrections:
+    """The corrections by which views agree best."""
+    corrections, num_steps = start, 1 if is_mount else len(views) - 1
+    for reach in _REACHES:
+        matches = _matched(views, pairs, corrections, reach * away)
+        if len(matches.views) == 0:
+            break
+        off, rows = _linearised(views, matches, corrections, is_mount)
+        scale = max(_SCALE * float(np.median(np.abs(off))), 1e-6 * away)
+        errors = np.concatenate([_logarithm(one) for one in corrections[-num_steps:]])
+        prior = _TOGETHER * (scale / (_ERROR * np.tile(np.repeat([1.0, away], 3), num_steps))) ** 2
+        step = _robust(off, rows, scale, errors, prior)
+        steps = np.tile(step, (len(views), 1)) if is_mount else np.concatenate([np.zeros(6), step]).reshape(-1, 6)
+        corrections = corrections @ np.stack([_exponential(one) for one in steps])
+    return corrections
+
+
+def _robust(
+    off: Float[np.ndarray, " n"],
+    rows: csr_array,
+    scale: float,
+    errors: Float[np.ndarray, " steps"],
+    prior: Float[np.ndarray, " steps"],
+) -> Float[np.ndarray, " steps"]:
+    """The step that makes the sum of rho(off + rows @ step), and of prior (errors + step)^2, least: by reweighted least
+    squares."""
+    step = np.zeros(rows.shape[1])
+    for _ in range(_STEPS):
+        weight = 1.0 / (1.0 + ((off + rows @ step) / scale) ** 2)
+        normal = (rows.T @ rows.multiply(weight[:, None])).toarray()
+        step = np.linalg.solve(normal + np.diag(prior), -(rows.T @ (weight * off)) - prior * errors)
+    return step
+
+
+def _linearised(
+    views: Sequence[_View], matches: _Matches, corrections: _Corrections, is_mount: bool
+) -> tuple[Float[np.ndarray, " n"], csr_array]:
+    """n_q . (T_i X_i p - T_j X_j q), and its derivative by steps X <- X exp(step): of all views, or of each but the
+    first. A view's share of a row is (p x m, m), m the normal in its camera's axes."""
+    true = np.stack([view.matrix for view in views]) @ corrections
+    (first, second), count = matches.views.T, len(matches.views)
+    normals = np.einsum("nij,nj->ni", true[second, :3, :3], matches.normals)
+    apart = _placed(true[first], matches.first) - _placed(true[second], matches.second)
+    shares = [
+        (view, sign * np.concatenate([np.cross(points, turned), turned], axis=1))
+        for view, points, sign in ((first, matches.first, 1.0), (second, matches.second, -1.0))
+        for turned in [np.einsum("nij,ni->nj", true[view, :3, :3], normals)]
+    ]
+    if is_mount:
+        return np.sum(normals * apart, axis=1), csr_array(shares[0][1] + shares[1][1])
+    row = np.repeat(np.arange(count), 6)
+    entries = [(share.ravel(), row, (6 * (view[:, None] - 1) + np.arange(6)).ravel()) for view, share in shares]
+    value, row, column = map(np.concatenate, zip(*entries, strict=True))
+    own, size = column >= 0, (count, 6 * (len(views) - 1))
+    return np.sum(normals * apart, axis=1), csr_array(coo_array((value[own], (row[own], column[own])), shape=size))
+
+
+def _placed(matrices: Float[np.ndarray, "n 4 4"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    return np.einsum("nij,nj->ni", matrices[:, :3, :3], points) + matrices[:, :3, 3]
+
+
+def _exponential(step: Float[np.ndarray, "6"]) -> Float[np.ndarray, "4 4"]:
+    """The motion of a rotation vector and a shift."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = Rotation.from_rotvec(step[:3]).as_matrix(), step[3:]
+    return matrix
+
+
+def _logarithm(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6"]:
+    return np.append(Rotation.from_matrix(matrix[:3, :3]).as_rotvec(), matrix[:3, 3])
+
+
+def _compared(
+    views: Sequence[_View], pairs: Sequence[tuple[int, int]], corrections: _Corrections, away: float
+) -> tuple[Float[np.ndarray, " views"], Float[np.ndarray, " views"]]:
+    """The median distances of each view from planes at the nearest points, and the median angles between normals."""
+    matches = _matched(views, pairs, corrections, _REACHES[0] * away)
+    off, _ = _linearised(views, matches, corrections, is_mount=True)
+    turns = np.stack([view.matrix for view in views])[:, :3, :3] @ corrections[:, :3, :3]
+    first, second = (
+        np.einsum("nij,nj->ni", turns[view], normals)
+        for view, normals in zip(matches.views.T, (matches.own_normals, matches.normals), strict=True)
+    )
+    angle = np.arccos(np.clip(np.sum(first * second, axis=1), -1.0, 1.0))
+    median = np.full((2, len(views)), np.nan)
+    for number in range(len(views)):
+        own = (matches.views == number).any(axis=1)
+        if own.any():
+            median[:, number] = np.median(np.abs(off[own])), np.median(angle[own])
+    return median[0], median[1]
+
+
+def _median(values: Float[np.ndarray, " n"]) -> float:
+    """Of those that are numbers; NaN for none."""
+    numbers = values[np.isfinite(values)]
+    return float(np.median(numbers)) if len(numbers) else np.nan
+
+
+def _noise(views: Sequence[_View]) -> float:
+    """The median distance of a point from the plane at its nearest in the same view."""
+    off = []
+    for points, normals, _ in views:
+        _, nearest = cKDTree(points).query(points, k=2)
+        off.append(np.sum(normals[nearest[:, 1]] * (points - points[nearest[:, 1]]), axis=1))
+    return float(np.median(np.abs(np.concatenate(off))))

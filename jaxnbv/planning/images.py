@@ -1,0 +1,78 @@
+"""A depth image with where it was taken, as a session gets it."""
+
+import hashlib
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Real
+
+from jaxnbv.checks import AnyArray, as_numbers, require, shown
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.depth_image import without_sentinels
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.geometry.volume import Box
+
+# A cloud holds some thousands of points; more rays than these only take time.
+_MOST_RAYS = 20_000
+# Entries of two matrices of one pose differ by less, as stored in 32 bits.
+_SAME_PLACE = 1e-5
+
+
+class Image(NamedTuple):
+    """A depth image as it was given: `scale` times `depth` is in world units, `matrix` is where the camera is said to
+    have been, and `mask`, unless it is None, tells which pixels show the object."""
+
+    depth: Real[np.ndarray, "height width"]
+    matrix: Float[np.ndarray, "4 4"]
+    scale: float
+    mask: Bool[np.ndarray, "height width"] | None
+
+    @classmethod
+    def of(cls, depth: AnyArray, matrix: AnyArray | list, scale: float, mask: AnyArray | None) -> "Image":
+        """**Raises:** `ValueError` for what is no image, no matrix, or no mask of the image's shape."""
+        pixels = as_numbers(depth, "the depth image", None)
+        shows = None if mask is None else np.asarray(mask)
+        if shows is not None:
+            proper = shows.dtype == bool and shows.shape == pixels.shape
+            require(
+                proper, f"the mask is {shown(mask)}: give truths, one for each of the image's {pixels.shape} pixels"
+            )
+        return cls(pixels, as_numbers(matrix, "the matrix of a pose", np.float64), scale, shows)
+
+    @property
+    def digest(self) -> bytes:
+        return hashlib.sha256(self.depth.tobytes()).digest()
+
+    def cleaned(self, camera: Camera, pose: Pose, box: Box) -> "Image":
+        """The image with zeros where its value stands for "not measured", see `without_sentinels`."""
+        return self._replace(depth=without_sentinels(self.depth, camera, pose, self.scale, box))
+
+    def cloud(self, camera: Camera, pose: Pose, stride: int, box: Box | None = None) -> PointCloud:
+        """What it shows, see `PointCloud.from_depth`; what is not masked is kept."""
+        return PointCloud.from_depth(self.depth, camera, pose, self.scale, stride, box)
+
+    def is_blank(self, cloud: PointCloud) -> bool:
+        """Whether it measured nothing: no pixel is valid, or all of them have one value and show no surface."""
+        if bool(cloud.mask.any()):
+            return False
+        values = np.unique(self.depth[self.depth > 0])
+        return not bool(np.any(cloud.missed)) or (len(values) == 1 and bool(np.isfinite(values[0])))
+
+    def check_moved(self, earlier: "tuple[Image, ...]") -> None:
+        """**Raises:** `ValueError` if an earlier image is the same though its pose is another, and it measured
+        something."""
+        if not (self.depth > 0).any():
+            return
+        same = next((index for index, image in enumerate(earlier) if image.digest == self.digest), None)
+        require(
+            same is None or bool(np.abs(earlier[same].matrix - self.matrix).max() <= _SAME_PLACE),
+            f"the image is bit for bit image {0 if same is None else same + 1}, which was taken from another pose: it "
+            "is of an earlier moment than its pose. Discard the frames that the driver still holds after a move",
+        )
+
+
+def stride_of(camera: Camera) -> int:
+    """The stride that leaves as many rays of an image as are worth their time."""
+    return math.ceil(math.sqrt(camera.num_rays / _MOST_RAYS))
