@@ -21,10 +21,12 @@ from scipy.spatial.transform import Rotation
 import jaxnbv as nbv
 from jaxnbv.acquisition import Acquisition
 from jaxnbv.geometry.frame import Frame
+from jaxnbv.networks import pretrained_classifier
 from jaxnbv.planning.loop import Sensor, Step
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.simulate import observe_scene
 from jaxnbv.readers import MeshFile, class_meshes
+from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning import TriangleMesh
 from jaxnbv.studies.engine.measures import Measure, Record
 from jaxnbv.studies.engine.records import RecordFolder
@@ -33,7 +35,7 @@ from jaxnbv.studies.engine.run import run_scene
 from jaxnbv.studies.engine.study import Scene, Study
 from jaxnbv.studies.identification import IDENTIFY
 from jaxnbv.studies.scenes.household import HOUSEHOLD
-from jaxnbv.surfaces import SurfaceSampler, Upright
+from jaxnbv.surfaces import Upright
 
 # The longest side of an object in scene units: turned about the vertical it fits into the box, with some room.
 _SIDE = 1.6
@@ -112,7 +114,7 @@ class ClassStudy(Study):
         """After each view: whether the class is right, by the hypotheses and by the network."""
         kinds = np.array(objects_in(self.meshes)[1])
         own, others = kinds[scene.task], kinds[self.others(scene)]
-        network = nbv.pretrained_classifier("household", _SIDE)
+        network = pretrained_classifier("household", _SIDE)
         held: Mapping[str, list[float]] = {"right": [], "probability": [], "network": []}
         for step in episode:
             weights = np.asarray(step.observations.hypotheses.shape_weights, np.float64)

@@ -30,6 +30,8 @@ from jaxnbv.geometry.pose import Pose
 _POINTS, _PAIRS = 800, 48
 # Views that look from farther apart than this share little surface; nor do pairs with fewer neighbours.
 _WIDEST, _FEWEST = np.radians(70.0), 20
+# What rounding does to points, in shares of the distance from the cameras.
+_ROUNDING = 1e-6
 # Two points are of one surface if the cosine of the angle between their normals is larger.
 _ALIKE = 0.7
 # How far apart neighbours may lie, in shares of the distance from the cameras, one round each.
@@ -148,7 +150,7 @@ def align_views(clouds: Sequence[PointCloud], poses: Sequence[Pose]) -> Alignmen
     require(not empty, f"view {empty[:1]} has no points: leave it out")
     pairs, away = _pairs(views), float(np.median(np.concatenate([np.linalg.norm(v.points, axis=1) for v in views])))
     still = np.tile(np.eye(4), (len(views), 1, 1))
-    noise = _noise(views)
+    noise = max(_noise(views), _ROUNDING * away)
 
     off, angle = _compared(views, pairs, still, away)
     mount = _solved(views, pairs, still, away, is_mount=True)
@@ -160,10 +162,11 @@ def align_views(clouds: Sequence[PointCloud], poses: Sequence[Pose]) -> Alignmen
     is_told = bool(values[0] > _TOLD * values[-1])
     corrections, is_mount, left = still, True, off
     after, _ = _compared(views, pairs, mount, away)
-    if _is_plausible(mount, away) and _LESS * _median(after) < _median(off):
+    is_off = bool(np.any(off > _OFF * noise))
+    if is_off and _is_plausible(mount, away) and _LESS * _median(after) < _median(off):
         corrections, left = mount, after
-    if len(views) > 2 and np.any(left > _OFF * noise):
-        each = _solved(views, pairs, corrections, away, is_mount=False)
+    if is_off and len(views) > 2 and np.any(left > _OFF * noise):
+        each = _solved(views, pairs, still, away, is_mount=False)
         after, _ = _compared(views, pairs, each, away)
         if _is_plausible(each, away) and _LESS * np.nanmax(after) < np.nanmax(left):
             corrections, is_mount, left = each, False, after
@@ -195,11 +198,10 @@ def _in_camera(cloud: PointCloud, pose: Pose) -> _View:
 
 def _pairs(views: Sequence[_View]) -> list[tuple[int, int]]:
     """Ordered pairs of views that may show the same surface, those of the nearest directions first."""
-    angles = {
-        (i, j): float(Rotation.from_matrix(a.matrix[:3, :3].T @ b.matrix[:3, :3]).magnitude())
-        for (i, a), (j, b) in itertools.permutations(enumerate(views), 2)
-    }
-    return [pair for pair, angle in sorted(angles.items(), key=lambda item: item[1]) if angle < _WIDEST][:_PAIRS]
+    ahead = np.stack([view.matrix[:3, 2] for view in views])
+    angles = np.arccos(np.clip(ahead @ ahead.T, -1.0, 1.0))
+    ordered = sorted(itertools.permutations(range(len(views)), 2), key=lambda pair: angles[pair])
+    return [pair for pair in ordered if angles[pair] < _WIDEST][:_PAIRS]
 
 
 def _matched(
@@ -242,7 +244,7 @@ def _solved(
         if len(matches.views) == 0:
             break
         off, rows = _linearised(views, matches, corrections, is_mount)
-        scale = max(_SCALE * float(np.median(np.abs(off))), 1e-6 * away)
+        scale = max(_SCALE * float(np.median(np.abs(off))), _ROUNDING * away)
         errors = np.concatenate([_logarithm(one) for one in corrections[-num_steps:]])
         prior = _TOGETHER * (scale / (_ERROR * np.tile(np.repeat([1.0, away], 3), num_steps))) ** 2
         step = _robust(off, rows, scale, errors, prior)
@@ -272,14 +274,16 @@ def _linearised(
     views: Sequence[_View], matches: _Matches, corrections: _Corrections, is_mount: bool
 ) -> tuple[Float[np.ndarray, " n"], csr_array]:
     """n_q . (T_i X_i p - T_j X_j q), and its derivative by steps X <- X exp(step): of all views, or of each but the
-    first. A view's share of a row is (p x m, m), m the normal in its camera's axes."""
+    first. A view's share of a row is (p x m, m), p and the normal m before its camera."""
     true = np.stack([view.matrix for view in views]) @ corrections
     (first, second), count = matches.views.T, len(matches.views)
     normals = np.einsum("nij,nj->ni", true[second, :3, :3], matches.normals)
     apart = _placed(true[first], matches.first) - _placed(true[second], matches.second)
+    # The plane turns with its view: what counts is where the first point is before the second camera.
+    opposite = matches.second + np.einsum("nij,ni->nj", true[second, :3, :3], apart)
     shares = [
         (view, sign * np.concatenate([np.cross(points, turned), turned], axis=1))
-        for view, points, sign in ((first, matches.first, 1.0), (second, matches.second, -1.0))
+        for view, points, sign in ((first, matches.first, 1.0), (second, opposite, -1.0))
         for turned in [np.einsum("nij,ni->nj", true[view, :3, :3], normals)]
     ]
     if is_mount:

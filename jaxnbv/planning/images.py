@@ -39,7 +39,8 @@ class Image(NamedTuple):
             require(
                 proper, f"the mask is {shown(mask)}: give truths, one for each of the image's {pixels.shape} pixels"
             )
-        return cls(pixels, as_numbers(matrix, "the matrix of a pose", np.float64), scale, shows)
+        # A driver may write its next image into the same memory.
+        return cls(pixels.copy(), as_numbers(matrix, "the matrix of a pose", np.float64), scale, shows)
 
     @property
     def digest(self) -> bytes:

@@ -385,7 +385,16 @@ def test_a_session_proposes_as_a_simulation_does(monkeypatch):
     episode = simulate(planner, scene, first, 4, key, progress=False)
     scans = iter(view.scan for view in episode.views)
     monkeypatch.setattr(PointCloud, "from_depth", lambda *args: next(scans))
-    session = session_of(camera=planner.camera, box=Box(), planner=planner, up="y", poses=None, obstacles=None, key=key)
+    session = session_of(
+        camera=planner.camera,
+        box=Box(),
+        planner=planner,
+        up="y",
+        poses=None,
+        obstacles=None,
+        key=key,
+        correct_mount=None,
+    )
     pose = first
     for view in episode.views:
         np.testing.assert_array_equal(pose.position, view.pose.position)
