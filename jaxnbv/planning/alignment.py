@@ -40,7 +40,7 @@ _REACHES = (0.08, 0.08, 0.08, 0.04, 0.04, 0.04, 0.02, 0.02, 0.01, 0.01)
 _SCALE, _STEPS = 2.0, 3
 # How large an error is before any view: radians, and shares of the distance from the cameras. Neighbouring points err
 # together: so many count as one.
-_ERROR, _TOGETHER = 0.02, 50
+_ERROR, _TOGETHER = 0.03, 50
 # The smallest eigenvalue of J^T J in shares of the largest from which on all of X is told: 4e-6 for three views of a
 # shelf from one side, 1e-3 and more where the views told it.
 _TOLD = 3e-4

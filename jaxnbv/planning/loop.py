@@ -227,6 +227,10 @@ class Loop:
             self._next.proposal, self._next.seconds = jax.block_until_ready(proposal), time.perf_counter() - start
         return self._next.proposal
 
+    def settle(self, proposal: Proposal) -> None:
+        """Take a proposal in place of the one that the search gave from the same samples."""
+        self._next.proposal = proposal
+
     def resume(self, proposal: Proposal) -> None:
         """Take a stored proposal for that of the next view."""
         self._next = _StepState(proposal=proposal, is_proposed=True)

@@ -67,11 +67,11 @@ class MountError:
             return pose
         return Pose.from_matrix(np.asarray(pose.to_matrix(), np.float64) @ correction)
 
-    def sent(self, pose: Pose) -> Pose:
-        """Where to send the camera, so that it comes to stand at a pose."""
+    def sent(self, poses: Pose) -> Pose:
+        """Where to send the camera, so that it comes to stand at poses (n,)."""
         if np.array_equal(self.mount, np.eye(4)):
-            return pose
-        return Pose.from_matrix(np.asarray(pose.to_matrix(), np.float64) @ np.linalg.inv(self.mount))
+            return poses
+        return Pose.from_matrix(np.asarray(poses.to_matrix(), np.float64) @ np.linalg.inv(self.mount))
 
     def update(self, images: Sequence[Image]) -> bool:
         """Use what the images tell now; whether that moves a camera."""

@@ -3,9 +3,10 @@
 import dataclasses
 import math
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import equinox as eqx
@@ -29,6 +30,7 @@ from jaxnbv.planning.images import Image, stride_of
 from jaxnbv.planning.loop import STAGES, Loop, View
 from jaxnbv.planning.mount import MountError
 from jaxnbv.planning.planner import Planner
+from jaxnbv.planning.reachability import Reachable, Refused, best_reachable
 from jaxnbv.planning.session_warnings import (
     warn_of_blank,
     warn_of_cut,
@@ -64,6 +66,7 @@ class NextView(eqx.Module):
     - `expected_depth`: what the sensor is expected to see there, in world units and at the planner's resolution: the
       mean depth over the posterior samples, NaN where most of them are missed; None without samples.
     - `proposal`: all that the search looked at, in scene coordinates.
+    - `refusals`: how many poses of more value cannot be reached, by the reason.
     """
 
     matrix: Float[np.ndarray, "4 4"]
@@ -71,6 +74,7 @@ class NextView(eqx.Module):
     standard_error: float | None
     expected_depth: Float[np.ndarray, "h w"] | None
     proposal: Proposal
+    refusals: dict[str, int] = eqx.field(default_factory=dict)
 
 
 class Session:
@@ -98,6 +102,9 @@ class Session:
     - `until`: when it is done, such as `Sure(0.95) | Budget(seconds=600)`; see `jaxnbv.planning.stopping`.
     - `correct_mount`: whether poses are corrected by what the images tell of their errors, from the third image on; see
       `alignment`. By default a warning says once that they are off; with None nothing is looked for.
+    - `reachable`: a function of matrices (n, 4, 4), in the session's convention, which says of each whether the arm
+      can go there: a truth; or None, and else why not ("joint limit"). It is asked about the best poses that the search
+      looked at, a few at a time, until one holds, and about each with the camera turned about its optical axis too.
     - `progress`: whether a bar shows what it is at while it plans.
 
     **Raises:** `ValueError` for a box without inside, no `up`, poses that the search has no use for, or a folder of
@@ -118,6 +125,7 @@ class Session:
         until: StopRule | None = None,
         obstacles: Obstacles | None = None,
         correct_mount: bool | None = False,
+        reachable: Reachable | None = None,
         progress: bool = True,
     ):
         self.camera, self.box, self.convention = camera, box_of(box), convention
@@ -138,11 +146,10 @@ class Session:
         self._cut: frozenset[str] = frozenset()
         self._next: NextView | None = None
         self._images: tuple[Image, ...] = ()
-        self.correct_mount, self._mount_error, self._warned_of_mount = (
-            correct_mount,
-            MountError(camera, convention),
-            False,
-        )
+        self.correct_mount, self._mount_error = correct_mount, MountError(camera, convention)
+        self._warned_of_mount = False
+        self.reachable = reachable
+        self._refused: list[Refused] = []
         self._folder: RunFolder | None = None
         if folder is not None:
             # What a session is made of, as it was given: `load` makes it again from these.
@@ -154,19 +161,24 @@ class Session:
 
     @classmethod
     def load(
-        cls, path: str | Path, planner: Planner | None = None, until: StopRule | None = None, progress: bool = True
+        cls,
+        path: str | Path,
+        planner: Planner | None = None,
+        until: StopRule | None = None,
+        progress: bool = True,
+        reachable: Reachable | None = None,
     ) -> "Session":
         """The session of a folder, which goes on from its last image.
 
         - `planner`: in place of the stored one, where that holds a function or a network that cannot be made again from
           its description; it must have the same description.
-        - `until`, `progress`: as of a new session; they are not stored.
+        - `until`, `progress`, `reachable`: as of a new session; they are not stored.
 
         **Raises:** `ValueError` if the folder holds no session, or its planner cannot be made again.
         """
         given = {} if planner is None else {"planner": planner}
         config = RunFolder.config_of(path, "session", **given)
-        return cls(**config, folder=path, until=until, progress=progress)
+        return cls(**config, folder=path, until=until, progress=progress, reachable=reachable)
 
     def __repr__(self) -> str:
         images = f"{len(self.views)} image{'s' * (len(self.views) != 1)}"
@@ -299,21 +311,41 @@ class Session:
         not proposed again, for where the sensor could not be held it need not be tried twice. Warns where the best view
         is worth no more than three standard errors and what is expected in vain.
 
-        **Raises:** `ValueError` before the first image, as `Planner.propose` does, or if another process has added
-        images to the folder.
+        **Raises:** `ValueError` before the first image, as `Planner.propose` does, if no pose can be reached, or if
+        another process has added images to the folder.
         """
         if self._next is None:
             with self._alone() as folder, self._planning():
                 require(len(self.views) > 0, _NO_IMAGE)
                 proposal, depth = self._loop.propose(), None
+                refusals: Mapping[str, int] = {}
+                if self.reachable is not None or self._refused:
+                    proposal, refusals = best_reachable(proposal, self.reachable, self._matrices, self._refused)
+                    self._loop.settle(proposal)
                 if (surfaces := self._loop.inputs().surfaces) is not None:
                     depth = self.frame.length_to_world(np.asarray(self.planner.expected_depth(surfaces, proposal.pose)))
-                next_view = self._next_of(proposal, depth)
+                next_view = self._next_of(proposal, depth, refusals)
                 warn_of_little(next_view.value, next_view.standard_error, self._in_vain(proposal))
                 if folder is not None:
                     folder.write("proposal", len(self.views), proposal=proposal, expected_depth=depth)
                 self._next = next_view
         return self._next
+
+    def refuse(self, reason: str = "refused") -> None:
+        """Say that the camera cannot be held where `next` asks for it: the next call gives the best other pose, at once
+        from the same samples, and this one is not proposed again. It is not counted as a place where the camera was.
+
+        **Raises:** `ValueError` if `next` was not asked since the last image.
+        """
+        if self._next is None:
+            raise InputError("there is no proposal to refuse: ask session.next() first")
+        refused = Refused(self._next.proposal.pose, reason)
+        with self._alone() as folder:
+            if folder is not None:
+                folder.write("refused", len(self._refused), pose=refused.pose, reason=np.asarray(reason))
+                folder.file("proposal", len(self.views)).unlink(missing_ok=True)
+            self._refused.append(refused)
+            self._next = None
 
     @property
     def next_view(self) -> NextView | None:
@@ -397,6 +429,9 @@ class Session:
     def _read(self, folder: RunFolder) -> None:
         """The images of the folder and the proposals that they followed; the proposal after the last one."""
         count = folder.count("image")
+        for index in range(folder.count("refused")):
+            said = folder.read("refused", index)
+            self._refused.append(Refused(said["pose"], str(said["reason"])))
         for index in range(count + 1):
             if index and folder.file("proposal", index).exists():
                 stored = folder.read("proposal", index)
@@ -409,13 +444,19 @@ class Session:
                 if self.correct_mount:
                     self._correct()
 
-    def _next_of(self, proposal: Proposal, expected_depth: np.ndarray | None) -> NextView:
+    def _next_of(
+        self, proposal: Proposal, expected_depth: np.ndarray | None, refusals: Mapping[str, int] = MappingProxyType({})
+    ) -> NextView:
         """A proposal in the user's world."""
-        sent = self._mount_error.sent(self.frame.to_world(proposal.pose))
-        matrix = np.asarray(sent.to_matrix(self.convention), np.float64)
         error = None if proposal.standard_error is None else self._loop.in_world(proposal.standard_error)
         error = error if error is not None and math.isfinite(error) else None
-        return NextView(matrix, self._loop.in_world(proposal.value), error, expected_depth, proposal)
+        (matrix,), value = self._matrices(proposal.pose[None]), self._loop.in_world(proposal.value)
+        return NextView(matrix, value, error, expected_depth, proposal, dict(refusals))
+
+    def _matrices(self, poses: Pose) -> Float[np.ndarray, "n 4 4"]:
+        """What to send the camera to for it to stand at poses of the scene."""
+        sent = self._mount_error.sent(self.frame.to_world(poses))
+        return np.asarray(sent.to_matrix(self.convention), np.float64)
 
     def _in_vain(self, proposal: Proposal) -> float:
         return 0.0 if proposal.in_vain is None else self._loop.in_world(proposal.in_vain)

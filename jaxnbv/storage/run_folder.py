@@ -11,6 +11,7 @@ cloud.ply         the points that were kept, in world units, once the episode is
 session.json      the configuration (planner, sensor, box, what is up) and the versions that made it
 image_00.npz      the first depth image as the sensor gave it, its pose and scale; image_01.npz and so on
 proposal_01.npz   where the planner wanted the image of that number to be taken, and the depth expected there
+refused_00.npz    a pose that was proposed and cannot be reached, and why; refused_01.npz and so on
 """
 
 import hashlib

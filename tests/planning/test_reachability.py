@@ -1,0 +1,113 @@
+"""Proposals that an arm can reach, and those that it refuses."""
+
+import numpy as np
+import pytest
+from small_session import CENTER, FIRST, POSES, planner_of, session_of, shot
+
+from jaxnbv.checks import InputError
+from jaxnbv.planning.session import Session
+from jaxnbv.search import GradientSearch
+
+
+def begun(**changes):
+    session = session_of(**changes)
+    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    return session
+
+
+@pytest.fixture(scope="module")
+def free():
+    """What is proposed where all can be reached: the numbers of the poses, those of most value first."""
+    session = begun()
+    return np.argsort(-np.asarray(session.next().proposal.values), kind="stable")
+
+
+def number_of(matrix):
+    """Which of the poses it is, whatever its roll."""
+    away = np.abs(POSES[:, :3, 3] - matrix[:3, 3]).max(axis=1)
+    assert away.min() < 1e-5
+    return int(away.argmin())
+
+
+def test_the_best_pose_that_can_be_reached_is_proposed_in_the_world(free):
+    """Matrices in metres: all but the third best are too far from the arm's shoulder."""
+    third = POSES[free[2], :3, 3]
+    asked = []
+
+    def reachable(matrices):
+        asked.append(matrices)
+        return [None if np.linalg.norm(place - third) < 1e-4 else "joint limit" for place in matrices[:, :3, 3]]
+
+    session = begun(reachable=reachable)
+    view = session.next()
+    np.testing.assert_allclose(view.matrix, POSES[free[2]], atol=1e-5)
+    assert view.refusals == {"joint limit": 2}
+    assert view.value == pytest.approx(float(session.frame.length_to_world(view.proposal.values[free[2]], 2)), rel=1e-5)
+    # In batches: each of the two that were refused was asked about with other rolls, none of all the others.
+    assert [len(matrices) for matrices in asked] == [8, 7, 7]
+    assert session.next() is view
+
+
+def test_a_camera_may_be_turned_about_its_optical_axis(free):
+    """The arm holds it with the image turned by a right angle alone."""
+    best = POSES[free[0]]
+
+    def reachable(matrices):
+        return np.abs(matrices[:, 2, 0]) > 0.5
+
+    view = begun(reachable=reachable).next()
+    np.testing.assert_allclose(view.matrix[:3, 2:], best[:3, 2:], atol=1e-5)
+    cosine = view.matrix[:3, 0] @ best[:3, 0]
+    assert abs(cosine) < 0.75
+    assert abs(view.matrix[2, 0]) > 0.5
+    assert view.refusals == {}
+
+
+def test_a_proposal_that_is_refused_is_not_made_again(free, tmp_path):
+    session = begun(folder=tmp_path)
+    assert number_of(session.next().matrix) == free[0]
+    samples = session._loop.inputs()
+    session.refuse("cable")
+    assert number_of(session.next().matrix) == free[1]
+    assert session.next().refusals == {"cable": 1}
+    assert session._loop.inputs() is samples
+    # No camera was there, and a session that is read goes on.
+    assert len(session.views) == int(session.observations.num_views) == 1
+    again = Session.load(tmp_path)
+    assert number_of(again.next().matrix) == free[1]
+    again.refuse()
+    assert number_of(again.next().matrix) == free[2]
+    again.add(shot(POSES[free[2]]), POSES[free[2]], depth_scale=1e-3)
+    assert number_of(again.next().matrix) not in free[:3]
+
+
+def test_a_gradient_search_ends_at_a_pose_that_holds():
+    """Above a height, where its own best is not."""
+    planner, places = planner_of(GradientSearch(num_starts=2, iterations=3, num_candidates=12)), []
+    free = begun(planner=planner, poses=None).next().matrix
+    limit = float(free[2, 3]) + 0.02
+
+    def reachable(matrices):
+        places.extend(matrices[:, 2, 3])
+        return matrices[:, 2, 3] > limit
+
+    view = begun(planner=planner, poses=None, reachable=reachable).next()
+    assert view.matrix[2, 3] > limit
+    # It still looks at the middle of the box.
+    ahead = CENTER - view.matrix[:3, 3]
+    assert view.matrix[:3, 2] @ ahead / np.linalg.norm(ahead) > 0.999
+    assert view.refusals["not reachable"] >= 1
+
+
+def test_what_cannot_be_reached_at_all_is_told():
+    session = begun(reachable=lambda matrices: ["collision" if x > CENTER[0] else "too far" for x in matrices[:, 0, 3]])
+    with pytest.raises(InputError, match=r"none of the \d+ poses .* can be reached \(\d+ [a-z ]+, \d+ [a-z ]+\): give"):
+        session.next()
+    with pytest.raises(InputError, match="no proposal to refuse: ask session"):
+        session.refuse()
+    session.reachable = lambda matrices: 0.5
+    with pytest.raises(InputError, match=r"reachable says 0\.5 of 8 poses: give a list of as many answers"):
+        session.next()
+    session.reachable = lambda matrices: [0.5] * len(matrices)
+    with pytest.raises(InputError, match=r"reachable says 0\.5 of a pose: give a truth; or None"):
+        session.next()
