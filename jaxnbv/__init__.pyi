@@ -20,6 +20,8 @@ from .geometry.pose import look_at as look_at
 from .geometry.volume import Box as Box
 from .observations import Observations as Observations
 from .observations import as_observations as as_observations
+from .planning.alignment import Alignment as Alignment
+from .planning.alignment import align_views as align_views
 from .planning.episode import Episode as Episode
 from .planning.loop import View as View
 from .planning.planner import Planner as Planner

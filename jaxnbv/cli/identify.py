@@ -139,9 +139,12 @@ def _shows(frames: "RecordedFrames", index: int, corners: "np.ndarray") -> bool:
     """Whether a frame shows something of a box."""
     import numpy as np
 
-    depth, matrix = frames.depth_scale * frames.depth(index).reshape(-1, 1), frames.matrices[index]
-    points = depth * np.asarray(frames.camera.pixel_directions(), np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
-    inside = (depth[:, 0] > 0) & np.all((points > corners[0]) & (points < corners[1]), axis=-1)
+    from jaxnbv.geometry.pose import Pose
+    from jaxnbv.planning.images import Image
+
+    image = Image.of(frames.depth(index), frames.matrices[index], frames.depth_scale, None)
+    points = image.points(frames.camera, Pose.from_matrix(image.matrix))
+    inside = (image.depth > 0) & np.all((points > corners[0]) & (points < corners[1]), axis=-1)
     return int(inside.sum()) >= _FEWEST
 
 

@@ -2,8 +2,10 @@
 
 import hashlib
 import math
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeAlias
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Real
 
@@ -13,6 +15,9 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.depth_image import without_sentinels
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
+
+Ignore: TypeAlias = Callable[[Float[np.ndarray, "n 3"]], Any]
+"""A function of points in the world: which of them are of the robot, say, and are left out."""
 
 # A cloud holds some thousands of points; more rays than these only take time.
 _MOST_RAYS = 20_000
@@ -50,8 +55,29 @@ class Image(NamedTuple):
         """The image with zeros where its value stands for "not measured", see `without_sentinels`."""
         return self._replace(depth=without_sentinels(self.depth, camera, pose, self.scale, box))
 
+    def points(self, camera: Camera, pose: Pose) -> Float[np.ndarray, "height width 3"]:
+        """The point of each pixel, in world units, without regard to distortion; the camera where nothing was met."""
+        depth = np.where(np.isfinite(self.depth), self.scale * np.asarray(self.depth, np.float64), 0.0)
+        away = depth[..., None] * np.asarray(camera.pixel_directions(), np.float64).reshape(*depth.shape, 3)
+        return away @ np.asarray(pose.rotation, np.float64).T + np.asarray(pose.position, np.float64)
+
+    def is_kept(self, ignore: Ignore, camera: Camera, pose: Pose) -> Bool[np.ndarray, "height width"]:
+        """Which pixels a function of points does not leave out.
+
+        **Raises:** `ValueError` if it does not say a truth of each point.
+        """
+        measured = np.isfinite(self.depth) & (self.depth > 0)
+        said = np.asarray(ignore(self.points(camera, pose)[measured]))
+        require(
+            said.shape == (int(measured.sum()),) and said.dtype == bool,
+            f"ignore says {shown(said)} of {int(measured.sum())} points: give a truth for each",
+        )
+        kept = np.ones(self.depth.shape, bool)
+        kept[measured] = ~said
+        return kept
+
     def cloud(self, camera: Camera, pose: Pose, stride: int, box: Box | None = None) -> PointCloud:
-        """What it shows, see `PointCloud.from_depth`; what is not masked is kept."""
+        """What it shows, see `PointCloud.from_depth`; the mask is not applied."""
         return PointCloud.from_depth(self.depth, camera, pose, self.scale, stride, box)
 
     def is_blank(self, cloud: PointCloud) -> bool:
@@ -72,6 +98,12 @@ class Image(NamedTuple):
             f"the image is bit for bit image {0 if same is None else same + 1}, which was taken from another pose: it "
             "is of an earlier moment than its pose. Discard the frames that the driver still holds after a move",
         )
+
+
+def only_where(cloud: PointCloud, pixels: Bool[np.ndarray, "height width"], stride: int) -> PointCloud:
+    """The points of some pixels of the image that a cloud was taken from; the rays of the others end where they did."""
+    rows = slice(stride // 2, None, stride)
+    return cloud.only(jnp.asarray(pixels[rows, rows].reshape(-1)))
 
 
 def stride_of(camera: Camera) -> int:

@@ -11,7 +11,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray, Real
 from tqdm import tqdm
@@ -26,7 +25,7 @@ from jaxnbv.geometry.volume import Box
 from jaxnbv.observations import Observations
 from jaxnbv.planning.alignment import Alignment
 from jaxnbv.planning.episode import Episode
-from jaxnbv.planning.images import Image, stride_of
+from jaxnbv.planning.images import Ignore, Image, only_where, stride_of
 from jaxnbv.planning.loop import STAGES, Loop, View
 from jaxnbv.planning.mount import MountError
 from jaxnbv.planning.planner import Planner
@@ -105,6 +104,8 @@ class Session:
     - `reachable`: a function of matrices (n, 4, 4), in the session's convention, which says of each whether the arm
       can go there: a truth; or None, and else why not ("joint limit"). It is asked about the best poses that the search
       looked at, a few at a time, until one holds, and about each with the camera turned about its optical axis too.
+    - `ignore`: a function of points (n, 3) in the world, which says of each whether it is of the robot itself: it is
+      no part of the object, and hides what is behind it. Asked about all that an image measured.
     - `progress`: whether a bar shows what it is at while it plans.
 
     **Raises:** `ValueError` for a box without inside, no `up`, poses that the search has no use for, or a folder of
@@ -126,6 +127,7 @@ class Session:
         obstacles: Obstacles | None = None,
         correct_mount: bool | None = False,
         reachable: Reachable | None = None,
+        ignore: Ignore | None = None,
         progress: bool = True,
     ):
         self.camera, self.box, self.convention = camera, box_of(box), convention
@@ -146,9 +148,9 @@ class Session:
         self._cut: frozenset[str] = frozenset()
         self._next: NextView | None = None
         self._images: tuple[Image, ...] = ()
-        self.correct_mount, self._mount_error = correct_mount, MountError(camera, convention)
+        self.correct_mount, self._mount_error = correct_mount, MountError(camera, convention, ignore)
         self._warned_of_mount = False
-        self.reachable = reachable
+        self.reachable, self.ignore = reachable, ignore
         self._refused: list[Refused] = []
         self._folder: RunFolder | None = None
         if folder is not None:
@@ -167,18 +169,18 @@ class Session:
         until: StopRule | None = None,
         progress: bool = True,
         reachable: Reachable | None = None,
+        ignore: Ignore | None = None,
     ) -> "Session":
         """The session of a folder, which goes on from its last image.
 
         - `planner`: in place of the stored one, where that holds a function or a network that cannot be made again from
           its description; it must have the same description.
-        - `until`, `progress`, `reachable`: as of a new session; they are not stored.
+        - `until`, `progress`, `reachable`, `ignore`: as of a new session; they are not stored.
 
         **Raises:** `ValueError` if the folder holds no session, or its planner cannot be made again.
         """
-        given = {} if planner is None else {"planner": planner}
-        config = RunFolder.config_of(path, "session", **given)
-        return cls(**config, folder=path, until=until, progress=progress, reachable=reachable)
+        config = RunFolder.config_of(path, "session", **({} if planner is None else {"planner": planner}))
+        return cls(**config, folder=path, until=until, progress=progress, reachable=reachable, ignore=ignore)
 
     def __repr__(self) -> str:
         images = f"{len(self.views)} image{'s' * (len(self.views) != 1)}"
@@ -395,11 +397,14 @@ class Session:
                 self._other_ups = other_ups(whole, self.box, self.frame.up)
             # Without a table there still are the points of D, which cameras keep clear of.
             loop = loop.emptied(dataclasses.replace(loop.planner, obstacles=self._table or Obstacles()))
+        if self.ignore is not None:
+            cloud = only_where(cloud, clean.is_kept(self.ignore, self.camera, pose), self.stride)
         if image.mask is not None:
-            rows = slice(self.stride // 2, None, self.stride)
-            cloud = cloud.only(jnp.asarray(image.mask[rows, rows].reshape(-1)))
-            shows_any = index > 0 or bool(cloud.mask.any())
-            require(shows_any, "the first image shows nothing of the box at the pixels of the mask")
+            cloud = only_where(cloud, image.mask, self.stride)
+        shows_any = index > 0 or bool(cloud.mask.any())
+        require(
+            shows_any, "the first image shows nothing of the box at the pixels of the mask, or that are not ignored"
+        )
         scan = self.frame.to_scene(cloud)
         if (obstacles := loop.planner.obstacles) is not None:
             scan = obstacles.remove_points(scan)

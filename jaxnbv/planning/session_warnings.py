@@ -81,7 +81,7 @@ def warn_of_mount(alignment: Alignment) -> None:
     else:
         cause = f"poses seem {off} at most, each in its own way; {use}"
     warnings.warn(
-        f"the views disagree by {alignment.disagreement[worst]:.2g}, where the sensor's noise is "
+        f"the views disagree by {alignment.disagreement[worst]:.2g}, where a single view's points scatter by "
         f"{alignment.noise:.2g}: {cause}",
         stacklevel=_CALLER_OF_ADD + 1,
     )

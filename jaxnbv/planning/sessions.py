@@ -113,7 +113,8 @@ class Sessions:
         cloud = PointCloud.from_depth(pixels, self.camera, pose, depth_scale, stride)
         if self._obstacles is None:
             self._obstacles = self._table_of(cloud)
-        points, inside = self._points(pixels, pose, depth_scale)
+        image = Image.of(depth, matrix, depth_scale, None)
+        points, inside = self._points(image._replace(depth=pixels), pose)
         if labels is None:
             numbers = np.zeros(pixels.shape, int)
             numbers[inside] = self._numbers(points[inside])
@@ -138,7 +139,7 @@ class Sessions:
             if np.any((corners - np.asarray(pose.position)) @ np.asarray(pose.forward) > 0):
                 session.add(depth, matrix, depth_scale, mask=numbers == number)
         self._next = None
-        self._images = (*self._images, Image.of(depth, matrix, depth_scale, None))
+        self._images = (*self._images, image)
         self._warned_of_mount = self._warned_of_mount or self._mount_error.warns(self._images)
 
     def next(self) -> Float[np.ndarray, "4 4"]:
@@ -196,16 +197,13 @@ class Sessions:
         lengths = (float(self._frame.length_to_world(length)) for length in (table.margin, table.clearance))
         return Obstacles((HalfSpace(*plane_of(table, self._frame)),), *lengths)
 
-    def _points(
-        self, pixels: np.ndarray, pose: Pose, scale: float
-    ) -> tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
+    def _points(self, image: Image, pose: Pose) -> tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
         """The point of each pixel, in world units, and which lie in the box and on no obstacle."""
-        depth = np.where(np.isfinite(pixels), scale * pixels, 0.0)
-        away = depth[..., None] * np.asarray(self.camera.pixel_directions()).reshape(*depth.shape, 3)
-        points = away @ np.asarray(pose.rotation, np.float64).T + np.asarray(pose.position, np.float64)
+        points = image.points(self.camera, pose)
+        depth = (points - np.asarray(pose.position, np.float64)) @ np.asarray(pose.forward, np.float64)
         assert self._obstacles is not None
         is_free = np.asarray(self._obstacles.distance(points)) > self._obstacles.margin
-        inside = (depth > max(0.0, self.camera.nearest)) & (np.asarray(self.box(points)) <= 0) & is_free
+        inside = (depth > max(1e-9, self.camera.nearest)) & (np.asarray(self.box(points)) <= 0) & is_free
         return points, inside
 
     def _numbers(self, points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:

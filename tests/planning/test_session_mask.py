@@ -36,6 +36,26 @@ def test_points_are_those_of_the_mask(tmp_path):
     assert np.array_equal(again.cloud.to_numpy()[0], masked.cloud.to_numpy()[0])
 
 
+def test_what_is_to_be_ignored_is_no_part_of_the_object():
+    """One half of the world is said to be the robot's."""
+
+    def is_robot(points):
+        return points[:, 0] > 0.3
+
+    plain, session, image = session_of(), session_of(ignore=is_robot), shot(FIRST)
+    plain.add(image, FIRST, 1e-3)
+    session.add(image, FIRST, 1e-3)
+    points, kept = plain.cloud.to_numpy()[0], session.cloud.to_numpy()[0]
+    # A pixel is 7 mm there, and a point is that of a fitted plane.
+    assert kept[:, 0].max() < 0.307
+    inside = points[points[:, 0] < 0.293]
+    assert np.abs(inside[:, None] - kept[None]).max(axis=-1).min(axis=1).max() < 1e-6
+    # Where it is, the rays have ended all the same.
+    assert np.array_equal(np.asarray(session.observations.looks.sight), np.asarray(plain.observations.looks.sight))
+    with pytest.raises(nbv.InputError, match=r"ignore says .* points: give a truth for each"):
+        session_of(ignore=lambda points: points).add(image, FIRST, 1e-3)
+
+
 @pytest.mark.parametrize("mask", [np.ones((4, 4), bool), np.ones((48, 64))], ids=["another size", "numbers"])
 def test_what_is_no_mask_is_refused(mask):
     with pytest.raises(nbv.InputError, match="the mask is"):
