@@ -11,7 +11,6 @@ of is small. Neighbours are looked for anew, nearer each time, as the views come
 planes, Chen and Medioni 1992). What no view tells of X shows in the smallest eigenvalue of J^T J.
 """
 
-import itertools
 from collections.abc import Sequence
 from typing import NamedTuple, TypeAlias
 
@@ -26,8 +25,8 @@ from jaxnbv.checks import checked, require
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 
-# Points of a view that are compared, and pairs of views at most: those of the nearest directions.
-_POINTS, _PAIRS = 800, 48
+# Points of a view that are compared, and how many others it is compared with: those of the nearest directions.
+_POINTS, _OTHERS = 800, 4
 # Views that look from farther apart than this share little surface; nor do pairs with fewer neighbours.
 _WIDEST, _FEWEST = np.radians(70.0), 20
 # What rounding does to points, in shares of the distance from the cameras.
@@ -63,7 +62,7 @@ class Alignment(eqx.Module):
       vector, radians) and its shift, in the camera's axes.
     - `is_told`: whether the views tell all of the mount's error. What they do not tell is taken for zero.
     - `weakest`: the turn and shift, in radians and lengths, of which the views tell least.
-    - `num_pairs`: how many ordered pairs of views look the same way, nearly.
+    - `num_pairs`: how many pairs of views were compared: each with up to four that look nearly the same way.
     - `distance`: of points from the cameras, the median.
     """
 
@@ -141,14 +140,13 @@ def align_views(clouds: Sequence[PointCloud], poses: Sequence[Pose]) -> Alignmen
 
     Where no two views overlap, nothing is told, and what they disagree by is NaN.
 
-    **Raises:** `ValueError` for fewer than two views, an empty one, or other numbers of clouds and poses.
+    **Raises:** `ValueError` for fewer than two views, other numbers of clouds and poses, or clouds without points.
     """
     require(len(clouds) == len(poses), f"there are {len(clouds)} clouds and {len(poses)} poses: give a pose for each")
     require(len(clouds) >= 2, f"there are {len(clouds)} views: only two or more can disagree")
     views = [_in_camera(cloud, pose) for cloud, pose in zip(clouds, poses, strict=True)]
-    empty = [number for number, view in enumerate(views, start=1) if len(view.points) < 2]
-    require(not empty, f"view {empty[:1]} has no points: leave it out")
-    pairs, away = _pairs(views), float(np.median(np.concatenate([np.linalg.norm(v.points, axis=1) for v in views])))
+    pairs, away = _pairs(views), _median(np.concatenate([np.linalg.norm(view.points, axis=1) for view in views]))
+    require(away > 0, f"none of the {len(clouds)} clouds has a point: there is nothing to compare")
     still = np.tile(np.eye(4), (len(views), 1, 1))
     noise = max(_noise(views), _ROUNDING * away)
 
@@ -197,11 +195,12 @@ def _in_camera(cloud: PointCloud, pose: Pose) -> _View:
 
 
 def _pairs(views: Sequence[_View]) -> list[tuple[int, int]]:
-    """Ordered pairs of views that may show the same surface, those of the nearest directions first."""
+    """Each view with the few others that look most nearly the same way, where these may show the same surface."""
     ahead = np.stack([view.matrix[:3, 2] for view in views])
     angles = np.arccos(np.clip(ahead @ ahead.T, -1.0, 1.0))
-    ordered = sorted(itertools.permutations(range(len(views)), 2), key=lambda pair: angles[pair])
-    return [pair for pair in ordered if angles[pair] < _WIDEST][:_PAIRS]
+    np.fill_diagonal(angles, np.inf)
+    nearest = np.argsort(angles, axis=1, kind="stable")[:, :_OTHERS]
+    return [(one, int(other)) for one, row in enumerate(nearest) for other in row if angles[one, other] < _WIDEST]
 
 
 def _matched(
@@ -338,8 +337,10 @@ def _median(values: Float[np.ndarray, " n"]) -> float:
 
 def _noise(views: Sequence[_View]) -> float:
     """The median distance of a point from the plane at its nearest in the same view."""
-    off = []
+    off = [np.zeros(0)]
     for points, normals, _ in views:
+        if len(points) < 2:
+            continue
         _, nearest = cKDTree(points).query(points, k=2)
         off.append(np.sum(normals[nearest[:, 1]] * (points - points[nearest[:, 1]]), axis=1))
-    return float(np.median(np.abs(np.concatenate(off))))
+    return float(np.nan_to_num(_median(np.abs(np.concatenate(off)))))

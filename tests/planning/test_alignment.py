@@ -138,6 +138,17 @@ def test_its_derivatives_are_those_of_finite_differences(is_mount):
     np.testing.assert_allclose(rows @ step, 0.5 * (moved(1.0) - moved(-1.0)), atol=1e-11)
 
 
+def test_a_view_without_points_changes_nothing():
+    clouds, poses = views_of_a_box(len(EYES) * [random_motion(3, 1.0, 0.005)])
+    without = align_views(clouds, poses)
+    blank = PointCloud(0.0 * clouds[0].points, clouds[0].normals, 0 * clouds[0].mask == 1)
+    alignment = align_views([*clouds, blank], [*poses, Pose.from_matrix(np.eye(4))])
+    assert np.isnan(alignment.disagreement[-1])
+    np.testing.assert_allclose(alignment.corrections[0], without.corrections[0], atol=1e-9)
+    with pytest.raises(InputError, match="none of the 2 clouds has a point"):
+        align_views([blank, blank], poses[:2])
+
+
 def test_what_cannot_be_compared_is_refused():
     clouds, poses = views_of_a_box([np.eye(4)] * 2, eyes=EYES[:2])
     with pytest.raises(InputError, match="there are 1 clouds and 2 poses: give a pose for each"):
