@@ -2,6 +2,10 @@ from .answers import Words as Words
 from .answers import words_of as words_of
 from .data import ReportData as ReportData
 from .data import report_data as report_data
+from .export import save_cloud as save_cloud
+from .export import save_mesh as save_mesh
+from .export import scanned_cloud as scanned_cloud
+from .export import surface_mesh as surface_mesh
 from .live import LiveView as LiveView
 from .notebook import show as show
 from .report import write_report as write_report

@@ -1,0 +1,109 @@
+"""What an episode leaves, as files in world units: its points, and the surface that they lie on."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from scipy.spatial import cKDTree
+
+from jaxnbv.checks import InputError, checked, require
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.observations import Observations
+from jaxnbv.planning.episode import Episode
+from jaxnbv.sampler import StepInputs, SurfaceSampler
+from jaxnbv.storage.files import write_bytes
+from jaxnbv.surfaces.part_hypotheses import PartHypotheses
+from jaxnbv.viz.mean_surface import MeanSurface, as_shown, mean_surface
+from jaxnbv.viz.placed_part import likeliest_part
+
+_CLOUDS, _MESHES = ("ply", "obj", "glb", "xyz"), ("ply", "obj", "glb", "stl", "off")
+
+
+@checked
+def scanned_cloud(episode: Episode) -> PointCloud:
+    """All points that the views measured of the object, in world units: at the resolution of the scans, where
+    `Episode.cloud` has those that planning keeps.
+
+    **Raises:** `ValueError` for an episode without views.
+    """
+    require(len(episode.views) > 0, "the episode has no view yet: there are no points")
+    points, normals = (
+        np.concatenate(rows) for rows in zip(*(view.scan.to_numpy() for view in episode.views), strict=True)
+    )
+    return episode.frame.to_world(PointCloud.from_arrays(points, normals))
+
+
+@checked
+def surface_mesh(episode: Episode, imagined: bool = True) -> trimesh.Trimesh:
+    """The surface after the last view, in world units: of the posterior's mean, or of the likeliest part where parts
+    are known.
+
+    - `imagined`: whether to keep what no view measured.
+
+    For each vertex, `vertex_attributes["deviation"]` is by how far the surface may be off along its normal, a standard
+    deviation; for each face, `face_attributes["measured"]` is 1 if points lie at it, within a cell of the sampler's
+    grid, and else 0.
+
+    **Raises:** `ValueError` for an episode without views, or whose grid holds no surface.
+    """
+    cloud = scanned_cloud(episode)
+    planner, frame = episode.planner, episode.frame
+    surface = _surface(planner.sampler, episode.observations_after(len(episode.views)))
+    if surface is None:
+        raise InputError("the sampler's grid holds no surface with points: give a finer one, or another view")
+    vertices = np.asarray(frame.to_world(surface.vertices), np.float64)
+    mesh = trimesh.Trimesh(vertices, surface.faces, process=False)
+    away, _ = cKDTree(cloud.to_numpy()[0]).query(vertices)
+    cell = float(frame.length_to_world(planner.sampler.grid.spacing))
+    mesh.vertex_attributes["deviation"] = np.asarray(frame.length_to_world(surface.deviation), np.float32)
+    measured = (away[mesh.faces] < cell).all(axis=1)
+    mesh.face_attributes["measured"] = measured.astype(np.uint8)
+    if not imagined:
+        mesh.update_faces(measured)
+        mesh.remove_unreferenced_vertices()
+    return mesh
+
+
+@checked
+def save_cloud(episode: Episode, path: str | Path) -> Path:
+    """Write `scanned_cloud` as a PLY, OBJ, GLB or XYZ file, by its ending; PLY holds the normals too.
+
+    **Raises:** `ValueError` as `scanned_cloud` does, for another ending, or if the file cannot be written.
+    """
+    points, normals = scanned_cloud(episode).to_numpy()
+    kind = _kind(path, _CLOUDS)
+    if kind == "ply":
+        # Clouds of trimesh have no normals.
+        bare = trimesh.Trimesh(points, vertex_normals=normals, process=False)
+        return _written(path, trimesh.exchange.ply.export_ply(bare, vertex_normal=True))
+    return _written(path, trimesh.PointCloud(points).export(file_type=kind))
+
+
+@checked
+def save_mesh(episode: Episode, path: str | Path, imagined: bool = True) -> Path:
+    """Write `surface_mesh` as a PLY, OBJ, GLB, STL or OFF file, by its ending; PLY holds the deviation of each vertex,
+    and of each face whether it was measured.
+
+    **Raises:** `ValueError` as `surface_mesh` does, for another ending, or if the file cannot be written.
+    """
+    kind = _kind(path, _MESHES)
+    return _written(path, surface_mesh(episode, imagined).export(file_type=kind))
+
+
+def _surface(sampler: SurfaceSampler, observations: Observations) -> MeanSurface | None:
+    if isinstance(observations.hypotheses, PartHypotheses):
+        return likeliest_part(observations.hypotheses)
+    inputs = StepInputs(observations, sampler.posterior(observations))
+    return as_shown(mean_surface(sampler, inputs), observations.cloud)
+
+
+def _kind(path: str | Path, kinds: tuple[str, ...]) -> str:
+    kind = Path(path).suffix[1:].lower()
+    require(kind in kinds, f"{path} does not say a format: end it with one of {', '.join('.' + one for one in kinds)}")
+    return kind
+
+
+def _written(path: str | Path, content: Any) -> Path:
+    write_bytes(Path(path), content.encode() if isinstance(content, str) else content)
+    return Path(path)

@@ -1,0 +1,76 @@
+"""Points and surfaces as files, of a ball of 10 cm in a world of metres."""
+
+import numpy as np
+import pytest
+import trimesh
+from small_session import BOX, FIRST, POSES, planner_of, session_of, shot
+
+import jaxnbv as nbv
+from jaxnbv.checks import InputError
+from jaxnbv.viz.export import save_cloud, save_mesh, scanned_cloud, surface_mesh
+
+CENTER = np.array([0.3, 0.2, 0.101])
+
+
+@pytest.fixture(scope="module")
+def episode():
+    session = session_of(planner=planner_of())
+    for matrix in (FIRST, POSES[2]):
+        session.add(shot(matrix), matrix, depth_scale=1e-3)
+    return session.episode
+
+
+def off(points):
+    return np.abs(np.linalg.norm(points - CENTER, axis=1) - 0.1)
+
+
+def test_the_cloud_has_all_points_of_the_scans(episode):
+    points, normals = scanned_cloud(episode).to_numpy()
+    assert len(points) == sum(int(view.scan.count) for view in episode.views) > 400
+    assert off(points).max() < 0.005
+    assert np.median(np.sum(normals * (points - CENTER), axis=1)) / 0.1 > 0.95
+
+
+def test_the_surface_is_marked_where_it_was_measured(episode):
+    mesh = surface_mesh(episode)
+    cell = 2.5 / 0.24 * 0 + float(episode.frame.length_to_world(episode.planner.sampler.grid.spacing))
+    measured = mesh.face_attributes["measured"] == 1
+    assert 0 < measured.sum() < len(measured)
+    centers = mesh.triangles_center
+    assert off(centers[measured]).max() < 1.5 * cell
+    # From both cameras the ball's far side is hidden; there nothing was measured.
+    eyes = np.stack([FIRST[:3, 3], POSES[2][:3, 3]]) - CENTER
+    hidden = ((centers - CENTER) @ eyes.T < -0.02).all(axis=1)
+    assert hidden.any()
+    assert not measured[hidden].any()
+    deviation = mesh.vertex_attributes["deviation"]
+    assert deviation[mesh.faces[hidden]].mean() > 3.0 * deviation[mesh.faces[measured]].mean()
+    alone = surface_mesh(episode, imagined=False)
+    assert len(alone.faces) == measured.sum()
+    assert alone.face_attributes["measured"].all()
+
+
+def test_files_hold_world_units(episode, tmp_path):
+    cloud = trimesh.load(save_cloud(episode, tmp_path / "cloud.ply"))
+    assert off(np.asarray(cloud.vertices)).max() < 0.005
+    plain = trimesh.load(save_cloud(episode, tmp_path / "cloud.xyz"))
+    np.testing.assert_allclose(np.asarray(plain.vertices), np.asarray(cloud.vertices), atol=1e-4)
+    low, high = np.array(BOX)
+    for kind in ("ply", "obj", "stl", "glb"):
+        mesh = trimesh.load(save_mesh(episode, tmp_path / f"mesh.{kind}"), force="mesh")
+        assert len(mesh.faces) > 100
+        assert np.all(mesh.bounds[0] > low - 0.02)
+        assert np.all(mesh.bounds[1] < high + 0.02)
+    kept = trimesh.load(tmp_path / "mesh.ply", process=False)
+    raw = kept.metadata["_ply_raw"]
+    assert "deviation" in raw["vertex"]["properties"]
+    assert "measured" in raw["face"]["properties"]
+
+
+def test_what_cannot_be_written_is_refused(episode, tmp_path):
+    with pytest.raises(
+        InputError, match=r"does not say a format: end it with one of \.ply, \.obj, \.glb, \.stl, \.off"
+    ):
+        save_mesh(episode, tmp_path / "mesh.step")
+    with pytest.raises(InputError, match="no view yet"):
+        scanned_cloud(nbv.Episode(episode.planner, None, None, episode.first, episode.key))
