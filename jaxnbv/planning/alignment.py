@@ -43,6 +43,8 @@ _ERROR, _TOGETHER = 0.03, 50
 # The smallest eigenvalue of J^T J in shares of the largest from which on all of X is told: 4e-6 for three views of a
 # shelf from one side, 1e-3 and more where the views told it.
 _TOLD = 3e-4
+# A correction that moves points by more than this share of their distance is no small error of a mount.
+_MOST = 0.15
 # Views that differ by so many times the noise disagree. A correction is used if what it leaves is so many times less.
 _OFF, _LESS = 3.0, 1.5
 _Corrections: TypeAlias = Float[np.ndarray, "views 4 4"]
@@ -223,9 +225,9 @@ def _matched(
 
 
 def _is_plausible(corrections: _Corrections, away: float) -> bool:
-    """Whether points move by no more than neighbours were looked for."""
+    """Whether points move little, as by a small error."""
     turn, shift = errors_of(corrections)
-    return bool(np.max(away * turn + shift) < _REACHES[0] * away)
+    return bool(np.max(away * turn + shift) < _MOST * away)
 
 
 def errors_of(corrections: _Corrections) -> tuple[Float[np.ndarray, " views"], Float[np.ndarray, " views"]]:

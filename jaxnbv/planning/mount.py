@@ -1,7 +1,5 @@
 """The error of the poses of a session: what its images tell, and where the cameras truly were."""
 
-from collections.abc import Sequence
-
 import numpy as np
 from jaxtyping import Float
 
@@ -31,18 +29,24 @@ class MountError:
     def __init__(self, camera: Camera, convention: str, ignore: Ignore | None = None):
         self.camera, self.convention, self.ignore = camera, convention, ignore
         self.corrections: Float[np.ndarray, "views 4 4"] = np.zeros((0, 4, 4))
+        self._images: list[Image] = []
         self._clouds: list[PointCloud] = []
         self._alignment: Alignment | None = None
 
-    def alignment(self, images: Sequence[Image]) -> Alignment:
+    def show(self, image: Image, index: int) -> None:
+        """An image of this number, without values that stand for "not measured"; it may be shown again."""
+        if index == len(self._images):
+            self._images.append(image)
+
+    def alignment(self) -> Alignment:
         """Of the images, with all that stands around the object.
 
         **Raises:** `ValueError` for fewer than two images.
         """
-        if self._alignment is None or len(self._alignment.corrections) != len(images):
-            poses = [Pose.from_matrix(image.matrix, self.convention) for image in images]
+        if self._alignment is None or len(self._alignment.corrections) != len(self._images):
+            poses = [Pose.from_matrix(image.matrix, self.convention) for image in self._images]
             stride = _COARSER * stride_of(self.camera)
-            for image, pose in list(zip(images, poses, strict=True))[len(self._clouds) :]:
+            for image, pose in list(zip(self._images, poses, strict=True))[len(self._clouds) :]:
                 cloud = image.cloud(self.camera, pose, stride)
                 if self.ignore is not None:
                     cloud = only_where(cloud, image.is_kept(self.ignore, self.camera, pose), stride)
@@ -50,9 +54,9 @@ class MountError:
             self._alignment = align_views(self._clouds, poses)
         return self._alignment
 
-    def warns(self, images: Sequence[Image]) -> bool:
+    def warns(self) -> bool:
         """Warn if the images disagree; whether they do."""
-        if len(images) < _ENOUGH or not (alignment := self.alignment(images)).disagrees:
+        if len(self._images) < _ENOUGH or not (alignment := self.alignment()).disagrees:
             return False
         warn_of_mount(alignment)
         return True
@@ -77,12 +81,12 @@ class MountError:
             return poses
         return Pose.from_matrix(np.asarray(poses.to_matrix(), np.float64) @ np.linalg.inv(self.mount))
 
-    def update(self, images: Sequence[Image]) -> bool:
+    def update(self) -> bool:
         """Use what the images tell now; whether that moves a camera."""
-        if len(images) < _ENOUGH:
+        if len(self._images) < _ENOUGH:
             return False
-        alignment = self.alignment(images)
-        used = np.tile(self.mount, (len(images), 1, 1))
+        alignment = self.alignment()
+        used = np.tile(self.mount, (len(self._images), 1, 1))
         used[: len(self.corrections)] = self.corrections
         turns, shifts = errors_of(np.linalg.inv(used) @ alignment.corrections)
         moves = bool(np.max(alignment.distance * turns + shifts) > _EQUAL * alignment.noise)

@@ -242,7 +242,7 @@ class Session:
 
         **Raises:** `ValueError` for fewer than two images.
         """
-        return self._mount_error.alignment(self._images)
+        return self._mount_error.alignment()
 
     @property
     def episode(self) -> Episode:
@@ -305,7 +305,7 @@ class Session:
         if self.correct_mount:
             self._correct()
         elif self.correct_mount is not None and not self._warned_of_mount:
-            self._warned_of_mount = self._mount_error.warns(self._images)
+            self._warned_of_mount = self._mount_error.warns()
 
     @own_settings()
     def next(self) -> NextView:
@@ -401,10 +401,9 @@ class Session:
             cloud = only_where(cloud, clean.is_kept(self.ignore, self.camera, pose), self.stride)
         if image.mask is not None:
             cloud = only_where(cloud, image.mask, self.stride)
-        shows_any = index > 0 or bool(cloud.mask.any())
-        require(
-            shows_any, "the first image shows nothing of the box at the pixels of the mask, or that are not ignored"
-        )
+        if self.ignore is not None or image.mask is not None:
+            shows_any = index > 0 or bool(cloud.mask.any())
+            require(shows_any, "the first image shows nothing of the box at the pixels of the mask, or all is ignored")
         scan = self.frame.to_scene(cloud)
         if (obstacles := loop.planner.obstacles) is not None:
             scan = obstacles.remove_points(scan)
@@ -418,11 +417,12 @@ class Session:
                 folder.write("image", index, **stored, **masked)
 
         loop.add(self.frame.to_scene(pose), scan, accepted=store)
+        self._mount_error.show(clean, index)
         self._loop, self._next, self._images = loop, None, (*self._images, image)
 
     def _correct(self) -> None:
         """Add the images again where they tell that cameras were elsewhere."""
-        if not self._mount_error.update(self._images):
+        if not self._mount_error.update():
             return
         images, views = self._images, self.views
         self._loop, self._images = self._loop.emptied(self._given_planner), ()

@@ -70,7 +70,7 @@ class Sessions:
         self.camera, self.box, self.until = camera, box_of(box), until
         self._frame, self._planner, self._key = whole.frame, planner, whole.key
         self._obstacles, self._progress = obstacles, progress
-        self._images: tuple[Image, ...] = ()
+        self._num_images = 0
         self._mount_error, self._warned_of_mount = MountError(camera, whole.convention), False
         self._longest_part = 2.0 * float(jnp.max(jnp.linalg.norm(bank.shapes.extremes, axis=-1)))
         self._gap = _GAP * float(np.max(self.box.high - self.box.low)) if gap is None else gap
@@ -113,8 +113,8 @@ class Sessions:
         cloud = PointCloud.from_depth(pixels, self.camera, pose, depth_scale, stride)
         if self._obstacles is None:
             self._obstacles = self._table_of(cloud)
-        image = Image.of(depth, matrix, depth_scale, None)
-        points, inside = self._points(image._replace(depth=pixels), pose)
+        image = Image.of(pixels, matrix, depth_scale, None)
+        points, inside = self._points(image, pose)
         if labels is None:
             numbers = np.zeros(pixels.shape, int)
             numbers[inside] = self._numbers(points[inside])
@@ -139,8 +139,9 @@ class Sessions:
             if np.any((corners - np.asarray(pose.position)) @ np.asarray(pose.forward) > 0):
                 session.add(depth, matrix, depth_scale, mask=numbers == number)
         self._next = None
-        self._images = (*self._images, image)
-        self._warned_of_mount = self._warned_of_mount or self._mount_error.warns(self._images)
+        self._mount_error.show(image, self._num_images)
+        self._num_images += 1
+        self._warned_of_mount = self._warned_of_mount or self._mount_error.warns()
 
     def next(self) -> Float[np.ndarray, "4 4"]:
         """Where to take the next image: the candidate of most value, in world units and summed over the objects for

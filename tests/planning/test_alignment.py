@@ -189,3 +189,16 @@ def test_a_session_warns_of_its_mount_once_and_corrects_it_where_that_is_asked_f
     # What the camera is sent to is off by as much as the mount is.
     sent, planned = corrected.next().matrix, corrected.frame.to_world(corrected.next().proposal.pose).to_matrix()
     np.testing.assert_allclose(sent @ corrected.alignment.corrections[0], planned, atol=1e-5)
+
+
+def test_comparing_views_says_nothing_twice():
+    """Pixels of 10 m are a mark, of which each image that has them is warned of once."""
+    session = session_of()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for matrix in PLACES[:3]:
+            image = shot(matrix)
+            image[:8] = 10_000
+            session.add(image, matrix, depth_scale=1e-3)
+    assert sum("as no measured surface would" in str(one.message) for one in caught) == 3
+    assert not any("disagree" in str(one.message) for one in caught)
