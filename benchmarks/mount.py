@@ -125,10 +125,10 @@ def main() -> None:
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--parts", type=Path)
     what.add_argument("--recording", type=Path)
-    for name, default in {"objects": 10, "every": 3}.items():
-        parser.add_argument(f"--{name}", default=default, type=int)
-    for name, default in {"degrees": 1.0, "length": 0.005}.items():
-        parser.add_argument(f"--{name}", default=default, type=float)
+    parser.add_argument("--objects", default=10, type=int)
+    parser.add_argument("--every", default=3, type=int)
+    parser.add_argument("--degrees", default=1.0, type=float)
+    parser.add_argument("--length", default=0.005, type=float)
     options = parser.parse_args()
     # Of tables that are found, and poses that are off on purpose.
     warnings.simplefilter("ignore", UserWarning)

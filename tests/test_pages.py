@@ -176,7 +176,7 @@ def test_the_block_of_a_session_runs(tmp_path, monkeypatch):
         capacity=2048,
     )
     monkeypatch.setattr("jaxnbv.planning.session.usual_planner", lambda: planner)
-    given = {"K": INTRINSICS, **CORNERS, "reachable": poses, "first": poses[0], "take_image": image_of_a_ball}
+    given = {"K": INTRINSICS, **CORNERS, "places": poses, "first": poses[0], "take_image": image_of_a_ball}
     (block,) = (block for block in blocks("how_to/depth_camera.md") if "take_image" in block)
     exec(block, given)
     session = given["session"]
