@@ -118,6 +118,13 @@ def test_a_cloud_is_no_recording(parts, tmp_path):
         identify(recording=tmp_path / "scan.ply", parts=parts, **ASKED)
 
 
+@pytest.mark.parametrize("several", [False, True])
+def test_a_box_that_no_frame_shows_is_told(several, parts, recording):
+    box = (*(CENTRE + 0.2), *(CENTRE + 0.3))
+    with pytest.raises(InputError, match=r"none of the 4 frames of .* shows an object in the box: give --box"):
+        identify(recording=recording, parts=parts, parts_scale="mm", several=several, **ASKED | {"box": box})
+
+
 def test_parts_of_another_unit_are_told(parts):
     assert bank_of(parts, "mm", 0.1).names == ("block", "bracket", "rod")
     assert bank_of(parts, "0.001", 0.1).is_true_size

@@ -122,6 +122,11 @@ def identify(options: IdentifyOptions, box: Any, intrinsics: Any, depth_scale: A
         if (reason := looked.done()) is not None:
             typer.echo(f"enough      {reason}")
             break
+    if not _objects(looked, names) or (isinstance(looked, Session) and not looked.views):
+        raise InputError(
+            f"none of the {len(chosen)} frames of {options.recording} shows an object in the box: give --box, or more "
+            "--views"
+        )
     # A named unit is one of a world in metres.
     unit = "m" if isinstance(as_unit(options.parts_scale), str) else None
     answers = {}

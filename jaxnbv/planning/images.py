@@ -1,6 +1,5 @@
 """A depth image with where it was taken, as a session gets it."""
 
-import hashlib
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
@@ -47,10 +46,6 @@ class Image(NamedTuple):
         # A driver may write its next image into the same memory.
         return cls(pixels.copy(), as_numbers(matrix, "the matrix of a pose", np.float64), scale, shows)
 
-    @property
-    def digest(self) -> bytes:
-        return hashlib.sha256(self.depth.tobytes()).digest()
-
     def cleaned(self, camera: Camera, pose: Pose, box: Box) -> "Image":
         """The image with zeros where its value stands for "not measured", see `without_sentinels`."""
         return self._replace(depth=without_sentinels(self.depth, camera, pose, self.scale, box))
@@ -92,12 +87,13 @@ class Image(NamedTuple):
         something."""
         if not (self.depth > 0).any():
             return
-        same = next((index for index, image in enumerate(earlier) if image.digest == self.digest), None)
-        require(
-            same is None or bool(np.abs(earlier[same].matrix - self.matrix).max() <= _SAME_PLACE),
-            f"the image is bit for bit image {0 if same is None else same + 1}, which was taken from another pose: it "
-            "is of an earlier moment than its pose. Discard the frames that the driver still holds after a move",
-        )
+        for number, image in enumerate(earlier, start=1):
+            is_same = np.array_equal(image.depth, self.depth, equal_nan=self.depth.dtype.kind == "f")
+            require(
+                not is_same or bool(np.abs(image.matrix - self.matrix).max() <= _SAME_PLACE),
+                f"the image is bit for bit image {number}, which was taken from another pose: it is of an earlier "
+                "moment than its pose. Discard the frames that the driver still holds after a move",
+            )
 
 
 def only_where(cloud: PointCloud, pixels: Bool[np.ndarray, "height width"], stride: int) -> PointCloud:

@@ -98,11 +98,9 @@ def _looks(proposal: Proposal) -> tuple[Pose, Float[Array, " looks"]]:
 
 def _with_pose(proposal: Proposal, pose: Pose, value: Float[Array, ""]) -> Proposal:
     """With another pose and its value, and its error where that is known."""
-    errors, same = proposal.standard_errors, proposal.values == value
-    if errors is None or value == proposal.value:
-        error = proposal.standard_error if value == proposal.value else None
-    else:
-        error = errors[jnp.argmax(same)] if bool(same.any()) else None
+    error, errors, same = proposal.standard_error, proposal.standard_errors, proposal.values == value
+    if value != proposal.value:
+        error = errors[jnp.argmax(same)] if errors is not None and bool(same.any()) else None
     return dataclasses.replace(proposal, pose=pose, value=value, standard_error=error)
 
 
