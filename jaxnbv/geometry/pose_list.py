@@ -44,9 +44,7 @@ class PoseList(eqx.Module):
 
     def holds(self, poses: Pose) -> Bool[Array, " poses"]:
         """Whether each of a batch of poses equals one of the list, to 1e-3 in position and viewing direction."""
-        near = jnp.linalg.norm(poses.position[:, None] - self.rows.position[None], axis=-1) < _SAME
-        aligned = jnp.linalg.norm(poses.forward[:, None] - self.rows.forward[None], axis=-1) < _SAME
-        return jnp.any(near & aligned & self.is_filled, axis=1)
+        return jnp.any(is_same_view(poses[:, None], self.rows[None]) & self.is_filled, axis=1)
 
     def distance(self, poses: Pose) -> Float[Array, " poses"]:
         """Distance from each of a batch of positions to the nearest of the list; infinite if it is empty."""
@@ -57,3 +55,9 @@ class PoseList(eqx.Module):
     def is_filled(self) -> Bool[Array, " room"]:
         """Which rows hold a pose of the list."""
         return jnp.arange(self.room) < self.count
+
+
+def is_same_view(poses: Pose, others: Pose) -> Bool[Array, "*batch"]:
+    """Whether poses equal others, which broadcast, to 1e-3 in position (scene units) and viewing direction."""
+    near = jnp.linalg.norm(poses.position - others.position, axis=-1) < _SAME
+    return near & (jnp.linalg.norm(poses.forward - others.forward, axis=-1) < _SAME)

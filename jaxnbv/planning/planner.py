@@ -229,6 +229,17 @@ class Planner(eqx.Module):
     @own_settings()
     @jax.debug_nans(False)
     @eqx.filter_jit
+    def values_at(self, inputs: StepInputs, poses: Pose) -> Float[Array, " poses"]:
+        """The values of a batch of poses, in scene coordinates, by the step's samples and with the cost of going there:
+        what the search maximises.
+
+        **Raises:** `ValueError` for inputs without samples.
+        """
+        return Problem(inputs, self.camera, self.acquisition, self.obstacles, self.cost).prepared().values(poses)
+
+    @own_settings()
+    @jax.debug_nans(False)
+    @eqx.filter_jit
     def expected_depth(self, surfaces: GridSurface, pose: Pose) -> Float[Array, "h w"]:
         """The depth image that is expected from a pose: `mean_depth` over the samples, by the planner's camera."""
         scans = scan_samples(surfaces, self.camera, pose[None], barrier_of(self.obstacles, self.camera, pose[None]))

@@ -12,7 +12,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray, Real
+from jaxtyping import Array, Float, PRNGKeyArray, Real
 from tqdm import tqdm
 
 from jaxnbv.checks import AnyArray, InputError, as_numbers, check_key, checked, own_settings, require, shown
@@ -102,8 +102,9 @@ class Session:
     - `correct_mount`: whether poses are corrected by what the images tell of their errors, from the third image on; see
       `alignment`. By default a warning says once that they are off; with None nothing is looked for.
     - `reachable`: a function of matrices (n, 4, 4), in the session's convention, which says of each whether the arm
-      can go there: a truth; or None, and else why not ("joint limit"). It is asked about the best poses that the search
-      looked at, a few at a time, until one holds, and about each with the camera turned about its optical axis too.
+      can go there: a truth; None if it can, else why not ("joint limit"); or a score from 0 to 1 that the value is
+      multiplied by, 1 / (1 + seconds of motion) say. It is asked about the best poses that the search looked at, a few
+      at a time, and about those that do not hold with the camera turned about its optical axis too.
     - `ignore`: a function of points (n, 3) in the world, which says of each whether it is of the robot itself: it is
       no part of the object, and hides what is behind it. Asked about all that an image measured.
     - `progress`: whether a bar shows what it is at while it plans.
@@ -308,10 +309,12 @@ class Session:
             self._warned_of_mount = self._mount_error.warns()
 
     @own_settings()
-    def next(self) -> NextView:
+    def next(self, seconds: float = math.inf) -> NextView:
         """Where to take the next image. It is stored, and the same until an image is added; what was proposed once is
         not proposed again, for where the sensor could not be held it need not be tried twice. Warns where the best view
         is worth no more than three standard errors and what is expected in vain.
+
+        - `seconds`: how long `reachable` may take, for a motion planner say: then the best pose so far is taken.
 
         **Raises:** `ValueError` before the first image, as `Planner.propose` does, if no pose can be reached, or if
         another process has added images to the folder.
@@ -322,7 +325,9 @@ class Session:
                 proposal, depth = self._loop.propose(), None
                 refusals: Mapping[str, int] = {}
                 if self.reachable is not None or self._refused:
-                    proposal, refusals = best_reachable(proposal, self.reachable, self._matrices, self._refused)
+                    values_at = self._values_at if self._sees_more_turned else None
+                    asked = self.reachable, self._matrices, self._refused, values_at, seconds
+                    proposal, refusals = best_reachable(proposal, *asked)
                     self._loop.settle(proposal)
                 if (surfaces := self._loop.inputs().surfaces) is not None:
                     depth = self.frame.length_to_world(np.asarray(self.planner.expected_depth(surfaces, proposal.pose)))
@@ -462,6 +467,15 @@ class Session:
         """What to send the camera to for it to stand at poses of the scene."""
         sent = self._mount_error.sent(self.frame.to_world(poses))
         return np.asarray(sent.to_matrix(self.convention), np.float64)
+
+    @property
+    def _sees_more_turned(self) -> bool:
+        """Whether the planner's image shows something else if the camera is turned about its optical axis."""
+        camera = self.planner.camera
+        return self.planner.search.uses_samples and camera.height != camera.width
+
+    def _values_at(self, poses: Pose) -> Float[Array, " n"]:
+        return self.planner.values_at(self._loop.inputs(), poses)
 
     def _in_vain(self, proposal: Proposal) -> float:
         return 0.0 if proposal.in_vain is None else self._loop.in_world(proposal.in_vain)

@@ -1,10 +1,14 @@
 """Proposals that an arm can reach, and those that it refuses."""
 
+import dataclasses
+
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from small_session import CENTER, FIRST, POSES, planner_of, session_of, shot
 
 from jaxnbv.checks import InputError
+from jaxnbv.geometry.camera import Camera
 from jaxnbv.planning.session import Session
 from jaxnbv.search import GradientSearch
 
@@ -108,6 +112,51 @@ def test_what_cannot_be_reached_at_all_is_told():
     session.reachable = lambda matrices: 0.5
     with pytest.raises(InputError, match=r"reachable says 0\.5 of 8 poses: give a list of as many answers"):
         session.next()
-    session.reachable = lambda matrices: [0.5] * len(matrices)
-    with pytest.raises(InputError, match=r"reachable says 0\.5 of a pose: give a truth; or None"):
+    session.reachable = lambda matrices: [1.5] * len(matrices)
+    with pytest.raises(InputError, match=r"reachable says 1\.5 of a pose: give a truth; None if .* from 0 to 1"):
         session.next()
+    session.reachable = lambda matrices: ["collision"] * len(matrices)
+    with pytest.raises(InputError, match=r"none of the 1 of the \d+ poses .*\(1 collision\).*, or more seconds"):
+        session.next(seconds=0.0)
+
+
+def test_a_score_is_multiplied_by_the_value(free):
+    """The choice is that of most value times score, though not all poses are asked about."""
+    order = np.argsort(-free_values(), kind="stable")
+    scores = np.random.default_rng(0).uniform(0.3, 1.0, len(POSES))
+    scores[order[3]] = 0.0
+    asked = []
+
+    def reachable(matrices):
+        asked.extend(number_of(matrix) for matrix in matrices)
+        return [scores[number_of(matrix)] for matrix in matrices]
+
+    view = begun(reachable=reachable).next()
+    values = free_values()
+    best = int(np.argmax(scores * values))
+    assert best != free[0]
+    assert number_of(view.matrix) == best
+    assert float(view.proposal.value) == pytest.approx(values[best], rel=1e-6)
+    # One batch more than needed at most, and seven rolls of the pose with the score zero.
+    can_win = int((values > scores[best] * values[best]).sum())
+    assert len(set(asked)) <= 8 * (can_win // 8 + 1)
+
+
+def free_values():
+    return np.asarray(begun().next().proposal.values)
+
+
+def test_a_turned_image_that_is_not_square_is_imagined_again(free):
+    """The wide image, turned by a right angle, is worth what the planner says of that pose."""
+
+    def reachable(matrices):
+        return np.abs(matrices[:, 2, 0]) > 0.9
+
+    session = begun(planner=dataclasses.replace(planner_of(), camera=Camera(height=8, width=24)), reachable=reachable)
+    view = session.next()
+    pose = view.proposal.pose
+    assert float(session.planner.values_at(session._loop.inputs(), pose[None])[0]) == pytest.approx(
+        float(view.proposal.value), rel=1e-5
+    )
+    upright = view.proposal.values
+    assert float(jnp.abs(upright - view.proposal.value).min()) > 1e-4 * float(upright.max())
