@@ -25,13 +25,18 @@ _SAME_PLACE = 1e-5
 
 
 class Image(NamedTuple):
-    """A depth image as it was given: `scale` times `depth` is in world units, `matrix` is where the camera is said to
-    have been, and `mask`, unless it is None, tells which pixels show the object."""
+    """A depth image as it was given.
+
+    - `depth`: `scale` times it is in world units; `matrix`: where the camera is said to have been.
+    - `mask`: pixels that show the object, None for all.
+    - `robot`: pixels that show the robot itself, None for none.
+    """
 
     depth: Real[np.ndarray, "height width"]
     matrix: Float[np.ndarray, "4 4"]
     scale: float
     mask: Bool[np.ndarray, "height width"] | None
+    robot: Bool[np.ndarray, "height width"] | None = None
 
     @classmethod
     def of(cls, depth: AnyArray, matrix: AnyArray | list, scale: float, mask: AnyArray | None) -> "Image":
@@ -56,8 +61,8 @@ class Image(NamedTuple):
         away = depth[..., None] * np.asarray(camera.pixel_directions(), np.float64).reshape(*depth.shape, 3)
         return away @ np.asarray(pose.rotation, np.float64).T + np.asarray(pose.position, np.float64)
 
-    def is_kept(self, ignore: Ignore, camera: Camera, pose: Pose) -> Bool[np.ndarray, "height width"]:
-        """Which pixels a function of points does not leave out.
+    def with_robot(self, ignore: Ignore, camera: Camera, pose: Pose) -> "Image":
+        """The image with the pixels whose points a function says to be of the robot.
 
         **Raises:** `ValueError` if it does not say a truth of each point.
         """
@@ -67,13 +72,14 @@ class Image(NamedTuple):
             said.shape == (int(measured.sum()),) and said.dtype == bool,
             f"ignore says {shown(said)} of {int(measured.sum())} points: give a truth for each",
         )
-        kept = np.ones(self.depth.shape, bool)
-        kept[measured] = ~said
-        return kept
+        robot = np.zeros(self.depth.shape, bool)
+        robot[measured] = said
+        return self._replace(robot=robot)
 
     def cloud(self, camera: Camera, pose: Pose, stride: int, box: Box | None = None) -> PointCloud:
-        """What it shows, see `PointCloud.from_depth`; the mask is not applied."""
-        return PointCloud.from_depth(self.depth, camera, pose, self.scale, stride, box)
+        """What it shows but for the robot, see `PointCloud.from_depth`; the mask is not applied."""
+        cloud = PointCloud.from_depth(self.depth, camera, pose, self.scale, stride, box)
+        return cloud if self.robot is None else only_where(cloud, ~self.robot, stride)
 
     def is_blank(self, cloud: PointCloud) -> bool:
         """Whether it measured nothing: no pixel is valid, or all of them have one value and show no surface."""

@@ -26,6 +26,7 @@ from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.stopping import StopContext, StopRule, checked_reason
 from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning import GridSurface
+from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.search import Proposal
 from jaxnbv.surfaces.part_hypotheses import PartHypotheses
 from jaxnbv.tasks.identification import identity_answer
@@ -134,6 +135,15 @@ class Loop:
         loop = copy.copy(self)
         loop.planner, loop.views, loop._observations = planner, (), None
         loop._pending, loop._next = PoseList.empty(planner.max_views), _StepState()
+        return loop
+
+    def with_clutter(self, clutter: SignedDistance | None) -> "Loop":
+        """With other clutter among the planner's obstacles, in scene units; None for none."""
+        assert self.planner.obstacles is not None
+        loop = copy.copy(self)
+        # The planner is checked already, which takes time.
+        where = lambda planner: planner.obstacles.clutter  # noqa: E731
+        loop.planner = eqx.tree_at(where, self.planner, clutter, is_leaf=lambda leaf: leaf is None)
         return loop
 
     @property

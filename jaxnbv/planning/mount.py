@@ -7,7 +7,7 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.planning.alignment import Alignment, align_views, errors_of
-from jaxnbv.planning.images import Ignore, Image, only_where, stride_of
+from jaxnbv.planning.images import Image, stride_of
 from jaxnbv.planning.session_warnings import warn_of_mount
 
 # Images are compared by every so many-th of the rows and columns that are planned with.
@@ -21,13 +21,12 @@ _EQUAL = 0.5
 class MountError:
     """How far the images of a session disagree, and the corrections of their poses that are used.
 
-    - `camera`: the sensor; `convention`: of the images' matrices, see `Pose.from_matrix`; `ignore`: as of
-      `Session`.
+    - `camera`: the sensor; `convention`: of the images' matrices, see `Pose.from_matrix`.
     - `corrections`: (views, 4, 4), X of each image: its camera was at `matrix @ X`, in OpenCV's axes.
     """
 
-    def __init__(self, camera: Camera, convention: str, ignore: Ignore | None = None):
-        self.camera, self.convention, self.ignore = camera, convention, ignore
+    def __init__(self, camera: Camera, convention: str):
+        self.camera, self.convention = camera, convention
         self.corrections: Float[np.ndarray, "views 4 4"] = np.zeros((0, 4, 4))
         self._images: list[Image] = []
         self._clouds: list[PointCloud] = []
@@ -47,10 +46,7 @@ class MountError:
             poses = [Pose.from_matrix(image.matrix, self.convention) for image in self._images]
             stride = _COARSER * stride_of(self.camera)
             for image, pose in list(zip(self._images, poses, strict=True))[len(self._clouds) :]:
-                cloud = image.cloud(self.camera, pose, stride)
-                if self.ignore is not None:
-                    cloud = only_where(cloud, image.is_kept(self.ignore, self.camera, pose), stride)
-                self._clouds.append(cloud)
+                self._clouds.append(image.cloud(self.camera, pose, stride))
             self._alignment = align_views(self._clouds, poses)
         return self._alignment
 

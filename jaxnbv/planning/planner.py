@@ -247,7 +247,9 @@ class Planner(eqx.Module):
         return depth.reshape(self.camera.height, self.camera.width)
 
     def _with_view(self, observations: Observations, pose: Pose, scan: PointCloud, camera: Camera) -> Observations:
-        return observations.add_view(pose, scan, camera, self.sampler.carving, self.obstacles)
+        # What clutter hid, the scan itself says.
+        obstacles = None if self.obstacles is None else self.obstacles.with_clutter(None)
+        return observations.add_view(pose, scan, camera, self.sampler.carving, obstacles)
 
     def _check(self, pose: Pose | None, scan: PointCloud, camera: Camera, first: bool) -> None:
         """**Raises:** `ValueError` for a scan that `init` refuses, or `observe` if it is not the first."""

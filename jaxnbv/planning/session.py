@@ -24,12 +24,14 @@ from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
 from jaxnbv.observations import Observations
 from jaxnbv.planning.alignment import Alignment
+from jaxnbv.planning.clutter import Clutter
 from jaxnbv.planning.episode import Episode
 from jaxnbv.planning.images import Ignore, Image, only_where, stride_of
 from jaxnbv.planning.loop import STAGES, Loop, View
 from jaxnbv.planning.mount import MountError
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.reachability import Reachable, Refused, best_reachable
+from jaxnbv.planning.session_folder import SessionFolder, StoredProposal
 from jaxnbv.planning.session_warnings import (
     warn_of_blank,
     warn_of_cut,
@@ -44,7 +46,6 @@ from jaxnbv.progress import progress_bar
 from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning import Obstacles
 from jaxnbv.search import DiscreteSearch, Proposal
-from jaxnbv.storage import RunFolder
 from jaxnbv.surfaces.part_hypotheses import hypotheses_of
 from jaxnbv.surfaces.part_pose import ObjectPose, object_pose
 from jaxnbv.tasks import NewSurface
@@ -91,7 +92,8 @@ class Session:
     - `obstacles`: what stands around the object, in world units: `Obstacles((table,), margin=0.005)`, say. By default
       the plane that the object stands on is looked for in the first image, named in a warning, and taken for a table:
       left out of the cloud, and no place for a camera. If there is none a warning says so, and whether there would be
-      one by another `up`. `Obstacles()` says that there is none.
+      one by another `up`. Other things outside the box that images show hide the object and keep cameras away,
+      coarsely. `Obstacles()` says that there is nothing.
     - `poses`: (n, 4, 4), where the sensor can be held; by default the candidates of the planner's search, in scene
       units about the box's centre, and of a whole sphere the upper half: what is below may be the table. In a room that
       is scanned from inside they must be given: the default ones stand outside the box.
@@ -106,7 +108,7 @@ class Session:
       multiplied by, 1 / (1 + seconds of motion) say. It is asked about the best poses that the search looked at, a few
       at a time, and about those that do not hold with the camera turned about its optical axis too.
     - `ignore`: a function of points (n, 3) in the world, which says of each whether it is of the robot itself: it is
-      no part of the object, and hides what is behind it. Asked about all that an image measured.
+      no part of the object, and hides what is behind it. Asked once about all that an image measured.
     - `progress`: whether a bar shows what it is at while it plans.
 
     **Raises:** `ValueError` for a box without inside, no `up`, poses that the search has no use for, or a folder of
@@ -145,21 +147,22 @@ class Session:
         rays = self.frame.to_scene(self.camera.strided(self.stride))
         self._loop = Loop(self._given_planner, self.key, self.until, self.frame, rays, begin=self._show)
         self._table: Obstacles | None = None
+        self._clutter = self._no_clutter()
         self._other_ups: tuple[str, ...] = ()
         self._cut: frozenset[str] = frozenset()
         self._next: NextView | None = None
         self._images: tuple[Image, ...] = ()
-        self.correct_mount, self._mount_error = correct_mount, MountError(camera, convention, ignore)
+        self.correct_mount, self._mount_error = correct_mount, MountError(camera, convention)
         self._warned_of_mount = False
         self.reachable, self.ignore = reachable, ignore
         self._refused: list[Refused] = []
-        self._folder: RunFolder | None = None
+        self._folder: SessionFolder | None = None
         if folder is not None:
             # What a session is made of, as it was given: `load` makes it again from these.
             config = {"camera": camera, "box": self.box, "planner": planner, "up": up, "poses": matrices}
             config |= {"convention": convention, "key": self.key, "obstacles": obstacles}
             config |= {"correct_mount": correct_mount}
-            self._folder = RunFolder(folder, "session", config)
+            self._folder = SessionFolder(folder, config)
             self._read(self._folder)
 
     @classmethod
@@ -180,7 +183,7 @@ class Session:
 
         **Raises:** `ValueError` if the folder holds no session, or its planner cannot be made again.
         """
-        config = RunFolder.config_of(path, "session", **({} if planner is None else {"planner": planner}))
+        config = SessionFolder.config_of(path, **({} if planner is None else {"planner": planner}))
         return cls(**config, folder=path, until=until, progress=progress, reachable=reachable, ignore=ignore)
 
     def __repr__(self) -> str:
@@ -287,6 +290,9 @@ class Session:
         another process has added images to the folder. Nothing is changed then.
         """
         image, count = Image.of(depth, matrix, depth_scale, mask), len(self.views)
+        if self.ignore is not None:
+            # Asked while the robot stands there, and stored.
+            image = image.with_robot(self.ignore, self.camera, Pose.from_matrix(image.matrix, self.convention))
         with self._alone() as folder:
             looks_for_table = count == 0 and self.planner.obstacles is None
             self._add(image, folder)
@@ -334,7 +340,7 @@ class Session:
                 next_view = self._next_of(proposal, depth, refusals)
                 warn_of_little(next_view.value, next_view.standard_error, self._in_vain(proposal))
                 if folder is not None:
-                    folder.write("proposal", len(self.views), proposal=proposal, expected_depth=depth)
+                    folder.store_proposal(len(self.views), StoredProposal(proposal, depth))
                 self._next = next_view
         return self._next
 
@@ -349,8 +355,7 @@ class Session:
         refused = Refused(self._next.proposal.pose, reason)
         with self._alone() as folder:
             if folder is not None:
-                folder.write("refused", len(self._refused), pose=refused.pose, reason=np.asarray(reason))
-                folder.file("proposal", len(self.views)).unlink(missing_ok=True)
+                folder.store_refused(len(self.views), refused)
             self._refused.append(refused)
             self._next = None
 
@@ -377,20 +382,27 @@ class Session:
             obstacles=planner.obstacles if obstacles is None else obstacles.in_scene(self.frame),
         )
 
-    def _add(self, image: Image, folder: RunFolder | None) -> None:
+    def _no_clutter(self) -> Clutter | None:
+        """None where the caller has said what stands around the object."""
+        if self._given_planner.obstacles is not None:
+            return None
+        reach = float(np.abs(np.asarray(self._given_planner.search.poses_around().position)).max())
+        return Clutter.empty(reach + float(Obstacles().clearance), self.frame.to_scene(self.box))
+
+    def _add(self, image: Image, folder: SessionFolder | None) -> None:
         """An image as a view, stored in the folder once the loop accepts it. The first may show what the object stands
         on, by which the planner is another."""
-        index, loop, kept = len(self.views), self._loop, self.box
+        index, loop, room = len(self.views), self._loop, self.box
         image.check_moved(self._images)
         pose = self._mount_error.pose(image, index)
         clean = image.cleaned(self.camera, pose, self.box)
         if (carving := loop.planner.sampler.carving) is not None:
-            kept = carving.with_room(kept, loop.planner.sampler.grid, self.frame)
+            room = carving.with_room(room, loop.planner.sampler.grid, self.frame)
         with warnings.catch_warnings():
             if index == 0:
                 warnings.simplefilter("error", NothingInside)
             try:
-                cloud = clean.cloud(self.camera, pose, self.stride, kept)
+                cloud = clean.cloud(self.camera, pose, self.stride, room)
             except NothingInside as problem:
                 raise InputError(f"the first image shows nothing of the box: {problem}") from problem
         if index > 0 and image.is_blank(cloud):
@@ -402,11 +414,9 @@ class Session:
                 self._other_ups = other_ups(whole, self.box, self.frame.up)
             # Without a table there still are the points of D, which cameras keep clear of.
             loop = loop.emptied(dataclasses.replace(loop.planner, obstacles=self._table or Obstacles()))
-        if self.ignore is not None:
-            cloud = only_where(cloud, clean.is_kept(self.ignore, self.camera, pose), self.stride)
         if image.mask is not None:
             cloud = only_where(cloud, image.mask, self.stride)
-        if self.ignore is not None or image.mask is not None:
+        if image.robot is not None or image.mask is not None:
             shows_any = index > 0 or bool(cloud.mask.any())
             require(shows_any, "the first image shows nothing of the box at the pixels of the mask, or all is ignored")
         scan = self.frame.to_scene(cloud)
@@ -415,13 +425,12 @@ class Session:
 
         def store() -> None:
             if folder is not None:
-                # Planned from images that were deleted since.
-                folder.file("proposal", index + 1).unlink(missing_ok=True)
-                masked = {} if image.mask is None else {"mask": image.mask}
-                stored = {"depth": image.depth, "matrix": image.matrix, "depth_scale": image.scale}
-                folder.write("image", index, **stored, **masked)
+                folder.store_image(index, image)
 
         loop.add(self.frame.to_scene(pose), scan, accepted=store)
+        if self._clutter is not None and obstacles is not None:
+            self._clutter = self._clutter.with_image(clean, self.camera, pose, self.frame, obstacles)
+            loop = loop.with_clutter(self._clutter.solid())
         self._mount_error.show(clean, index)
         self._loop, self._next, self._images = loop, None, (*self._images, image)
 
@@ -430,27 +439,21 @@ class Session:
         if not self._mount_error.update():
             return
         images, views = self._images, self.views
-        self._loop, self._images = self._loop.emptied(self._given_planner), ()
+        self._loop, self._images, self._clutter = self._loop.emptied(self._given_planner), (), self._no_clutter()
         for image, view in zip(images, views, strict=True):
             if view.proposal is not None:
                 self._loop.resume(view.proposal)
             self._add(image, None)
 
-    def _read(self, folder: RunFolder) -> None:
+    def _read(self, folder: SessionFolder) -> None:
         """The images of the folder and the proposals that they followed; the proposal after the last one."""
-        count = folder.count("image")
-        for index in range(folder.count("refused")):
-            said = folder.read("refused", index)
-            self._refused.append(Refused(said["pose"], str(said["reason"])))
+        self._refused, count = folder.refused(), folder.num_images
         for index in range(count + 1):
-            if index and folder.file("proposal", index).exists():
-                stored = folder.read("proposal", index)
-                self._loop.resume(stored["proposal"])
-                self._next = self._next_of(stored["proposal"], stored.get("expected_depth"))
+            if index and (stored := folder.proposal(index)) is not None:
+                self._loop.resume(stored.proposal)
+                self._next = self._next_of(stored.proposal, stored.expected_depth)
             if index < count:
-                stored = folder.read("image", index)
-                image = Image.of(stored["depth"], stored["matrix"], float(stored["depth_scale"]), stored.get("mask"))
-                self._add(image, None)
+                self._add(folder.image(index), None)
                 if self.correct_mount:
                     self._correct()
 
@@ -498,7 +501,7 @@ class Session:
             self._bar = None
 
     @contextmanager
-    def _alone(self) -> Iterator[RunFolder | None]:
+    def _alone(self) -> Iterator[SessionFolder | None]:
         """The folder, if there is one, while nobody else writes there.
 
         **Raises:** `ValueError` if another process does, or has added images.
@@ -506,13 +509,7 @@ class Session:
         if self._folder is None:
             yield None
             return
-        with self._folder.writing():
-            stored = self._folder.count("image")
-            require(
-                stored == len(self.views),
-                f"{self._folder.path} holds {stored} images, but this session knows {len(self.views)}: another process "
-                "has added some; make the session again, which reads them",
-            )
+        with self._folder.writing(len(self.views)):
             yield self._folder
 
 

@@ -195,8 +195,8 @@ class Sessions:
                 stacklevel=4,
             )
             return Obstacles()
-        lengths = (float(self._frame.length_to_world(length)) for length in (table.margin, table.clearance))
-        return Obstacles((HalfSpace(*plane_of(table, self._frame)),), *lengths)
+        margin, clearance = (float(self._frame.length_to_world(one)) for one in (table.margin, table.clearance))
+        return Obstacles((HalfSpace(*plane_of(table, self._frame)),), margin, clearance)
 
     def _points(self, image: Image, pose: Pose) -> tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
         """The point of each pixel, in world units, and which lie in the box and on no obstacle."""

@@ -33,6 +33,8 @@ class Obstacles(eqx.Module):
     - `solids`: solids of `jaxnbv.scanning.sdf`: a table is a `HalfSpace`, a mesh is made one by `solid_of_mesh`.
     - `margin`: points nearer than this to an obstacle are taken for its own.
     - `clearance`: no camera comes nearer than this to an obstacle, nor to a point that was seen.
+    - `clutter`: what else stands there, known coarsely: it hides and keeps cameras away as solids do, but no point is
+      taken for its own and imagined surfaces may go through it. A session finds it in its images.
 
     **Raises:** `ValueError` for solids that are not solids, or a negative length.
     """
@@ -41,6 +43,7 @@ class Obstacles(eqx.Module):
     # Arrays, so that what was compiled for one scale runs for any.
     margin: float = eqx.field(converter=np.float64, default=0.03)
     clearance: float = eqx.field(converter=np.float64, default=0.1)
+    clutter: SignedDistance | None = None
 
     def __check_init__(self):
         check_fields(self)
@@ -53,22 +56,29 @@ class Obstacles(eqx.Module):
 
     def in_scene(self, frame: Frame) -> "Obstacles":
         """From world units to those of the scene."""
-        moved = (obstacle.translate(-np.asarray(frame.center)) for obstacle in self.solids)
-        solids = tuple(Rotated(solid, frame.rotation).scale(frame.scale) for solid in moved)
-        return Obstacles(solids, frame.scale * self.margin, frame.scale * self.clearance)
+
+        def moved(solid: SignedDistance) -> SignedDistance:
+            return Rotated(solid.translate(-np.asarray(frame.center)), frame.rotation).scale(frame.scale)
+
+        clutter = None if self.clutter is None else moved(self.clutter)
+        solids = tuple(map(moved, self.solids))
+        return Obstacles(solids, frame.scale * self.margin, frame.scale * self.clearance, clutter)
+
+    def with_clutter(self, clutter: SignedDistance | None) -> "Obstacles":
+        """The same solids with other clutter, None for none."""
+        return dataclasses.replace(self, clutter=clutter)
 
     def distance(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
-        """Signed distance to the nearest obstacle, infinite where there is none."""
-        if not self.solids:
-            return jnp.full(jnp.shape(x)[:-1], jnp.inf, jnp.result_type(float))
-        return functools.reduce(operator.or_, self.solids)(x)
+        """Signed distance to the nearest solid, infinite where there is none."""
+        return _distance(self.solids, x)
 
     def barrier(self, camera: Camera, poses: Pose) -> Float[Array, "*batch rays"] | None:
-        """How far along each ray of a camera the first obstacle stands; infinite where none does, None without any."""
-        if not self.solids:
+        """How far along each ray of a camera the first obstacle stands, clutter included; infinite where none does,
+        None without any."""
+        if not self._all:
             return None
         origins, directions = camera.rays(poses)
-        surface = SDFSurface(functools.reduce(operator.or_, self.solids), bounding_radius=_FAR)
+        surface = SDFSurface(functools.reduce(operator.or_, self._all), bounding_radius=_FAR)
         hits = surface.trace(origins.reshape(-1, 3), directions.reshape(-1, 3))
         along = jnp.linalg.norm(hits.points - origins.reshape(-1, 3), axis=-1)
         return jnp.where(hits.mask, along, jnp.inf).reshape(origins.shape[:-1])
@@ -89,7 +99,17 @@ class Obstacles(eqx.Module):
         """By how much each of a batch of cameras is too near to an obstacle or to D, in scene units; zero where it is
         not. Differentiable."""
         seen = jnp.sqrt(jnp.maximum(nearest_squared_distance(poses.position, cloud), 1e-12))
-        return jnp.maximum(self.clearance - jnp.minimum(self.distance(poses.position), seen), 0.0)
+        return jnp.maximum(self.clearance - jnp.minimum(_distance(self._all, poses.position), seen), 0.0)
+
+    @property
+    def _all(self) -> tuple[SignedDistance, ...]:
+        return self.solids if self.clutter is None else (*self.solids, self.clutter)
+
+
+def _distance(solids: tuple[SignedDistance, ...], x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
+    if not solids:
+        return jnp.full(jnp.shape(x)[:-1], jnp.inf, jnp.result_type(float))
+    return functools.reduce(operator.or_, solids)(x)
 
 
 def barrier_of(obstacles: Obstacles | None, camera: Camera, poses: Pose) -> Float[Array, "*batch rays"] | None:

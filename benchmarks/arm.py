@@ -1,0 +1,84 @@
+"""What an arm reaches, how long it moves and how exactly it scans, in a simulator.
+
+    python benchmarks/arm.py --parts FOLDER [--objects 10] [--views 6] [--degrees 1] [--millimetres 5]
+
+For each mesh, in metres, as it stands on a table: new surface with motion as its cost, farthest view among the poses
+that the arm reaches, and new surface with a camera whose mount is off, without and with its correction. A column has
+the share of proposals that can be reached, the seconds of motion, the share of the surface within 3 mm of a measured
+point, and the median and 90 % distance of the points from the object in millimetres.
+"""
+
+import argparse
+import sys
+import warnings
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+import jaxnbv as nbv
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "examples"))
+from arm_simulator import Arm, on_a_table
+from mujoco_arm import box_about, distances_mm, hand_eye_error, scan_object
+
+_NEAR, _POINTS = 0.003, 4000
+
+
+def planner_of(search: nbv.DiscreteSearch | nbv.FarthestView) -> nbv.Planner:
+    sampler = nbv.SurfaceSampler(num_samples=8)
+    return nbv.Planner(nbv.NewSurface(), search, nbv.Camera(height=24, width=32), sampler, capacity=4000)
+
+
+def row_of(mesh: trimesh.Trimesh, views: int, search, error: np.ndarray, corrects: bool, counts_motion: bool) -> list:
+    arm = Arm(mesh, error)
+
+    def reachable(matrices: np.ndarray) -> list:
+        answers = arm.reachable(matrices)
+        return answers if counts_motion else [isinstance(answer, float) or answer for answer in answers]
+
+    scan = scan_object(arm, box_about(mesh), planner_of(search), views, None, corrects, reachable)
+    points = nbv.viz.scanned_cloud(scan.session.episode).to_numpy()[0]
+    surface = trimesh.sample.sample_surface(mesh, _POINTS, seed=0)[0]
+    seen = trimesh.PointCloud(points).kdtree.query(surface)[0] < _NEAR
+    refused = sum(scan.refusals.values())
+    few = np.random.default_rng(0).choice(len(points), min(len(points), _POINTS), replace=False)
+    return [scan.proposals / (scan.proposals + refused), arm.seconds, seen.mean(), *distances_mm(points[few], mesh)]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--parts", type=Path, required=True)
+    parser.add_argument("--objects", default=10, type=int)
+    parser.add_argument("--views", default=6, type=int)
+    parser.add_argument("--degrees", default=1.0, type=float)
+    parser.add_argument("--millimetres", default=5.0, type=float)
+    options = parser.parse_args()
+    # Planes that are taken for tables, and mounts that are off on purpose.
+    warnings.simplefilter("ignore", UserWarning)
+    nbv.keep_compiled()
+    exact, off = np.eye(4), hand_eye_error(options.degrees, options.millimetres)
+    new, farthest = (kind(nbv.Reach(160)) for kind in (nbv.DiscreteSearch, nbv.FarthestView))
+    columns = {
+        "new surface": (new, exact, False, True),
+        "farthest": (farthest, exact, False, False),
+        "mount off": (new, off, False, True),
+        "corrected": (new, off, True, True),
+    }
+    print(f"{'':24}", *(f"{name:^37}" for name in columns))
+    print(f"{'':24}", *(f"{'reached':>8}{'s':>7}{'seen':>7}{'mm':>7}{'90 %':>7} " for _ in columns))
+    rows = []
+    for file in sorted(options.parts.rglob("*.glb"))[: options.objects]:
+        mesh = on_a_table(file)
+        rows.append([row_of(mesh, options.views, *column) for column in columns.values()])
+        _print(file.stem, rows[-1])
+    _print("mean", np.mean(rows, axis=0))
+
+
+def _print(name: str, row: list) -> None:
+    cells = (f"{share:8.0%}{s:7.1f}{seen:7.0%}{mm:7.2f}{most:7.2f} " for share, s, seen, mm, most in row)
+    print(f"{name:24}", *cells, flush=True)
+
+
+if __name__ == "__main__":
+    main()

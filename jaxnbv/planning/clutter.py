@@ -1,0 +1,101 @@
+"""What else stands around the box of a session: coarse cells that its images have shown to be occupied."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.ndimage import distance_transform_edt
+
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.frame import Frame
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.geometry.volume import Box
+from jaxnbv.planning.images import Image
+from jaxnbv.scanning import Obstacles
+from jaxnbv.scanning.sdf import Sampled
+
+# Cells along a side: about 1.5 cm for an object of 20 cm.
+_CELLS = 48
+# Pixels of one image that a cell needs to count as occupied. Fewer may be flying pixels at an edge.
+_FEWEST = 5
+
+
+class Clutter(NamedTuple):
+    """Cells of a cube about the middle of the scene, in scene coordinates.
+
+    - `votes`: images that show a cell to be occupied, less those that see through it.
+    - `half_extent`: half a side of the cube; `box`: of the object, no cell of which is counted.
+    """
+
+    votes: Int[np.ndarray, "n n n"]
+    half_extent: float
+    box: Box
+
+    @classmethod
+    def empty(cls, half_extent: float, box: Box) -> "Clutter":
+        """Without any image."""
+        return cls(np.zeros((_CELLS,) * 3, np.int64), half_extent, box)
+
+    def with_image(
+        self,
+        image: Image,
+        camera: Camera,
+        pose: Pose,
+        frame: Frame,
+        obstacles: Obstacles,
+    ) -> "Clutter":
+        """With the votes of one more image.
+
+        - `image`, `camera`, `pose`: in world units.
+        - `obstacles`: in scene units, with points of their own.
+        """
+        shows_robot = np.zeros(image.depth.shape, bool) if image.robot is None else image.robot
+        depth = np.where(
+            np.isfinite(image.depth) & ~shows_robot, image.scale * np.asarray(image.depth, np.float64), 0.0
+        )
+        points = np.asarray(frame.to_scene(image.points(camera, pose)[depth > 0]), np.float64)
+        cells = np.floor((points + self.half_extent) / self.spacing).astype(int)
+        cells = cells[((cells >= 0) & (cells < _CELLS)).all(axis=1)]
+        numbers = np.ravel_multi_index(tuple(cells.T), self.votes.shape)
+        is_occupied = np.bincount(numbers, minlength=self.votes.size).reshape(self.votes.shape) >= _FEWEST
+        centers = self._centers()
+        is_near_box = np.asarray(self.box(centers)) < self.spacing
+        is_of_obstacle = np.asarray(obstacles.distance(centers)) < obstacles.margin + self.spacing
+        is_empty = self._is_seen_through(depth, camera, pose, frame) & ~is_occupied
+        votes = self.votes + is_occupied.astype(int) - is_empty.astype(int)
+        return self._replace(votes=np.where(is_near_box | is_of_obstacle, 0, votes))
+
+    def solid(self) -> Sampled | None:
+        """The occupied cells as an obstacle; None where there is none."""
+        is_occupied = self.votes > 0
+        if not is_occupied.any():
+            return None
+        # Distances to the middles of cells, of which the faces are half a cell nearer.
+        inside, outside = distance_transform_edt(is_occupied), distance_transform_edt(~is_occupied)
+        cells = np.where(is_occupied, 0.5 - inside, outside - 0.5)
+        return Sampled((self.spacing * cells).astype(np.float32), self._centers()[0, 0, 0], self.spacing, 0.0)
+
+    @property
+    def spacing(self) -> float:
+        """The side of a cell."""
+        return 2.0 * self.half_extent / _CELLS
+
+    def _centers(self) -> Float[np.ndarray, "n n n 3"]:
+        axis = (np.arange(_CELLS) + 0.5) * self.spacing - self.half_extent
+        return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
+
+    def _is_seen_through(
+        self, depth: Float[np.ndarray, "height width"], camera: Camera, pose: Pose, frame: Frame
+    ) -> Bool[np.ndarray, "n n n"]:
+        """Cells that lie before what an image measured."""
+        cell = frame.length_to_world(self.spacing)
+        centers = np.asarray(frame.to_world(self._centers().reshape(-1, 3)), np.float64)
+        local = (centers - np.asarray(pose.position, np.float64)) @ np.asarray(pose.rotation, np.float64)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            pixels = local / local[:, 2:] @ camera.intrinsics.T
+        column, row = (np.nan_to_num(pixels[:, axis], nan=-1.0, posinf=-1.0, neginf=-1.0) for axis in (0, 1))
+        column, row = np.round(column).astype(int), np.round(row).astype(int)
+        in_image = (local[:, 2] > 0) & (row >= 0) & (row < camera.height) & (column >= 0) & (column < camera.width)
+        measured = np.zeros(len(centers))
+        measured[in_image] = depth[row[in_image], column[in_image]]
+        return (measured > local[:, 2] + cell).reshape(self.votes.shape)
