@@ -49,10 +49,9 @@ class Clutter(NamedTuple):
         - `image`, `camera`, `pose`: in world units.
         - `obstacles`: in scene units, with points of their own.
         """
-        shows_robot = np.zeros(image.depth.shape, bool) if image.robot is None else image.robot
-        depth = np.where(
-            np.isfinite(image.depth) & ~shows_robot, image.scale * np.asarray(image.depth, np.float64), 0.0
-        )
+        depth = np.where(np.isfinite(image.depth), image.scale * np.asarray(image.depth, np.float64), 0.0)
+        if image.robot is not None:
+            depth = np.where(image.robot, 0.0, depth)
         points = np.asarray(frame.to_scene(image.points(camera, pose)[depth > 0]), np.float64)
         cells = np.floor((points + self.half_extent) / self.spacing).astype(int)
         cells = cells[((cells >= 0) & (cells < _CELLS)).all(axis=1)]

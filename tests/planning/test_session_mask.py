@@ -56,6 +56,16 @@ def test_what_is_to_be_ignored_is_no_part_of_the_object():
         session_of(ignore=lambda points: points).add(image, FIRST, 1e-3)
 
 
+def test_the_robot_is_where_it_was_when_the_image_was_taken(tmp_path):
+    """Images that are added again, by a session that is read or by corrected poses, show it where it was."""
+    edge = [0.3]
+    session = session_of(tmp_path, ignore=lambda points: points[:, 0] > edge[0])
+    session.add(shot(FIRST), FIRST, 1e-3)
+    edge[0] = 0.0
+    again = nbv.Session.load(tmp_path, progress=False, ignore=session.ignore)
+    np.testing.assert_array_equal(again.cloud.to_numpy()[0], session.cloud.to_numpy()[0])
+
+
 @pytest.mark.parametrize("mask", [np.ones((4, 4), bool), np.ones((48, 64))], ids=["another size", "numbers"])
 def test_what_is_no_mask_is_refused(mask):
     with pytest.raises(nbv.InputError, match="the mask is"):
