@@ -1,24 +1,28 @@
 """A thin ROS 2 node about a session: depth images in, the next pose of the camera out.
 
 Topics: `depth/image` (sensor_msgs/Image, 16UC1 or mono16 in millimetres, 32FC1 in metres), `depth/camera_info`
-(sensor_msgs/CameraInfo, with its distortion, region of interest and binning; a rectified stream has no distortion),
-`next_view` (geometry_msgs/PoseStamped). The camera's pose is that of `camera_frame` in
-`world_frame`, by tf at the image's time; camera frames of ROS look along z with y down, which is OpenCV's convention.
-An image is taken in when the service `take` (std_srvs/Trigger) is called, since most of a stream shows nothing new.
+(sensor_msgs/CameraInfo, with its distortion, region of interest and binning) and `next_view`
+(geometry_msgs/PoseStamped). The camera's pose is that of `camera_frame` in `world_frame`, by tf at the image's time.
+Camera frames of ROS look along z with y down, which is OpenCV's convention. The service `take` (std_srvs/Trigger) adds
+the latest image, since most images of a stream show nothing new.
 
-What does not need ROS is in `Bridge`, which is tested with stand-ins for the messages; the node itself is not.
+The functions and `Bridge` need no ROS: `tests/planning/test_ros2_next_view.py` plays bags through them. The node in
+`main` has not run.
 """
 
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 import jaxnbv as nbv
 
 _DTYPES = {"16UC1": (np.uint16, 1e-3), "mono16": (np.uint16, 1e-3), "32FC1": (np.float32, 1.0)}
-# Models of sensor_msgs/CameraInfo that are OpenCV's; none where there is no distortion.
+# The models of sensor_msgs/CameraInfo that are OpenCV's; some drivers leave the name empty.
 _MODELS = ("plumb_bob", "rational_polynomial", "")
+# A fisheye lens, which bends rays even where all of its coefficients are zero.
+_FISHEYE = "equidistant"
 
 
 def image_of(message: Any) -> tuple[np.ndarray, float]:
@@ -34,17 +38,25 @@ def image_of(message: Any) -> tuple[np.ndarray, float]:
     return image.astype(dtype), scale
 
 
-def camera_of(message: Any) -> nbv.Camera:
-    """The camera of a stream. The matrix and size of a message are those of the full image, of which the stream shows
-    the region of interest, in full pixels, binned.
+def camera_of(message: Any, is_rectified: bool = False) -> nbv.Camera:
+    """The camera of a stream. A message has the matrix and the size of the full image. The stream shows the region of
+    interest, which is given in full pixels, and bins it.
 
-    **Raises:** `ValueError` for a distortion that is not OpenCV's, or a matrix of zeros, which means uncalibrated.
+    - `is_rectified`: whether the images come from image_proc. It leaves K and D of the message as they were. Then the
+      intrinsics are those of P, and there is no distortion.
+
+    **Raises:** `ValueError` for a lens model that is not OpenCV's, or a matrix of zeros, which means uncalibrated.
     """
-    coefficients = tuple(message.d) if np.any(message.d) else ()
-    if coefficients and message.distortion_model not in _MODELS:
-        raise ValueError(f"the distortion is {message.distortion_model!r}: rectify the stream first (image_proc)")
-    roi, matrix = message.roi, np.array(message.k, float).reshape(3, 3)
-    binning = max(message.binning_x, 1), max(message.binning_y, 1)
+    matrix = (
+        np.array(message.p, float).reshape(3, 4)[:, :3] if is_rectified else np.array(message.k, float).reshape(3, 3)
+    )
+    coefficients = () if is_rectified or not np.any(message.d) else tuple(message.d)
+    model = message.distortion_model
+    if not is_rectified and (model == _FISHEYE or (coefficients and model not in _MODELS)):
+        raise ValueError(
+            f"the distortion is {model!r}: rectify the stream (image_proc) and set the parameter is_rectified"
+        )
+    roi, binning = message.roi, (max(message.binning_x, 1), max(message.binning_y, 1))
     width, height = (roi.width or message.width) // binning[0], (roi.height or message.height) // binning[1]
     for row, (offset, factor) in enumerate(zip((roi.x_offset, roi.y_offset), binning, strict=True)):
         matrix[row] /= factor
@@ -54,50 +66,64 @@ def camera_of(message: Any) -> nbv.Camera:
 
 
 def matrix_of(transform: Any) -> np.ndarray:
-    """The 4 x 4 matrix of a geometry_msgs/Transform."""
-    x, y, z, w = (getattr(transform.rotation, name) for name in "xyzw")
+    """The 4 x 4 matrix of a geometry_msgs/Transform, whose quaternion may have any length.
+
+    **Raises:** `ValueError` for a quaternion of zeros.
+    """
     matrix = np.eye(4)
-    matrix[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
+    matrix[:3, :3] = Rotation.from_quat([getattr(transform.rotation, name) for name in "xyzw"]).as_matrix()
     matrix[:3, 3] = [getattr(transform.translation, name) for name in "xyz"]
     return matrix
+
+
+def write_pose(pose: Any, matrix: np.ndarray) -> None:
+    """Write a 4 x 4 matrix into a geometry_msgs/Pose."""
+    for name, value in zip("xyz", matrix[:3, 3], strict=True):
+        setattr(pose.position, name, float(value))
+    for name, value in zip("xyzw", Rotation.from_matrix(matrix[:3, :3]).as_quat(), strict=True):
+        setattr(pose.orientation, name, float(value))
 
 
 class Bridge:
     """Messages in, the next pose out.
 
-    - `start`: makes the session, once the camera is known.
-    - `lookup`: the transform of the camera in the world at a time stamp.
-    - `publish`: what is to be done with the next pose, a 4 x 4 matrix, camera to world.
+    - `start`: makes the session of a camera.
+    - `lookup`: returns the geometry_msgs/Transform from camera to world at a time stamp, or None before tf reaches it.
+    - `publish`: receives the next pose, a 4 x 4 matrix, camera to world.
+    - `is_rectified`: see `camera_of`.
     """
 
     def __init__(
         self,
         start: Callable[[nbv.Camera], nbv.Session],
-        lookup: Callable[[Any], Any],
+        lookup: Callable[[Any], Any | None],
         publish: Callable[[np.ndarray], None],
+        is_rectified: bool = False,
     ):
-        self.start, self.lookup, self.publish = start, lookup, publish
+        self.start, self.lookup, self.publish, self.is_rectified = start, lookup, publish, is_rectified
         self.session: nbv.Session | None = None
         self.latest: Any = None
 
     def on_camera_info(self, message: Any) -> None:
         if self.session is None:
-            self.session = self.start(camera_of(message))
+            self.session = self.start(camera_of(message, self.is_rectified))
 
     def on_image(self, message: Any) -> None:
         self.latest = message
 
     def take(self) -> str:
-        """Take in the latest image and publish where to go next; says what was done."""
+        """Add the latest image, publish where to go next, and say so. An image is added once.
+
+        **Raises:** `ValueError` as `image_of`, `matrix_of` and `Session.add` do.
+        """
         if self.session is None or self.latest is None:
             return "there is no image yet"
+        transform = self.lookup(self.latest.header.stamp)
+        if transform is None:
+            return "tf does not reach the image's time yet: call again"
         image, self.latest = self.latest, None
         depth, scale = image_of(image)
-        self.session.add(depth, matrix_of(self.lookup(image.header.stamp)), depth_scale=scale)
+        self.session.add(depth, matrix_of(transform), depth_scale=scale)
         if (reason := self.session.done()) is not None:
             return f"done: {reason}"
         self.publish(self.session.next().matrix)
@@ -105,7 +131,8 @@ class Bridge:
 
 
 def main() -> None:
-    """Parameters of the node: world_frame, camera_frame, folder, and low and high, two corners of the object's box."""
+    """Run the node. Its parameters are `world_frame`, `camera_frame`, `folder`, `is_rectified` (see `camera_of`), and
+    `low` and `high`, two corners of the object's box."""
     import rclpy
     import tf2_ros
     from geometry_msgs.msg import PoseStamped
@@ -115,9 +142,9 @@ def main() -> None:
 
     rclpy.init()
     node = Node("next_view")
-    world, camera, folder = (
-        node.declare_parameter(name, value).value
-        for name, value in (("world_frame", "world"), ("camera_frame", "camera_optical_frame"), ("folder", "live"))
+    defaults = {"world_frame": "world", "camera_frame": "camera_optical_frame", "folder": "live", "is_rectified": False}
+    world_frame, camera_frame, folder, is_rectified = (
+        node.declare_parameter(name, value).value for name, value in defaults.items()
     )
     low, high = (
         tuple(node.declare_parameter(name, value).value)
@@ -128,25 +155,31 @@ def main() -> None:
     publisher = node.create_publisher(PoseStamped, "next_view", 1)
 
     def publish(matrix: np.ndarray) -> None:
-        from scipy.spatial.transform import Rotation
-
         message = PoseStamped()
-        message.header.frame_id = world
-        for name, value in zip("xyz", matrix[:3, 3], strict=True):
-            setattr(message.pose.position, name, float(value))
-        for name, value in zip("xyzw", Rotation.from_matrix(matrix[:3, :3]).as_quat(), strict=True):
-            setattr(message.pose.orientation, name, float(value))
+        message.header.frame_id = world_frame
+        message.header.stamp = node.get_clock().now().to_msg()
+        write_pose(message.pose, matrix)
         publisher.publish(message)
 
-    def start(found: nbv.Camera) -> nbv.Session:
+    def start(camera: nbv.Camera) -> nbv.Session:
         search, rays = nbv.HalvingSearch(nbv.Reach()), nbv.Camera(height=24, width=32)
         planner = nbv.Planner(nbv.NewSurface(), search, rays, capacity=2000)
-        return nbv.Session(found, (low, high), planner, up="z", folder=folder, until=nbv.Covered(0.9))
+        return nbv.Session(camera, (low, high), planner, up="z", folder=folder, until=nbv.Covered(0.9))
 
-    bridge = Bridge(start, lambda stamp: buffer.lookup_transform(world, camera, stamp).transform, publish)
+    def lookup(stamp: Any) -> Any | None:
+        try:
+            return buffer.lookup_transform(world_frame, camera_frame, stamp).transform
+        except tf2_ros.TransformException as problem:
+            node.get_logger().warning(str(problem))
+            return None
+
+    bridge = Bridge(start, lookup, publish, is_rectified)
 
     def take(request: Any, response: Any) -> Any:
-        response.message, response.success = bridge.take(), True
+        try:
+            response.message, response.success = bridge.take(), True
+        except ValueError as problem:
+            response.message, response.success = str(problem), False
         return response
 
     node.create_subscription(CameraInfo, "depth/camera_info", bridge.on_camera_info, 1)

@@ -1,10 +1,11 @@
 """What an episode leaves, as files in world units: its points, and the surface that they lie on."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from jaxnbv.checks import InputError, checked, require
@@ -63,6 +64,49 @@ def surface_mesh(episode: Episode, imagined: bool = True) -> trimesh.Trimesh:
         mesh.update_faces(measured)
         mesh.remove_unreferenced_vertices()
     return mesh
+
+
+class Region(NamedTuple):
+    """A part of the surface that no view measured, in world units.
+
+    - `center`: the mean of its points; `normal`: its mean normal, the side to look from; `area`; `radius`: how far its
+      points are from the center at most.
+    """
+
+    center: Float[np.ndarray, "3"]
+    normal: Float[np.ndarray, "3"]
+    area: float
+    radius: float
+
+
+@checked
+def missing_regions(episode: Episode, smallest: float = 0.0) -> list[Region]:
+    """What is missing: connected parts of the expected surface that no view measured, the largest first. Where the
+    object stands on an obstacle, nothing can be measured and nothing is missing.
+
+    - `smallest`: the least area of a region, in world units.
+
+    **Raises:** `ValueError` as `surface_mesh` does.
+    """
+    mesh, planner, frame = surface_mesh(episode), episode.planner, episode.frame
+    measured: Bool[np.ndarray, " f"] = mesh.face_attributes["measured"].astype(bool)
+    is_missing = ~measured
+    if (obstacles := planner.obstacles) is not None:
+        near = obstacles.margin + planner.sampler.grid.spacing
+        is_missing &= np.asarray(obstacles.distance(frame.to_scene(mesh.triangles_center))) > near
+    neighbours = mesh.face_adjacency[is_missing[mesh.face_adjacency].all(axis=1)]
+    parts = trimesh.graph.connected_components(neighbours, nodes=np.flatnonzero(is_missing))
+    regions = [_region(mesh, faces) for faces in parts]
+    return sorted((region for region in regions if region.area > smallest), key=lambda region: -region.area)
+
+
+def _region(mesh: trimesh.Trimesh, faces: Int[np.ndarray, " f"]) -> Region:
+    areas, centers = mesh.area_faces[faces], mesh.triangles_center[faces]
+    normal, area = areas @ mesh.face_normals[faces], float(areas.sum())
+    center = areas @ centers / max(area, np.finfo(float).tiny)
+    # A closed surface has no side.
+    length = max(float(np.linalg.norm(normal)), np.finfo(float).tiny)
+    return Region(center, normal / length, area, float(np.linalg.norm(centers - center, axis=1).max()))
 
 
 @checked

@@ -1,5 +1,7 @@
 """Points and surfaces as files, of a ball of 10 cm in a world of metres."""
 
+import itertools
+
 import numpy as np
 import pytest
 import trimesh
@@ -7,7 +9,7 @@ from small_session import BOX, FIRST, POSES, planner_of, session_of, shot
 
 import jaxnbv as nbv
 from jaxnbv.checks import InputError
-from jaxnbv.viz.export import save_cloud, save_mesh, scanned_cloud, surface_mesh
+from jaxnbv.viz.export import missing_regions, save_cloud, save_mesh, scanned_cloud, surface_mesh
 
 CENTER = np.array([0.3, 0.2, 0.101])
 
@@ -48,6 +50,27 @@ def test_the_surface_is_marked_where_it_was_measured(episode):
     alone = surface_mesh(episode, imagined=False)
     assert len(alone.faces) == measured.sum()
     assert alone.face_attributes["measured"].all()
+
+
+def test_what_is_missing_is_the_far_side_in_metres(episode):
+    """The part of the ball that no camera sees is one region, which looks away from both."""
+    regions = missing_regions(episode, smallest=1e-3)
+    eyes = np.stack([FIRST[:3, 3], POSES[2][:3, 3]])
+    eyes = (eyes - CENTER) / np.linalg.norm(eyes - CENTER, axis=1, keepdims=True)
+    largest = regions[0]
+    assert largest.normal @ eyes.sum(axis=0) < 0
+    assert np.linalg.norm(largest.normal) == pytest.approx(1.0)
+    # By points spread evenly over the ball: a camera at distance d sees those whose cosine to it is above r / d.
+    points = np.random.default_rng(0).normal(size=(20_000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    distances = np.linalg.norm(np.stack([FIRST[:3, 3], POSES[2][:3, 3]]) - CENTER, axis=1)
+    hidden = (points @ eyes.T < 0.1 / distances).all(axis=1)
+    area = hidden.mean() * 4 * np.pi * 0.1**2
+    # A cell's width about the border is missing or not.
+    assert sum(region.area for region in regions) == pytest.approx(area, rel=0.35)
+    assert largest.center @ points[hidden].mean(axis=0) > CENTER @ points[hidden].mean(axis=0)
+    assert all(a.area >= b.area > 1e-3 for a, b in itertools.pairwise([*regions, regions[-1]]))
+    assert largest.radius < 0.2
 
 
 def test_files_hold_world_units(episode, tmp_path):
