@@ -16,6 +16,9 @@ from jaxnbv.checks import AnyArray, as_numbers, require
 _SHAPES = ((4,), (5,), (8,))
 # Depths of neighbouring pixels that differ by more, as a share and by pixels of the focal length, are not averaged.
 _ALIKE, _STEEPEST = 0.01, 4.0
+# Lenses of depth cameras move a place by a third of its distance from the axis at most, and each iteration leaves about
+# such a share of the error.
+_ITERATIONS = 25
 
 
 def distorted(
@@ -28,6 +31,26 @@ def distorted(
     across = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)
     down = y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
     return across, down
+
+
+def straightened(
+    x: Float[np.ndarray, "*n"], y: Float[np.ndarray, "*n"], coefficients: tuple[float, ...]
+) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
+    """Places of the plane Z = 1 that appear at (x, y) through the lens: the inverse of `distorted`, by fixed-point
+    iteration as in OpenCV."""
+    across, down = x, y
+    for _ in range(_ITERATIONS):
+        moved = distorted(across, down, coefficients)
+        across, down = across + x - np.asarray(moved[0]), down + y - np.asarray(moved[1])
+    return across, down
+
+
+def pixels_of(
+    place: Float[AnyArray, "*n 2"], matrix: Float[AnyArray, "3 3"], coefficients: tuple[float, ...]
+) -> tuple[Float[AnyArray, "*n"], Float[AnyArray, "*n"]]:
+    """The column and the row at which each place of the plane Z = 1 appears through the lens, in pixels."""
+    across, down = distorted(place[..., 0], place[..., 1], coefficients)
+    return across * matrix[0, 0] + matrix[0, 2], down * matrix[1, 1] + matrix[1, 2]
 
 
 def check_distortion(coefficients: tuple[float, ...], radius: float) -> None:
@@ -63,9 +86,8 @@ def undistorted(
     - `depth`: through the lens; what is valid of it is positive and finite.
     - `place`: of the pinhole's pixels in the plane Z = 1; `matrix`: intrinsics, of the pinhole and of the lens.
     """
-    focal, center = jnp.diagonal(matrix)[:2], matrix[:2, 2]
-    across, down = distorted(place[..., 0], place[..., 1], coefficients)
-    column, row = across * focal[0] + center[0], down * focal[1] + center[1]
+    focal = jnp.diagonal(matrix)[:2]
+    column, row = (jnp.asarray(pixel) for pixel in pixels_of(place, matrix, coefficients))
     height, width = depth.shape
     within = (column > -0.5) & (column < width - 0.5) & (row > -0.5) & (row < height - 0.5)
     nearest = jnp.round(row).astype(int).clip(0, height - 1), jnp.round(column).astype(int).clip(0, width - 1)

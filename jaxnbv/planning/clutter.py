@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt
 
 from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.distortion import pixels_of
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
@@ -18,6 +19,10 @@ from jaxnbv.scanning.sdf import Sampled
 _CELLS = 48
 # Pixels of one image that a cell needs to count as occupied. Fewer may be flying pixels at an edge.
 _FEWEST = 5
+
+
+# Tangents of angles off the axis.
+_WIDEST = 3.0
 
 
 class Clutter(NamedTuple):
@@ -90,9 +95,12 @@ class Clutter(NamedTuple):
         cell = frame.length_to_world(self.spacing)
         centers = np.asarray(frame.to_world(self._centers().reshape(-1, 3)), np.float64)
         local = (centers - np.asarray(pose.position, np.float64)) @ np.asarray(pose.rotation, np.float64)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            pixels = local / local[:, 2:] @ camera.intrinsics.T
-        column, row = (np.nan_to_num(pixels[:, axis], nan=-1.0, posinf=-1.0, neginf=-1.0) for axis in (0, 1))
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            place = local[:, :2] / local[:, 2:]
+            # A lens's formula means nothing far beside its image.
+            place = np.where((np.abs(place) < _WIDEST).all(axis=1, keepdims=True), place, np.nan)
+            pixels = pixels_of(place, camera.intrinsics, camera.distortion)
+        column, row = (np.nan_to_num(pixel, nan=-1.0) for pixel in pixels)
         column, row = np.round(column).astype(int), np.round(row).astype(int)
         in_image = (local[:, 2] > 0) & (row >= 0) & (row < camera.height) & (column >= 0) & (column < camera.width)
         measured = np.zeros(len(centers))

@@ -12,6 +12,7 @@ from jaxnbv.checks import AnyArray, as_numbers, require, shown
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.depth_image import without_sentinels
+from jaxnbv.geometry.distortion import pixels_of, straightened
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
 
@@ -56,10 +57,13 @@ class Image(NamedTuple):
         return self._replace(depth=without_sentinels(self.depth, camera, pose, self.scale, box))
 
     def points(self, camera: Camera, pose: Pose) -> Float[np.ndarray, "height width 3"]:
-        """The point of each pixel, in world units, without regard to distortion; the camera where nothing was met."""
+        """The point of each pixel, in world units; the camera where nothing was met."""
         depth = np.where(np.isfinite(self.depth), self.scale * np.asarray(self.depth, np.float64), 0.0)
-        away = depth[..., None] * np.asarray(camera.pixel_directions(), np.float64).reshape(*depth.shape, 3)
-        return away @ np.asarray(pose.rotation, np.float64).T + np.asarray(pose.position, np.float64)
+        ahead = np.asarray(camera.pixel_directions(), np.float64).reshape(*depth.shape, 3)
+        if camera.distortion:
+            ahead = np.stack([*straightened(ahead[..., 0], ahead[..., 1], camera.distortion), ahead[..., 2]], axis=-1)
+        local = depth[..., None] * ahead
+        return local @ np.asarray(pose.rotation, np.float64).T + np.asarray(pose.position, np.float64)
 
     def with_robot(self, ignore: Ignore, camera: Camera, pose: Pose) -> "Image":
         """The image with the pixels whose points a function says to be of the robot.
@@ -79,7 +83,7 @@ class Image(NamedTuple):
     def cloud(self, camera: Camera, pose: Pose, stride: int, box: Box | None = None) -> PointCloud:
         """What it shows but for the robot, see `PointCloud.from_depth`; the mask is not applied."""
         cloud = PointCloud.from_depth(self.depth, camera, pose, self.scale, stride, box)
-        return cloud if self.robot is None else only_where(cloud, ~self.robot, stride)
+        return cloud if self.robot is None else only_where(cloud, ~self.robot, camera, stride)
 
     def is_blank(self, cloud: PointCloud) -> bool:
         """Whether it measured nothing: no pixel is valid, or all of them have one value and show no surface."""
@@ -102,8 +106,14 @@ class Image(NamedTuple):
             )
 
 
-def only_where(cloud: PointCloud, pixels: Bool[np.ndarray, "height width"], stride: int) -> PointCloud:
+def only_where(cloud: PointCloud, pixels: Bool[np.ndarray, "height width"], camera: Camera, stride: int) -> PointCloud:
     """The points of some pixels of the image that a cloud was taken from; the rays of the others end where they did."""
+    if camera.distortion:
+        # The rows of a cloud are pixels of the pinhole.
+        place = np.asarray(camera.pixel_directions(), np.float64).reshape(*pixels.shape, 3)[..., :2]
+        column, row = pixels_of(place, camera.intrinsics, camera.distortion)
+        across = np.clip(np.round(column).astype(int), 0, camera.width - 1)
+        pixels = pixels[np.clip(np.round(row).astype(int), 0, camera.height - 1), across]
     rows = slice(stride // 2, None, stride)
     return cloud.only(jnp.asarray(pixels[rows, rows].reshape(-1)))
 

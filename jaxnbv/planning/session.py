@@ -415,7 +415,7 @@ class Session:
             # Without a table there still are the points of D, which cameras keep clear of.
             loop = loop.emptied(dataclasses.replace(loop.planner, obstacles=self._table or Obstacles()))
         if image.mask is not None:
-            cloud = only_where(cloud, image.mask, self.stride)
+            cloud = only_where(cloud, image.mask, self.camera, self.stride)
         if image.robot is not None or image.mask is not None:
             shows_any = index > 0 or bool(cloud.mask.any())
             require(shows_any, "the first image shows nothing of the box at the pixels of the mask, or all is ignored")

@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from opencv_lens import undistort
 from small_session import FIRST, POSES, planner_of, session_of, shot
 
 import jaxnbv as nbv
+from jaxnbv.planning.images import Image, only_where
 
 
 def left_half(image):
@@ -86,3 +88,36 @@ def test_a_planner_without_parts_names_none():
     session.add(shot(FIRST), FIRST, 1e-3)
     with pytest.raises(nbv.InputError, match="knows no parts"):
         session.identity  # noqa: B018
+
+
+@pytest.mark.parametrize("k1", [0.2, -0.15])
+def test_masks_and_robots_are_seen_through_the_lens(k1):
+    """The mask and the robot are the ball's pixels of the raw image, by rays that are undistorted in NumPy."""
+    lens = (k1, 0.02, 0.001, -0.001, 0.0)
+    camera = nbv.Camera(fov=1.0, height=120, width=160, distortion=lens)
+    (fx, _, cx), (_, fy, cy), _ = camera.intrinsics
+    column, row = np.meshgrid(np.arange(160), np.arange(120))
+    ideal = undistort(np.stack([(column - cx) / fx, (row - cy) / fy], axis=-1), lens)
+    rays = np.concatenate([ideal, np.ones((120, 160, 1))], axis=-1)
+    # A ball of 0.3 beside the axis, 1.5 m ahead, before a wall at 2 m.
+    center = np.array([0.5, 0.3, 1.5])
+    along, squared = rays @ center, (rays**2).sum(axis=-1)
+    root = along**2 - squared * (center @ center - 0.3**2)
+    on_ball = root > 0
+    depth = np.where(on_ball, (along - np.sqrt(np.maximum(root, 0.0))) / squared, 2.0)
+    image, pose = Image.of(depth, np.eye(4), 1.0, None), nbv.Pose.from_matrix(np.eye(4))
+    np.testing.assert_allclose(image.points(camera, pose), depth[..., None] * rays, atol=1e-6)
+
+    def away(cloud):
+        return np.abs(np.linalg.norm(cloud.to_numpy()[0] - center, axis=1) - 0.3)
+
+    cloud = image.cloud(camera, pose, 1)
+    ball = only_where(cloud, on_ball, camera, 1)
+    # Pixels at its border may be of either.
+    assert (away(ball) > 0.01).mean() < 0.03
+    assert (away(ball) < 0.01).sum() > 0.97 * (away(cloud) < 0.01).sum()
+    without = image.with_robot(
+        lambda points: np.abs(np.linalg.norm(points - center, axis=1) - 0.3) < 1e-3, camera, pose
+    )
+    np.testing.assert_array_equal(without.robot, on_ball)
+    assert (away(without.cloud(camera, pose, 1)) < 0.01).sum() < 0.03 * on_ball.sum()
