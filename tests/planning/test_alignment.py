@@ -5,6 +5,7 @@ import warnings
 
 import numpy as np
 import pytest
+import small_gicp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -95,6 +96,31 @@ def test_the_error_of_a_single_pose_is_its_own():
     assert angle < 0.2
     assert shift < 0.003
     assert np.argmax(alignment.errors[0]) == np.argmax(alignment.errors[1]) == 1
+
+
+def test_a_single_pose_is_corrected_as_small_gicp_does():
+    """It moves the view's points onto all others by generalised ICP, which knows nothing of mounts."""
+    errors = len(EYES) * [np.eye(4)]
+    errors[1] = random_motion(5, 1.5, 0.008)
+    clouds, poses = views_of_a_box(errors, noise=0.0005)
+    alignment = align_views(clouds, poses)
+    source = clouds[1].to_numpy()[0].astype(np.float64)
+    others = [cloud.to_numpy()[0] for index, cloud in enumerate(clouds) if index != 1]
+    result = small_gicp.align(
+        np.concatenate(others).astype(np.float64),
+        source,
+        registration_type="GICP",
+        downsampling_resolution=0.004,
+        max_correspondence_distance=0.02,
+    )
+    assert result.converged
+    said = np.asarray(poses[1].to_matrix(), np.float64)
+    ours = said @ alignment.corrections[1] @ np.linalg.inv(said)
+    corrected, oracle = (source @ motion[:3, :3].T + motion[:3, 3] for motion in (ours, result.T_target_source))
+    moved = np.linalg.norm(corrected - source, axis=1)
+    # Points that were moved by 1 cm are put to the same place, to a tenth of that.
+    assert moved.mean() > 0.008
+    assert np.linalg.norm(corrected - oracle, axis=1).mean() < 0.1 * moved.mean()
 
 
 def test_views_that_only_shift_do_not_tell_a_shift_of_the_mount():
