@@ -78,7 +78,9 @@ from .utility import Quantity as Quantity
 from .utility import Utility as Utility
 from .version import __version__ as __version__
 from .viz import LiveView as LiveView
+from .viz import missing_regions as missing_regions
 from .viz import save_cloud as save_cloud
 from .viz import save_mesh as save_mesh
 from .viz import show as show
 from .viz import write_report as write_report
+from .viz.deviation import deviation as deviation

@@ -2,6 +2,10 @@ from .answers import Words as Words
 from .answers import words_of as words_of
 from .data import ReportData as ReportData
 from .data import report_data as report_data
+from .deviation import Deviation as Deviation
+from .deviation import WorstPlace as WorstPlace
+from .export import Region as Region
+from .export import missing_regions as missing_regions
 from .export import save_cloud as save_cloud
 from .export import save_mesh as save_mesh
 from .export import scanned_cloud as scanned_cloud

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from jaxnbv.checks import InputError, checked, require
@@ -89,7 +89,7 @@ def missing_regions(episode: Episode, smallest: float = 0.0) -> list[Region]:
     **Raises:** `ValueError` as `surface_mesh` does.
     """
     mesh, planner, frame = surface_mesh(episode), episode.planner, episode.frame
-    measured: Bool[np.ndarray, " f"] = mesh.face_attributes["measured"].astype(bool)
+    measured = np.asarray(mesh.face_attributes["measured"], bool)
     is_missing = ~measured
     if (obstacles := planner.obstacles) is not None:
         near = obstacles.margin + planner.sampler.grid.spacing

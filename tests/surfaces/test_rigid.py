@@ -41,8 +41,8 @@ def scanned(mesh, ahead, rng, noise=0.0, count=3000):
     points, normals = np.asarray(points), mesh.face_normals[rows]
     direction = np.asarray(ahead) / np.linalg.norm(ahead)
     faces, _ = first_faces(mesh.vertices, mesh.faces)(points + 1e-3 * normals, np.tile(direction, (count, 1)))
-    shown = (normals @ direction > 0.1) & (faces < 0)
-    return points[shown] + noise * rng.normal(size=(shown.sum(), 3)), normals[shown]
+    rows = (normals @ direction > 0.1) & (faces < 0)
+    return points[rows] + noise * rng.normal(size=(rows.sum(), 3)), normals[rows]
 
 
 def moved(matrix, points, normals):
@@ -84,7 +84,7 @@ def test_a_symmetric_part_has_no_rival():
     assert result.rival == 0
 
 
-def test_the_flat_of_a_round_shaft_is_found():
+def test_the_flat_of_a_shaft_determines_its_rotation():
     mesh, is_solid = outward(shaft_with_flat())
     truth = motion(RNG)
     result = register_scan(*moved(truth, *scanned(mesh, (1, 0.4, 0.6), RNG, noise=0.05)), mesh, is_solid)
@@ -99,7 +99,7 @@ def test_a_face_that_can_slide_has_a_rival():
     assert register_scan(points[patch], normals[patch], mesh, is_solid).rival > 1.0
 
 
-def test_what_is_outside_follows_from_the_solid_and_not_from_the_winding():
+def test_faces_are_wound_outward_however_they_were_wound():
     box = trimesh.creation.box((3, 2, 1))
     inverted = box.copy()
     inverted.invert()
@@ -107,8 +107,8 @@ def test_what_is_outside_follows_from_the_solid_and_not_from_the_winding():
     mixed.faces[::3] = mixed.faces[::3, ::-1]
     soup = trimesh.Trimesh(box.triangles.reshape(-1, 3), np.arange(36).reshape(-1, 3), process=False)
     without_lid = trimesh.Trimesh(box.vertices, box.faces[box.face_normals[:, 2] < 0.5], process=False)
-    for given in (box, inverted, mixed, soup, without_lid):
-        mesh, is_solid = outward(given)
+    for cad in (box, inverted, mixed, soup, without_lid):
+        mesh, is_solid = outward(cad)
         assert is_solid
         assert len(mesh.vertices) == 8
         assert np.all(np.sum(mesh.triangles_center * mesh.face_normals, axis=1) > 0)
@@ -116,7 +116,7 @@ def test_what_is_outside_follows_from_the_solid_and_not_from_the_winding():
 
 def test_a_sheet_keeps_its_winding():
     sheet = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]], process=False)
-    for given in (sheet, trimesh.Trimesh(sheet.vertices, sheet.faces[:, ::-1], process=False)):
-        mesh, is_solid = outward(given)
+    for cad in (sheet, trimesh.Trimesh(sheet.vertices, sheet.faces[:, ::-1], process=False)):
+        mesh, is_solid = outward(cad)
         assert not is_solid
-        np.testing.assert_allclose(mesh.face_normals, given.face_normals)
+        np.testing.assert_allclose(mesh.face_normals, cad.face_normals)

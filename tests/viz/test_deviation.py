@@ -93,9 +93,9 @@ def test_half_of_a_box_is_missing_where_three_of_its_sides_were_scanned():
     result = nbv.deviation(cloud(points, normals), BOX, register=False)
     assert result.area + result.missing_area == pytest.approx(BOX.area)
     assert result.missing_area / BOX.area == pytest.approx(0.5, abs=0.03)
-    seen, unseen = np.array([[0.0, 10.0, 20.0]]), np.array([[0.0, 10.0, -20.0]])
-    assert result.values_at(seen, np.array([[0.0, 0.0, 1.0]])) == pytest.approx(0.0, abs=1e-4)
-    assert np.isnan(result.values_at(unseen, np.array([[0.0, 0.0, -1.0]])))
+    front, back = np.array([[0.0, 10.0, 20.0]]), np.array([[0.0, 10.0, -20.0]])
+    assert result.values_at(front, np.array([[0.0, 0.0, 1.0]])) == pytest.approx(0.0, abs=1e-4)
+    assert np.isnan(result.values_at(back, np.array([[0.0, 0.0, -1.0]])))
 
 
 @pytest.mark.parametrize("more", [0.8, -0.8])
@@ -195,12 +195,12 @@ def test_places_stand_apart_and_flanks_are_none():
     height = sum(size * np.exp(-np.sum((places - at) ** 2, axis=1) / 18.0) for at, size in flaws.items())
     points = np.column_stack([places, 20.0 + height])
     result = nbv.deviation(cloud(points, np.tile([0.0, 0.0, 1.0], (len(points), 1))), BOX, register=False)
-    found = result.worst(3)
-    for place, at in zip(found, [(-30.0, 0.0), (0.0, 5.0), (32.0, -9.0)], strict=True):
+    worst = result.worst(3)
+    for place, at in zip(worst, [(-30.0, 0.0), (0.0, 5.0), (32.0, -9.0)], strict=True):
         np.testing.assert_allclose(place.position[:2], at, atol=2.0)
-    assert [np.sign(place.distance) for place in found] == [1, -1, 1]
+    assert [np.sign(place.distance) for place in worst] == [1, -1, 1]
     # Full width at half maximum of a Gaussian of standard deviation 3.
-    assert found[1].extent == pytest.approx(2.355 * 3.0, abs=2.0)
+    assert worst[1].extent == pytest.approx(2.355 * 3.0, abs=2.0)
     assert [place.distance for place in result.worst(2, apart=70.0)] == pytest.approx([2.0, 0.0], abs=0.2)
 
 
@@ -259,7 +259,7 @@ def test_the_figure_shows_the_flaw_in_the_colour_of_its_sign_and_numbers_it(tmp_
     assert bar.get_ylim() == pytest.approx((-2.0, 2.0), abs=0.2)
     texts = " ".join(text.get_text() for text in figure.texts)
     assert "1:  −1.9" in texts or "1:  −1.8" in texts
-    assert "50 % of the CAD not scanned" in texts or "49 % of the CAD not scanned" in texts
+    assert any(f"{share} % of the CAD not scanned" in texts for share in (49, 50, 51, 52))
     assert [text.get_text() for axes in (first, second) for text in axes.texts].count("1") >= 1
     image = np.asarray(first.images[0].get_array())
     clear, (red, _, blue) = image[..., 3] > 0.9, np.moveaxis(image[..., :3], -1, 0)

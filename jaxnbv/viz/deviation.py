@@ -1,0 +1,308 @@
+"""Inspection: how far a scanned surface lies from its CAD model, where most, and what was not scanned."""
+
+import dataclasses
+import warnings
+from pathlib import Path
+from typing import Any, NamedTuple, TypeAlias
+
+import equinox as eqx
+import numpy as np
+import trimesh
+from jaxtyping import Float
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from jaxnbv.checks import AnyArray, as_numbers, checked, require, shown
+from jaxnbv.errors import explained_imports, optional
+from jaxnbv.geometry.cloud import PointCloud, check_single
+from jaxnbv.geometry.frame import Frame
+from jaxnbv.geometry.pose import rigid_matrices
+from jaxnbv.scanning.mesh import TriangleMesh
+from jaxnbv.scanning.mesh_files import read_nodes
+from jaxnbv.scanning.sdf.sampled import checked_triangles
+from jaxnbv.surfaces.rigid import outward, register_scan
+
+# Points sampled from a mesh, fewest points of a cloud, points of the CAD at which coverage is tested.
+_POINTS, _FEWEST, _SAMPLES = 50_000, 10, 20_000
+# A scan that is this many times larger than the CAD, or smaller, has other units.
+_LARGER, _SMALLER = 8.0, 50.0
+# Shares of the CAD's diameter: distance between the worst places, farthest scan that covers it, median of a poor fit.
+_APART, _FAR, _POOR = 0.05, 0.05, 0.02
+# Neighbours whose median smooths the deviation.
+_NEIGHBOURS = 9
+# Places of the CAD are covered by this many points within a radius, in distances to the fourth neighbour, if the cosine
+# of their normals is larger.
+_COVERING, _RADIUS, _FACING = 3, 1.5, 0.3
+# Numbered places are this many times worse than the median. End of the colours if nothing deviates.
+_STANDS_OUT, _LEAST = 4.0, 1e-9
+
+_Mesh: TypeAlias = trimesh.Trimesh | trimesh.Scene | str | Path
+
+
+class WorstPlace(NamedTuple):
+    """A local extreme of the deviation, in the coordinates and units of the scan.
+
+    - `position`: the point of the scan.
+    - `distance`: signed, the median over its nine nearest points.
+    - `extent`: diameter of the connected region about it where the deviation is more than half as large.
+    """
+
+    position: Float[np.ndarray, "3"]
+    distance: float
+    extent: float
+
+
+class Deviation(eqx.Module):
+    """Signed distances of a scan from its CAD model, in the coordinates and units of the scan.
+
+    - `pose`: where the CAD lies, from its coordinates to the scan's.
+    - `points`: points of the scan, uniform by area if it is a mesh.
+    - `distances`: from the CAD to each point, positive outside (too much material).
+    - `feet`, `normals`: the nearest point of the CAD for each point, and its outward normal there.
+    - `cad`: the CAD where it lies.
+    - `area`, `missing_area`: surface of the CAD that the scan covers, and the rest, of which the distances say nothing.
+    - `imagined`: share of the scanned mesh that no view measured, which is left out.
+    - `radius`: a place of the CAD is covered if three of its four nearest `feet` are nearer than this, on its side.
+    """
+
+    pose: Float[np.ndarray, "4 4"]
+    points: Float[np.ndarray, "n 3"]
+    distances: Float[np.ndarray, " n"]
+    feet: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+    cad: TriangleMesh
+    area: float
+    missing_area: float
+    imagined: float
+    radius: float
+
+    @property
+    def median(self) -> float:
+        """Median of |distance|."""
+        return self.percentile(50.0)
+
+    @checked
+    def percentile(self, share: float) -> float:
+        """The |distance| that `share` percent of the points do not exceed.
+
+        **Raises:** `ValueError` for a share outside [0, 100].
+        """
+        require(0 <= share <= 100, f"the share is {share} percent; give a number from 0 to 100")
+        return float(np.percentile(np.abs(self.distances), share))
+
+    @checked
+    def worst(self, count: int = 5, apart: float | None = None) -> tuple[WorstPlace, ...]:
+        """The places of the largest deviation, the worst first; fewer where there are fewer.
+
+        Two extremes count as one if the deviation stays above half of the smaller one between them.
+
+        - `apart`: least distance between two places; 5 % of the CAD's diameter by default.
+
+        **Raises:** `ValueError` for a count below 1 or a negative distance.
+        """
+        require(count >= 1, f"the number of places is {count}; ask for at least one")
+        apart = _APART * _diameter(self.cad.vertices) if apart is None else apart
+        require(apart >= 0, f"places are {apart} apart; give a positive length")
+        tree = cKDTree(self.points)
+        _, near = tree.query(self.points, k=_NEIGHBOURS)
+        smooth = np.median(self.distances[near], axis=1)
+        size, num = np.abs(smooth), len(smooth)
+        edges = np.repeat(np.arange(num), _NEIGHBOURS - 1), near[:, 1:].ravel()
+        graph = coo_array((np.ones(len(edges[0]), bool), edges), (num, num)).tocsr()
+        places, rows, is_left = list[WorstPlace](), list[int](), np.ones(num, bool)
+        while len(places) < count and is_left.any():
+            row = int(np.argmax(np.where(is_left, size, -1.0)))
+            high = np.flatnonzero((size >= 0.5 * size[row]) & (np.sign(smooth) == np.sign(smooth[row])))
+            _, labels = connected_components(graph[high][:, high], directed=False)
+            region = high[labels == labels[np.searchsorted(high, row)]]
+            is_left[region] = False
+            if not np.isin(rows, region).any():
+                rows.append(row)
+                is_left[tree.query_ball_point(self.points[row], apart)] = False
+                places.append(WorstPlace(self.points[row], float(smooth[row]), _diameter(self.points[region])))
+        return tuple(places)
+
+    def values_at(self, places: Float[np.ndarray, "m 3"], normals: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, " m"]:
+        """Signed distances of the scan at places on the CAD; NaN where the scan does not cover it.
+
+        - `places`, `normals`: points of `cad` and the outward normals there. One side of a wall does not cover the
+          other.
+        """
+        rows = np.flatnonzero(np.abs(self.distances) < _FAR * _diameter(self.cad.vertices))
+        if len(rows) == 0:
+            return np.full(len(places), np.nan)
+        gaps, near = cKDTree(self.feet[rows]).query(places, k=[1, 2, 3, 4], distance_upper_bound=self.radius)
+        near = rows[np.minimum(near, len(rows) - 1)]
+        is_facing = np.einsum("mki,mi->mk", self.normals[near], normals) > _FACING
+        is_near = np.isfinite(gaps) & is_facing
+        weight = np.where(is_near, 1.0 / (np.where(is_near, gaps, 0.0) + 0.1 * self.radius), 0.0)
+        mean = np.sum(weight * self.distances[near], axis=1) / np.maximum(weight.sum(axis=1), 1e-30)
+        return np.where(is_near.sum(axis=1) >= _COVERING, mean, np.nan)
+
+    @checked
+    def figure(
+        self,
+        unit: str = "units of the scan",
+        scale: float = 1.0,
+        limit: float | None = None,
+        count: int = 5,
+        up: str = "z",
+    ) -> Any:
+        """The CAD from two sides, coloured by the deviation and grey where it was not scanned: a `Figure` of
+        matplotlib. Numbers mark the worst place, and others of four times the median deviation or more.
+
+        - `unit`: name of the unit of the colours, and `scale`: what distances are multiplied by, 1000 for millimetres
+          if the scan is in metres.
+        - `limit`: deviation at the ends of the colours, in that unit; that of the worst place by default.
+        - `count`: how many places are numbered at most. `up`: the axis of the scan that is upward, see `Frame`.
+
+        **Raises:** `ValueError` for a scale or limit that is not positive, another axis, or if matplotlib is missing.
+        """
+        with explained_imports():
+            from jaxnbv.viz.deviation_figure import Mark, deviation_figure
+        require(scale > 0, f"the scale is {scale}; it must be positive")
+        first, *others = self.worst(count)
+        places = [first, *(place for place in others if abs(place.distance) >= _STANDS_OUT * self.median)]
+        distances = [scale * place.distance for place in places]
+        limit = max(abs(distances[0]), _LEAST) if limit is None else limit
+        require(limit > 0, f"the colours end at {limit}; give a positive deviation")
+        _, rows = cKDTree(self.points).query([place.position for place in places])
+        middle, most = (scale * self.percentile(share) for share in (50.0, 90.0))
+        missing = 100.0 * self.missing_area / (self.area + self.missing_area)
+        caption = f"median {middle:.3g},  90 % within {most:.3g};  {missing:.0f} % of the CAD not scanned"
+        marks = [Mark(*mark) for mark in zip(self.feet[rows], self.normals[rows], distances, strict=True)]
+        return deviation_figure(self.cad, lambda *at: scale * self.values_at(*at), marks, limit, unit, caption, up)
+
+
+@checked
+def deviation(
+    mesh: trimesh.Trimesh | trimesh.Scene | PointCloud | str | Path,
+    cad: trimesh.Trimesh | trimesh.Scene | TriangleMesh | str | Path,
+    pose: Float[AnyArray, "4 4"] | list | None = None,
+    register: bool = True,
+) -> Deviation:
+    """Compare a scanned surface, or a part of it, with a CAD model in the same units.
+
+    The CAD is laid on the scan by iterative closest points; a symmetric one has several poses that are equally right.
+    Distances are to the nearest surface: a dent deeper than half of a wall is measured from the wall's other side.
+
+    - `mesh`: the scan, as a mesh whose faces are wound outward, a file of one, or a cloud with outward normals. If a
+      mesh says which faces were measured, as `surface_mesh` and the PLY files of `save_mesh` do, only these are
+      compared.
+    - `cad`: need not be closed. The outside of a sheet is where the normals of its faces point.
+    - `pose`: from the CAD's coordinates to the scan's: a start, such as `session.object_pose.matrix`. Without it all
+      rotations are tried.
+    - `register`: False if the CAD lies at `pose` (at the identity without one) and is not to be moved.
+
+    A `UserWarning` says if no pose fits well, or if other poses fit nearly as well.
+
+    **Raises:** `ValueError` for a file that cannot be read, a mesh without faces, a scan of fewer than ten points or
+    without measured faces, a pose that is not rigid, units that differ, or if libigl is missing.
+    """
+    model, is_solid = outward(_mesh_of(cad))
+    points, normals, imagined = _points_of(mesh)
+    _check_units(_diameter(points), _diameter(model.vertices))
+    matrix = _checked_pose(pose)
+    if register:
+        matrix = _registered(points, normals, model, is_solid, None if pose is None else matrix)
+    turn, faces = matrix[:3, :3], np.ascontiguousarray(model.faces, np.int64)
+    vertices = np.ascontiguousarray(model.vertices @ turn.T + matrix[:3, 3])
+    # Pseudonormals give a sign on open meshes too, where winding numbers have no inside.
+    igl = optional("igl")
+    kind = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
+    distances, rows, feet, _ = igl.signed_distance(np.ascontiguousarray(points), vertices, faces, kind)
+    gaps, _ = cKDTree(points).query(points, k=5)
+    radius, outer = _RADIUS * float(np.quantile(gaps[:, 4], 0.9)), model.face_normals @ turn.T
+    cad_here, area = TriangleMesh(vertices, faces, Frame()), float(model.area)
+    result = Deviation(matrix, points, distances, feet, outer[rows], cad_here, area, 0.0, imagined, radius)
+    samples, rows = trimesh.sample.sample_surface(cad_here.to_trimesh(), _SAMPLES, seed=0)
+    missing = area * float(np.mean(np.isnan(result.values_at(np.asarray(samples), outer[rows]))))
+    return dataclasses.replace(result, area=area - missing, missing_area=missing)
+
+
+def _registered(
+    points: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    model: trimesh.Trimesh,
+    is_solid: bool,
+    pose: Float[np.ndarray, "4 4"] | None,
+) -> Float[np.ndarray, "4 4"]:
+    start = None if pose is None else np.linalg.inv(pose)
+    result = register_scan(points, normals, model, is_solid, start)
+    if result.median > _POOR * _diameter(model.vertices):
+        warnings.warn(
+            f"the CAD fits the scan poorly: the median distance is {result.median:.4g}. Give pose=, and check that it "
+            "is this part, that the scan shows little else, and that its faces are wound outward",
+            stacklevel=4,
+        )
+    if result.rival > 0:
+        warnings.warn(
+            "the CAD fits the scan nearly as well in another pose, where its surface is off by "
+            f"{result.rival:.4g} on average: scan more of the part, or give pose=",
+            stacklevel=4,
+        )
+    return np.linalg.inv(result.matrix)
+
+
+def _mesh_of(thing: _Mesh | TriangleMesh) -> trimesh.Trimesh:
+    """The mesh in its own units, its faces marked as measured if they are."""
+    if isinstance(thing, TriangleMesh):
+        return trimesh.Trimesh(thing.frame.to_world(thing.vertices), thing.faces, process=False)
+    parts = [part for _, part in read_nodes(thing)]
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    corners = [part.faces + start for part, start in zip(parts, starts[:-1], strict=True)]
+    vertices, faces = checked_triangles(np.concatenate([part.vertices for part in parts]), np.concatenate(corners))
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    require(mesh.area > 0, f"all {len(faces)} faces of the mesh have zero area: there is no surface")
+    marks: Any = None
+    if isinstance(thing, trimesh.Trimesh):
+        marks = thing.face_attributes.get("measured")
+    elif isinstance(thing, str | Path) and Path(thing).suffix.lower() == ".ply":
+        raw = trimesh.load(thing, process=False).metadata.get("_ply_raw", {}).get("face", {}).get("data")
+        marks = raw["measured"] if "measured" in (getattr(raw, "dtype", np.dtype(int)).names or ()) else None
+    if marks is not None and len(marks) == len(faces):
+        mesh.face_attributes["measured"] = np.asarray(marks).astype(bool)
+    return mesh
+
+
+def _points_of(scan: _Mesh | PointCloud) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], float]:
+    """Points of a scan, their normals, and the share of its surface that was left out."""
+    if isinstance(scan, PointCloud):
+        check_single(scan)
+        points, normals = (rows.astype(np.float64) for rows in scan.to_numpy())
+        require(len(points) >= _FEWEST, f"the scan has {len(points)} points: give at least {_FEWEST}")
+        require(bool(np.isfinite(points).all()), "the scan has points that are not finite: drop them")
+        return points, normals, 0.0
+    mesh = _mesh_of(scan)
+    is_measured = mesh.face_attributes.get("measured", np.ones(len(mesh.faces), bool))
+    weight = np.where(is_measured, mesh.area_faces, 0.0)
+    require(weight.sum() > 0, f"none of the {len(mesh.faces)} faces of the scan was measured: add a view")
+    points, rows = trimesh.sample.sample_surface(mesh, _POINTS, face_weight=weight, seed=0)
+    return np.asarray(points), mesh.face_normals[rows], max(0.0, 1.0 - float(weight.sum() / mesh.area))
+
+
+def _check_units(scan: float, cad: float) -> None:
+    times = max(scan, cad) / max(min(scan, cad), 1e-30)
+    require(
+        times < (_LARGER if scan > cad else _SMALLER),
+        f"the scan is {scan:.4g} across and the CAD {cad:.4g}, a factor of {times:.3g}: their units differ, such as "
+        "millimetres and metres (1000). Scale one, as by cad.apply_scale(0.001), or crop the scan to the part",
+    )
+
+
+def _checked_pose(pose: Float[AnyArray, "4 4"] | list | None) -> Float[np.ndarray, "4 4"]:
+    """The pose as a rigid matrix; the identity for None."""
+    matrix = np.eye(4) if pose is None else as_numbers(pose, "the pose", np.float64)
+    require(
+        matrix.shape == (4, 4), f"the pose has shape {matrix.shape}: give a matrix (4, 4), from the CAD to the scan"
+    )
+    (matrix,), (is_rigid,) = rigid_matrices(matrix[None])
+    require(is_rigid, f"the pose is no rigid motion: {shown(pose)}; give a rotation and a shift, [[R, t], [0, 1]]")
+    return matrix
+
+
+def _diameter(points: Float[np.ndarray, "n 3"]) -> float:
+    """Distance between two points that lie about the farthest apart."""
+    far = points[np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1))]
+    return float(np.linalg.norm(points - far, axis=1).max())
