@@ -19,7 +19,6 @@ import jaxnbv as nbv
 # Where the object stands, and the joints at which the arm waits, looking down at it.
 PLACE = np.array([0.5, 0.0, 0.0])
 HOME = np.array([3.14, -1.9, 1.9, -1.57, -1.57, 0.0])
-CAMERA = nbv.Camera(height=180, width=240, fov=0.9, nearest=0.1, farthest=1.2)
 # Standard deviation of a depth at half a metre, by which it grows with the square; no depth at steeper angles.
 _NOISE, _STEEPEST = 5e-4, math.cos(math.radians(80.0))
 # Radians a second that the arm's joints turn, and radians between two postures of a way.
@@ -75,13 +74,14 @@ class Arm:
     - `mesh`: the object, at its place.
     - `error`: (4, 4), the error X of the hand-eye calibration: the camera truly is at `matrix @ X`, where the robot
       says that it is at `matrix`.
-    - `camera`: its depth camera; `seed`: of the noise.
+    - `camera`: its depth camera, by default of 180 x 240 pixels; `seed`: of the noise.
     """
 
     def __init__(
-        self, mesh: trimesh.Trimesh, error: np.ndarray | None = None, camera: nbv.Camera = CAMERA, seed: int = 0
+        self, mesh: trimesh.Trimesh, error: np.ndarray | None = None, camera: nbv.Camera | None = None, seed: int = 0
     ):
-        self.model, self.camera = model_of(mesh), camera
+        self.model = model_of(mesh)
+        self.camera = camera or nbv.Camera(height=180, width=240, fov=0.9, nearest=0.1, farthest=1.2)
         self.data = mujoco.MjData(self.model)
         self.error = np.eye(4) if error is None else error
         self.joints, self.seconds = HOME.copy(), 0.0

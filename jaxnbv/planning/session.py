@@ -31,7 +31,7 @@ from jaxnbv.planning.loop import STAGES, Loop, View
 from jaxnbv.planning.mount import MountError
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.reachability import Reachable, Refused, best_reachable
-from jaxnbv.planning.session_folder import SessionFolder, StoredProposal
+from jaxnbv.planning.session_folder import SessionFolder
 from jaxnbv.planning.session_warnings import (
     warn_of_blank,
     warn_of_cut,
@@ -63,8 +63,6 @@ class NextView(eqx.Module):
       is by so much off as the mount is, so that the camera arrives where it should.
     - `value`: what the search maximises, a length or an area in world units; `standard_error`: of the value, as a mean
       over the posterior samples; None for a search that draws fewer than two.
-    - `expected_depth`: what the sensor is expected to see there, in world units and at the planner's resolution: the
-      mean depth over the posterior samples, NaN where most of them are missed; None without samples.
     - `proposal`: all that the search looked at, in scene coordinates.
     - `refusals`: how many poses of more value cannot be reached, by the reason.
     """
@@ -72,7 +70,6 @@ class NextView(eqx.Module):
     matrix: Float[np.ndarray, "4 4"]
     value: float
     standard_error: float | None
-    expected_depth: Float[np.ndarray, "h w"] | None
     proposal: Proposal
     refusals: dict[str, int] = eqx.field(default_factory=dict)
 
@@ -328,21 +325,32 @@ class Session:
         if self._next is None:
             with self._alone() as folder, self._planning():
                 require(len(self.views) > 0, _NO_IMAGE)
-                proposal, depth = self._loop.propose(), None
+                proposal = self._loop.propose()
                 refusals: Mapping[str, int] = {}
                 if self.reachable is not None or self._refused:
                     values_at = self._values_at if self._sees_more_turned else None
                     asked = self.reachable, self._matrices, self._refused, values_at, seconds
                     proposal, refusals = best_reachable(proposal, *asked)
                     self._loop.settle(proposal)
-                if (surfaces := self._loop.inputs().surfaces) is not None:
-                    depth = self.frame.length_to_world(np.asarray(self.planner.expected_depth(surfaces, proposal.pose)))
-                next_view = self._next_of(proposal, depth, refusals)
+                next_view = self._next_of(proposal, refusals)
                 warn_of_little(next_view.value, next_view.standard_error, self._in_vain(proposal))
                 if folder is not None:
-                    folder.store_proposal(len(self.views), StoredProposal(proposal, depth))
+                    folder.store_proposal(len(self.views), proposal)
                 self._next = next_view
         return self._next
+
+    @own_settings()
+    def expected_depth(self) -> Float[np.ndarray, "h w"] | None:
+        """What the sensor is expected to see at the pose that `next` gives, in world units and at the planner's
+        resolution: the mean depth over the posterior samples, NaN where most of them are missed; None for a search
+        without samples.
+
+        **Raises:** `ValueError` as `next` does.
+        """
+        proposal, surfaces = self.next().proposal, self._loop.inputs().surfaces
+        if surfaces is None:
+            return None
+        return self.frame.length_to_world(np.asarray(self.planner.expected_depth(surfaces, proposal.pose)))
 
     def refuse(self, reason: str = "refused") -> None:
         """Say that the camera cannot be held where `next` asks for it: the next call gives the best other pose, at once
@@ -450,21 +458,19 @@ class Session:
         self._refused, count = folder.refused(), folder.num_images
         for index in range(count + 1):
             if index and (stored := folder.proposal(index)) is not None:
-                self._loop.resume(stored.proposal)
-                self._next = self._next_of(stored.proposal, stored.expected_depth)
+                self._loop.resume(stored)
+                self._next = self._next_of(stored)
             if index < count:
                 self._add(folder.image(index), None)
                 if self.correct_mount:
                     self._correct()
 
-    def _next_of(
-        self, proposal: Proposal, expected_depth: np.ndarray | None, refusals: Mapping[str, int] = MappingProxyType({})
-    ) -> NextView:
+    def _next_of(self, proposal: Proposal, refusals: Mapping[str, int] = MappingProxyType({})) -> NextView:
         """A proposal in the user's world."""
         error = None if proposal.standard_error is None else self._loop.in_world(proposal.standard_error)
         error = error if error is not None and math.isfinite(error) else None
         (matrix,), value = self._matrices(proposal.pose[None]), self._loop.in_world(proposal.value)
-        return NextView(matrix, value, error, expected_depth, proposal, dict(refusals))
+        return NextView(matrix, value, error, proposal, dict(refusals))
 
     def _matrices(self, poses: Pose) -> Float[np.ndarray, "n 4 4"]:
         """What to send the camera to for it to stand at poses of the scene."""

@@ -3,10 +3,9 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxnbv.checks import require
 from jaxnbv.planning.images import Image
@@ -15,13 +14,6 @@ from jaxnbv.search import Proposal
 from jaxnbv.storage import RunFolder
 
 _KIND = "session"
-
-
-class StoredProposal(NamedTuple):
-    """A proposal, and the depth image that was expected there, in world units; None where there is none."""
-
-    proposal: Proposal
-    expected_depth: Float[np.ndarray, "h w"] | None
 
 
 class SessionFolder:
@@ -75,16 +67,15 @@ class SessionFolder:
         pixels = {name: rows for name, rows in pixels.items() if rows is not None}
         self._folder.write("image", index, depth=image.depth, matrix=image.matrix, depth_scale=image.scale, **pixels)
 
-    def proposal(self, num_images: int) -> StoredProposal | None:
+    def proposal(self, num_images: int) -> Proposal | None:
         """What was proposed after so many images; None for nothing."""
         if not self._folder.file("proposal", num_images).exists():
             return None
-        stored = self._folder.read("proposal", num_images)
-        return StoredProposal(stored["proposal"], stored.get("expected_depth"))
+        return self._folder.read("proposal", num_images)["proposal"]
 
-    def store_proposal(self, num_images: int, stored: StoredProposal) -> None:
+    def store_proposal(self, num_images: int, proposal: Proposal) -> None:
         """Store what is proposed after so many images."""
-        self._folder.write("proposal", num_images, **stored._asdict())
+        self._folder.write("proposal", num_images, proposal=proposal)
 
     def refused(self) -> list[Refused]:
         """Poses that were refused."""

@@ -82,8 +82,11 @@ class LiveView:
     def update(self, shown: Episode | Session) -> None:
         """Show an episode as it is now, or a session and where it asks for the next image."""
         episode = shown.episode if isinstance(shown, Session) else shown
-        asked, observations = (shown.next_view, shown.observations) if isinstance(shown, Session) else (None, None)
-        proposal, expected = (None, None) if asked is None else (asked.proposal, asked.expected_depth)
+        proposal, expected, observations = None, None, None
+        if isinstance(shown, Session):
+            observations = shown.observations
+            if shown.next_view is not None:
+                proposal, expected = shown.next_view.proposal, shown.expected_depth()
         views = episode.views
 
         def show(count: int) -> None:

@@ -19,8 +19,8 @@ MUG = arm_simulator.on_a_table()
 
 
 def points_of(depth, matrix):
-    """By the equations of a pinhole, in NumPy: the points of an image in the world, and which are measured."""
-    (fx, _, cx), (_, fy, cy), _ = arm_simulator.CAMERA.intrinsics
+    """By the equations of a pinhole, in NumPy: the points of an image in the world."""
+    (fx, _, cx), (_, fy, cy), _ = arm_simulator.Arm(MUG).camera.intrinsics
     rows, columns = np.indices(depth.shape)
     local = np.stack([(columns - cx) / fx * depth, (rows - cy) / fy * depth, depth], axis=-1)[depth > 0]
     return local @ matrix[:3, :3].T + matrix[:3, 3]

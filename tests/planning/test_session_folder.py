@@ -24,7 +24,7 @@ def test_a_session_goes_on_from_its_folder(tmp_path):
     again = session_of(tmp_path)
     files = {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("*.npz")}
     np.testing.assert_array_equal(again.next().matrix, matrix)
-    np.testing.assert_array_equal(again.next().expected_depth, session.next().expected_depth)
+    np.testing.assert_array_equal(again.expected_depth(), session.expected_depth())
     assert files == {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("*.npz")}
     again.add(shot(matrix), matrix, depth_scale=1e-3)
     last = session_of(tmp_path)
