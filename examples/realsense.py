@@ -8,6 +8,7 @@ it moves the camera and returns the pose where the camera then stands, a 4 x 4 m
 camera.
 """
 
+import threading
 import time
 
 import numpy as np
@@ -94,6 +95,9 @@ def main(
     try:
         camera, scale = depth_camera(profile)
         session = nbv.Session(camera, BOX, planner, up="z", folder=folder, until=nbv.Covered(0.9))
+        if not session.views:
+            # It compiles while the camera goes to its first pose.
+            threading.Thread(target=session.rehearse).start()
         while len(session.views) < views and not session.done():
             matrix = go_to(session.next().matrix if session.views else first)
             depth = np.asanyarray(depth_frame(pipeline, time.time()).get_data())

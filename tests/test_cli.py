@@ -3,6 +3,7 @@
 import gc
 import json
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -251,6 +252,14 @@ def test_no_posterior_waits_for_a_rival_or_for_an_earlier_drawing(tmp_path, monk
     assert result.returncode == 0, result.stderr
     assert "a race" in result.stdout
     assert held == [False, False, True]
+
+
+@pytest.mark.slow
+def test_warm_up_compiles_for_a_camera(tmp_path):
+    camera = ["--intrinsics", "40", "40", "32", "24", "--size", "48", "64"]
+    result = run_command("warm-up", *camera, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert re.search(r"[1-9]\d+ programs in \d+ s, kept in ", result.stdout)
 
 
 @pytest.mark.slow

@@ -60,7 +60,8 @@ def points_of_depth(
         matrix = jnp.asarray(camera.intrinsics, depth.dtype)
         depth, missed = undistorted(depth, jnp.asarray(missed), place, matrix, camera.distortion)
     gap = 1 if is_traced(depth) else gap_of(np.isfinite(depth) & (np.asarray(depth) > 0))
-    image = depth, jnp.asarray(missed), camera, pose, stride, rounding, box, gap
+    # An array, so that what is compiled for one unit runs for any.
+    image = depth, jnp.asarray(missed), camera, pose, stride, jnp.asarray(rounding, depth.dtype), box, gap
     points, normals, mask, missed, inside, sight = _oriented(*image)
     if box is not None and not is_traced(points):
         _warn_of_nothing_inside(np.asarray(points)[np.asarray(mask)], np.asarray(inside)[np.asarray(mask)], box)
@@ -76,7 +77,7 @@ def _oriented(
     camera: Camera,
     pose: Pose,
     stride: int,
-    rounding: float,
+    rounding: Float[Array, ""],
     box: Box | None,
     gap: int,
 ) -> tuple[

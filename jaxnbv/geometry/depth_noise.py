@@ -19,7 +19,9 @@ _ENOUGH = 16
 _MEDIAN_SIZE = math.sqrt(20.0) * NormalDist().inv_cdf(0.75)
 
 
-def depth_noise(depth: Float[Array, "h w"], valid: Bool[Array, "h w"], least: float) -> Float[Array, "h w"]:
+def depth_noise(
+    depth: Float[Array, "h w"], valid: Bool[Array, "h w"], least: float | Float[Array, ""]
+) -> Float[Array, "h w"]:
     """The standard deviation of each pixel's noise, rounding included, in units of the depth; at least `least`.
 
     From the median of third differences along rows and columns, which are little but noise where the surface is smooth:

@@ -30,7 +30,12 @@ _DIFFERENCE, _MOST_UNLIKE = 3.0 * math.sqrt(2.0), 5
 
 
 def fitted_planes(
-    depth: Float[Array, "h w"], valid: Bool[Array, "h w"], camera: Camera, stride: int, least_noise: float, gap: int = 1
+    depth: Float[Array, "h w"],
+    valid: Bool[Array, "h w"],
+    camera: Camera,
+    stride: int,
+    least_noise: float | Float[Array, ""],
+    gap: int = 1,
 ) -> tuple[Float[Array, "k l"], Float[Array, "k l 3"], Bool[Array, "k l"]]:
     """Depths and normals of every so many-th row and column, in the camera's frame, and which have a plane.
 

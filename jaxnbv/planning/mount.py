@@ -1,5 +1,6 @@
 """The error of the poses of a session: what its images tell, and where the cameras truly were."""
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -44,9 +45,12 @@ class MountError:
         """
         if self._alignment is None or len(self._alignment.corrections) != len(self._images):
             poses = [Pose.from_matrix(image.matrix, self.convention) for image in self._images]
-            stride = _COARSER * stride_of(self.camera)
+            stride = stride_of(self.camera)
+            strided = self.camera.strided(stride)
+            kept = np.zeros((strided.height, strided.width), bool)
+            kept[_COARSER // 2 :: _COARSER, _COARSER // 2 :: _COARSER] = True
             for image, pose in list(zip(self._images, poses, strict=True))[len(self._clouds) :]:
-                self._clouds.append(image.cloud(self.camera, pose, stride))
+                self._clouds.append(image.cloud(self.camera, pose, stride).only(jnp.asarray(kept.reshape(-1))))
             self._alignment = align_views(self._clouds, poses)
         return self._alignment
 

@@ -1,7 +1,9 @@
 """A live session: depth images of a real sensor in, where to take the next one out, in the user's own world."""
 
+import copy
 import dataclasses
 import math
+import threading
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -31,6 +33,7 @@ from jaxnbv.planning.loop import STAGES, Loop, View
 from jaxnbv.planning.mount import MountError
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.reachability import Reachable, Refused, best_reachable
+from jaxnbv.planning.rehearsal import ProgramCount, Rehearsal, ball_on_a_table, slanted
 from jaxnbv.planning.session_folder import SessionFolder
 from jaxnbv.planning.session_warnings import (
     warn_of_blank,
@@ -153,6 +156,7 @@ class Session:
         self._warned_of_mount = False
         self.reachable, self.ignore = reachable, ignore
         self._refused: list[Refused] = []
+        self._rehearsing = threading.RLock()
         self._folder: SessionFolder | None = None
         if folder is not None:
             # What a session is made of, as it was given: `load` makes it again from these.
@@ -188,6 +192,30 @@ class Session:
         kept = f", {int(self.observations.cloud.count):,} points" if self.views else ""
         proposed = ", the next view proposed" if self.next_view else ""
         return f"Session({self.planner.quantity.name}: {images}{kept}{proposed})"
+
+    def rehearse(self) -> Rehearsal:
+        """Compile what the first views run, by images of a ball on a table. It takes half a minute to a minute, or a
+        few seconds where programs are kept, see `keep_compiled`. The session stays as it is.
+
+        Call it in a thread while the camera goes to its first pose; images that come before it ends wait for it:
+        `threading.Thread(target=session.rehearse).start()`.
+        """
+        with self._rehearsing:
+            count = ProgramCount()
+            rehearsed = copy.copy(self)
+            rehearsed._loop = Loop(self._given_planner, self.key, self.until, self.frame, self._loop.camera)
+            rehearsed._mount_error, rehearsed._images = MountError(self.camera, self.convention), ()
+            box = self.frame.to_scene(self.box)
+            try:
+                for pose in slanted(self.planner.search.poses_around(), 2):
+                    depth = ball_on_a_table(self.frame.to_scene(self.camera), pose, box) / self.frame.scale
+                    matrix = self.frame.to_world(pose).to_matrix(self.convention)
+                    rehearsed._add(Image.of(depth, matrix, 1.0, None), None)
+                    rehearsed._loop.enough()
+                    rehearsed._loop.propose()
+            finally:
+                rehearsal = count.end()
+            return rehearsal
 
     @property
     def planner(self) -> Planner:
@@ -290,7 +318,7 @@ class Session:
         if self.ignore is not None:
             # Asked while the robot stands there, and stored.
             image = image.with_robot(self.ignore, self.camera, Pose.from_matrix(image.matrix, self.convention))
-        with self._alone() as folder:
+        with self._rehearsing, self._alone() as folder:
             looks_for_table = count == 0 and self.planner.obstacles is None
             self._add(image, folder)
         if len(self.views) == count:

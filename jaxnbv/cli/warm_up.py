@@ -1,0 +1,46 @@
+"""`jaxnbv warm-up`: compile what a session runs, before the camera is there."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import typer
+
+from jaxnbv.cli.options import command, seeing
+from jaxnbv.compiled import keep_compiled
+
+_BOX = (-0.15, -0.15, 0.0, 0.15, 0.15, 0.3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WarmUpOptions:
+    intrinsics: Annotated[
+        tuple[float, float, float, float], seeing(metavar="FX FY CX CY", help="Intrinsics of the camera, in pixels.")
+    ]
+    size: Annotated[tuple[int, int], seeing(metavar="HEIGHT WIDTH", help="Rows and columns of its images.")]
+    nearest: Annotated[float, seeing(min=0.0, help="The least depth that it measures, in world units.")] = 0.0
+    farthest: Annotated[float | None, seeing(help="The largest depth that it measures.", show_default="no limit")] = (
+        None
+    )
+    box: Annotated[
+        tuple[float, float, float, float, float, float],
+        seeing(
+            metavar="LOW HIGH", help="Two corners of the object's box, z up. It matters with --nearest, --farthest."
+        ),
+    ] = _BOX
+
+
+@command(WarmUpOptions)
+def warm_up(options: WarmUpOptions) -> None:
+    """Compile what a session with this camera runs, and keep it, so that its first view comes at once.
+
+    A session of your program finds it after nbv.keep_compiled(). With another planner, compile it there:
+    session.rehearse().
+    """
+    import jaxnbv as nbv
+
+    (fx, fy, cx, cy), (height, width) = options.intrinsics, options.size
+    matrix = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
+    camera = nbv.Camera.from_intrinsics(matrix, height, width, options.nearest, options.farthest)
+    session = nbv.Session(camera, (options.box[:3], options.box[3:]), up="z", progress=False)
+    typer.echo("compiling, which takes about a minute")
+    typer.echo(f"{session.rehearse()}, kept in {keep_compiled()}")

@@ -1,0 +1,70 @@
+"""A session is rehearsed before its first image, so that its programs are compiled once the image is there."""
+
+import time
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.geometry.volume import Box
+
+_COMPILED = "/jax/core/compile/backend_compile_duration"
+# Radius of the ball, as a share of the box's shortest side.
+_RADIUS = 0.2
+
+
+class Rehearsal(NamedTuple):
+    """What a rehearsal did.
+
+    - `programs`: how many programs it compiled, or read where they are kept; `seconds`: how long it took.
+    """
+
+    programs: int
+    seconds: float
+
+    def __str__(self) -> str:
+        return f"{self.programs} programs in {self.seconds:.0f} s"
+
+
+class ProgramCount:
+    """Counts the programs that the process compiles, from now on."""
+
+    def __init__(self) -> None:
+        self._start, self._programs = time.monotonic(), 0
+        jax.monitoring.register_event_duration_secs_listener(self._listen)
+
+    def end(self) -> Rehearsal:
+        """The count so far; it ends."""
+        jax.monitoring.unregister_event_duration_listener(self._listen)
+        return Rehearsal(self._programs, time.monotonic() - self._start)
+
+    def _listen(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
+        self._programs += event == _COMPILED
+
+
+def slanted(poses: Pose, count: int) -> Pose:
+    """Those of some poses that look down most nearly at 30 degrees, in scene units: they see what the object is on."""
+    down = -np.asarray(poses.forward)[:, 1]
+    return poses[jnp.asarray(np.argsort(np.abs(down - 0.5), kind="stable")[:count])]
+
+
+def ball_on_a_table(camera: Camera, pose: Pose, box: Box) -> Float[np.ndarray, "height width"]:
+    """The depth image of a ball in the middle of a box and of a table under it, by the equations of a ray; zero where
+    neither is met. In scene units, with y up."""
+    origin = np.asarray(pose.position, np.float64)
+    ahead = np.asarray(camera.pixel_directions(), np.float64)
+    rays = ahead @ np.asarray(pose.rotation, np.float64).T
+    middle, radius = 0.5 * (box.low + box.high), _RADIUS * float((box.high - box.low).min())
+    along, squared = rays @ (middle - origin), (rays**2).sum(axis=1)
+    root = along**2 - squared * (((middle - origin) ** 2).sum() - radius**2)
+    ball = np.where(root > 0, (along - np.sqrt(np.maximum(root, 0.0))) / squared, np.inf)
+    with np.errstate(divide="ignore"):
+        table = (box.low[1] - origin[1]) / rays[:, 1]
+    depth = np.minimum(np.where(ball > 0, ball, np.inf), np.where(table > 0, table, np.inf))
+    farthest = np.inf if camera.farthest is None else camera.farthest
+    measured = (depth >= camera.nearest) & (depth <= farthest) & np.isfinite(depth)
+    return np.where(measured, depth, 0.0).reshape(camera.height, camera.width)
