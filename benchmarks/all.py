@@ -27,7 +27,7 @@ from timing import least_time
 import jaxnbv as nbv
 from jaxnbv.acquisition import inputs_of, scores
 from jaxnbv.networks import pretrained_classifier
-from jaxnbv.planning.session import usual_planner
+from jaxnbv.planning.session_scene import usual_planner
 from jaxnbv.planning.simulate import observe_scene
 from jaxnbv.scanning.grid import samples_at_once
 from jaxnbv.search.candidates import sphere_candidates

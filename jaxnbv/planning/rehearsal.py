@@ -11,6 +11,9 @@ from jaxtyping import Float
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
+from jaxnbv.planning.images import Image
+from jaxnbv.planning.intake import Intake
+from jaxnbv.planning.loop import Loop
 
 _COMPILED = "/jax/core/compile/backend_compile_duration"
 # Radius of the ball, as a share of the box's shortest side.
@@ -30,20 +33,29 @@ class Rehearsal(NamedTuple):
         return f"{self.programs} programs in {self.seconds:.0f} s"
 
 
-class ProgramCount:
-    """Counts the programs that the process compiles, from now on."""
+def rehearse(intake: Intake, loop: Loop) -> Rehearsal:
+    """Add two views of a ball on a table to a session's intake and loop, and propose after each.
 
-    def __init__(self) -> None:
-        self._start, self._programs = time.monotonic(), 0
-        jax.monitoring.register_event_duration_secs_listener(self._listen)
+    - `intake`, `loop`: without any view; they are of no use afterwards.
+    """
+    start, programs = time.monotonic(), 0
 
-    def end(self) -> Rehearsal:
-        """The count so far; it ends."""
-        jax.monitoring.unregister_event_duration_listener(self._listen)
-        return Rehearsal(self._programs, time.monotonic() - self._start)
+    def listen(event: str, duration_secs: float, **kwargs: str | int) -> None:
+        nonlocal programs
+        programs += event == _COMPILED
 
-    def _listen(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
-        self._programs += event == _COMPILED
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        frame, planner = intake.frame, loop.planner
+        for pose in slanted(planner.search.poses_around(), 2):
+            depth = ball_on_a_table(frame.to_scene(intake.camera), pose, frame.to_scene(intake.box)) / frame.scale
+            matrix = frame.to_world(pose).to_matrix(intake.convention)
+            loop = intake.add(loop, Image.of(depth, matrix, 1.0, None)) or loop
+            loop.enough()
+            loop.propose()
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    return Rehearsal(programs, time.monotonic() - start)
 
 
 def slanted(poses: Pose, count: int) -> Pose:

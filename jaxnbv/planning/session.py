@@ -1,11 +1,8 @@
 """A live session: depth images of a real sensor in, where to take the next one out, in the user's own world."""
 
-import copy
-import dataclasses
 import math
 import threading
-import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType
@@ -17,24 +14,23 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, Real
 from tqdm import tqdm
 
-from jaxnbv.checks import AnyArray, InputError, as_numbers, check_key, checked, own_settings, require, shown
+from jaxnbv.checks import AnyArray, InputError, as_numbers, check_key, checked, own_settings, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
-from jaxnbv.geometry.depth_image import NothingInside
 from jaxnbv.geometry.frame import AXES, Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
 from jaxnbv.observations import Observations
 from jaxnbv.planning.alignment import Alignment
-from jaxnbv.planning.clutter import Clutter
 from jaxnbv.planning.episode import Episode
-from jaxnbv.planning.images import Ignore, Image, only_where, stride_of
+from jaxnbv.planning.images import Ignore, Image
+from jaxnbv.planning.intake import Intake
 from jaxnbv.planning.loop import STAGES, Loop, View
-from jaxnbv.planning.mount import MountError
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.reachability import Reachable, Refused, best_reachable
-from jaxnbv.planning.rehearsal import ProgramCount, Rehearsal, ball_on_a_table, slanted
+from jaxnbv.planning.rehearsal import Rehearsal, rehearse
 from jaxnbv.planning.session_folder import SessionFolder
+from jaxnbv.planning.session_scene import box_of, in_scene, usual_planner
 from jaxnbv.planning.session_warnings import (
     warn_of_blank,
     warn_of_cut,
@@ -44,19 +40,14 @@ from jaxnbv.planning.session_warnings import (
     warn_of_table,
 )
 from jaxnbv.planning.stopping import StopRule
-from jaxnbv.planning.table import other_ups, table_under
 from jaxnbv.progress import progress_bar
-from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning import Obstacles
-from jaxnbv.search import DiscreteSearch, Proposal
+from jaxnbv.search import Proposal
 from jaxnbv.surfaces.part_hypotheses import hypotheses_of
 from jaxnbv.surfaces.part_pose import ObjectPose, object_pose
-from jaxnbv.tasks import NewSurface
 
 _NO_UP = 'say which axis of the world is upward, up="z" for most robots: one of'
 _NO_IMAGE = "the session has no image yet: add one first, session.add(depth, matrix)"
-# On recordings twice as many showed no more.
-_SAMPLES = 8
 
 
 class NextView(eqx.Module):
@@ -139,21 +130,17 @@ class Session:
         if up is None:
             raise InputError(f"{_NO_UP} {', '.join(AXES)}")
         self.frame = Frame.fit(np.array([self.box.low, self.box.high]), up=up)
-        self.stride = stride_of(camera)
         planner = usual_planner() if planner is None else planner
         matrices = None if poses is None else as_numbers(poses, "the poses", np.float64)
         self._bar: tqdm[Any] | None = None
-        self._given_planner = self._placed(planner, matrices, obstacles)
-        rays = self.frame.to_scene(self.camera.strided(self.stride))
+        place = self.camera, self.box, self.frame, convention
+        self._given_planner = in_scene(planner, *place, matrices, obstacles)
+        self._intake = Intake(*place, self._given_planner)
+        rays = self.frame.to_scene(self.camera.strided(self._intake.stride))
         self._loop = Loop(self._given_planner, self.key, self.until, self.frame, rays, begin=self._show)
-        self._table: Obstacles | None = None
-        self._clutter = self._no_clutter()
-        self._other_ups: tuple[str, ...] = ()
         self._cut: frozenset[str] = frozenset()
         self._next: NextView | None = None
-        self._images: tuple[Image, ...] = ()
-        self.correct_mount, self._mount_error = correct_mount, MountError(camera, convention)
-        self._warned_of_mount = False
+        self.correct_mount, self._warned_of_mount = correct_mount, False
         self.reachable, self.ignore = reachable, ignore
         self._refused: list[Refused] = []
         self._rehearsing = threading.RLock()
@@ -201,21 +188,9 @@ class Session:
         `threading.Thread(target=session.rehearse).start()`.
         """
         with self._rehearsing:
-            count = ProgramCount()
-            rehearsed = copy.copy(self)
-            rehearsed._loop = Loop(self._given_planner, self.key, self.until, self.frame, self._loop.camera)
-            rehearsed._mount_error, rehearsed._images = MountError(self.camera, self.convention), ()
-            box = self.frame.to_scene(self.box)
-            try:
-                for pose in slanted(self.planner.search.poses_around(), 2):
-                    depth = ball_on_a_table(self.frame.to_scene(self.camera), pose, box) / self.frame.scale
-                    matrix = self.frame.to_world(pose).to_matrix(self.convention)
-                    rehearsed._add(Image.of(depth, matrix, 1.0, None), None)
-                    rehearsed._loop.enough()
-                    rehearsed._loop.propose()
-            finally:
-                rehearsal = count.end()
-            return rehearsal
+            intake = Intake(self.camera, self.box, self.frame, self.convention, self._given_planner)
+            loop = Loop(self._given_planner, self.key, self.until, self.frame, self._loop.camera)
+            return rehearse(intake, loop)
 
     @property
     def planner(self) -> Planner:
@@ -271,7 +246,7 @@ class Session:
 
         **Raises:** `ValueError` for fewer than two images.
         """
-        return self._mount_error.alignment()
+        return self._intake.mount_error.alignment()
 
     @property
     def episode(self) -> Episode:
@@ -320,14 +295,14 @@ class Session:
             image = image.with_robot(self.ignore, self.camera, Pose.from_matrix(image.matrix, self.convention))
         with self._rehearsing, self._alone() as folder:
             looks_for_table = count == 0 and self.planner.obstacles is None
-            self._add(image, folder)
+            self._add(image, lambda: None if folder is None else folder.store_image(count, image))
         if len(self.views) == count:
             warn_of_blank()
             return
-        if looks_for_table and self._table is not None:
-            warn_of_table(self._table, self.frame)
+        if looks_for_table and self._intake.table is not None:
+            warn_of_table(self._intake.table, self.frame)
         elif looks_for_table:
-            warn_of_no_table(self.frame.up, self._other_ups)
+            warn_of_no_table(self.frame.up, self._intake.other_ups)
         cameras = np.stack([np.asarray(self.frame.to_world(view.pose).position) for view in self.views])
         candidates = self.frame.to_world(self.planner.search.poses_around()).position
         warn_of_inside(self.box, cameras, np.asarray(candidates))
@@ -337,7 +312,7 @@ class Session:
         if self.correct_mount:
             self._correct()
         elif self.correct_mount is not None and not self._warned_of_mount:
-            self._warned_of_mount = self._mount_error.warns()
+            self._warned_of_mount = self._intake.mount_error.warns()
 
     @own_settings()
     def next(self, seconds: float = math.inf) -> NextView:
@@ -400,86 +375,21 @@ class Session:
         """What `next` gave since the last image; None where it was not asked yet."""
         return self._next
 
-    def _placed(self, planner: Planner, matrices: np.ndarray | None, obstacles: Obstacles | None) -> Planner:
-        """The planner at this sensor and box, in scene coordinates."""
-        sampler, search = planner.sampler.within(self.frame.to_scene(self.box)), planner.search
-        sampler = dataclasses.replace(sampler, model=sampler.model.in_scene(self.frame))
-        if matrices is None:
-            search = search.above()
-        else:
-            search = search.among(self.frame.to_scene(Pose.from_matrix(matrices, self.convention)))
-        rows, columns = planner.camera.height, planner.camera.width
-        return dataclasses.replace(
-            planner,
-            search=search,
-            camera=self.frame.to_scene(self.camera).resized(rows, columns),
-            sampler=sampler,
-            cost=None if planner.cost is None else planner.cost.in_world(self.frame),
-            obstacles=planner.obstacles if obstacles is None else obstacles.in_scene(self.frame),
-        )
-
-    def _no_clutter(self) -> Clutter | None:
-        """None where the caller has said what stands around the object."""
-        if self._given_planner.obstacles is not None:
-            return None
-        reach = float(np.abs(np.asarray(self._given_planner.search.poses_around().position)).max())
-        return Clutter.empty(reach + float(Obstacles().clearance), self.frame.to_scene(self.box))
-
-    def _add(self, image: Image, folder: SessionFolder | None) -> None:
-        """An image as a view, stored in the folder once the loop accepts it. The first may show what the object stands
-        on, by which the planner is another."""
-        index, loop, room = len(self.views), self._loop, self.box
-        image.check_moved(self._images)
-        pose = self._mount_error.pose(image, index)
-        clean = image.cleaned(self.camera, pose, self.box)
-        if (carving := loop.planner.sampler.carving) is not None:
-            room = carving.with_room(room, loop.planner.sampler.grid, self.frame)
-        with warnings.catch_warnings():
-            if index == 0:
-                warnings.simplefilter("error", NothingInside)
-            try:
-                cloud = clean.cloud(self.camera, pose, self.stride, room)
-            except NothingInside as problem:
-                raise InputError(f"the first image shows nothing of the box: {problem}") from problem
-        if index > 0 and image.is_blank(cloud):
-            return
-        if index == 0 and loop.planner.obstacles is None:
-            whole = clean.cloud(self.camera, pose, self.stride)
-            self._table = table_under(self.frame.to_scene(whole), self.frame.to_scene(self.box))
-            if self._table is None:
-                self._other_ups = other_ups(whole, self.box, self.frame.up)
-            # Without a table there still are the points of D, which cameras keep clear of.
-            loop = loop.emptied(dataclasses.replace(loop.planner, obstacles=self._table or Obstacles()))
-        if image.mask is not None:
-            cloud = only_where(cloud, image.mask, self.camera, self.stride)
-        if image.robot is not None or image.mask is not None:
-            shows_any = index > 0 or bool(cloud.mask.any())
-            require(shows_any, "the first image shows nothing of the box at the pixels of the mask, or all is ignored")
-        scan = self.frame.to_scene(cloud)
-        if (obstacles := loop.planner.obstacles) is not None:
-            scan = obstacles.remove_points(scan)
-
-        def store() -> None:
-            if folder is not None:
-                folder.store_image(index, image)
-
-        loop.add(self.frame.to_scene(pose), scan, accepted=store)
-        if self._clutter is not None and obstacles is not None:
-            self._clutter = self._clutter.with_image(clean, self.camera, pose, self.frame, obstacles)
-            loop = loop.with_clutter(self._clutter.solid())
-        self._mount_error.show(clean, index)
-        self._loop, self._next, self._images = loop, None, (*self._images, image)
+    def _add(self, image: Image, accepted: Callable[[], None] = lambda: None) -> None:
+        """Add a view, unless the image is blank."""
+        if (loop := self._intake.add(self._loop, image, accepted)) is not None:
+            self._loop, self._next = loop, None
 
     def _correct(self) -> None:
         """Add the images again where they tell that cameras were elsewhere."""
-        if not self._mount_error.update():
+        if not self._intake.mount_error.update():
             return
-        images, views = self._images, self.views
-        self._loop, self._images, self._clutter = self._loop.emptied(self._given_planner), (), self._no_clutter()
+        images, views = self._intake.images, self.views
+        self._loop, self._intake = self._loop.emptied(self._given_planner), self._intake.emptied()
         for image, view in zip(images, views, strict=True):
             if view.proposal is not None:
                 self._loop.resume(view.proposal)
-            self._add(image, None)
+            self._add(image)
 
     def _read(self, folder: SessionFolder) -> None:
         """The images of the folder and the proposals that they followed; the proposal after the last one."""
@@ -489,7 +399,7 @@ class Session:
                 self._loop.resume(stored)
                 self._next = self._next_of(stored)
             if index < count:
-                self._add(folder.image(index), None)
+                self._add(folder.image(index))
                 if self.correct_mount:
                     self._correct()
 
@@ -502,7 +412,7 @@ class Session:
 
     def _matrices(self, poses: Pose) -> Float[np.ndarray, "n 4 4"]:
         """What to send the camera to for it to stand at poses of the scene."""
-        sent = self._mount_error.sent(self.frame.to_world(poses))
+        sent = self._intake.mount_error.sent(self.frame.to_world(poses))
         return np.asarray(sent.to_matrix(self.convention), np.float64)
 
     @property
@@ -545,18 +455,3 @@ class Session:
             return
         with self._folder.writing(len(self.views)):
             yield self._folder
-
-
-def usual_planner() -> Planner:
-    """What a session plans by where nothing else is given."""
-    return Planner(
-        NewSurface(), DiscreteSearch(), Camera(height=24, width=32), SurfaceSampler(num_samples=_SAMPLES), capacity=2000
-    )
-
-
-def box_of(corners) -> Box:
-    """**Raises:** `ValueError` for what is neither a `Box` nor two corners."""
-    if isinstance(corners, Box):
-        return corners
-    require(np.shape(corners) == (2, 3), f"the box is {shown(corners)}; give two corners, (low, high), or a Box")
-    return Box(*(as_numbers(corner, "a corner of the box", np.float64) for corner in corners))

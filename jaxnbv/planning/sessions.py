@@ -20,7 +20,8 @@ from jaxnbv.geometry.volume import Box
 from jaxnbv.planning.images import Image, stride_of
 from jaxnbv.planning.mount import MountError
 from jaxnbv.planning.planner import Planner
-from jaxnbv.planning.session import Session, box_of
+from jaxnbv.planning.session import Session
+from jaxnbv.planning.session_scene import box_of
 from jaxnbv.planning.stopping import StopRule
 from jaxnbv.planning.table import plane_of, table_under
 from jaxnbv.scanning import Obstacles

@@ -104,7 +104,7 @@ def test_a_post_beside_the_box_hides_it_and_keeps_cameras_away(is_robot):
     scale = float(session.frame.scale)
     places = np.asarray(session.frame.to_scene(np.array([[0.33, -0.1, 0.2], [0.5, -0.1, 0.2], FIRST[:3, 3]])))
     at_face, beside, far = np.asarray(clutter(places), np.float64) / scale
-    cell = session._clutter.spacing / scale
+    cell = session._intake.clutter.spacing / scale
     assert at_face < 0.5 * cell
     # By the solid's own distances, to a cell.
     for distance, place in ((beside, [0.5, -0.1, 0.2]), (far, FIRST[:3, 3])):

@@ -1,0 +1,106 @@
+"""Images of a session as views: what each shows of the object, where its camera was, and what else stands there."""
+
+import copy
+import dataclasses
+import warnings
+from collections.abc import Callable
+
+import numpy as np
+
+from jaxnbv.checks import InputError, require
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.depth_image import NothingInside
+from jaxnbv.geometry.frame import Frame
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.geometry.volume import Box
+from jaxnbv.planning.clutter import Clutter
+from jaxnbv.planning.images import Image, only_where, stride_of
+from jaxnbv.planning.loop import Loop
+from jaxnbv.planning.mount import MountError
+from jaxnbv.planning.planner import Planner
+from jaxnbv.planning.table import other_ups, table_under
+from jaxnbv.scanning import Obstacles
+
+
+class Intake:
+    """The images so far, and what they told about the place.
+
+    - `camera`, `box`, `convention`: those of the session, in world units; `frame`: from its world to the scene.
+    - `planner`: in scene coordinates. If it has no obstacles, the first image is searched for a table, and all images
+      for clutter.
+    """
+
+    def __init__(self, camera: Camera, box: Box, frame: Frame, convention: str, planner: Planner):
+        self.camera, self.box, self.frame, self.convention, self.planner = camera, box, frame, convention, planner
+        self.stride = stride_of(camera)
+        self.images: tuple[Image, ...] = ()
+        self.mount_error = MountError(camera, convention)
+        self.table: Obstacles | None = None
+        # Axes under which there is a table, if there is none by the session's own.
+        self.other_ups: tuple[str, ...] = ()
+        self.clutter = self._no_clutter()
+
+    def emptied(self) -> "Intake":
+        """Without its images, to add them again by the mount's corrections, which stay."""
+        intake = copy.copy(self)
+        intake.images, intake.clutter = (), self._no_clutter()
+        return intake
+
+    def add(self, loop: Loop, image: Image, accepted: Callable[[], None] = lambda: None) -> Loop | None:
+        """The loop with one more view; None for a later image that measured nothing.
+
+        - `accepted`: is called once nothing can refuse the image, before it is added.
+
+        **Raises:** `ValueError` as `Session.add` does. Nothing is changed then.
+        """
+        index = len(self.images)
+        image.check_moved(self.images)
+        pose = self.mount_error.pose(image, index)
+        clean = image.cleaned(self.camera, pose, self.box)
+        cloud = self._cloud(clean, pose, is_first=index == 0)
+        if index > 0 and image.is_blank(cloud):
+            return None
+        table, ups = self.table, self.other_ups
+        if index == 0 and self.planner.obstacles is None:
+            whole = clean.cloud(self.camera, pose, self.stride)
+            table = table_under(self.frame.to_scene(whole), self.frame.to_scene(self.box))
+            ups = other_ups(whole, self.box, self.frame.up) if table is None else ()
+            # Without a table there still are the points of D, which cameras keep clear of.
+            loop = loop.emptied(dataclasses.replace(self.planner, obstacles=table or Obstacles()))
+        if image.mask is not None:
+            cloud = only_where(cloud, image.mask, self.camera, self.stride)
+        if image.robot is not None or image.mask is not None:
+            shows_any = index > 0 or bool(cloud.mask.any())
+            require(shows_any, "the first image shows nothing of the box at the pixels of the mask, or all is ignored")
+        obstacles, scan = loop.planner.obstacles, self.frame.to_scene(cloud)
+        loop.add(self.frame.to_scene(pose), scan if obstacles is None else obstacles.remove_points(scan), accepted)
+        if self.clutter is not None and obstacles is not None:
+            self.clutter = self.clutter.with_image(clean, self.camera, pose, self.frame, obstacles)
+            loop = loop.with_clutter(self.clutter.solid())
+        self.mount_error.show(clean, index)
+        self.images, self.table, self.other_ups = (*self.images, image), table, ups
+        return loop
+
+    def _cloud(self, image: Image, pose: Pose, is_first: bool) -> PointCloud:
+        """What an image shows of the box, and of the room about it that the planner asks for.
+
+        **Raises:** `ValueError` if the first image shows nothing of the box.
+        """
+        room, sampler = self.box, self.planner.sampler
+        if sampler.carving is not None:
+            room = sampler.carving.with_room(room, sampler.grid, self.frame)
+        with warnings.catch_warnings():
+            if is_first:
+                warnings.simplefilter("error", NothingInside)
+            try:
+                return image.cloud(self.camera, pose, self.stride, room)
+            except NothingInside as problem:
+                raise InputError(f"the first image shows nothing of the box: {problem}") from problem
+
+    def _no_clutter(self) -> Clutter | None:
+        """None where the caller has said what stands around the object."""
+        if self.planner.obstacles is not None:
+            return None
+        reach = float(np.abs(np.asarray(self.planner.search.poses_around().position)).max())
+        return Clutter.empty(reach + float(Obstacles().clearance), self.frame.to_scene(self.box))

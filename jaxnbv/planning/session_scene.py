@@ -1,0 +1,62 @@
+"""A session's box and planner, in the coordinates of its scene."""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxnbv.checks import as_numbers, require, shown
+from jaxnbv.geometry.camera import Camera
+from jaxnbv.geometry.frame import Frame
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.geometry.volume import Box
+from jaxnbv.planning.planner import Planner
+from jaxnbv.sampler import SurfaceSampler
+from jaxnbv.scanning import Obstacles
+from jaxnbv.search import DiscreteSearch
+from jaxnbv.tasks import NewSurface
+
+# On recordings twice as many showed no more.
+_SAMPLES = 8
+
+
+def usual_planner() -> Planner:
+    """What a session plans by where nothing else is given."""
+    return Planner(
+        NewSurface(), DiscreteSearch(), Camera(height=24, width=32), SurfaceSampler(num_samples=_SAMPLES), capacity=2000
+    )
+
+
+def box_of(corners) -> Box:
+    """**Raises:** `ValueError` for what is neither a `Box` nor two corners."""
+    if isinstance(corners, Box):
+        return corners
+    require(np.shape(corners) == (2, 3), f"the box is {shown(corners)}; give two corners, (low, high), or a Box")
+    return Box(*(as_numbers(corner, "a corner of the box", np.float64) for corner in corners))
+
+
+def in_scene(
+    planner: Planner,
+    camera: Camera,
+    box: Box,
+    frame: Frame,
+    convention: str,
+    matrices: Float[np.ndarray, "n 4 4"] | None,
+    obstacles: Obstacles | None,
+) -> Planner:
+    """The planner at a sensor and a box, in scene coordinates.
+
+    - `camera`, `box`, `matrices`, `obstacles`: as a `Session` gets them, in world units; None for the planner's own.
+    """
+    search = planner.search.above()
+    if matrices is not None:
+        search = planner.search.among(frame.to_scene(Pose.from_matrix(matrices, convention)))
+    sampler = planner.sampler.within(frame.to_scene(box))
+    return dataclasses.replace(
+        planner,
+        search=search,
+        camera=frame.to_scene(camera).resized(planner.camera.height, planner.camera.width),
+        sampler=dataclasses.replace(sampler, model=sampler.model.in_scene(frame)),
+        cost=None if planner.cost is None else planner.cost.in_world(frame),
+        obstacles=planner.obstacles if obstacles is None else obstacles.in_scene(frame),
+    )
