@@ -6,14 +6,14 @@ OpenCV convention: in the camera's own frame x points right, y down and z forwar
 import dataclasses
 import math
 import warnings
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnbv.checks import AnyArray, as_numbers, check_fields, checked, require
+from jaxnbv.checks import AnyArray, as_numbers, check_fields, checked, is_traced, require
 from jaxnbv.geometry.distortion import check_distortion
 from jaxnbv.geometry.pose import Pose
 
@@ -27,6 +27,13 @@ _SKEW = 1e-6
 _WIDEST, _OFF_CENTER = math.tan(math.radians(70.0)), 0.2
 # Where both shares of the principal point are this large, the image is a part of what the matrix is for.
 _SURELY = 0.96
+
+
+def _limit(depth: Any) -> Any:
+    """A limit of the range as an array, so that what is compiled for one scale of a scene runs for any. No limit stays
+    0.0 or None, which programs may ask for."""
+    is_number = isinstance(depth, int | float) and not isinstance(depth, bool) and depth != 0
+    return np.float64(depth) if is_number else depth
 
 
 class Camera(eqx.Module):
@@ -52,8 +59,8 @@ class Camera(eqx.Module):
     width: int = eqx.field(static=True, default=50)
     aspect: float = eqx.field(static=True, default=1.0)
     center: tuple[float, float] = eqx.field(static=True, default=(0.5, 0.5))
-    nearest: float = eqx.field(static=True, default=0.0)
-    farthest: float | None = eqx.field(static=True, default=None)
+    nearest: float = eqx.field(converter=_limit, default=0.0)
+    farthest: float | None = eqx.field(converter=_limit, default=None)
     max_incidence: float = eqx.field(static=True, default=0.5 * math.pi)
     distortion: tuple[float, ...] = eqx.field(static=True, default=())
 
@@ -64,7 +71,8 @@ class Camera(eqx.Module):
             require(side >= 1, f"the camera has {self.height} x {self.width} pixels; it needs at least one")
         require(self.aspect > 0, f"the aspect of the pixels is {self.aspect}; it must be positive")
         require(
-            0 <= self.nearest < (math.inf if self.farthest is None else self.farthest),
+            is_traced(self.nearest, self.farthest)
+            or 0 <= self.nearest < (math.inf if self.farthest is None else self.farthest),
             f"the camera measures from {self.nearest} to {self.farthest}: give depths of which the second is greater",
         )
         require(
@@ -164,7 +172,7 @@ class Camera(eqx.Module):
     @property
     def limited(self) -> bool:
         """Whether the sensor has a range, or an angle beyond which hits do not return."""
-        return self.nearest > 0 or self.farthest is not None or self.max_incidence < 0.5 * math.pi
+        return is_traced(self.nearest) or bool(self.nearest > 0) or self.farthest is not None or self.max_incidence < 0.5 * math.pi
 
     def pixel_directions(self) -> Float[Array, "rays 3"]:
         """Directions through the pixel centres in the camera's frame, scaled so that z = 1; row by row."""

@@ -316,3 +316,22 @@ def test_a_batch_of_poses_is_iterated_once():
     for pose, again in zip(poses, [poses[0], poses[1], poses[-1]], strict=True):
         np.testing.assert_array_equal(pose.position, again.position)
     assert [len(list(row)) for row in nbv.look_at(np.ones((2, 3, 3)))] == [3, 3]
+
+
+def test_a_program_for_one_range_runs_for_any():
+    """A session's range is in scene units, which another box changes."""
+    traces = []
+
+    @eqx.filter_jit
+    def measures(camera, depth):
+        traces.append(camera.limited)
+        strided = camera.strided(2)
+        return (depth >= strided.nearest) & (depth <= strided.farthest)
+
+    depth = jnp.array([0.1, 0.25, 1.0, 2.5, 4.0])
+    for nearest, farthest in ((0.2, 2.0), (0.3, 3.0), (0.05, 9.0)):
+        camera = nbv.Camera(height=4, width=4, nearest=nearest, farthest=farthest)
+        expected = (np.asarray(depth) >= nearest) & (np.asarray(depth) <= farthest)
+        np.testing.assert_array_equal(measures(camera, depth), expected)
+    assert traces == [True]
+    assert not nbv.Camera().limited
