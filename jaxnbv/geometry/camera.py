@@ -172,7 +172,8 @@ class Camera(eqx.Module):
     @property
     def limited(self) -> bool:
         """Whether the sensor has a range, or an angle beyond which hits do not return."""
-        return is_traced(self.nearest) or bool(self.nearest > 0) or self.farthest is not None or self.max_incidence < 0.5 * math.pi
+        has_range = is_traced(self.nearest) or bool(self.nearest > 0) or self.farthest is not None
+        return has_range or self.max_incidence < 0.5 * math.pi
 
     def pixel_directions(self) -> Float[Array, "rays 3"]:
         """Directions through the pixel centres in the camera's frame, scaled so that z = 1; row by row."""
