@@ -2,11 +2,13 @@
 
 import threading
 
-import jax
 import numpy as np
 import pytest
 from small_session import BOX, FIRST, POSES, planner_of, session_of, shot
 
+import jaxnbv.geometry.depth_image as depth_image
+import jaxnbv.planning.planner as planner_module
+import jaxnbv.sampler as sampler_module
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import look_at
 from jaxnbv.geometry.volume import Box
@@ -31,6 +33,12 @@ def test_the_image_is_of_a_ball_on_a_table():
     assert on_ball[past < 0.39].all()
 
 
+def sizes():
+    """How many programs were compiled of each function that takes long to compile."""
+    functions = planner_module._propose, sampler_module._sample, depth_image._oriented
+    return [function._cached._cache_size() for function in functions]
+
+
 @pytest.fixture(scope="module")
 def rehearsed():
     """Of an image size that no other test has."""
@@ -41,18 +49,17 @@ def rehearsed():
 
 def test_a_session_is_as_before_and_compiles_little_afterwards(rehearsed):
     session, rehearsal = rehearsed
-    assert rehearsal.programs > 10
+    assert rehearsal.programs > 0
     assert str(rehearsal).startswith(f"{rehearsal.programs} programs in ")
     assert session.views == ()
     assert session.next_view is None
-    count, event = [], "/jax/core/compile/backend_compile_duration"
-    listen = lambda name, seconds, **_: count.append(name == event)  # noqa: E731
-    jax.monitoring.register_event_duration_secs_listener(listen)
+    before = sizes()
+    assert min(before) > 0
     with pytest.warns(UserWarning, match="taken for a table"):
         session.add(shot(FIRST), FIRST, depth_scale=1e-3)
     first = session.next()
-    jax.monitoring.unregister_event_duration_listener(listen)
-    assert sum(count) < 0.3 * rehearsal.programs
+    # Nothing large is compiled for the image and its proposal.
+    assert sizes() == before
     again = session_of(planner=planner_of(DiscreteSearch(14), num_samples=2, capacity=390), obstacles=None, poses=None)
     with pytest.warns(UserWarning, match="taken for a table"):
         again.add(shot(FIRST), FIRST, depth_scale=1e-3)
@@ -61,11 +68,14 @@ def test_a_session_is_as_before_and_compiles_little_afterwards(rehearsed):
     assert session.rehearse().programs == 0
 
 
-def test_an_image_waits_for_a_rehearsal_in_a_thread(rehearsed):
+def test_an_image_waits_until_a_rehearsal_ends():
     session = session_of(poses=POSES, box=BOX)
-    thread = threading.Thread(target=session.rehearse)
-    thread.start()
-    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
-    assert not thread.is_alive() or not session._rehearsing.acquire(blocking=False)
-    thread.join()
+    adding = threading.Thread(target=session.add, args=(shot(FIRST), FIRST, 1e-3))
+    # As in `rehearse`.
+    with session._rehearsing:
+        adding.start()
+        adding.join(0.3)
+        assert adding.is_alive()
+        assert session.views == ()
+    adding.join()
     assert len(session.views) == 1
