@@ -66,7 +66,8 @@ class Obstacles(eqx.Module):
 
     def with_clutter(self, clutter: SignedDistance | None) -> "Obstacles":
         """The same solids with other clutter, None for none."""
-        return dataclasses.replace(self, clutter=clutter)
+        # Runs under jit, where a new one would convert its lengths.
+        return eqx.tree_at(lambda known: known.clutter, self, clutter, is_leaf=lambda leaf: leaf is None)
 
     def distance(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         """Signed distance to the nearest solid, infinite where there is none."""
