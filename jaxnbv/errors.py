@@ -12,9 +12,11 @@ EXTRAS = {
     "PIL": "report",
     "plotly": "report",
     "jinja2": "report",
+    "distributed": "cluster",
     "loky": "heat",
     "robust_laplacian": "heat",
     "pandas": "studies",
+    "threadpoolctl": "cluster",
     "viser": "view",
 }
 """Which extra brings what a part of the package needs beyond the dependencies that all of it has."""

@@ -10,14 +10,16 @@ import threading
 import time
 import types
 import weakref
+from pathlib import Path
 from unittest import mock
 
 import numpy as np
 import pytest
 import trimesh
+import typer
 from commands import run_command, run_process
 
-from jaxnbv.cli import play
+from jaxnbv.cli import app, play
 from jaxnbv.cli.tasks import TASKS
 from jaxnbv.planning.loop import Step
 from jaxnbv.viz import Sketches
@@ -46,6 +48,13 @@ def test_demo_leaves_an_episode_and_a_report(finished):
     assert str(out.relative_to(folder) / "report.html") in result.stdout
     config = json.loads((out / "episode.json").read_text())["config"]
     assert config["planner"]["search"]["type"].endswith(":HalvingSearch")
+
+
+def test_an_option_for_several_folders_takes_all_words_up_to_the_next():
+    words = ["pyramid", "--join", "a", "b", "--quick", "--join", "c", "--workers", "2"]
+    values = typer.main.get_command(app).commands["study"].make_context("study", words).params
+    assert values["join"] == [Path("a"), Path("b"), Path("c")]
+    assert (values["name"], values["quick"], values["workers"]) == ("pyramid", True, 2)
 
 
 @pytest.mark.slow
@@ -138,6 +147,8 @@ def test_run_takes_a_mesh_each_search_and_each_model(search, model, tmp_path):
         (("study", "parts", "--method", "halved:it"), ("halved:it", "SyntaxError")),
         (("study", "parts", "--method", ".mine:it"), (".mine:it", "cannot be found")),
         (("study", "reconstruction", "--meshes", "occupied"), ("occupied", "no mesh")),
+        (("study", "pyramid", "--quick", "--cluster", "here"), ("here", "dask scheduler")),
+        (("study", "pyramid", "--quick", "--join", "occupied", "lost"), ("occupied", "no records of this study")),
     ],
 )
 def test_bad_input_is_one_line_that_names_the_value_and_the_remedy(arguments, words, tmp_path):

@@ -116,7 +116,7 @@ def check_extras(arguments: list[str]) -> None:
 
 CHECKS = {"jaxnbv": parse, "python": check_script, "python3": check_script, "pip": check_extras, "uv": check_extras}
 # Programs of others, whose options are not looked at.
-OTHERS = {"mkdir", "tar", "cp", "ruff", "mypy", "pytest", "sphinx-build"}
+OTHERS = {"mkdir", "tar", "cp", "ruff", "mypy", "pytest", "sphinx-build", "dask"}
 
 
 @pytest.mark.parametrize("page", DOCUMENTS)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
+from test_documents import parse
 
 import jaxnbv as nbv
 from jaxnbv.networks import pretrained_classifier, save_checkpoint
@@ -79,8 +80,31 @@ def before_pytorch(monkeypatch):
     save_checkpoint(pretrained_classifier("pyramid", num_points=64).network, "net.safetensors")
 
 
+def before_cluster(monkeypatch):
+    """Clusters that nobody has started, and a command that is not run."""
+
+    class Started:
+        scheduler_address = "tcp://HOST:8786"
+
+        def __init__(self, **settings):
+            assert "NPROC" in str(settings)
+
+        def adapt(self, maximum_jobs):
+            assert maximum_jobs > 1
+
+        def close(self):
+            pass
+
+    stand_in(monkeypatch, "dask_jobqueue", SLURMCluster=Started)
+    stand_in(monkeypatch, "dask_kubernetes")
+    stand_in(monkeypatch, "dask_kubernetes.operator", KubeCluster=Started)
+    monkeypatch.setenv("NPROC", "")
+    monkeypatch.setattr("subprocess.run", lambda words, check: parse(words[1:]))
+
+
 # What a page leaves to its reader.
 BEFORE = {
+    "how_to/cluster.md": before_cluster,
     "how_to/mesh.md": before_mesh,
     "how_to/pytorch_classifier.md": before_pytorch,
 }

@@ -8,6 +8,7 @@ import typer
 
 import jaxnbv
 from jaxnbv.cli.background import end_process, is_working
+from jaxnbv.cli.options import Command
 from jaxnbv.cli.streams import write_readable
 from jaxnbv.compiled import keep_compiled
 from jaxnbv.errors import InputError, explained_imports
@@ -58,7 +59,7 @@ def _add_commands() -> None:
     named = {point.name: point for point in sorted(entry_points(group="jaxnbv.commands"), key=_is_own)}
     for point in sorted(named.values(), key=lambda point: (not _is_own(point), point.name)):
         try:
-            app.command(point.name)(point.load())
+            app.command(point.name, cls=Command)(point.load())
         # Whatever a module of somebody else does as it is imported.
         except (Exception, SystemExit) as error:
             package = point.dist.name if point.dist else point.module

@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any, TypeAlias, TypeVar, get_type_hints
 
 import typer
+from typer.core import TyperCommand
 
 Position: TypeAlias = tuple[float, float, float]
 T = TypeVar("T")
@@ -46,6 +47,24 @@ def command(options: type[T], more: Mapping[str, Any] = {}) -> Callable[[Callabl
         return call
 
     return decorate
+
+
+class Command(TyperCommand):
+    """A command that reads `--option A B` as `--option A --option B` where the option's metavar ends in dots: a shell
+    writes out a pattern of files as several words."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """The words that are left, as in click."""
+        several = {flag for one in self.params if str(one.metavar).endswith("...") for flag in one.opts}
+        words: list[str] = []
+        flag = None
+        for word in args:
+            if word.startswith("-"):
+                flag = word if word in several else None
+            elif flag and words[-1] != flag:
+                words.append(flag)
+            words.append(word)
+        return super().parse_args(ctx, words)
 
 
 _EMPTY = inspect.Parameter.empty

@@ -4,7 +4,9 @@ import functools
 import os
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from concurrent.futures import Executor
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,9 @@ from jaxnbv.cli.study_options import StudyOptions
 from jaxnbv.storage import describe
 from jaxnbv.storage.files import write_bytes, write_text
 from jaxnbv.studies.engine.chart import CHART, chart
+from jaxnbv.studies.engine.cluster import Cluster
 from jaxnbv.studies.engine.pictures import write_pictures
+from jaxnbv.studies.engine.processes import Processes
 from jaxnbv.studies.engine.records import RecordFolder
 from jaxnbv.studies.engine.results import results, summary
 from jaxnbv.studies.engine.run import Factory, methods_of, run_scene
@@ -47,29 +51,55 @@ def run_study(options: StudyOptions, **of_studies: Any) -> None:
         scenes = scenes[: kind.quick_scenes]
     failures: dict[str, str] = {}
     count = 0
-    for part, study in kind.configured(model, options.views or entry.views, options.quick, **given).items():
-        arrays: dict[str, np.ndarray] = {}
-        config = {"study": describe(study, arrays, "study"), "methods": sorted(methods)}
-        config |= {"own": {text: describe(make) for text, make in own.items()}} if own else {}
-        there = scenes if study.num_scenes is None else [index for index in scenes if index < study.num_scenes]
-        run = functools.partial(run_scene, study, methods=methods, own=own)
-        held = RecordFolder(folder / part, config, options.workers, arrays)
-        records = held.collect(there, run)
-        failures |= {f"{part} scene {index}".strip(): error for index, error in held.failures(there).items()}
-        count += len(there)
-        if records:
-            table = results(records, type(study))
-            write_text(folder / part / "results.csv", table.round(6).to_csv(index=False))
-            write_bytes(folder / part / CHART, chart(table, type(study)))
-            write_pictures(records, study, folder / part)
-            typer.echo(f"\n{f'{part}. ' if part else ''}{summary(table, type(study))}")
-            typer.echo(f"All tables as CSV, chart and pictures: {folder / part}\n")
+    studies_by_part = kind.configured(model, options.views or entry.views, options.quick, **given)
+    sources = _sources(options.join or (), studies_by_part)
+    with _executor(options) as executor:
+        for part, study in studies_by_part.items():
+            arrays: dict[str, np.ndarray] = {}
+            config = {"study": describe(study, arrays, "study"), "methods": sorted(methods)}
+            config |= {"own": {text: describe(make) for text, make in own.items()}} if own else {}
+            there = scenes if study.num_scenes is None else [index for index in scenes if index < study.num_scenes]
+            run = functools.partial(run_scene, study, methods=methods, own=own)
+            held = RecordFolder(folder / part, config, executor, arrays)
+            held.join(sources[part])
+            records = held.collect(there, run)
+            failures |= {f"{part} scene {index}".strip(): error for index, error in held.failures(there).items()}
+            count += len(there)
+            if records:
+                table = results(records, type(study))
+                write_text(folder / part / "results.csv", table.round(6).to_csv(index=False))
+                write_bytes(folder / part / CHART, chart(table, type(study)))
+                write_pictures(records, study, folder / part)
+                typer.echo(f"\n{f'{part}. ' if part else ''}{summary(table, type(study))}")
+                typer.echo(f"All tables as CSV, chart and pictures: {folder / part}\n")
     if failures:
         where, error = next(iter(failures.items()))
         raise InputError(
             f"{len(failures)} of {count} scenes failed, the first {where} ({error}): {folder} has scene_*.failed that "
             "tell how, and the same command tries them again"
         )
+
+
+def _executor(options: StudyOptions) -> AbstractContextManager[Executor | None]:
+    """What runs the scenes; None for this process."""
+    require(
+        options.cluster is None or options.workers == 1,
+        f"--workers {options.workers} and --cluster {options.cluster} exclude each other: leave one out",
+    )
+    if options.cluster is not None:
+        return Cluster(options.cluster)
+    return nullcontext() if options.workers == 1 else Processes(options.workers)
+
+
+def _sources(folders: Iterable[Path], parts: Iterable[str]) -> dict[str, list[Path]]:
+    """The folders of records to join, by the part of the study that they are of."""
+    sources = {part: [folder / part for folder in folders if (folder / part / "study.json").exists()] for part in parts}
+    for folder in folders:
+        require(
+            any(folder / part in sources[part] for part in sources),
+            f"--join {folder} holds no records of this study: give folders that the same command wrote (--out)",
+        )
+    return sources
 
 
 def _given(name: str, entry: Entry, of_studies: dict[str, Any]) -> dict[str, Any]:

@@ -64,3 +64,19 @@ class StudyOptions:
         bool, running("--quick", help="Small settings and few scenes: minutes, and not the full study.")
     ] = False
     workers: Annotated[int, running(min=1, help="Scenes at a time, in as many processes, which share the cores.")] = 1
+    cluster: Annotated[
+        str | None,
+        running(
+            metavar="tcp://HOST:PORT",
+            help="Address of a Dask scheduler. Its workers run the scenes; this process writes the records.",
+            show_default=False,
+        ),
+    ] = None
+    join: Annotated[
+        list[Path] | None,
+        running(
+            metavar="FOLDER...",
+            help="Output folders of the same study, whose records are first copied into this run's.",
+            show_default=False,
+        ),
+    ] = None

@@ -32,9 +32,16 @@ def software() -> dict[str, str]:
     return {name: importlib.metadata.version(name) for name in names}
 
 
-def versions(cores: int | None = None) -> dict[str, Any]:
-    """Versions of what the numbers depend on, the kind of device, and the cores that share a sum, by default all."""
-    return software() | {"device": jax.devices()[0].device_kind, "cores": cores or os.cpu_count()}
+def num_threads() -> int:
+    """Threads among which XLA splits a sum on a CPU: NPROC, or else the cores that this process may use."""
+    if threads := os.environ.get("NPROC"):
+        return int(threads)
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def versions() -> dict[str, Any]:
+    """What the last bits of this process's numbers depend on: software, kind of device, and number of threads."""
+    return software() | {"device": jax.devices()[0].device_kind, "cores": num_threads()}
 
 
 def differences(found: Any, asked: Any, name: str = "") -> list[str]:
@@ -149,7 +156,6 @@ class ResultFolder:
     """A folder, and the configuration that its results have: a record, written with the first of them.
 
     - `config`: what JSON can say, see `jaxnbv.storage.describe`.
-    - `cores`: how many share a sum, by default all.
     - `arrays`: contents of its large arrays by their hashes, kept in arrays.npz.
 
     A subclass says of what `kind` its results are, after which the record is named, the `pattern` of their names, and
@@ -163,14 +169,11 @@ class ResultFolder:
     format: int
 
     def __init__(
-        self,
-        path: str | Path,
-        config: dict[str, Any],
-        cores: int | None = None,
-        arrays: Mapping[str, np.ndarray] = MappingProxyType({}),
+        self, path: str | Path, config: dict[str, Any], arrays: Mapping[str, np.ndarray] = MappingProxyType({})
     ):
-        self.path, self.config, self.cores = make_folder(path), json.loads(json.dumps(config)), cores
+        self.path, self.config = make_folder(path), json.loads(json.dumps(config))
         self.arrays = dict(arrays)
+        self.versions: dict[str, Any] = {}
         self.bound = False
         self._check()
 
@@ -185,10 +188,23 @@ class ResultFolder:
             self._check()
             yield
 
+    def set_versions(self, there: dict[str, Any]) -> None:
+        """Set the `versions` of the process that computes the results to come. Warns if the folder has others."""
+        self.versions = there
+        if not self.bound:
+            return
+        written = read_record(self.path, self.kind, "choose another output folder")
+        if other := differences(written.get("versions"), there):
+            warnings.warn(
+                f"{self.path} was begun with other versions ({'; '.join(other)}): new results may differ in their last "
+                "bits from those of an uninterrupted run",
+                stacklevel=3,
+            )
+
     def bind(self) -> None:
         """Write the record and its arrays, if they are not there, before the first result is."""
         if not self.bound:
-            record = {"format": self.format, "config": self.config, "versions": versions(self.cores)}
+            record = {"format": self.format, "config": self.config, "versions": self.versions}
             # The record first: arrays alone would be of nobody.
             write_text(self.path / f"{self.kind}.json", json.dumps(record, indent=2))
             if self.arrays:
@@ -216,11 +232,4 @@ class ResultFolder:
             f"the output folder {self.path} belongs to another {self.kind}; it differs in {'; '.join(changed[:3])}. "
             "Choose another folder, or remove this one",
         )
-        other = differences(written.get("versions"), versions(self.cores))
-        if other and not self.bound:
-            warnings.warn(
-                f"{self.path} was begun with other versions ({'; '.join(other)}): new results may differ in their last "
-                "bits from those of an uninterrupted run",
-                stacklevel=3,
-            )
         self.bound = True

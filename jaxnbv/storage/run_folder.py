@@ -31,7 +31,7 @@ from jaxnbv.geometry.pose import Pose
 from jaxnbv.search import Proposal, Trajectories
 from jaxnbv.storage.description import describe
 from jaxnbv.storage.files import write_whole
-from jaxnbv.storage.folders import ResultFolder, read_arrays, write_arrays
+from jaxnbv.storage.folders import ResultFolder, read_arrays, versions, write_arrays
 from jaxnbv.storage.rebuilding import read_config
 
 # What is stored as several arrays.
@@ -61,7 +61,8 @@ class RunFolder(ResultFolder):
         self.kind = kind
         arrays: dict[str, np.ndarray] = {}
         described = {name: describe(part, arrays, name) for name, part in config.items()}
-        super().__init__(path, described, arrays=arrays)
+        super().__init__(path, described, arrays)
+        self.set_versions(versions())
 
     @classmethod
     def config_of(cls, path: str | Path, kind: str, **given: Any) -> dict[str, Any]:

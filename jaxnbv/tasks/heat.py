@@ -1,6 +1,7 @@
 """Heat diffusion: where does a body that is heated at one place stay coldest?"""
 
 import math
+import multiprocessing
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -100,7 +101,8 @@ def _value(points: np.ndarray, heat: HeatProblem, reached_only: bool) -> float:
 
 
 def _map(function: Callable, clouds: list, problems: list, workers: int) -> list[float]:
-    if workers == 1 or len(clouds) == 1:
+    # A worker of Dask's is a daemon, which Python lets start no processes.
+    if workers == 1 or len(clouds) == 1 or multiprocessing.current_process().daemon:
         return list(map(function, clouds, problems))
     executor = optional("loky").get_reusable_executor(workers, timeout=_IDLE_SECONDS, env=_WORKER_ENVIRONMENT)
     return list(executor.map(function, clouds, problems, chunksize=math.ceil(len(clouds) / (4 * workers))))

@@ -4,7 +4,8 @@ import hashlib
 import json
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import Executor
 from contextlib import closing
 from pathlib import Path
 from types import MappingProxyType
@@ -15,9 +16,9 @@ import numpy as np
 from jaxnbv.checks import InputError, require
 from jaxnbv.progress import progress_bar
 from jaxnbv.storage.files import write_text
-from jaxnbv.storage.folders import ResultFolder, check_format, read_json
+from jaxnbv.storage.folders import ResultFolder, check_format, differences, read_json, read_record, versions
 from jaxnbv.studies.engine.measures import Record
-from jaxnbv.studies.engine.trials import Failure, Trial, cores_of, outcomes
+from jaxnbv.studies.engine.trials import Failure, Trial, outcomes
 
 _FAILED = ".failed"
 _FORMAT = 2
@@ -27,7 +28,8 @@ _NONE: Mapping[str, np.ndarray] = MappingProxyType({})
 class RecordFolder(ResultFolder):
     """A folder of records that belong to one configuration, kept beside them in study.json.
 
-    - `workers`: how many missing ones are made at a time.
+    - `executor`: an executor of `concurrent.futures` that runs the missing scenes, such as `Processes(8)` or a
+      `Cluster`. By default this process runs them, and it alone writes records.
     - `arrays`: the large arrays of the configuration, see `describe`.
 
     **Raises:** `ValueError` if the folder cannot be made or holds records of another configuration.
@@ -36,10 +38,14 @@ class RecordFolder(ResultFolder):
     kind, pattern, format = "study", "scene_*.json", _FORMAT
 
     def __init__(
-        self, path: str | Path, config: dict[str, Any], workers: int = 1, arrays: Mapping[str, np.ndarray] = _NONE
+        self,
+        path: str | Path,
+        config: dict[str, Any],
+        executor: Executor | None = None,
+        arrays: Mapping[str, np.ndarray] = _NONE,
     ):
-        self.workers = workers
-        super().__init__(path, config, cores_of(workers), arrays)
+        self.executor = executor
+        super().__init__(path, config, arrays)
 
     def collect(self, scenes: Sequence[int], run: Trial, progress: bool = True) -> list[Record]:
         """The records of these scenes, in order: those on disk as they are, the others from `run`, each written once it
@@ -52,8 +58,10 @@ class RecordFolder(ResultFolder):
         with self.writing():
             records = {index: _read(self._file(index), index) for index in scenes if self._file(index).exists()}
             missing = [index for index in scenes if index not in records]
+            if missing:
+                self.set_versions(versions() if self.executor is None else self.executor.submit(versions).result())
             bar = progress_bar(None, progress, True, total=len(scenes), initial=len(records), desc=self.path.name)
-            with bar, closing(outcomes(run, missing, self.workers)) as ended:
+            with bar, closing(outcomes(run, missing, self.executor)) as ended:
                 for index, outcome in ended:
                     if isinstance(outcome, Failure):
                         self._write_failure(index, outcome)
@@ -63,6 +71,33 @@ class RecordFolder(ResultFolder):
                     if progress and bar.disable:
                         print(f"{self.path.name}: scene {index} is done", file=sys.stderr, flush=True)
         return [records[index] for index in sorted(records)]
+
+    def join(self, folders: Iterable[str | Path]) -> None:
+        """Copy the records of folders into this one.
+
+        **Raises:** `ValueError` if a folder holds no records, or records of another configuration; for a record that is
+        damaged; and if a scene is in two folders with results that differ in more than the seconds they took.
+        """
+        with self.writing():
+            for folder in map(Path, folders):
+                self._join(folder)
+
+    def _join(self, folder: Path) -> None:
+        record = read_record(folder, self.kind, "leave it out")
+        check_format(record.get("format"), _FORMAT, folder / f"{self.kind}.json")
+        changes = differences(record["config"], self.config)
+        require(
+            not changes,
+            f"{folder} has other settings than {self.path}; it differs in {'; '.join(changes[:3])}: leave it out, or "
+            "join folders of the same command",
+        )
+        self.set_versions(record.get("versions", {}))
+        for index, file in _files(folder):
+            there, own = _read(file, index), self._file(index)
+            if not own.exists():
+                self._write(index, there)
+            elif changes := differences(_without_seconds(there), _without_seconds(_read(own, index))):
+                raise InputError(f"{file} and {own} differ in {'; '.join(changes[:3])}: delete the one that is wrong")
 
     def failures(self, scenes: Sequence[int]) -> dict[int, str]:
         """The errors of scenes that failed, a line each; beside the records, scene_*.failed has their tracebacks."""
@@ -91,12 +126,25 @@ def read_records(folder: str | Path) -> list[Record]:
 
     **Raises:** `ValueError` for a record that is damaged, or a file of a name that no record has.
     """
-    records = []
-    for file in sorted(Path(folder).glob("scene_*.json")):
+    return [_read(file, index) for index, file in _files(Path(folder))]
+
+
+def _files(folder: Path) -> list[tuple[int, Path]]:
+    files = []
+    for file in sorted(folder.glob(RecordFolder.pattern)):
         number = file.stem.removeprefix("scene_")
         require(number.isdecimal(), f"{file} is no record, which has the number of its scene: move it elsewhere")
-        records.append(_read(file, int(number)))
-    return records
+        files.append((int(number), file))
+    return files
+
+
+def _without_seconds(content: Any) -> Any:
+    """All but what was timed, at any depth."""
+    if isinstance(content, list):
+        return [_without_seconds(one) for one in content]
+    if isinstance(content, dict):
+        return {key: _without_seconds(value) for key, value in content.items() if key != "seconds"}
+    return content
 
 
 def _checksum(index: int, record: dict[str, Any]) -> str:

@@ -1,20 +1,12 @@
-"""How the trials of a study are run: one after the other, or several at a time in processes of their own."""
+"""How the trials of a study are run: one after the other in this process, or by an executor."""
 
-import os
-import threading
-import time
+import functools
 import traceback
-from collections import deque
 from collections.abc import Callable, Generator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, wait
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, wait
 from typing import NamedTuple, TypeAlias
 
-import loky
-from loky.process_executor import TerminatedWorkerError
-
 from jaxnbv.studies.engine.measures import Record
-
-_TRIES = 2
 
 
 class Failure(NamedTuple):
@@ -30,74 +22,37 @@ Outcome: TypeAlias = Record | Failure
 Outcomes: TypeAlias = Generator[tuple[int, Outcome], None, None]
 
 
-def cores_of(workers: int) -> int:
-    """How many cores share the sums of one trial."""
-    return max(loky.cpu_count() // workers, 1)
+def outcomes(trial: Trial, indices: Sequence[int], executor: Executor | None = None) -> Outcomes:
+    """Each trial's outcome once, in the order in which they end.
 
+    - `executor`: of `concurrent.futures`; by default this process runs the trials, one after the other.
 
-def outcomes(trial: Trial, indices: Sequence[int], workers: int = 1) -> Outcomes:
-    """Each trial's outcome once, in the order in which they end: in this process, or of several workers in as many
-    processes, which share the machine's cores evenly.
-
-    A trial whose process dies, for want of memory say, is begun once more in a new one.
+    A `BrokenExecutor` from the executor says that it gave a trial up, because its process died: a `Failure`. Any other
+    error of the executor itself is raised. Trials that have not begun when the generator is closed are cancelled.
     """
-    if workers > 1:
-        yield from _in_processes(trial, indices, workers)
+    attempt = functools.partial(_attempt, trial)
+    if executor is None:
+        for index in indices:
+            yield index, attempt(index)
         return
-    for index in indices:
-        yield index, _attempt(trial, index)
-
-
-def _in_processes(trial: Trial, indices: Sequence[int], workers: int) -> Outcomes:
-    waiting, tries = deque(indices), dict.fromkeys(indices, 0)
-    # A pool each: when a process dies it is known which trial died with it.
-    free = [_pool(workers) for _ in range(min(workers, len(indices)))]
-    running: dict[Future, tuple[int, loky.ProcessPoolExecutor]] = {}
+    running = {executor.submit(attempt, index): index for index in indices}
     try:
-        while waiting or running:
-            while waiting and free:
-                index, pool = waiting.popleft(), free.pop()
-                tries[index] += 1
-                running[pool.submit(_attempt, trial, index)] = index, pool
+        while running:
             for future in wait(running, return_when=FIRST_COMPLETED).done:
-                index, pool = running.pop(future)
+                index = running.pop(future)
                 try:
                     outcome: Outcome = future.result()
-                except TerminatedWorkerError as error:
-                    pool.shutdown(kill_workers=True)
-                    free.append(_pool(workers))
-                    if tries[index] < _TRIES:
-                        waiting.appendleft(index)
-                        continue
-                    outcome = Failure(f"its process died {_TRIES} times ({error})", str(error))
-                else:
-                    free.append(pool)
+                except BrokenExecutor as error:
+                    outcome = Failure(str(error), str(error))
                 yield index, outcome
     finally:
-        for pool in (*free, *(pool for _, pool in running.values())):
-            pool.shutdown(kill_workers=True)
-
-
-def _pool(workers: int) -> loky.ProcessPoolExecutor:
-    # What XLA, the libraries of linear algebra and our own pools of processes ask for how many threads to start.
-    names = ("NPROC", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "LOKY_MAX_CPU_COUNT")
-    environment = dict.fromkeys(names, str(cores_of(workers)))
-    return loky.ProcessPoolExecutor(1, env=environment, initializer=_end_with, initargs=(os.getpid(),))
-
-
-def _end_with(parent: int) -> None:
-    """Ends this process when its parent is gone: one that is killed cannot end its processes."""
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(1)
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
+        for future in running:
+            future.cancel()
 
 
 def _attempt(trial: Trial, index: int) -> Outcome:
     try:
         return trial(index)
-    except Exception as error:
+    # A method of the user's may end the process.
+    except (Exception, SystemExit) as error:
         return Failure(f"{type(error).__name__}: {error}", traceback.format_exc())

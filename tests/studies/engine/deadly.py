@@ -24,6 +24,17 @@ class Trial:
         return [*self.folder.glob(f"{index}-*")]
 
 
+class Stalling(Trial):
+    """Trials that note their beginnings. Number 2 does not end the first time."""
+
+    def __call__(self, index):
+        first = not self.beginnings(index)
+        (self.folder / f"{index}-{os.getpid()}").touch()
+        while index == 2 and first:
+            time.sleep(1)
+        return {"square": index * index}
+
+
 class Endless:
     """A trial that notes its process and does not end."""
 

@@ -1,5 +1,8 @@
 """Records of a study on disk."""
 
+import functools
+import json
+
 import pytest
 
 from jaxnbv.checks import InputError
@@ -72,6 +75,53 @@ def test_records_that_are_not_what_they_were_are_refused(tmp_path):
         (tmp_path / "study.json").write_text(changed)
         with pytest.raises(InputError, match=r"study\.json is no study record .*choose another"):
             collect()
+
+
+def test_records_of_several_folders_are_joined(tmp_path):
+    def record(index, seconds=1.0):
+        return {"x": index / 3, "steps": [{"seconds": seconds}]}
+
+    def collect(name, scenes, seconds):
+        run = functools.partial(record, seconds=seconds)
+        RecordFolder(tmp_path / name, {"views": 3}).collect(scenes, run, progress=False)
+
+    collect("a", range(0, 3), 1.0)
+    collect("b", range(2, 4), 2.0)
+    written = json.loads((tmp_path / "a" / "study.json").read_text())
+    written["versions"]["cores"] = 77
+    (tmp_path / "a" / "study.json").write_text(json.dumps(written))
+    joined = RecordFolder(tmp_path / "joined", {"views": 3})
+    with pytest.warns(UserWarning, match="cores: 77 there"):
+        joined.join([tmp_path / "a", tmp_path / "b"])
+    assert json.loads((tmp_path / "joined" / "study.json").read_text())["versions"]["cores"] == 77
+    asked = []
+    with pytest.warns(UserWarning, match="cores: 77 there"):
+        records = joined.collect(range(5), lambda index: asked.append(index) or record(index), progress=False)
+    assert records == [record(0), record(1), record(2), record(3, 2.0), record(4)]
+    assert asked == [4]
+    # To join one once more changes nothing.
+    joined.join([tmp_path / "a"])
+    assert joined.collect(range(5), asked.append, progress=False) == records
+
+
+def test_folders_that_do_not_belong_together_are_not_joined(tmp_path):
+    for name, views, value in (("a", 3, 0.5), ("other", 4, 0.5), ("wrong", 3, 0.25)):
+        RecordFolder(tmp_path / name, {"views": views}).collect(range(1), lambda _, x=value: {"x": x}, progress=False)
+    joined = RecordFolder(tmp_path / "joined", {"views": 3})
+    with pytest.raises(
+        InputError, match=r"other has other settings than .*joined; it differs in views: 4 there, 3 now"
+    ):
+        joined.join([tmp_path / "a", tmp_path / "other"])
+    with pytest.raises(
+        InputError, match=r"wrong.scene_0000\.json and .*joined.scene_0000\.json differ in x: 0.25 there"
+    ):
+        joined.join([tmp_path / "wrong"])
+    with pytest.raises(InputError, match=r"nowhere.study\.json is no study record .*leave it out"):
+        joined.join([tmp_path / "nowhere"])
+    (tmp_path / "wrong" / "scene_0000.json").write_text("{")
+    with pytest.raises(InputError, match=r"wrong.scene_0000\.json is damaged"):
+        joined.join([tmp_path / "wrong"])
+    assert joined.collect(range(1), lambda index: {}, progress=False) == [{"x": 0.5}]
 
 
 def test_keys_that_are_numbers_are_read_as_text(tmp_path):

@@ -1,11 +1,14 @@
 """Where trials are run."""
 
 import functools
+import json
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import loky
@@ -17,9 +20,11 @@ from test_study import small, without_time
 from jaxnbv.checks import InputError
 from jaxnbv.cli import run_study as command
 from jaxnbv.cli.study_options import StudyOptions
+from jaxnbv.storage.folders import num_threads, versions
+from jaxnbv.studies.engine.processes import Processes
 from jaxnbv.studies.engine.records import RecordFolder
 from jaxnbv.studies.engine.run import run_scene
-from jaxnbv.studies.engine.trials import _pool, cores_of
+from jaxnbv.studies.engine.trials import outcomes
 from jaxnbv.studies.registry import Entry, studies
 
 
@@ -29,8 +34,10 @@ def squares(*indices):
 
 @pytest.mark.slow
 def test_no_trial_is_lost_though_some_die(tmp_path):
-    trial, records = Trial(tmp_path), RecordFolder(tmp_path / "records", {"views": 3}, workers=2)
-    assert records.collect(range(6), trial, progress=False) == squares(0, 1, 2, 5)
+    trial = Trial(tmp_path)
+    with Processes(2) as processes:
+        records = RecordFolder(tmp_path / "records", {"views": 3}, processes)
+        assert records.collect(range(6), trial, progress=False) == squares(0, 1, 2, 5)
     assert [len(trial.beginnings(index)) for index in range(6)] == [1, 1, 2, 1, 2, 1]
     failures = records.failures(range(6))
     assert list(failures) == [3, 4]
@@ -49,8 +56,9 @@ def test_no_trial_is_lost_though_some_die(tmp_path):
 @pytest.mark.slow
 def test_processes_end_when_the_command_is_killed(tmp_path):
     program = (
-        "from pathlib import Path; from deadly import Endless; from jaxnbv.studies.engine.trials import outcomes;"
-        f"list(outcomes(Endless(Path({str(tmp_path)!r})), [0], workers=2))"
+        "from pathlib import Path; from deadly import Endless; from jaxnbv.studies.engine.processes import Processes;"
+        "from jaxnbv.studies.engine.trials import outcomes;"
+        f"list(outcomes(Endless(Path({str(tmp_path)!r})), [0], Processes(2)))"
     )
     folder = str(Path(__file__).parent)
     command = subprocess.Popen([sys.executable, "-c", program], env=os.environ | {"PYTHONPATH": folder})
@@ -78,20 +86,53 @@ def is_running(process):
 
 @pytest.mark.slow
 def test_a_study_in_processes_finds_what_it_finds_here(tmp_path):
-    balls = small(num_candidates=4, views=2)
-    trial = functools.partial(run_scene, balls)
-    here, processes = (
-        RecordFolder(tmp_path / str(workers), {}, workers).collect(range(2), trial, progress=False)
-        for workers in (1, 2)
-    )
-    assert list(map(without_time, here)) == list(map(without_time, processes))
+    trial = functools.partial(run_scene, small(num_candidates=4, views=2))
+    here = RecordFolder(tmp_path / "here", {}).collect(range(2), trial, progress=False)
+    with Processes(2) as processes:
+        there = RecordFolder(tmp_path / "there", {}, processes).collect(range(2), trial, progress=False)
+    assert list(map(without_time, here)) == list(map(without_time, there))
 
 
 def test_processes_share_the_cores():
-    assert [cores_of(workers) for workers in (1, 2, 1000)] == [loky.cpu_count(), max(loky.cpu_count() // 2, 1), 1]
-    pool = _pool(2)
-    assert pool.submit(eval, "__import__('loky').cpu_count()").result() == cores_of(2)
-    pool.shutdown()
+    share = max(loky.cpu_count() // 2, 1)
+    with Processes(2) as processes:
+        assert processes.submit(eval, "__import__('loky').cpu_count()").result() == share
+        assert processes.submit(num_threads).result() == share
+
+
+def test_any_executor_runs_trials_and_the_folder_says_where(tmp_path):
+    with ThreadPoolExecutor(3) as threads:
+        records = RecordFolder(tmp_path, {}, threads)
+        assert records.collect(range(6), lambda index: {"square": index**2}, progress=False) == squares(*range(6))
+    assert json.loads((tmp_path / "study.json").read_text())["versions"] == versions()
+
+
+def test_leaving_early_cancels_the_trials_that_have_not_begun():
+    began, go = [], threading.Event()
+
+    def trial(index):
+        began.append(index)
+        if index == 1:
+            go.wait()
+        return {}
+
+    with ThreadPoolExecutor(1) as threads:
+        ended = outcomes(trial, range(9), threads)
+        assert next(ended) == (0, {})
+        ended.close()
+        go.set()
+    assert began in ([0], [0, 1])
+
+
+def test_a_method_that_ends_the_process_fails_its_scene_alone():
+    def trial(index):
+        if index == 0:
+            sys.exit("enough")
+        return {}
+
+    (_, failure), second = outcomes(trial, range(2))
+    assert failure.error == "SystemExit: enough"
+    assert second == (1, {})
 
 
 def test_a_command_writes_what_was_found_and_fails_at_the_end(tmp_path, monkeypatch):
@@ -100,9 +141,9 @@ def test_a_command_writes_what_was_found_and_fails_at_the_end(tmp_path, monkeypa
             raise RuntimeError("lost")
         return {"scene": index, "methods": {name: {"points": [1000, 4000], "views": [0, 1]} for name in methods}}
 
-    def run(out, scenes, **of_studies):
-        options = StudyOptions(name="pyramid", scenes=scenes, views=2, model="paper", out=tmp_path / out)
-        command.run_study(options, **of_studies)
+    def run(out, scenes, meshes=None, **more):
+        options = StudyOptions(name="pyramid", scenes=scenes, views=2, model="paper", out=tmp_path / out, **more)
+        command.run_study(options, meshes=meshes)
 
     monkeypatch.setitem(studies(), "pyramid", Entry("toy:ToyStudy", "", 3, 2))
     monkeypatch.setattr(command, "run_scene", fake)
@@ -123,3 +164,11 @@ def test_a_command_writes_what_was_found_and_fails_at_the_end(tmp_path, monkeypa
             run("wrong", wrong)
     with pytest.raises(InputError, match="the study pyramid takes no --meshes: it is for heat"):
         run("wrong", "2", meshes=tmp_path)
+    monkeypatch.setattr(command, "run_scene", lambda study, index, **given: fake(study, index + 4, **given))
+    run("joined", "3", join=[tmp_path / "some"])
+    scenes = [json.loads((tmp_path / "joined" / f"scene_000{index}.json").read_text())["record"] for index in range(3)]
+    assert [record["scene"] for record in scenes] == [0, 5, 2]
+    with pytest.raises(InputError, match=r"--join .*/nowhere holds no records of this study"):
+        run("joined", "2", join=[tmp_path / "some", tmp_path / "nowhere"])
+    with pytest.raises(InputError, match=r"--workers 2 and --cluster tcp://here:1 exclude each other"):
+        run("wrong", "2", workers=2, cluster="tcp://here:1")

@@ -1,0 +1,163 @@
+"""Workers of a Dask cluster that run the trials of a study."""
+
+import concurrent.futures
+import contextlib
+import functools
+import importlib
+import itertools
+import logging
+import pickle
+import sys
+from collections.abc import Callable
+from concurrent.futures import BrokenExecutor, Executor, Future
+from typing import Any
+
+from jaxnbv.checks import InputError, require
+from jaxnbv.compiled import keep_compiled
+from jaxnbv.errors import optional
+from jaxnbv.storage.folders import differences, num_threads, versions
+
+# Seconds until a scheduler must have answered.
+_TIMEOUT = 5
+
+
+class Cluster(Executor):
+    """The workers of a Dask scheduler, each of which runs one call at a time.
+
+    - `address`: the scheduler's, such as "tcp://HOST:8786".
+
+    Blocks until there is a worker. If a worker dies, Dask starts its call again on another one. Once it gives the call
+    up, by default after four workers have died with it, the future raises `BrokenExecutor`.
+
+    **Raises:** `ValueError` if Dask is not installed or no scheduler answers. Here, and from a future: if a worker runs
+    several calls at a time or has other software or threads than this process, or another device than the first worker,
+    or cannot import what it runs; and if the scheduler is gone.
+    """
+
+    def __init__(self, address: str):
+        distributed = optional("distributed")
+        self.address = address
+        # Tracebacks of a lost connection, which our error names.
+        logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
+        try:
+            self._client = distributed.Client(address, timeout=_TIMEOUT, set_as_default=False)
+        # Whatever answers at the address, if it is no scheduler of Dask's.
+        except Exception as error:
+            raise InputError(
+                f"no Dask scheduler answers at {address} ({error}): start one with `dask scheduler`, and give the "
+                "address that it shows, such as tcp://HOST:8786"
+            ) from error
+        self._pickled: tuple[Any, Any] = None, None
+        self._count = itertools.count()
+        self._running: set[Future] = set()
+        pools = optional("threadpoolctl").threadpool_info()
+        threads = [pool["num_threads"] for pool in pools if pool["user_api"] == "blas"]
+        # Dask's workers have one by default. They get as many as this process has, at most NPROC.
+        self._blas_threads = min([*threads, num_threads()])
+        self._versions = versions()
+        del self._versions["device"]
+        try:
+            if not self._client.scheduler_info()["workers"]:
+                print(f"waiting for a worker of {address}", file=sys.stderr, flush=True)
+            self._versions["device"] = self.submit(versions).result()["device"]
+        except BaseException:
+            self.shutdown(cancel_futures=True)
+            raise
+
+    def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future:
+        """The future of a call. A function is sent once, however often it is called in a row."""
+        require(self._client.status == "running", self._lost())
+        if function is not self._pickled[0]:
+            # Pickled here, for a worker compares versions before it imports what the function needs.
+            content = optional("cloudpickle").dumps(function)
+            self._pickled = function, self._client.submit(bytes, content, pure=False)
+        task = self._client.submit(
+            # A lambda is pickled as code: a scheduler needs no jaxnbv, and a worker without it can say so.
+            lambda *values: importlib.import_module("jaxnbv.studies.engine.cluster")._call(*values),
+            self._pickled[1],
+            self._versions,
+            self._blas_threads,
+            args,
+            kwargs,
+            # First come, first served: Dask has no order within a tenth of a second.
+            priority=-next(self._count),
+            pure=False,
+        )
+        answer: Future = Future()
+        self._running.add(answer)
+        answer.add_done_callback(self._running.discard)
+        answer.add_done_callback(lambda answer: task.cancel() if answer.cancelled() else None)
+        task.add_done_callback(lambda task: self._settle(task, answer))
+        return answer
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Leave the cluster, which goes on, once no call is left.
+
+        - `cancel_futures`: leave now; calls that have not ended are forgotten.
+        """
+        if wait and not cancel_futures:
+            concurrent.futures.wait(tuple(self._running))
+        self._client.close()
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self.shutdown(cancel_futures=kind is not None)
+
+    def _settle(self, task: Any, answer: Future) -> None:
+        """Pass the end of a task of Dask's on to the future that stands for it."""
+        if not answer.set_running_or_notify_cancel():
+            return
+        if task.status == "cancelled":
+            answer.set_exception(InputError(self._lost()))
+            return
+        try:
+            answer.set_result(task.result())
+        except optional("distributed").KilledWorker as error:
+            answer.set_exception(BrokenExecutor(str(error)))
+        except ImportError as error:
+            problem = f"a worker of {self.address} cannot import what it runs ({error})"
+            remedy = "install the same packages there, and name folders of your own modules in PYTHONPATH"
+            answer.set_exception(InputError(f"{problem}: {remedy}"))
+        except BaseException as error:
+            answer.set_exception(error)
+        # Dask computes a result anew if the worker that holds it dies, until it is released.
+        task.release()
+
+    def _lost(self) -> str:
+        return (
+            f"the Dask scheduler at {self.address} is gone: start it, then the same command again; scenes that have a "
+            "record are kept"
+        )
+
+
+def _call(
+    content: bytes, client_versions: dict[str, Any], blas_threads: int, args: tuple[Any, ...], kwargs: dict[str, Any]
+) -> Any:
+    """Compare the versions of this worker with the client's, then call the pickled function."""
+    worker = optional("distributed").get_worker()
+    require(
+        worker.state.nthreads == 1,
+        f"the worker {worker.address} runs {worker.state.nthreads} calls at a time: start it with --nthreads 1",
+    )
+    there = _prepare()
+    changes = differences({name: there[name] for name in client_versions}, client_versions)
+    require(
+        not changes,
+        f"the worker {worker.address} is unlike this process ({'; '.join(changes)}): install the same versions, and "
+        "set NPROC, the number of threads, to the same number for both",
+    )
+    try:
+        function = pickle.loads(content)
+    # Whatever a module of the user's does as it is imported.
+    except Exception as error:
+        raise ImportError(f"{type(error).__name__}: {error}") from error
+    # The last bits of linear algebra depend on its threads too.
+    optional("threadpoolctl").threadpool_limits(blas_threads, user_api="blas")
+    return function(*args, **kwargs)
+
+
+@functools.cache
+def _prepare() -> dict[str, Any]:
+    """The versions of this process, determined once. From here on it keeps compiled programs, as the command does."""
+    with contextlib.suppress(InputError):
+        keep_compiled()
+    return versions()
