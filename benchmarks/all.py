@@ -1,7 +1,7 @@
 """Time every stage of planning on this machine, as ratios to a yardstick, to rivals, and to what the arithmetic takes.
 
     python benchmarks/all.py [--mesh FILE] [--only STAGE ...] [--out runs/all]
-    JAX_NUM_CPU_DEVICES=2 python benchmarks/all.py --only devices
+    JAX_NUM_CPU_DEVICES=2 python benchmarks/all.py --only devices episodes
 
 The paper's settings: 16 samples, 120 candidates, 50 x 50 rays, samples on a 100^3 grid, one view of a mug or of a
 mesh. Times are after compilation, the least of three; "first" says where it is included. The yardstick is a 2,000^3
@@ -189,13 +189,34 @@ def devices(bench: Bench) -> None:
             bench.take(f"new surface: a step shared among {count} devices", step, alone=alone)
 
 
+def episodes(bench: Bench) -> None:
+    """Eight episodes of five views in one program and by `simulate` in a loop; on a GPU also 64, against one."""
+    planner, key = usual_planner(), bench.key
+
+    def program(count: int, batch_size: int | None = None):
+        keys = jax.random.split(key, count)
+        return lambda: nbv.episodes(planner, count * [demo_object()], bench.first, 5, keys, batch_size=batch_size)
+
+    def loop():
+        return [nbv.simulate(planner, demo_object(), bench.first, 5, own, progress=False) for own in keys]
+
+    keys = jax.random.split(key, 8)
+    one = bench.note("an episode of five views as a program", least_time(program(1), repeats=1))
+    alone = bench.note("eight episodes, by simulate in a loop", least_time(loop, repeats=1), one=one)
+    bench.note("eight episodes as a program", least_time(program(8), repeats=1), one=one, loop=alone)
+    if jax.default_backend() == "cpu":
+        bench.note("eight episodes as a program, four at once", least_time(program(8, 4), repeats=1), loop=alone)
+    else:
+        bench.note("64 episodes as a program", least_time(program(64), repeats=1), one=one)
+
+
 def yardstick() -> float:
     matrix = jax.random.normal(jax.random.key(0), (2000, 2000))
     product = jax.jit(lambda a: jnp.matmul(a, a, precision="highest"))
     return least_time(lambda: product(matrix), repeats=10)
 
 
-STAGES = (coverage, sessions, cross_entropy, gradient, networks, devices)
+STAGES = (coverage, sessions, cross_entropy, gradient, networks, devices, episodes)
 
 
 def page(record: dict) -> str:

@@ -23,6 +23,8 @@ from .observations import as_observations as as_observations
 from .planning.alignment import Alignment as Alignment
 from .planning.alignment import align_views as align_views
 from .planning.episode import Episode as Episode
+from .planning.episodes import Episodes as Episodes
+from .planning.episodes import episodes as episodes
 from .planning.loop import View as View
 from .planning.planner import Planner as Planner
 from .planning.session import NextView as NextView

@@ -24,7 +24,7 @@ from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning import GridSurface, Surface, scan
 from jaxnbv.scanning.grid import samples_at_once
 from jaxnbv.sharding import batched_map, share_of, shared, shared_map
-from jaxnbv.utility import Answer, AnyUtility, Quantity, as_utility, default_batch_size, plain_function
+from jaxnbv.utility import Answer, AnyUtility, Quantity, Utility, as_utility, default_batch_size, plain_function
 
 
 class ImaginedView(eqx.Module):
@@ -104,6 +104,10 @@ class Acquisition(eqx.Module):
         """What D answers to what the acquisition asks; None where it has no answer."""
         return None
 
+    def answer_values(self, cloud: PointCloud) -> Float[Array, " n"] | None:
+        """The values of `answer`, made of JAX operations; None where there are none, or only host code has them."""
+        return None
+
     def true_answer(self, scene: Surface, cloud: PointCloud) -> Answer | None:
         """What `answer` should come to in the end; None where that is not known.
 
@@ -161,6 +165,13 @@ class ExpectedUtilityImprovement(Acquisition):
         """The utility's own answer, or its value."""
         own = self.utility.answer(cloud)
         return Answer((self.utility.name,), np.array([float(context_of(self, cloud)[1])])) if own is None else own
+
+    def answer_values(self, cloud: PointCloud) -> Float[Array, " n"] | None:
+        """The utility's own, or its value."""
+        own = self.utility.answer_values(cloud)
+        if own is None and type(self.utility).answer is Utility.answer:
+            return jnp.atleast_1d(context_of(self, cloud)[1])
+        return own
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> Answer:
         """The utility's own, or its answer on all of the surface."""

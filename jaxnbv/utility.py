@@ -91,6 +91,10 @@ class Utility(eqx.Module):
         """What D answers; None for u(D) itself."""
         return None
 
+    def answer_values(self, cloud: PointCloud) -> Float[Array, " n"] | None:
+        """See `Acquisition.answer_values`."""
+        return None
+
     def true_answer(self, scene: Surface, cloud: PointCloud) -> Answer | None:
         """What `answer` should come to, see `Acquisition.true_answer`; None for `answer` on all of the surface."""
         return None

@@ -165,6 +165,16 @@ def test_the_script_of_the_readme_runs(tmp_path, monkeypatch):
     assert (tmp_path / "runs" / "spot" / "cloud.ply").exists()
 
 
+@pytest.mark.slow
+def test_the_block_of_episodes_runs():
+    """With two of 64 scenes, and two views."""
+    block = blocks("../README.md")[1].replace("64", "2").replace("views=5", "views=2")
+    given = {"nbv": nbv, "jax": jax, "planner": smaller()(nbv.NewSurface(), nbv.DiscreteSearch(12))}
+    exec(compile(block, "README.md", "exec"), given)
+    assert given["batch"].values.shape == (2, 2)
+    assert np.isfinite(given["batch"].values[:, 1]).all()
+
+
 def image_of_a_ball(matrix):
     """Of 0.1 metres, on the table z = 0; in millimetres along the camera's axis."""
     matrix = np.asarray(matrix, np.float64)

@@ -12,7 +12,7 @@ from typing import NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from jaxnbv.acquisition import Acquisition
 from jaxnbv.checks import InputError, own_settings
@@ -295,7 +295,7 @@ class Loop:
         return self._next.inputs
 
 
-def view_keys(key: PRNGKeyArray, index: int) -> tuple[PRNGKeyArray, PRNGKeyArray, PRNGKeyArray]:
+def view_keys(key: PRNGKeyArray, index: int | Int[Array, ""]) -> tuple[PRNGKeyArray, PRNGKeyArray, PRNGKeyArray]:
     """Keys of view `index` (from 0) of an episode: of its posterior samples, its search and its sensor's noise."""
     step_key, noise_key = jax.random.split(jax.random.fold_in(key, index))
     sample_key, search_key = jax.random.split(step_key)

@@ -46,6 +46,11 @@ class PartHypotheses(eqx.Module):
         """How likely each part of the bank is."""
         return jnp.zeros(len(self.bank)).at[self.placed.shape].add(self.weights[:-1])
 
+    @property
+    def part_weights(self) -> Float[Array, " k_and_none"]:
+        """How likely each part of the bank is, and last how likely the object is none of them."""
+        return jnp.append(self.shape_weights, self.weights[-1])
+
     def names(self) -> dict[str, float]:
         """How likely the object is each part, most likely first, and "none of these"; parts that no hypothesis is
         about are left out."""

@@ -118,9 +118,13 @@ class ClassAcquisition(Acquisition):
 
     def answer(self, cloud: PointCloud) -> "ClassAnswer":
         """The probabilities of the classes given D."""
-        p = np.exp(np.asarray(context_of(self, cloud)[1], np.float64))
+        p = np.asarray(self.answer_values(cloud), np.float64)
         names = self.classifier.classes or tuple(f"class {index}" for index in range(len(p)))
         return ClassAnswer(tuple(names), p)
+
+    def answer_values(self, cloud: PointCloud) -> Float[Array, " classes"]:
+        """The probabilities of the classes given D."""
+        return jnp.exp(context_of(self, cloud)[1])
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> "ClassAnswer | None":
         """The object's own class, where it says one that the classifier knows."""

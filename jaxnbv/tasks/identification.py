@@ -19,6 +19,7 @@ from jaxnbv.scanning.grid import samples_at_once
 from jaxnbv.sharding import shared_map
 from jaxnbv.surfaces.part_evidence import MOST, misfit_of, weight_of
 from jaxnbv.surfaces.part_hypotheses import NONE, PartHypotheses, hypotheses_of
+from jaxnbv.surfaces.shape_bank import ShapeBank
 from jaxnbv.utility import Answer, Quantity
 
 # Nodes along an axis of the surfaces that are imagined.
@@ -123,10 +124,23 @@ class IdentityAnswer(Answer):
 
 def identity_answer(hypotheses: PartHypotheses, acquisition: Acquisition) -> IdentityAnswer:
     """Which part the object is; which group of parts, for `Identify(group=...)`."""
+    names, values = weights_by_name(hypotheses.bank, np.asarray(hypotheses.part_weights), acquisition)
+    return IdentityAnswer((*names, NONE), values)
+
+
+def weights_by_name(
+    bank: ShapeBank, weights: Float[np.ndarray, "*batch k_and_none"], acquisition: Acquisition
+) -> tuple[list[str], Float[np.ndarray, "*batch n"]]:
+    """The names of a bank's parts in alphabetical order, and the weight of each and last of none; groups in place of
+    names for `Identify(group=...)`.
+
+    - `weights`: `PartHypotheses.part_weights`, with any leading axes.
+    """
     group = acquisition.group if isinstance(acquisition, Identify) else None
-    names, numbers = np.unique(hypotheses.bank.names if group is None else group, return_inverse=True)
-    weights = np.bincount(numbers, np.asarray(hypotheses.shape_weights, np.float64), len(names))
-    return IdentityAnswer((*names.tolist(), NONE), np.append(weights, float(hypotheses.weights[-1])))
+    names, numbers = np.unique(bank.names if group is None else group, return_inverse=True)
+    rows = weights.reshape(-1, weights.shape[-1]).astype(np.float64)
+    values = np.stack([np.append(np.bincount(numbers, row[:-1], len(names)), row[-1]) for row in rows])
+    return names.tolist(), values.reshape(*weights.shape[:-1], -1)
 
 
 def _image(surface: GridSurface, camera: Camera, poses: Pose, barrier: Float[Array, "poses rays"] | None) -> _Image:

@@ -119,11 +119,15 @@ class SoftPartCount(Utility):
 
     def answer(self, cloud: PointCloud) -> "PartAnswer":
         """How many points are predicted of each part: of those that the segmenter names, or of those that it finds."""
-        counts = np.asarray(_counts(self.segmenter, cloud), np.float64)
+        counts = np.asarray(self.answer_values(cloud), np.float64)
         known = self.segmenter.part_names
         names = tuple((known or {}).get(index, f"part {index}") for index in range(len(counts)))
         asked = tuple(np.flatnonzero(counts > 0).tolist() if known is None else known)
         return PartAnswer(names, counts, asked=asked, target=self.target)
+
+    def answer_values(self, cloud: PointCloud) -> Float[Array, " parts"]:
+        """How many points are predicted of each part."""
+        return _counts(self.segmenter, cloud).astype(cloud.points.dtype)
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> "PartAnswer":
         """Of a solid with labels, how many points of its surface belong to each; of others, the answer on all of it.

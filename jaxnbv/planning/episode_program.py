@@ -1,0 +1,108 @@
+"""Simulated episodes as one program: what `simulate` does, in JAX alone."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
+
+from jaxnbv.acquisition import Acquisition
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.geometry.pose_list import PoseList
+from jaxnbv.observations import Observations
+from jaxnbv.planning.loop import view_keys
+from jaxnbv.planning.planner import Planner
+from jaxnbv.planning.program_parts import in_parts
+from jaxnbv.planning.simulate import observe_scene
+from jaxnbv.scanning import Noise, Surface
+from jaxnbv.sharding import batched_map, shared
+from jaxnbv.surfaces.part_hypotheses import hypotheses_of
+
+
+class ViewRecord(NamedTuple):
+    """What is kept of a view. `value` is NaN for the first one. `answer` holds the values of the acquisition's answer,
+    or `PartHypotheses.part_weights` where `answers_by_parts`."""
+
+    pose: Pose
+    value: Float[Array, ""]
+    answer: Float[Array, " n"] | None
+
+
+def answers_by_parts(planner: Planner) -> bool:
+    """Whether `View.answer` says which of some known parts the object is."""
+    return type(planner.acquisition).answer is Acquisition.answer and planner.sampler.model.carries_hypotheses
+
+
+@eqx.filter_jit
+def run(
+    planner: Planner,
+    noise: Noise,
+    views: Int[Array, ""],
+    rows: tuple[Surface, Pose, Key[Array, " episodes"]],
+    at_once: int,
+) -> tuple[ViewRecord, PointCloud, Bool[Array, " episodes"]]:
+    """Records (episodes, max_views) of the views, D after the last view, and whether the first view saw anything.
+
+    - `rows`: scene, first pose and key of each episode along a leading axis, of which each device gets a share.
+    - `at_once`: episodes that a device computes together.
+    """
+
+    def of_share(rows: Any, planner: Planner, views: Int[Array, ""]) -> Any:
+        return batched_map(lambda row: _episode(planner, noise, views, *row), rows, at_once)
+
+    return shared(of_share, rows, planner, views)
+
+
+def _episode(
+    planner: Planner, noise: Noise, views: Int[Array, ""], scene: Surface, first: Pose, key: PRNGKeyArray
+) -> tuple[ViewRecord, PointCloud, Bool[Array, ""]]:
+    room = planner.max_views
+    observations, record, sees = in_parts(_first_view, planner, noise, scene, first, key)
+    records = jax.tree.map(lambda leaf: jnp.zeros((room, *leaf.shape), leaf.dtype).at[0].set(leaf), record)
+    arrays, rest = eqx.partition(observations, eqx.is_array)
+
+    # A loop of any number of rounds, so that one program has any number of views.
+    def add(index: Any, state: Any) -> Any:
+        arrays, pending, records = state
+        before = eqx.combine(arrays, rest), pending
+        after, pending, record = in_parts(_next_view, planner, noise, scene, key, index, *before)
+        records = jax.tree.map(lambda rows, row: rows.at[index].set(row), records, record)
+        return eqx.filter(after, eqx.is_array), pending, records
+
+    arrays, _, records = jax.lax.fori_loop(1, views, add, (arrays, PoseList.empty(room), records))
+    return records, eqx.combine(arrays, rest).cloud, sees
+
+
+def _first_view(
+    planner: Planner, noise: Noise, scene: Surface, first: Pose, key: PRNGKeyArray
+) -> tuple[Observations, ViewRecord, Bool[Array, ""]]:
+    *_, noise_key = view_keys(key, 0)
+    scan = observe_scene(scene, planner.camera, first, noise, noise_key, planner.obstacles)
+    observations = planner.init(first, scan)
+    value = jnp.full((), jnp.nan, first.position.dtype)
+    return observations, ViewRecord(first, value, _answer(planner, observations)), jnp.any(scan.mask)
+
+
+def _next_view(
+    planner: Planner,
+    noise: Noise,
+    scene: Surface,
+    key: PRNGKeyArray,
+    index: Int[Array, ""],
+    observations: Observations,
+    pending: PoseList,
+) -> tuple[Observations, PoseList, ViewRecord]:
+    sample_key, search_key, noise_key = view_keys(key, index)
+    proposal = planner.choose(planner.step_inputs(observations, sample_key), search_key, pending)
+    scan = observe_scene(scene, planner.camera, proposal.pose, noise, noise_key, planner.obstacles)
+    observations = planner.observe(observations, proposal.pose, scan)
+    record = ViewRecord(proposal.pose, proposal.value, _answer(planner, observations))
+    return observations, pending.append(proposal.pose), record
+
+
+def _answer(planner: Planner, observations: Observations) -> Float[Array, " n"] | None:
+    if answers_by_parts(planner):
+        return hypotheses_of(observations).part_weights
+    return planner.acquisition.answer_values(observations.cloud)

@@ -1,0 +1,132 @@
+"""Many simulated episodes in one compiled program."""
+
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+from jax.sharding import Mesh, get_abstract_mesh
+from jaxtyping import Array, Bool, Float, Key
+
+from jaxnbv.checks import InputError, checked, is_traced, require, shown
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.pose import Pose
+from jaxnbv.planning.episode_program import answers_by_parts, run
+from jaxnbv.planning.planner import Planner
+from jaxnbv.scanning import Noise, SensorNoise, Surface
+from jaxnbv.scanning.scanner import far_from_scene
+from jaxnbv.scanning.scene_batch import scene_batch
+from jaxnbv.scanning.sdf import SignedDistance
+from jaxnbv.sharding import on_cpu, share_of
+from jaxnbv.surfaces import KnownShapes
+from jaxnbv.tasks.identification import weights_by_name
+
+
+class Episodes(eqx.Module):
+    """What `episodes` gives of each episode, along a leading axis; in scene coordinates.
+
+    - `poses`: (episodes, views) where the views were taken.
+    - `values`: what the search expected of each view; NaN for the first one, which was given.
+    - `clouds`: D after the last view.
+    - `answers`: the values of `View.answer` after each view; None where there are none, or only host code has them.
+    """
+
+    poses: Pose
+    values: Float[Array, "episodes views"]
+    clouds: PointCloud
+    answers: Float[Array, "episodes views n"] | None
+
+
+@checked
+def episodes(
+    planner: Planner,
+    scenes: Surface | SignedDistance | trimesh.Geometry | Sequence,
+    first: Pose,
+    views: int,
+    keys: Key[Array, " episodes"],
+    noise: Noise = SensorNoise(),
+    batch_size: int | None = None,
+) -> Episodes:
+    """The episodes `simulate(planner, scene, first, views, key, noise)` of a batch of scenes and keys, as one compiled
+    program. On a CPU poses, values, clouds and answers have the same bits.
+
+    Several devices take a share of the episodes each: those of `jax.set_mesh`, by default all that JAX has here.
+
+    - `scenes`: a list with a solid or surface for each key, all of one structure; or one with a leading axis on its
+      arrays, as `jax.vmap` makes it. `[scene] * len(keys)` repeats a scene.
+    - `first`: the pose of the first view, or a batch with one for each key.
+    - `views`: views of each episode. The program that was compiled for one number runs for any.
+    - `keys`: one for each episode, `jax.random.split(key, episodes)`.
+    - `batch_size`: episodes that a device computes together, by default one on a CPU and its whole share on a GPU.
+      Memory grows with it, and for more than one values are those of `simulate` to rounding.
+
+    **Raises:** `ValueError` for triangle meshes, for scenes of several structures, unless there are as many scenes and
+    keys, for `views` < 1 or more than the planner has room for, and for episodes in which the first view sees nothing
+    or the value of a view is not finite.
+    """
+    require(views >= 1, f"asked for {views} views; ask for at least one")
+    require(
+        views <= planner.max_views,
+        f"asked for {views} views but the planner has room for {planner.max_views}: raise Planner(max_views=...)",
+    )
+    require(batch_size is None or batch_size >= 1, f"the batch size is {batch_size}; it must be at least 1")
+    are_keys = isinstance(keys, Array) and jnp.issubdtype(keys.dtype, jax.dtypes.prng_key)
+    require(
+        are_keys and keys.ndim == 1 and keys.size > 0,
+        f"the keys are {shown(keys)}: make them with jax.random.split(jax.random.key(seed), episodes)",
+    )
+    require(not is_traced(scenes, first, keys), "episodes is a compiled program itself: call it outside jit and vmap")
+    count = len(keys)
+    rows = scene_batch(scenes, count), _batch_of_poses(first, count), keys
+    # NaN is the value of the first view.
+    with _devices(count), jax.debug_nans(False):
+        at_once = min(batch_size or (1 if on_cpu() else count), share_of(count))
+        records, clouds, sees = run(planner, noise, jnp.asarray(views), rows, at_once)
+        poses, values, answers = jax.tree.map(lambda leaf: leaf[:, :views], records)
+    _check(planner, np.asarray(values), clouds, np.asarray(sees))
+    if answers is not None and answers_by_parts(planner):
+        assert isinstance(planner.sampler.model, KnownShapes)
+        _, by_name = weights_by_name(planner.sampler.model.bank, np.asarray(answers), planner.acquisition)
+        answers = jnp.asarray(by_name, answers.dtype)
+    return Episodes(poses, values, clouds, answers)
+
+
+def _batch_of_poses(first: Pose, count: int) -> Pose:
+    """**Raises:** `ValueError` unless it is one pose or `count`, and for poses that are far from the scene."""
+    batch = first.position.shape[:-1]
+    require(
+        batch in ((), (count,)),
+        f"the first pose is a batch {batch} of poses for {count} keys: give one pose, or one for each key",
+    )
+    problem = far_from_scene(first)
+    require(problem is None, f"the first pose is not of the scene: {problem}")
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape[len(batch) :])), first)
+
+
+def _devices(count: int) -> AbstractContextManager:
+    """Where a program runs on as many devices of this process as there are episodes, unless the user chose some."""
+    chosen = not get_abstract_mesh().empty or jax.config.jax_default_device is not None  # type: ignore[attr-defined]
+    devices = jax.local_devices()[:count]
+    return nullcontext() if chosen or len(devices) == 1 else jax.set_mesh(Mesh(np.array(devices), "devices"))
+
+
+def _check(
+    planner: Planner, values: Float[np.ndarray, "b v"], clouds: PointCloud, sees: Bool[np.ndarray, " b"]
+) -> None:
+    """**Raises:** `ValueError` for what `simulate` refuses while it runs."""
+    require(
+        bool(sees.all()),
+        f"the first view of episode {sees.argmin()} sees nothing: point the camera at the object",
+    )
+    if planner.search.uses_samples:
+        planner.acquisition.check(clouds[0])
+    for episode, view in np.argwhere(~np.isfinite(values[:, 1:])):
+        value = values[episode, view + 1]
+        visited = "all candidates have been visited, or no camera may stand there: give the search more candidates"
+        unknown = "call simulate with its scene and key, which names the cause"
+        raise InputError(
+            f"the value of view {view + 2} of episode {episode} is {value}: {visited if value < 0 else unknown}"
+        )

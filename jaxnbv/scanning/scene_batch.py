@@ -1,0 +1,64 @@
+"""Scenes of one structure along a leading axis, for a program that scans any of them."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+
+from jaxnbv.checks import check_type, require, shown
+from jaxnbv.scanning.mesh_files import as_surface
+from jaxnbv.scanning.scanner import Surface
+from jaxnbv.scanning.sdf import SignedDistance
+from jaxnbv.scanning.sphere_tracing import SDFSurface
+
+
+def scene_batch(scenes: Any, count: int) -> Surface:
+    """The scenes with a leading axis on their arrays.
+
+    **Raises:** `ValueError` for a scene that JAX cannot trace, unless there are `count`, and for several structures.
+    """
+    if not isinstance(scenes, Sequence):
+        batch = _traceable(scenes, "the scene")
+        shapes = [np.shape(leaf) for leaf in jax.tree.leaves(eqx.filter(batch, eqx.is_array))]
+        wrong = [shape for shape in shapes if shape[:1] != (count,)]
+        require(
+            not wrong,
+            f"there are {count} keys, but the scenes hold an array of shape {wrong[:1]}, which needs a leading axis of "
+            f"{count}: give a list with a scene for each key, [scene] * {count} to repeat one",
+        )
+        return batch
+    require(len(scenes) == count, f"there are {len(scenes)} scenes for {count} keys: give a scene for each key")
+    surfaces = [_traceable(scene, f"scene {index}") for index, scene in enumerate(scenes)]
+    for index, surface in enumerate(surfaces):
+        require(
+            _structure(surface) == _structure(surfaces[0]),
+            f"scene {index} ({_kind(surface)}) has another structure, or other shapes of arrays, than scene 0 "
+            f"({_kind(surfaces[0])}), and one program scans scenes of one: sample them all on one grid, with "
+            "nbv.scanning.GridSurface.from_values",
+        )
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves) if eqx.is_array(leaves[0]) else leaves[0], *surfaces)
+
+
+def _traceable(scene: Any, name: str) -> Surface:
+    is_mesh = isinstance(scene, trimesh.Geometry) or (isinstance(scene, Surface) and not scene.in_jit)
+    require(
+        not is_mesh,
+        f"{name} is {shown(scene)}, which host code scans, and a compiled program cannot: give it as a solid, "
+        "nbv.sdf.solid_of_mesh(mesh.vertices, mesh.faces, cubic=True), or call simulate for each",
+    )
+    check_type(scene, Surface | SignedDistance, name)
+    return as_surface(scene)
+
+
+def _structure(surface: Surface) -> Any:
+    """What surfaces must share to be stacked."""
+    arrays, rest = eqx.partition(surface, eqx.is_array)
+    return jax.tree.structure(arrays), list(map(np.shape, jax.tree.leaves(arrays))), jax.tree.leaves(rest)
+
+
+def _kind(surface: Surface) -> str:
+    return type(surface.sdf if isinstance(surface, SDFSurface) else surface).__name__

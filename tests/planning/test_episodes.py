@@ -1,0 +1,216 @@
+"""Whole episodes in one program: those of `simulate`, one by one, to the last bit."""
+
+import subprocess
+import sys
+import textwrap
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+from small_planner import FIRST, planner_of
+
+import jaxnbv as nbv
+from jaxnbv.checks import InputError
+from jaxnbv.scanning import GridSurface, mesh_from_sdf
+from jaxnbv.scanning.sdf import Capsule, Cuboid, Sphere
+from jaxnbv.surfaces import FreeRotation
+
+# Without optimisation, on one LLVM module, XLA rounds a part otherwise by what else is in the module.
+COMPUTES = True
+BALLS = [Sphere(radius) | Capsule([0.2, 0.3, -0.4], [0.5, 0.6, 0.9], 0.3) for radius in (0.7, 0.8, 0.6)]
+KEYS = jax.random.split(jax.random.key(7), 3)
+POSES = nbv.look_at([(0.8, 0.9, 2.2), (0.8, -0.9, 2.2), (-2.0, 0.9, 1.0)])
+COVERAGE, NOISE = planner_of(), nbv.SensorNoise()
+
+
+def by_height(cloud):
+    """Two classes, by the mean height of the points."""
+    height = jnp.sum(jnp.where(cloud.mask, cloud.points[:, 1], 0.0)) / jnp.maximum(cloud.count, 1)
+    return jax.nn.log_softmax(jnp.stack([height, -height]))
+
+
+def by_octant(cloud):
+    """Parts by the largest coordinate."""
+    return jnp.where(cloud.mask[:, None], jax.nn.softmax(5.0 * cloud.points, axis=1), 0.0)
+
+
+def one_by_one(planner, scenes, poses, views, keys, noise=NOISE):
+    runs = zip(scenes, poses, keys, strict=True)
+    return [nbv.simulate(planner, scene, pose, views, key, noise, progress=False) for scene, pose, key in runs]
+
+
+def stacked(trees):
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
+
+
+def assert_same_bits(a, b):
+    assert jax.tree.structure(a) == jax.tree.structure(b)
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+def assert_equal(together, alone, acquisition):
+    values = [[np.nan if view.proposal is None else view.proposal.value for view in each.views] for each in alone]
+    np.testing.assert_array_equal(together.values, np.asarray(values, np.float32))
+    assert np.isnan(together.values[:, 0]).all()
+    assert_same_bits(together.poses, stacked([stacked([view.pose for view in each.views]) for each in alone]))
+    assert_same_bits(together.clouds, stacked([each.cloud for each in alone]))
+    answers = [[view.answer(acquisition) for view in each.views] for each in alone]
+    if answers[0][0] is None:
+        assert together.answers is None
+    else:
+        expected = [[answer.values for answer in each] for each in answers]
+        np.testing.assert_array_equal(together.answers, np.asarray(expected, np.float32))
+
+
+def test_episodes_are_those_of_simulate(compilations):
+    """From a first pose each, and from one for all; any number of views by one program."""
+    together = nbv.episodes(COVERAGE, BALLS, POSES, 3, KEYS)
+    assert_equal(together, one_by_one(COVERAGE, BALLS, POSES, 3, KEYS), COVERAGE.acquisition)
+    assert len(np.unique(np.asarray(together.poses.position).reshape(-1, 3), axis=0)) > 5
+    keys = jax.random.split(jax.random.key(8), 3)
+    del compilations[:]
+    more = nbv.episodes(COVERAGE, BALLS[::-1], FIRST, 4, keys)
+    # The pose along an axis, and slices of another length: no program of an episode.
+    assert len(compilations) < 10
+    assert_equal(more, one_by_one(COVERAGE, BALLS[::-1], 3 * [FIRST], 4, keys), COVERAGE.acquisition)
+
+
+@pytest.mark.parametrize(
+    ("score", "noise"),
+    [
+        (nbv.CrossEntropy(by_height, num_points=64), nbv.SensorNoise(0.03, 0.02)),
+        (nbv.SoftPartCount(by_octant), nbv.SensorNoise(0.0, 0.0)),
+        (lambda cloud: jnp.sum(cloud.points**2), nbv.SensorNoise()),
+    ],
+    ids=["classes", "parts", "utility"],
+)
+def test_answers_are_those_of_each_view(score, noise):
+    planner = planner_of(nbv.FarthestView(12), score)
+    together = nbv.episodes(planner, BALLS, POSES, 3, KEYS, noise)
+    assert together.answers.shape[:2] == (3, 3)
+    assert (together.answers[:, 0] != together.answers[:, 1]).any()
+    assert_equal(together, one_by_one(planner, BALLS, POSES, 3, KEYS, noise), planner.acquisition)
+
+
+def test_scenes_on_a_grid_with_a_leading_axis():
+    nodes = jnp.stack(jnp.meshgrid(*3 * [jnp.asarray(nbv.Grid(20).axis, jnp.float32)], indexing="ij"), axis=-1)
+    values = jnp.stack([ball(nodes) for ball in BALLS])
+    batch, planner = GridSurface.from_values(values, 0.0, nbv.Grid(20)), planner_of(nbv.FarthestView(12))
+    surfaces = [GridSurface.from_values(value, 0.0, nbv.Grid(20)) for value in values]
+    together = nbv.episodes(planner, batch, FIRST, 3, KEYS)
+    assert_equal(together, one_by_one(planner, surfaces, 3 * [FIRST], 3, KEYS), planner.acquisition)
+    assert_same_bits(nbv.episodes(planner, surfaces, FIRST, 3, KEYS), together)
+
+
+def test_several_at_once_choose_the_same_views():
+    """Two, and the third by itself."""
+    planner = planner_of(nbv.FarthestView(12))
+    alone = stacked([each.cloud for each in one_by_one(planner, BALLS, POSES, 3, KEYS)])
+    together = nbv.episodes(planner, BALLS, POSES, 3, KEYS, batch_size=2)
+    np.testing.assert_array_equal(together.clouds.mask, alone.mask)
+    np.testing.assert_allclose(together.clouds.points, alone.points, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_answers_about_known_parts():
+    blocks = [Cuboid([1.0, 0.4, 0.8]), Cuboid([0.5, 0.6, 0.6])]
+    bank = nbv.ShapeBank.of(blocks, ["wide", "cube"], is_true_size=True)
+    sampler = planner_of().sampler.with_bank(bank, FreeRotation())
+    planner = planner_of(nbv.FarthestView(12))
+    planner = eqx.tree_at(lambda planner: planner.sampler, planner, sampler)
+    together = nbv.episodes(planner, blocks, POSES[:2], 3, KEYS[:2])
+    assert together.answers.shape == (2, 3, 3)
+    # Names are in alphabetical order.
+    assert (np.argmax(together.answers[:, -1], axis=1) == [1, 0]).all()
+    assert_equal(together, one_by_one(planner, blocks, POSES[:2], 3, KEYS[:2]), planner.acquisition)
+
+
+def with_views(views):
+    return lambda: nbv.episodes(COVERAGE, BALLS, FIRST, views, KEYS)
+
+
+def of_scenes(*scenes):
+    return lambda: nbv.episodes(COVERAGE, list(scenes), FIRST, 2, KEYS[: len(scenes)])
+
+
+BOX = trimesh.creation.box()
+WRONG = {
+    "no view": (with_views(0), "asked for 0 views"),
+    "more views than there is room for": (with_views(7), "room for 6: raise"),
+    "triangles": (of_scenes(mesh_from_sdf(BALLS[0], nbv.Grid(20))), "scene 0 is a TriangleMesh.*solid_of_mesh"),
+    "a mesh of trimesh's": (of_scenes(BALLS[0], BOX), "scene 1 is a Trimesh.*solid_of_mesh"),
+    "one mesh": (lambda: nbv.episodes(COVERAGE, BOX, FIRST, 2, KEYS), "the scene is a Trimesh.*solid_of_mesh"),
+    "two structures": (of_scenes(BALLS[0], Sphere(0.7)), r"scene 1 \(Sphere\) has another .* scene 0 \(Union\)"),
+    "what is no scene": (of_scenes("spot.obj"), "scene 0 is 'spot.obj'; give Surface or SignedDistance"),
+    "too few scenes": (lambda: nbv.episodes(COVERAGE, BALLS[:2], FIRST, 2, KEYS), "2 scenes for 3 keys"),
+    "no leading axis": (lambda: nbv.episodes(COVERAGE, BALLS[0], FIRST, 2, KEYS), r"3 keys, but .* \[scene\] \* 3"),
+    "too few poses": (lambda: nbv.episodes(COVERAGE, BALLS, POSES[:2], 2, KEYS), r"batch \(2,\) of poses for 3 keys"),
+    "a pose in millimetres": (
+        lambda: nbv.episodes(COVERAGE, BALLS, nbv.look_at((0.0, 0.0, 2500.0)), 2, KEYS),
+        "not of the scene",
+    ),
+    "none at once": (lambda: nbv.episodes(COVERAGE, BALLS, FIRST, 2, KEYS, batch_size=0), "the batch size is 0"),
+    "no keys": (lambda: nbv.episodes(COVERAGE, [], FIRST, 2, KEYS[:0]), "the keys are an array of shape"),
+    "within jit": (
+        lambda: jax.jit(lambda keys: nbv.episodes(COVERAGE, BALLS, FIRST, 2, keys).values)(KEYS),
+        "outside jit",
+    ),
+}
+
+
+@pytest.mark.parametrize(("call", "message"), WRONG.values(), ids=WRONG)
+def test_what_cannot_be_meant_is_refused(call, message):
+    with pytest.raises(InputError, match=message):
+        call()
+
+
+def test_episodes_that_go_wrong_are_named():
+    planner, away = planner_of(nbv.FarthestView(2)), nbv.look_at((0.0, 0.0, 2.5), (0.0, 0.0, 9.0))
+    firsts = jax.tree.map(lambda row, rows: rows.at[1].set(row), away, POSES)
+    with pytest.raises(InputError, match="first view of episode 1 sees nothing"):
+        nbv.episodes(planner, BALLS, firsts, 2, KEYS)
+    with pytest.raises(InputError, match="value of view 4 of episode 0 is -inf: all candidates have been visited"):
+        nbv.episodes(planner, BALLS, POSES, 4, KEYS)
+
+
+PROGRAM = """
+    import sys
+
+    import jax
+
+    jax.config.update("jax_num_cpu_devices", 2)
+    import numpy as np
+
+    import jaxnbv as nbv
+
+    sampler = nbv.SurfaceSampler(nbv.GeometricSPSR(0.05, truncation=6), nbv.Grid(20), num_samples=2)
+    camera, search = nbv.Camera(height=8, width=8), getattr(nbv, sys.argv[1])(8)
+    planner = nbv.Planner(nbv.NewSurface(), search, camera, sampler, capacity=64, max_views=4)
+    scenes = [nbv.sdf.Sphere(radius) for radius in (0.6, 0.7, 0.8)]
+    first, keys = nbv.look_at((0.8, 0.9, 2.2)), jax.random.split(jax.random.key(0), 3)
+    shared = nbv.episodes(planner, scenes, first, 3, keys)
+    assert len(shared.values.sharding.device_set) == 2
+    with jax.default_device(jax.devices()[0]):
+        alone = nbv.episodes(planner, scenes, first, 3, keys)
+    assert len(alone.values.sharding.device_set) == 1
+    for a, b in zip(jax.tree.leaves(shared), jax.tree.leaves(alone), strict=True):
+        np.testing.assert_array_equal(a, b)
+    one = nbv.simulate(planner, scenes[2], first, 3, keys[2], progress=False)
+    np.testing.assert_array_equal(shared.values[2, 1:], np.stack([view.proposal.value for view in one.views[1:]]))
+    np.testing.assert_array_equal(shared.clouds.points[2], one.cloud.points)
+"""
+
+
+@pytest.mark.parametrize("search", ["FarthestView", pytest.param("DiscreteSearch", marks=pytest.mark.slow)])
+def test_two_devices_give_the_same_arrays(search, tmp_path, monkeypatch):
+    """In a process of its own, before whose start the devices are counted, compiled as users' programs are."""
+    for name in ("XLA_FLAGS", "JAX_DISABLE_MOST_OPTIMIZATIONS"):
+        monkeypatch.delenv(name, raising=False)
+    program = tmp_path / "program.py"
+    program.write_text(textwrap.dedent(PROGRAM))
+    ended = subprocess.run([sys.executable, program, search], capture_output=True, text=True, timeout=600)
+    assert ended.returncode == 0, ended.stderr

@@ -1,0 +1,55 @@
+"""Parts of a program have the bits of programs of their own, with XLA's optimisations on."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxnbv.planning.program_parts import in_parts
+
+COMPUTES = True
+X, Y, Z = jax.random.normal(jax.random.key(0), (3, 500, 3))
+
+
+@jax.jit
+def turned(x, y):
+    """Laid out by columns within the program."""
+    return jnp.stack([x[:, 0] * y[:, 1], x[:, 1] / 3.0, jnp.exp(y[:, 2])]).T
+
+
+@jax.jit
+def lengths(x):
+    return jnp.sqrt(jnp.sum(x * x * 0.3 + x, axis=-1) ** 2 + jnp.sum(x * x, axis=-1))
+
+
+def chain(x, y, z):
+    """Fused, a product and a sum are rounded once."""
+    return lengths(turned(x * y + z, y)) * x[:, 0] + z[:, 0] / 3.0
+
+
+@pytest.mark.parametrize("compiled", [jax.jit, lambda f: lambda *a: jax.jit(jax.vmap(f))(*(x[None] for x in a))[0]])
+def test_a_program_has_the_bits_of_its_parts(compiled):
+    found = compiled(lambda *given: in_parts(chain, *given))(X, Y, Z)
+    np.testing.assert_array_equal(found, chain(X, Y, Z))
+
+
+def test_what_does_not_change_in_a_loop_keeps_its_bits():
+    """Moved out of the loop, the product would be rounded by itself."""
+    step = jax.jit(lambda total, x, y: x * y + total)
+
+    def add(index, total):
+        return in_parts(step, total, X, Y)
+
+    found = jax.jit(lambda: jax.lax.fori_loop(0, 4, add, Z))()
+    expected = Z
+    for _ in range(4):
+        expected = step(expected, X, Y)
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_what_is_no_array_passes():
+    part = eqx.filter_jit(lambda pair: in_parts(lambda p: (p[0] + 1, p[1], None), pair))
+    found = part((X, "name"))
+    assert found[1:] == ("name", None)
+    np.testing.assert_array_equal(found[0], X + 1)
