@@ -416,7 +416,7 @@ REFUSED = {
     "a depth's noise below zero": (lambda: nbv.DepthNoise(-1.0), "deviation is -1.0"),
     "a depth's noise for another camera": (
         lambda: nbv.DepthNoise(0.1)(SCAN, KEY, nbv.Camera(), POSE),
-        "give its camera",
+        "give the camera that took it",
     ),
     "a ball of no size around a solid": (lambda: nbv.SDFSurface(nbv.sdf.Sphere(1.0), 0.0), "must be positive"),
     "values of another size": (

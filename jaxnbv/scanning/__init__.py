@@ -1,4 +1,4 @@
-"""Surfaces that rays can hit, and the scanner."""
+"""Surfaces that rays can hit, simulated scans of them, free space and obstacles."""
 
 from jaxnbv.scanning import metrics as metrics
 from jaxnbv.scanning.free_space import Carving as Carving

@@ -1,4 +1,4 @@
-"""How good a set of views was, measured against the true surface: coverage, Chamfer and Hausdorff distance."""
+"""Metrics that compare views or a reconstruction with the true surface: coverage, Chamfer and Hausdorff distance."""
 
 import math
 from collections.abc import Iterable
@@ -17,40 +17,41 @@ from jaxnbv.scanning.mesh import TriangleMesh, mesh_from_sdf
 from jaxnbv.scanning.scanner import Surface
 from jaxnbv.scanning.sphere_tracing import SDFSurface
 
-# Of the authors: points that each of the two surfaces is sampled at.
+# The authors' number of sample points on each of the two surfaces.
 SURFACE_POINTS = 20_000
-# The least cosine of incidence at which a pixel shows all of the plane that it meets.
+# Least cosine of incidence. Pixels that are steeper show no more than they would at this one.
 GRAZING = 0.2
 
 
 def coverage(views: Iterable[Any], truth: Float[AnyArray, "n 3"], size: float = 0.05) -> list[float]:
-    """Share in [0, 1] of the n points of `truth` that a pixel of a view, or of one before it, shows; after each view.
+    """Share in [0, 1] of the n points of `truth` that this view or an earlier one shows, after each view.
 
-    - `views`: those of an episode, or others that have a `scan`, the `camera` that took it, and the `pose`.
-    - `size`: how far before or behind its pixel's hit a point may be; sensor noise is to be well below it.
+    - `views`: the views of an episode, or other objects with a `scan`, its `camera` and its `pose`.
+    - `size`: largest distance along the ray between a point and its pixel's hit. Sensor noise must be well below it.
 
-    With points that are uniform by area it is a share of area. Surface that no camera can see, such as the walls of a
-    closed cavity, counts as not covered. A sheet thinner than `size` is covered from either side.
+    If the points are uniform by area, the result is a share of area. Surface that no camera can see, such as the walls
+    of a closed cavity, counts as not covered. A sheet thinner than `size` is covered from either side.
 
-    **Raises:** `ValueError` if `truth` is empty or not finite, `size` <= 0, or a scan is no image of its camera.
+    **Raises:** `ValueError` if `truth` is empty or not finite, `size` <= 0, or a scan does not have one row per ray of
+    its camera.
     """
     truth = _points(truth, "true surface")
     require(size > 0, f"the size is {size}; it must be positive, in scene units")
-    seen = np.zeros(len(truth), bool)
+    is_covered = np.zeros(len(truth), bool)
     shares = []
     for view in views:
-        seen |= shows(view.scan, view.camera, view.pose, truth, size)
-        shares.append(float(seen.mean()))
+        is_covered |= shows(view.scan, view.camera, view.pose, truth, size)
+        shares.append(float(is_covered.mean()))
     return shares
 
 
 def shows(
     scan: PointCloud, camera: Camera, pose: Pose, truth: Float[np.ndarray, "n 3"], size: float
 ) -> Bool[np.ndarray, " n"]:
-    """Whether a scan shows each of some points of the true surface: the point is as far away as the hit of the pixel
-    that it falls into, to `size` and to what the hit's plane gains within half a pixel.
+    """Whether a scan shows each point of the true surface. It does if the point's distance from the camera differs from
+    that of its pixel's hit by at most `size` plus the change of distance on the hit's plane within half a pixel.
 
-    **Raises:** `ValueError` if the scan is no image of the camera.
+    **Raises:** `ValueError` if the scan does not have one row per ray of the camera.
     """
     points, normals, mask = (np.asarray(rows) for rows in (scan.points, scan.normals, scan.mask))
     require(
@@ -74,26 +75,26 @@ def shows(
 
 
 def truth_points(scene: Surface, key: PRNGKeyArray, count: int = SURFACE_POINTS) -> Float[np.ndarray, "count 3"] | None:
-    """`count` points of the `true_mesh`, uniform by area, in scene coordinates; None where there is none."""
+    """`count` points of the `true_mesh`, uniform by area, in scene coordinates; None if there is no mesh."""
     mesh = true_mesh(scene)
     return None if mesh is None else mesh.sample_points(key, count)
 
 
 def true_mesh(scene: Surface) -> TriangleMesh | None:
-    """A known surface as triangles in scene coordinates: a mesh as it is, a signed distance by marching cubes over the
-    scene's grid; None for another kind."""
+    """The surface as triangles in scene coordinates: a mesh is returned unchanged, a signed distance goes through
+    marching cubes on the default grid. None for another kind of surface."""
     if isinstance(scene, SDFSurface):
         return mesh_from_sdf(scene.sdf, Grid())
     return scene if isinstance(scene, TriangleMesh) else None
 
 
 class SurfaceDistance(NamedTuple):
-    """Distances between a reconstruction R and the truth T, each given by points of it, in scene units.
+    """Distances between points of a reconstruction R and points of the true surface T, in scene units.
 
     With d(x, Y) = min_{y in Y} |x - y|, not squared:
 
-    - `accuracy`: mean_{x in R} d(x, T), large where the reconstruction has surface that is not there;
-    - `completeness`: mean_{y in T} d(y, R), large where it lacks some;
+    - `accuracy`: mean_{x in R} d(x, T), large if the reconstruction has surface that is not there;
+    - `completeness`: mean_{y in T} d(y, R), large if surface is missing from the reconstruction;
     - `hausdorff`: max(max_{x in R} d(x, T), max_{y in T} d(y, R)).
     """
 
@@ -103,22 +104,22 @@ class SurfaceDistance(NamedTuple):
 
     @property
     def chamfer(self) -> float:
-        """accuracy + completeness: the sum of both directions, which is of the size of the paper's numbers."""
+        """accuracy + completeness, the sum of both directions. The paper's numbers have this size."""
         return self.accuracy + self.completeness
 
 
 def surface_distance(reconstruction: Float[AnyArray, "n 3"], truth: Float[AnyArray, "m 3"]) -> SurfaceDistance:
     """Chamfer and Hausdorff distance between two surfaces, from points of each (`TriangleMesh.sample_points`).
 
-    Two samples of one surface do not coincide: n points that are uniform on an area A have a mean distance of about
-    sqrt(A / n) / 2 to another sample, and so a Chamfer distance of twice that.
+    The distance between two samples of the same surface is not zero: n points that are uniform on an area A have a mean
+    distance of about sqrt(A / n) / 2 to another sample. Their Chamfer distance is twice that.
 
-    **Raises:** `ValueError` if either has no points, or some that are not finite.
+    **Raises:** `ValueError` if either has no points or points that are not finite.
     """
-    found, true = _points(reconstruction, "reconstruction"), _points(truth, "true surface")
-    from_found, from_true = cKDTree(true).query(found)[0], cKDTree(found).query(true)[0]
-    hausdorff = max(float(from_found.max()), float(from_true.max()))
-    return SurfaceDistance(float(from_found.mean()), float(from_true.mean()), hausdorff)
+    points, true = _points(reconstruction, "reconstruction"), _points(truth, "true surface")
+    from_points, from_true = cKDTree(true).query(points)[0], cKDTree(points).query(true)[0]
+    hausdorff = max(float(from_points.max()), float(from_true.max()))
+    return SurfaceDistance(float(from_points.mean()), float(from_true.mean()), hausdorff)
 
 
 def _points(points: Float[AnyArray, "n 3"], name: str) -> Float[np.ndarray, "n 3"]:

@@ -1,5 +1,5 @@
-"""Surfaces that rays can hit; the paper's scan(theta; f), the oriented points that a depth camera sees of one; sensors'
-noise; and how a hit moves with the ray and the surface."""
+"""Surfaces that rays can hit, the paper's scan(theta; f) (the oriented points that a depth camera sees), sensor noise,
+and the derivatives of hits."""
 
 import math
 import warnings
@@ -19,7 +19,7 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 
-# Forty times the longest side of an object.
+# In scene units: forty times the longest side of an object.
 _FAR_OFF = 100.0
 
 
@@ -51,33 +51,32 @@ class Surface(eqx.Module):
 
     @abstractmethod
     def trace(self, origins: Float[AnyArray, "rays 3"], directions: Float[AnyArray, "rays 3"]) -> Hits:
-        """First hits of the rays origin + t direction, t >= 0, with unit directions; of either side of the surface.
+        """First hits of the rays origin + t direction, t >= 0, with unit directions. Both sides of the surface count.
 
-        A sensor sees only what faces it: an origin inside the surface sees the surface from within, its normals turned
-        to the origin like all others.
+        A ray that starts inside the surface hits it from within. Normals point to the side of the origin there too.
         """
 
     def contains(self, points: Float[AnyArray, "n 3"]) -> Bool[AnyArray, " n"]:
-        """Which points (scene coordinates) lie inside; none of a surface that encloses nothing."""
+        """Whether each point (scene coordinates) lies inside. All False for a surface that encloses nothing."""
         return np.zeros(len(points), bool)
 
     @property
     def class_label(self) -> Int[AnyArray, ""] | None:
-        """Index of the object's class; None where it has none."""
+        """Index of the object's class; None if it has none."""
         return None
 
     def part_labels(self, points: Float[Array, "n 3"]) -> Int[Array, " n"] | None:
-        """Index of the part that each point of the surface belongs to; None for an object without parts."""
+        """Index of the part that each surface point belongs to; None for an object without parts."""
         return None
 
     @property
     def world_frame(self) -> Frame | None:
-        """From the world that the surface was given in to the scene; None where it was given in the scene."""
+        """The frame that maps the surface's original world coordinates to the scene; None if these are the scene's."""
         return None
 
 
 class SensorNoise(eqx.Module):
-    """Gaussian sensor noise: x + eps with eps ~ N(0, points^2 I), and normals n + eps, normalised again.
+    """Gaussian sensor noise: x + eps with eps ~ N(0, points^2 I). Normals become n + eps and are normalised again.
 
     - `points`: standard deviation of each coordinate, in scene units.
     - `normals`: standard deviation of each component of the unit normals.
@@ -99,9 +98,9 @@ class SensorNoise(eqx.Module):
     def __call__(
         self, cloud: PointCloud, key: PRNGKeyArray, camera: Camera | None = None, pose: Pose | None = None
     ) -> PointCloud:
-        """The cloud with noise on its filled rows, whatever took it.
+        """The cloud with noise on its filled rows. The camera does not matter.
 
-        Where the pose is given, `sight` is the distance to the noisy points: a noisy scan holds no exact range.
+        If there is a pose, `sight` becomes the distance to the noisy points, so that it does not reveal exact ranges.
         """
         point_key, normal_key = jax.random.split(key)
         points = cloud.points + self.points * jax.random.normal(point_key, cloud.points.shape, cloud.points.dtype)
@@ -117,16 +116,16 @@ class SensorNoise(eqx.Module):
 
 
 class DepthNoise(eqx.Module):
-    """What triangulation does to a depth image: a disparity is 1/z times a constant, so noise and rounding are the same
-    at all depths in 1/z, and in z they grow as z^2,
+    """Noise and rounding of a depth camera that triangulates. A disparity is 1/z times a constant, so both are the same
+    at all depths z in 1/z and grow as z^2 in z:
 
         1/z' = step round((1/z + deviation eps) / step),   eps ~ N(0, 1).
 
-    Points and normals are then found as of any depth image, by `PointCloud.from_depth`. Which hits return at all is
-    up to the camera: its range and `max_incidence`.
+    `PointCloud.from_depth` then computes points and normals, as for any depth image. The camera's range and
+    `max_incidence` decide which hits return at all.
 
     - `deviation`, `step`: in 1 / metre; a step of 0 does not round.
-    - `scale`: scene units a metre, `frame.scale` where the world is in metres.
+    - `scale`: scene units per metre; `frame.scale` if the world is in metres.
 
     **Raises:** `ValueError` for a negative deviation or step, or a scale that is not positive.
     """
@@ -139,41 +138,43 @@ class DepthNoise(eqx.Module):
         check_fields(self)
         for name in ("deviation", "step"):
             require(getattr(self, name) >= 0, f"the noise's {name} is {getattr(self, name)}; it must not be negative")
-        require(self.scale > 0, f"the noise's scale is {self.scale}; it must be positive, in scene units a metre")
+        require(self.scale > 0, f"the noise's scale is {self.scale}; it must be positive, in scene units per metre")
 
     @classmethod
     def kinect_v1(cls, scale: float = 1.0) -> "DepthNoise":
-        """1.4 mm at a metre, in steps of 2.85 mm (Khoshelham and Oude Elberink, Sensors 12, 2012)."""
+        """Noise of 1.4 mm at 1 m, in steps of 2.85 mm (Khoshelham and Oude Elberink, Sensors 12, 2012)."""
         return cls(1.425e-3, 2.85e-3, scale)
 
     @classmethod
     def realsense_d435(cls, scale: float = 1.0) -> "DepthNoise":
-        """3.8 mm at a metre, in steps of 1.5 mm: a disparity is right to 0.08 pixels and told to 1/32, with a baseline
-        of 50 mm and 848 pixels across 90 degrees (Intel's papers on tuning and on subpixel linearity)."""
+        """Noise of 3.8 mm at 1 m, in steps of 1.5 mm: disparities have an error of 0.08 pixels and a resolution of
+        1/32, with a baseline of 50 mm and 848 pixels across 90 degrees (Intel's papers on tuning and on subpixel
+        linearity)."""
         pixels_times_metres = 848 / 2 / math.tan(math.radians(45.0)) * 0.05
         return cls(0.08 / pixels_times_metres, 1 / 32 / pixels_times_metres, scale)
 
     @checked
     def measured(self, depth: Float[Array, " n"], key: PRNGKeyArray) -> Float[Array, " n"]:
-        """What is measured of depths in scene units, zero where there is none."""
-        seen = depth > 0
-        inverse = jnp.where(seen, self.scale / jnp.where(seen, depth, 1.0), 0.0)
+        """Noisy depths for exact ones, in scene units. In both, zero stands for no depth."""
+        has_depth = depth > 0
+        inverse = jnp.where(has_depth, self.scale / jnp.where(has_depth, depth, 1.0), 0.0)
         inverse = inverse + self.deviation * jax.random.normal(key, inverse.shape, inverse.dtype)
         if self.step > 0:
             inverse = self.step * jnp.round(inverse / self.step)
-        known = seen & (inverse > 0)
-        return jnp.where(known, self.scale / jnp.where(known, inverse, 1.0), 0.0)
+        is_measured = has_depth & (inverse > 0)
+        return jnp.where(is_measured, self.scale / jnp.where(is_measured, inverse, 1.0), 0.0)
 
     @checked
     def __call__(self, scan: PointCloud, key: PRNGKeyArray, camera: Camera, pose: Pose) -> PointCloud:
-        """What the camera makes of a scan without noise: again one row a pixel. A pixel whose depth is rounded to
-        nothing, or whose neighbours have no plane, is invalid.
+        """The noisy scan for a scan without noise, again one row per pixel. A pixel is invalid if its inverse depth
+        becomes zero or negative, or if no plane fits its neighbours.
 
-        **Raises:** `ValueError` if the scan is no image of the camera.
+        **Raises:** `ValueError` if the scan does not have one row per ray of the camera.
         """
         require(
             scan.mask.shape == (camera.num_rays,),
-            f"the scan has rows of shape {scan.mask.shape} but the camera {camera.num_rays} rays: give its camera",
+            f"the scan has rows of shape {scan.mask.shape} but the camera {camera.num_rays} rays: give the camera that "
+            "took it",
         )
         depth = jnp.matmul(scan.points - pose.position, pose.forward, precision="highest")
         depth = self.measured(jnp.where(scan.mask, depth, 0.0), key)
@@ -183,17 +184,17 @@ class DepthNoise(eqx.Module):
 
 
 Noise: TypeAlias = SensorNoise | DepthNoise
-"""What a sensor makes of a scan without noise: a function of the scan, a key, the camera and the pose."""
+"""Sensor noise: a function of a scan without noise, a key, the camera and the pose that returns the noisy scan."""
 
 
 def far_from_scene(pose: Pose) -> str | None:
-    """What is wrong with known poses that stand too far from the scene to be meant; None if nothing is."""
-    away = float(np.linalg.norm(np.asarray(pose.position), axis=-1).max(initial=0.0))
-    if away <= _FAR_OFF:
+    """An error message if a pose (not traced) is implausibly far from the scene; None if all are near enough."""
+    distance = float(np.linalg.norm(np.asarray(pose.position), axis=-1).max(initial=0.0))
+    if distance <= _FAR_OFF:
         return None
     return (
-        f"a camera stands {away:.4g} scene units from the middle of the scene, where an object's longest side is 2.5. "
-        "Is its pose in millimetres or metres? Bring it to the scene with Frame.to_scene(pose), or use a Session"
+        f"a camera stands {distance:.4g} scene units from the middle of the scene, where an object's longest side is "
+        "2.5. Is its pose in millimetres or metres? Bring it to the scene with Frame.to_scene(pose), or use a Session"
     )
 
 
@@ -201,21 +202,21 @@ def far_from_scene(pose: Pose) -> str | None:
 def scan(
     surface: Surface, camera: Camera, pose: Pose, barrier: Float[Array, "*batch rays"] | None = None
 ) -> PointCloud:
-    """What the camera sees of the surface from a pose: one row a pixel, missed where its ray hits nothing in its range,
-    invalid where it hits what is too near, or too aslant.
+    """The scan of a surface from a pose, one row per pixel. A row is missed if its ray hits nothing within the camera's
+    range. It is invalid if the hit is too near or at too large an angle of incidence.
 
-    - `barrier`: how far along each ray something else stands (`Obstacles.barrier`); what is behind is missed.
+    - `barrier`: distance along each ray to an obstacle (`Obstacles.barrier`); hits behind it are missed.
 
-    Poses with leading axes give clouds with the same leading axes. Points are in scene coordinates; normals are unit
-    and turned to the sensor. No noise: apply a `SensorNoise` to the result. Runs under `jit` where `surface.in_jit`.
-    Warns if a camera so far off that its pose must be in other units sees nothing.
+    Poses with leading axes give clouds with the same leading axes. Points are in scene coordinates. Normals are unit
+    and point towards the sensor. There is no noise: apply a `SensorNoise` to the result. Runs under `jit` if
+    `surface.in_jit`. Warns if the scan is empty and the camera so far away that its pose must be in other units.
     """
     origins, directions = camera.rays(pose)
     hits = surface.trace(origins.reshape(-1, 3), directions.reshape(-1, 3))
-    found = _returns(hits, origins, directions, camera, pose, barrier)
-    if not is_traced(pose, found) and (problem := far_from_scene(pose)) and not bool(found.mask.any()):
+    cloud = _returns(hits, origins, directions, camera, pose, barrier)
+    if not is_traced(pose, cloud) and (problem := far_from_scene(pose)) and not bool(cloud.mask.any()):
         warnings.warn(f"the scan sees nothing: {problem}", stacklevel=3)
-    return found
+    return cloud
 
 
 @eqx.filter_jit
@@ -227,7 +228,7 @@ def _returns(
     pose: Pose,
     barrier: Float[Array, "*batch rays"] | None,
 ) -> PointCloud:
-    """The hits that the sensor sees, as an image."""
+    """The hits that return to the sensor, as a scan."""
     shape = origins.shape[:-1]
     mask = hits.mask.reshape(shape)
     points, normals = hits.points.reshape(*shape, 3), hits.normals.reshape(*shape, 3)
@@ -257,16 +258,16 @@ def implicit_depth(
     mask: Bool[Array, " n"],
     grazing: Float[Array, " n"],
 ) -> Float[Array, " n"]:
-    """The depths t at which n rays meet a surface, as differentiable functions of whatever `along` holds.
+    """The depths t at which n rays meet a surface, differentiable in the arrays of `along`.
 
-    - `along`: a module that gives f at a depth along every ray; its arrays are what hits are differentiated in.
-    - `depth`: the roots, f = 0, however they were found; they come back as they are.
-    - `mask`: which rays hit; the others have derivative zero.
-    - `grazing`: smaller slopes |df/dt| are held at this value, their sign kept: where a ray runs along the surface the
-      derivative of its hit is unbounded.
+    From f(theta, t(theta)) = 0 follows dt = -(df/dtheta dtheta) / (df/dt). The rule applies to itself for derivatives
+    of higher order.
 
-    From f(theta, t(theta)) = 0 follows dt = -(df/dtheta dtheta) / (df/dt). The rule is applied to itself for
-    derivatives of higher order.
+    - `along`: a module that returns f at a depth along each ray. Its arrays are the parameters theta.
+    - `depth`: the roots, f = 0, from any method. They are returned unchanged.
+    - `mask`: whether each ray hits; the others have derivative zero.
+    - `grazing`: least slope |df/dt|. Smaller ones are set to it and keep their sign, since the derivative is unbounded
+      for a ray that runs along the surface.
     """
     return depth
 
@@ -282,12 +283,12 @@ def _implicit_depth_jvp(primals, tangents):
 
 
 def pixel_area(scan: PointCloud, camera: Camera, pose: Pose, steepest: float) -> Float[Array, " rays"]:
-    """The area of each pixel on the surface that it shows, in squared scene units; zero where it shows none.
+    """The area of surface that each pixel shows, in squared scene units; zero for pixels without a point.
 
-    A pixel of focal lengths fx and fy at depth z and distance r has r^2 omega / cos = z^3 / (r fx fy cos).
+    With focal lengths fx and fy, depth z and distance r it is r^2 omega / cos = z^3 / (r fx fy cos).
 
-    - `scan`: of the camera's rays from the pose. `steepest`: the least cosine of incidence at which a pixel counts for
-      all of its area.
+    - `scan`: the scan of this camera from this pose.
+    - `steepest`: least cosine of incidence. Smaller ones count as this one.
     """
     offset = jnp.where(scan.mask[:, None], scan.points - pose.position, pose.forward)
     depth = jnp.matmul(offset, pose.forward, precision="highest")
