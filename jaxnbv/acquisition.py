@@ -1,9 +1,9 @@
-"""From imagined scans to the value of a pose: the paper's acquisition functions.
+"""Acquisition functions of the paper: the value of a pose, computed from imagined scans.
 
     alpha(theta) = E alpha(D, scan(theta; f | D)),   estimated by the mean over the step's samples f_1, ..., f_S,
 
-the same samples for all poses (common random numbers). An acquisition computes its context once from what has been
-seen, and from that the *score* of each imagined view.
+the same samples for all poses (common random numbers). An acquisition computes its *context* once a step, from the
+observations, and the *score* of each imagined view from the context.
 """
 
 from abc import abstractmethod
@@ -28,7 +28,7 @@ from jaxnbv.utility import Answer, AnyUtility, Quantity, Utility, as_utility, de
 
 
 class ImaginedView(eqx.Module):
-    """One imagined scan (rows, masked, in scene coordinates), the camera that takes it, and from which pose."""
+    """One imagined scan (masked rows, scene coordinates), its camera and its pose."""
 
     scan: PointCloud
     camera: Camera
@@ -36,16 +36,16 @@ class ImaginedView(eqx.Module):
 
 
 class Acquisition(eqx.Module):
-    """What one imagined scan is worth, given what has been seen. A search maximises the mean over the posterior.
+    """Base class: the worth of one imagined scan, given the observations. A search maximises its mean over the samples.
 
-    - `needs_posterior`: whether `context` looks at the posterior, which a planner then puts into the step.
-    - `cloud_only`: whether `context` looks at D alone, so that a planner can try it before there are observations.
-    - `measurable_only`: whether surface that a view looked at in vain is left out of the samples, see `Looks`.
-    - `needs_hypotheses`: whether it is about the hypotheses that a model of known parts carries, and looks at no
-      posterior; the step's only sample is then the likeliest part.
-    - `gains_once`: whether a pose that was taken has nothing more to give, so that what is expected there is expected
-      in vain. A search over candidates then takes the farthest from the cameras so far among those that are level with
-      the best, see `Proposal.tied_with_best`.
+    - `needs_posterior`: whether `context` reads the posterior. A planner then puts the posterior into the step.
+    - `cloud_only`: whether `context` reads D alone, so that a planner can try it before there are observations.
+    - `measurable_only`: whether to drop sampled surface that a view should have measured and did not, see `Looks`.
+    - `needs_hypotheses`: whether it reads the hypotheses of a model of known parts, and no posterior. The step's only
+      sample is then the likeliest part.
+    - `gains_once`: whether a second view from the same pose gains nothing. The value at the poses of earlier views is
+      then an error, and counts in which candidates are level with the best (`Proposal.tied_with_best`). A search over
+      candidates takes the one of these that is farthest from the cameras so far.
     """
 
     needs_posterior: ClassVar[bool] = False
@@ -56,11 +56,11 @@ class Acquisition(eqx.Module):
 
     @abstractmethod
     def context(self, step: StepInputs) -> Any:
-        """Whatever depends on what has been seen alone; computed once a step."""
+        """All that does not depend on the view. Computed once a step."""
 
     @abstractmethod
     def score(self, context: Any, view: ImaginedView) -> Float[Array, "*values"]:
-        """The score of one view. Finite; for a scan that sees nothing, no more than for any other."""
+        """The score of one view. It must be finite, and an empty scan must not score higher than any other."""
 
     def sample_scores(
         self,
@@ -70,12 +70,11 @@ class Acquisition(eqx.Module):
         poses: Pose,
         barrier: Float[Array, "poses rays"] | None = None,
     ) -> Float[Array, "samples poses *scores"]:
-        """The score of what each of the sampled surfaces would show from each of a batch of poses. One row will do for
-        an acquisition that is no mean over samples.
+        """Scores of the imagined scans of each sampled surface from each pose of a batch.
 
-        All poses are scanned at once, of one sample or of `samples_at_once`, so memory is that of these scans; they are
-        scored `batch_size` of them at a time. Samples are shared among devices, or the poses are where samples are too
-        few.
+        An acquisition that is not a mean over samples may return a single row. `samples_at_once` samples are scanned
+        together from all poses, and memory must hold these scans. Their scores are computed `batch_size` at a time.
+        Devices share the samples, or the poses if there are fewer samples than devices.
 
         - `barrier`: see `scan`.
         """
@@ -84,49 +83,52 @@ class Acquisition(eqx.Module):
         return shared_map(_of_sample, surfaces, context, views, self, camera, together, at_once=together)
 
     def inputs(self, step: StepInputs) -> StepInputs:
-        """The part of a step that `context` looks at. Steps whose parts have equal shapes share one compilation."""
+        """The inputs that `context` reads. Steps for which these have equal shapes share one compilation."""
         if self.cloud_only:
             return inputs_of(step.observations.cloud)
         return StepInputs(step.observations, step.posterior if self.needs_posterior else None)
 
     @property
     def batch_size(self) -> int:
-        """How many scans are scored together."""
+        """Number of scans to score together."""
         return default_batch_size()
 
     @property
     def quantity(self) -> Quantity:
-        """What its expected value is."""
+        """Name, unit and meaning of its expected value."""
         meaning = "value of an imagined scan, mean over posterior samples."
         return Quantity(f"acquisition, {type(self).__name__}", "", meaning)
 
     def answer(self, cloud: PointCloud) -> Answer | None:
-        """What D answers to what the acquisition asks; None where it has no answer."""
+        """The answer that D gives to the acquisition's question, or None if there is no such answer."""
         return None
 
     def answer_values(self, cloud: PointCloud) -> Float[Array, " n"] | None:
-        """The values of `answer`, made of JAX operations; None where there are none, or only host code has them."""
+        """The values of `answer` by JAX operations, or None if there are none or only host code can compute them."""
         return None
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> Answer | None:
-        """What `answer` should come to in the end; None where that is not known.
+        """The correct `answer`, or None if it is not known.
 
-        - `scene`: the true surface; `cloud`: points all over it, uniform by area.
+        - `scene`: the true surface.
+        - `cloud`: points on all of it, uniform by area.
         """
         return self.answer(cloud)
 
     def check(self, cloud: PointCloud) -> None:
-        """Raise `ValueError` if what the acquisition is made of gives something impossible on a cloud: the first D, and
-        D with a scan whose score is no finite number."""
+        """Raise `ValueError` if a part of the acquisition, a network say, returns an impossible result on this cloud.
+
+        Called on the first D, and on D together with a scan if the score of that scan is not finite.
+        """
         return
 
 
 class ExpectedUtilityImprovement(Acquisition):
-    """max(0, u(D u scan) - u(D)) for any utility u(cloud): the paper's alpha^(u), once averaged over samples.
+    """max(0, u(D u scan) - u(D)) for any utility u(cloud). Its mean over samples is the paper's alpha^(u).
 
-    - `utility`: a `Utility`, or a function from a `PointCloud` (rows, masked) to a scalar, made of JAX operations.
-    - `num_points`: where given, D is thinned to so many by farthest point sampling, once a step, before scans are
-      added to it: for a utility that looks at so many points anyway, and would sample D again for every scan.
+    - `utility`: a `Utility`, or a function from a `PointCloud` (masked rows) to a scalar, made of JAX operations.
+    - `num_points`: if not None, D is thinned to this number by farthest point sampling, once a step, before scans are
+      added. Use it for a utility that would otherwise thin D to this number again for every scan.
     """
 
     cloud_only: ClassVar[bool] = True
@@ -138,7 +140,7 @@ class ExpectedUtilityImprovement(Acquisition):
         require(self.num_points is None or self.num_points >= 1, f"num_points is {self.num_points}; give at least 1")
 
     def context(self, step: StepInputs) -> tuple[PointCloud, Array]:
-        """D, thinned, and u(D)."""
+        """D, thinned to `num_points`, and u(D)."""
         cloud = step.observations.cloud
         cloud = cloud if self.num_points is None else limit_capacity(cloud, self.num_points)
         return cloud, self._value(cloud)
@@ -153,7 +155,7 @@ class ExpectedUtilityImprovement(Acquisition):
 
     @property
     def batch_size(self) -> int:
-        """As the utility prefers."""
+        """The utility's batch size."""
         return self.utility.batch_size
 
     @property
@@ -162,24 +164,24 @@ class ExpectedUtilityImprovement(Acquisition):
         return self.utility.improvement
 
     def answer(self, cloud: PointCloud) -> Answer:
-        """The utility's own answer, or its value."""
+        """The utility's own answer, or u(D)."""
         own = self.utility.answer(cloud)
         return Answer((self.utility.name,), np.array([float(context_of(self, cloud)[1])])) if own is None else own
 
     def answer_values(self, cloud: PointCloud) -> Float[Array, " n"] | None:
-        """The utility's own, or its value."""
+        """The values of the utility's own answer, or u(D)."""
         own = self.utility.answer_values(cloud)
         if own is None and type(self.utility).answer is Utility.answer:
             return jnp.atleast_1d(context_of(self, cloud)[1])
         return own
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> Answer:
-        """The utility's own, or its answer on all of the surface."""
+        """The utility's own true answer, or its answer on all of the surface."""
         own = self.utility.true_answer(scene, cloud)
         return self.answer(cloud) if own is None else own
 
     def check(self, cloud: PointCloud) -> None:
-        """**Raises:** `ValueError` as the utility's own `check` does, or if u(D) is not a finite number."""
+        """**Raises:** `ValueError` if the utility's own `check` does, or if u(D) is not finite."""
         self.utility.check(cloud)
         _, value = context_of(self, cloud)
         name, count = self.utility.name, int(cloud.count)
@@ -187,7 +189,7 @@ class ExpectedUtilityImprovement(Acquisition):
 
 
 def as_acquisition(value: Any) -> Acquisition:
-    """An acquisition as it is; the expected improvement of a utility, or of a plain function as one.
+    """The value itself if it is an acquisition, else the expected improvement of this utility or plain function.
 
     **Raises:** `ValueError` for anything else.
     """
@@ -197,53 +199,55 @@ def as_acquisition(value: Any) -> Acquisition:
 
 
 class AcquisitionList(Acquisition):
-    """Several acquisitions of the same scans: compared on the same samples, at the cost of one scan.
+    """Several acquisitions evaluated on the same samples and the same scans, so each pose is scanned only once.
 
-    Its value is a vector, the members' values in their order (a member whose value is a vector itself takes as many
-    places): for `expected_value` and `Problem.scores`, not for a planner.
+    Its value is the vector of the members' values in order, and a member with a vector value takes as many places.
+    Use it with `expected_value` and `Problem.scores`, not in a planner.
     """
 
     members: tuple[Acquisition, ...]
 
     def __check_init__(self):
-        known = isinstance(self.members, tuple) and all(isinstance(member, Acquisition) for member in self.members)
-        require(known and len(self.members) > 0, f"the members are {shown(self.members)}; give a tuple of some")
+        is_valid = isinstance(self.members, tuple) and all(isinstance(member, Acquisition) for member in self.members)
+        require(
+            is_valid and len(self.members) > 0, f"the members are {shown(self.members)}; give a tuple of acquisitions"
+        )
 
     @property
     def needs_posterior(self) -> bool:  # type: ignore[override]
-        """Whether one of them does."""
+        """Whether any member needs the posterior."""
         return any(member.needs_posterior for member in self.members)
 
     def context(self, step: StepInputs) -> tuple[Any, ...]:
-        """That of each."""
+        """The context of each member."""
         return tuple(member.context(member.inputs(step)) for member in self.members)
 
     def score(self, context: tuple[Any, ...], view: ImaginedView) -> Float[Array, " values"]:
-        """The scores of one view."""
+        """The members' scores of one view."""
         values = [member.score(own, view) for member, own in zip(self.members, context, strict=True)]
         return jnp.concatenate([jnp.atleast_1d(value) for value in values])
 
     @property
     def batch_size(self) -> int:
-        """The least that one prefers."""
+        """The smallest batch size among the members."""
         return min(member.batch_size for member in self.members)
 
     def check(self, cloud: PointCloud) -> None:
-        """**Raises:** `ValueError` as one of them does."""
+        """**Raises:** `ValueError` if the check of any member does."""
         for member in self.members:
             member.check(cloud)
 
 
 def inputs_of(seen: StepInputs | Observations | PointCloud) -> StepInputs:
-    """A step's inputs as they are; observations, or a cloud alone, as inputs without posterior and samples."""
+    """Inputs of a step: `seen` itself, or observations or a cloud as inputs without posterior and samples."""
     return seen if isinstance(seen, StepInputs) else StepInputs(as_observations(seen))
 
 
 def context_of(acquisition: Acquisition, seen: StepInputs | Observations | PointCloud) -> Any:
-    """The acquisition's context, compiled.
+    """The acquisition's context, computed by a compiled function.
 
-    **Raises:** `ValueError` for a function of the user's that JAX cannot trace, and if the acquisition needs a
-    posterior and there is none.
+    **Raises:** `ValueError` if JAX cannot trace a function of the user's, or if the acquisition needs a posterior and
+    there is none.
     """
     inputs = _inputs(acquisition, seen)
     with functions_of_users():
@@ -265,23 +269,23 @@ def _context_of(acquisition: Acquisition, inputs: StepInputs) -> Any:
 
 
 def zero_if_empty(scan: PointCloud, value: Float[Array, "*values"]) -> Float[Array, "*values"]:
-    """The value, or values, or zero for a scan that sees nothing."""
+    """The value or values, or zero if the scan is empty."""
     return jnp.where(jnp.any(scan.mask), value, 0.0)
 
 
 def check_traceable(
     acquisition: Acquisition, seen: Observations | int, camera: Camera, differentiable: bool = False
 ) -> None:
-    """Check that JAX can trace an acquisition, by shapes alone: nothing is computed.
+    """Check that JAX can trace an acquisition. Uses shapes alone and computes nothing.
 
     - `seen`: observations, or the capacity of a cloud D.
-    - `camera`: whose scans it scores.
+    - `camera`: the camera of the scans that it scores.
     - `differentiable`: whether it must have derivatives in the points and normals of a scan.
 
-    **Raises:** `ValueError` if it cannot, as for a utility of NumPy, or derivatives of what calls back to host code.
+    **Raises:** `ValueError` if JAX cannot trace it (a utility in NumPy, say) or cannot differentiate it (host code).
     """
     if acquisition.needs_posterior or acquisition.needs_hypotheses:
-        # There are none yet.
+        # There is no posterior and there are no hypotheses yet.
         return
 
     def cloud(rows: int) -> PointCloud:
@@ -316,21 +320,19 @@ def expected_value(
     poses: Pose,
     barrier: Float[Array, "poses rays"] | None = None,
 ) -> Float[Array, "poses *scores"]:
-    """The acquisition at each of a batch of poses: mean over the sampled surfaces of the score of what they would show.
+    """The acquisition at each pose of a batch: the mean score of the imagined scans over the sampled surfaces.
 
-    Runs under `jit`, `grad` and `vmap`, in the poses and in what has been seen.
+    Supports `jit`, `grad` and `vmap`, in the poses and in `seen`. `AcquisitionList` adds an axis for its members.
 
-    - `seen`: a cloud D suffices for all acquisitions but those that need the posterior, which `StepInputs` holds.
+    - `seen`: the observations, or a cloud D alone. Acquisitions that need the posterior take `StepInputs`.
     - `surfaces`: the samples along a leading axis.
     - `barrier`: see `scan`.
 
-    The members of `AcquisitionList` have an axis of their own.
-
-    **Raises:** `ValueError` as the acquisition's `check` does, where values are known, and for a function of the user's
-    that JAX cannot trace.
+    **Raises:** `ValueError` if the acquisition's `check` does (not run on traced values), or if JAX cannot trace a
+    function of the user's.
     """
     inputs = _inputs(acquisition, seen)
-    # Under jit even what follows from known values is traced, so there is nothing that a check could look at.
+    # The zero is traced under jit even if all inputs are concrete. `check` needs concrete results.
     if not is_traced(acquisition, inputs, jnp.zeros(())):
         acquisition.check(inputs.observations.cloud)
     with functions_of_users():
@@ -341,8 +343,9 @@ def expected_value(
 def scores(
     acquisition: Acquisition, context: Any, scans: PointCloud, camera: Camera, poses: Pose, samples: int = 1
 ) -> Float[Array, "poses *scores"]:
-    """The score of each of a batch of scans, one from each of a batch of poses, `batch_size` of them at a time; fewer
-    where several samples are scored together.
+    """Scores of a batch of scans, one scan from each pose. `batch_size // samples` of them are computed at a time.
+
+    - `samples`: number of samples whose scans are scored together.
     """
     return batched_map(
         lambda rows: acquisition.score(context, ImaginedView(rows[0], camera, rows[1])),
@@ -351,7 +354,7 @@ def scores(
     )
 
 
-# Poses, and how far along the rays from each obstacles stand.
+# Poses, and the distance to obstacles along the rays of each.
 _Views: TypeAlias = tuple[Pose, Float[Array, "poses rays"] | None]
 
 

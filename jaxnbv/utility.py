@@ -1,4 +1,4 @@
-"""What a cloud is worth, in numbers and in words: utilities, answers, and the quantities that are maximised."""
+"""Utilities of a cloud, answers, and names and units of the quantities that are maximised."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -18,11 +18,11 @@ _POWERS = {1: "", 2: "²", 3: "³"}
 
 
 class Quantity(eqx.Module):
-    """The name, unit and meaning of what is maximised, for tables and captions.
+    """The name, unit and meaning of a maximised value, for tables and captions.
 
-    - `name`, `unit`: in words; the unit is empty where there is none, and leaves out the power of length.
+    - `name`, `unit`: in words. The unit leaves out the power of length, and is empty if there is no other unit.
     - `meaning`: the rest of a caption that begins with "Value:".
-    - `smooth`: whether values between two candidates mean anything.
+    - `smooth`: whether interpolation between the values of two candidates makes sense.
     - `length_power`: power of length in the unit (2 for an area).
     """
 
@@ -33,16 +33,16 @@ class Quantity(eqx.Module):
     length_power: int = 0
 
     def unit_in(self, frame: Frame) -> str:
-        """The whole unit in words, lengths in the units of a frame's world."""
+        """The whole unit in words, with lengths in the unit of the frame's world."""
         length = f"{frame.unit}{_POWERS.get(self.length_power, f'^{self.length_power}')}" if self.length_power else ""
         return f"{length} {self.unit}".strip()
 
 
 class Answer(eqx.Module):
-    """What the cloud D answers to the question: numbers with names. `jaxnbv.viz` puts them into words.
+    """The answer of a cloud D to the question of a task: named numbers. `jaxnbv.viz` puts them into words.
 
-    - `names`, `values`: one each.
-    - `form`: how a value is written, in the language of `str.format`.
+    - `names`, `values`: one name for each value.
+    - `form`: format of a value, for `str.format`.
     """
 
     names: tuple[str, ...]
@@ -50,27 +50,25 @@ class Answer(eqx.Module):
     form: str = "{:.4g}"
 
     def in_world(self, frame: Frame) -> "Answer":
-        """The answer, to be said in the world of a frame: the same, unless it has points or lengths."""
+        """The answer, with points and lengths converted to the frame's world when they are put into words."""
         return self
 
 
 def default_batch_size() -> int:
-    """How many calls of a function of clouds to batch.
-
-    A CPU takes them one by one, lest a network's layers leave its cache, and a GPU many at once.
-    """
+    """Number of clouds to pass to a function at once: 1 on a CPU, where larger batches leave its cache, else 128."""
     return 1 if on_cpu() else 128
 
 
 class Utility(eqx.Module):
-    """u(D): one number that says what a cloud is worth. Only `__call__` must be given.
+    """Base class of utilities u(D), the worth of a cloud as one number. Subclasses must define `__call__` only.
 
-    `name` is in words. `improvement` is the `Quantity` that is expected of a view.
+    - `name`: in words.
+    - `improvement`: name, unit and meaning of the expected improvement by a view.
     """
 
     @abstractmethod
     def __call__(self, cloud: PointCloud) -> Float[Array, ""]:
-        """u(D) of a cloud (rows, masked), made of JAX operations."""
+        """u(D) of a cloud (masked rows), by JAX operations."""
 
     @property
     def name(self) -> str:
@@ -84,11 +82,11 @@ class Utility(eqx.Module):
 
     @property
     def batch_size(self) -> int:
-        """How many clouds are valued together."""
+        """Number of clouds to evaluate together."""
         return default_batch_size()
 
     def answer(self, cloud: PointCloud) -> Answer | None:
-        """What D answers; None for u(D) itself."""
+        """The answer of D, or None if u(D) itself is the answer."""
         return None
 
     def answer_values(self, cloud: PointCloud) -> Float[Array, " n"] | None:
@@ -96,32 +94,34 @@ class Utility(eqx.Module):
         return None
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> Answer | None:
-        """What `answer` should come to, see `Acquisition.true_answer`; None for `answer` on all of the surface."""
+        """The correct `answer`, see `Acquisition.true_answer`. None means `answer` on all of the surface."""
         return None
 
     def check(self, cloud: PointCloud) -> None:
-        """Raise `ValueError` if what the utility is made of gives something impossible on a cloud."""
+        """Raise `ValueError` if a part of the utility, a network say, returns an impossible result on this cloud."""
         return
 
 
 class FunctionUtility(Utility):
-    """A plain function of a cloud as a utility, which has the function's name."""
+    """A utility from a plain function of a cloud. It has the function's name."""
 
     function: Callable[[PointCloud], Float[Array, ""]]
 
-    # What it returns is checked by `Acquisition.check`, which names it.
+    # `Acquisition.check` checks the result, since it can name the function in the error.
     def __call__(self, cloud: PointCloud) -> Any:
         return self.function(cloud)
 
     @property
     def name(self) -> str:
-        # Only functions have a name of their own; a callable object does not.
+        # Only functions have a `__name__`. Other callable objects do not.
         name = getattr(self.function, "__name__", "").strip("_").replace("_", " ")
         return name if name and name != "<lambda>" else "utility"
 
 
 def plain_function(value: Any, name: str, example: str = "") -> Callable[..., Any]:
-    """A function of a cloud as it is.
+    """The value itself if it is a function of a cloud.
+
+    - `name`, `example`: name of the argument and an example of a valid one, for the error.
 
     **Raises:** `ValueError` for anything else, a class included.
     """
@@ -131,14 +131,14 @@ def plain_function(value: Any, name: str, example: str = "") -> Callable[..., An
 
 
 def as_utility(value: Any) -> Utility:
-    """A utility as it is; a plain function as one.
+    """The value itself if it is a utility, else a plain function wrapped as one.
 
     **Raises:** `ValueError` for anything else.
     """
     return value if isinstance(value, Utility) else FunctionUtility(plain_function(value, "the utility"))
 
 
-# Functions are converted on the way in, which mypy cannot see.
+# A converter accepts plain functions too, which mypy cannot see.
 if TYPE_CHECKING:
     AnyUtility: TypeAlias = Any
 else:
