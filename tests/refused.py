@@ -403,7 +403,7 @@ REFUSED = {
         lambda: dataclasses.replace(P, sampler=NEVER).init(POSE, SCAN),
         "outside the volume",
     ),
-    "a volume of one number": (lambda: nbv.Carving(lambda x: jnp.sum(x)), "one number a point"),
+    "a volume of one number": (lambda: nbv.Carving(lambda x: jnp.sum(x)), "one number per point"),
     "a volume of NumPy": (lambda: nbv.Carving(lambda x: np.linalg.norm(x, axis=1)), "jax.numpy"),
     "two points of three values": (
         lambda: nbv.surfaces.ValueRows(jnp.zeros((2, 3)), jnp.zeros(3), jnp.ones(3), jnp.ones(3, bool)),

@@ -1,7 +1,7 @@
-"""Space that a sensor has seen to be empty, and surfaces carved by it.
+"""Space that a sensor has seen to be empty, and carving of surfaces by it.
 
-A ray says three things: it hit, and was empty up to the hit; it met nothing, and was empty all the way; or it is
-invalid and says nothing. A node of the grid is *seen empty* once all rays near it went past it.
+A ray is one of three: it hit and is empty up to the hit, it missed and is empty all the way, or it is invalid and says
+nothing. A node of the grid is *seen empty* once all rays near it went past it.
 """
 
 import functools
@@ -21,20 +21,20 @@ from jaxnbv.geometry.tensor_grid import on_tensor_grid
 from jaxnbv.geometry.volume import Box, Volume
 from jaxnbv.scanning.grid import Grid
 
-# Noise takes fewer of the points on a face of the volume two voxels out of it.
+# Share of points that may lie outside the volume. Noise moves fewer points of a face two voxels out of the volume.
 _STRAY = 0.01
 
 
 class Carving(eqx.Module):
-    """No imagined surface is inside where the sensor saw empty space, nor outside the volume that holds the object.
+    """Makes samples empty in space that the sensor saw empty, and outside the volume that holds the object.
 
     - `volume`: where the object can be, see `jaxnbv.geometry.volume`; by default the box that scenes are scaled to.
-    - `margin_voxels`: in spacings of the grid. A node is seen empty if every ray that passes within the margin of it,
-      and its neighbours in the image, went on for the margin beyond it; it is outside if the volume is farther than
-      two.
+    - `margin_voxels`: margin in spacings of the grid. A node is seen empty if every ray that passes within the margin
+      of it, and the neighbours of these rays in the image, went on for the margin beyond it. A node is outside if it
+      is more than two margins from the volume.
 
-    So a sheet thinner than a voxel keeps its surface, though both its sides were seen; noise on a hit does not carve
-    while its standard deviation is below a third of the margin.
+    The margin keeps the surface of a sheet thinner than a voxel that was seen from both sides. Noise on a hit does not
+    carve while its standard deviation is below a third of the margin.
 
     **Raises:** `ValueError` if the margin is below half a voxel or not finite.
     """
@@ -50,10 +50,10 @@ class Carving(eqx.Module):
             f"the margin of the carving is {self.margin_voxels} voxels; it must be finite and at least 0.5",
         )
         with functions_of_users():
-            found = jax.eval_shape(self.volume, jnp.zeros((2, 3)))
+            values = jax.eval_shape(self.volume, jnp.zeros((2, 3)))
         require(
-            getattr(found, "shape", None) == (2,) and jnp.issubdtype(found.dtype, jnp.floating),
-            f"the volume says {found} of two points; it must give one number a point",
+            getattr(values, "shape", None) == (2,) and jnp.issubdtype(values.dtype, jnp.floating),
+            f"the volume returns {values} for two points; it must return one number per point",
         )
 
     def empty_nodes(
@@ -64,29 +64,29 @@ class Carving(eqx.Module):
         camera: Camera,
         barrier: Float[Array, " rays"] | None = None,
     ) -> Bool[Array, "g g g"]:
-        """The nodes that one scan shows to be empty; none for a cloud that is no sensor's image.
+        """Whether one scan shows each node to be empty. All False for a cloud that is not a sensor's image.
 
-        - `barrier`: how far along each ray something else than the object stands, beyond which nothing is known.
+        - `barrier`: distance along each ray to an obstacle, behind which nothing is known.
         """
         if scan.missed is None:
             return jnp.zeros((grid.resolution,) * 3, bool)
         # Depth along the camera's axis up to which each pixel's ray was empty.
         along = jnp.matmul(scan.points - pose.position, pose.forward, precision="highest")
-        known = jnp.asarray(jnp.inf if camera.farthest is None else camera.farthest)
+        limit = jnp.asarray(jnp.inf if camera.farthest is None else camera.farthest)
         if barrier is not None:
-            known = jnp.minimum(known, barrier / jnp.linalg.norm(camera.pixel_directions(), axis=-1))
-        depth = jnp.where(scan.mask, along, jnp.where(scan.missed, known, 0.0)).reshape(camera.height, camera.width)
+            limit = jnp.minimum(limit, barrier / jnp.linalg.norm(camera.pixel_directions(), axis=-1))
+        depth = jnp.where(scan.mask, along, jnp.where(scan.missed, limit, 0.0)).reshape(camera.height, camera.width)
         return _crossed(grid, depth, camera, pose, self.margin_voxels * grid.spacing)
 
     @eqx.filter_jit
     def outside(self, grid: Grid) -> Bool[Array, "g g g"]:
-        """The nodes outside the volume, by two margins."""
+        """Whether each node is more than two margins outside the volume."""
         axis = jnp.asarray(grid.axis, jnp.result_type(float))
         return on_tensor_grid(self.volume, axis) > self._beyond_volume(grid)
 
     def with_room(self, box: Box, grid: Grid, frame: Frame) -> Box:
-        """A box of the world with room for points that are still taken for the object's: a scan that is cropped to it
-        shows that the surface goes on where the box cuts it."""
+        """A box in world coordinates, widened by the distance at which points still count as the object's. A scan
+        cropped to the wider box shows that the surface goes on where the box cuts it."""
         return frame.to_world(frame.to_scene(box).widened(self._beyond_volume(grid) / math.sqrt(3.0)))
 
     def _beyond_volume(self, grid: Grid) -> float:
@@ -94,14 +94,14 @@ class Carving(eqx.Module):
 
     @eqx.filter_jit
     def inside(self, grid: Grid) -> Bool[Array, "g g g"]:
-        """The nodes within the volume."""
+        """Whether each node is inside the volume."""
         return on_tensor_grid(self.volume, jnp.asarray(grid.axis, jnp.result_type(float))) < 0
 
     def check_inside(self, cloud: PointCloud, grid: Grid) -> None:
-        """Check that the volume, widened by two margins, holds the cloud but for one point in a hundred, which noise
-        may have moved: an object is never cut without a word.
+        """Check that the volume, widened by two margins, holds the cloud, so that no object is cut silently. One point
+        in a hundred may lie outside because of noise.
 
-        **Raises:** `ValueError` if it does not.
+        **Raises:** `ValueError` if more do.
         """
         limit = self._beyond_volume(grid)
         outside, farthest = _beyond(self.volume, cloud, limit)
@@ -109,17 +109,17 @@ class Carving(eqx.Module):
             int(outside) <= _STRAY * int(cloud.count),
             f"{int(outside)} of {int(cloud.count)} scanned points lie up to {float(farthest):.4g} outside the volume "
             f"that is to hold the object ({self.volume}), more than {limit:.4g}: declare a larger one, "
-            "Carving(Box(low, high)), drop what is not of the object, or bring the scan to scene coordinates with "
+            "Carving(Box(low, high)), drop points of other things, or bring the scan to scene coordinates with "
             "Frame.to_scene",
         )
 
 
 @jax.jit
 def carve(values: Float[Array, "*s g g g"], empty: Bool[Array, "g g g"]) -> Float[Array, "*s g g g"]:
-    """Values of f minus its level, made positive (outside) at the nodes that are empty.
+    """Values of f minus its level, made positive (outside) at the empty nodes.
 
-    There the value is twice the largest magnitude among the node and its neighbours, so that what surface remains
-    crosses the edges of the grid near the node that may be inside, at a third of them at most.
+    The new value is twice the largest magnitude among the node and its neighbours. So where a surface crosses an edge
+    between an inside node and an empty one, it does so within a third of the edge from the inside node.
     """
     magnitude = jnp.maximum(jnp.abs(values), jnp.finfo(values.dtype).tiny)
     for axis in (-3, -2, -1):
@@ -131,16 +131,16 @@ def carve(values: Float[Array, "*s g g g"], empty: Bool[Array, "g g g"]) -> Floa
 
 @eqx.filter_jit
 def _beyond(volume: Volume, cloud: PointCloud, limit: float) -> tuple[Int[Array, ""], Float[Array, ""]]:
-    """How many points lie farther than the limit outside the volume, and how far the farthest does."""
-    # All rows, so that clouds of other counts share a compilation.
+    """The number of points farther than the limit outside the volume, and the distance of the farthest point."""
+    # All rows, so that clouds with different counts share a compilation.
     distance = jnp.where(cloud.mask, volume(cloud.points), -jnp.inf)
-    # What is not a number is not inside.
+    # Negated so that NaN counts as outside.
     return jnp.sum(~(distance <= limit)), jnp.max(distance, initial=-jnp.inf)
 
 
 def _crossed(grid: Grid, depth: Float[Array, "h w"], camera: Camera, pose: Pose, margin: float) -> Bool[Array, "g g g"]:
-    """The nodes that the rays about them have crossed, by `margin` (scene units) to all sides."""
-    # nearest[k] is the least depth within 2^k pixels, of those that there are.
+    """Whether all rays within `margin` (scene units) of each node went on for the margin beyond it."""
+    # nearest[k] is the least depth within 2^k pixels inside the image.
     nearest = [_least_within(depth, 1)]
     while 2 ** len(nearest) < max(depth.shape):
         nearest.append(_least_within(nearest[-1], 2 ** (len(nearest) - 1)))
@@ -156,30 +156,31 @@ def _crossed(grid: Grid, depth: Float[Array, "h w"], camera: Camera, pose: Pose,
         safe = jnp.where(in_front, ahead, 1.0)
         a, b = right / safe, down / safe
         place = camera.to_pixels(jnp.stack([a, b], axis=-1)).T
-        # With rays on all sides of it.
+        # The node must have rays on all sides.
         inside = (place >= 0.5) & (place <= jnp.array([[camera.width - 0.5], [camera.height - 0.5]]))
         column, row = jnp.floor(place).astype(jnp.int32)
-        # A ball's image is stretched off the axis, at most by this; one pixel more takes in the rays on both sides.
+        # The factor 1 + a^2 + b^2 bounds the stretch of a ball's image off the axis. One more pixel includes the rays
+        # on both sides.
         radius = max(camera.focal_lengths) * margin / (safe - margin) * (1.0 + a**2 + b**2) + 1.0
         radius = jnp.ceil(radius)
         level = jnp.floor(jnp.log2(radius)).astype(jnp.int32)
-        known = in_front & inside.all(axis=0) & (level < len(nearest))
-        level = jnp.where(known, level, 0)
-        # A square of any size is that of four squares of the power of two below, which overlap.
-        aside = jnp.where(known, radius.astype(jnp.int32) - 2**level, 0)
+        has_rays = in_front & inside.all(axis=0) & (level < len(nearest))
+        level = jnp.where(has_rays, level, 0)
+        # Four overlapping squares, whose size is the power of two below, cover a square of any size.
+        aside = jnp.where(has_rays, radius.astype(jnp.int32) - 2**level, 0)
         corners = [
             pyramid[level, jnp.clip(row + down, 0, camera.height - 1), jnp.clip(column + across, 0, camera.width - 1)]
             for down in (-aside, aside)
             for across in (-aside, aside)
         ]
         least = functools.reduce(jnp.minimum, corners)
-        return (known & (least >= ahead + margin)).reshape(grid.resolution, -1)
+        return (has_rays & (least >= ahead + margin)).reshape(grid.resolution, -1)
 
     return jax.lax.map(slab, axis)
 
 
 def _least_within(image: Float[Array, "h w"], pixels: int) -> Float[Array, "h w"]:
-    """The least of each pixel and those `pixels` rows and columns away; beyond the border there are none."""
+    """The minimum of each pixel and the eight that are `pixels` rows or columns away; infinite beyond the border."""
     for axis in (0, 1):
         pad = [(0, 0), (0, 0)]
         pad[axis] = (pixels, pixels)

@@ -1,8 +1,8 @@
-"""Which surface the views so far have measured, and how far each of them saw.
+"""The surface that earlier views have measured, and how far each view saw.
 
-D is thinned to its capacity, so what lies between its points may have been measured all the same. The hits of all rays
-say what has been, at the resolution of the sensor. A sampled surface that a view must have seen and has not measured is
-none that the sensor can measure: it is not there, or too dark, or too shiny.
+D is thinned to its capacity, so surface between its points may have been measured too. The hits of all rays show what
+has been measured, at the resolution of the sensor. If a view should have seen a sampled surface but did not measure it,
+the sensor cannot measure it: the surface is not there, or too dark, or too shiny.
 """
 
 import dataclasses
@@ -23,21 +23,21 @@ from jaxnbv.scanning.grid import Grid, GridSurface
 from jaxnbv.scanning.scanner import Surface, pixel_area, scan
 from jaxnbv.sharding import shared_map
 
-# In spacings of the grid: up to here distances to hits are kept.
+# Largest distance to a hit that is kept, in spacings of the grid.
 _REACH = 3
 STEEP = 0.5
-"""The cosine of incidence below which little is expected: sensors measure little that is steeper, so that no look at it
-is in vain, and imagined slopes are uncertain."""
+"""The cosine of incidence below which little is expected. Sensors measure little of steeper surface, so a missing hit
+there proves nothing, and imagined slopes are uncertain."""
 
-# Of a view, at most: with more, imagining what it would have shown takes longer.
+# Most rays kept of a view. More would slow down the scans of sampled surfaces.
 _RAYS = 5_000
 
 
 class Looks(eqx.Module):
-    """What the rays of all views came back with. Immutable and of fixed shapes.
+    """The measured surface and the lines of sight of all views. Immutable, with fixed shapes.
 
     - `distance`: from each node of the grid to the nearest pixel on the surface, in scene units, at most `reach`.
-    - `sight`: how far each view saw along the rays of `camera`, see `PointCloud`; zero beside its image.
+    - `sight`: how far each view saw along the rays of `camera`, see `PointCloud`; zero outside its image.
     """
 
     distance: Float[Array, "g g g"]
@@ -47,21 +47,21 @@ class Looks(eqx.Module):
 
     @classmethod
     def none(cls, grid: Grid, camera: Camera, max_views: int) -> "Looks":
-        """Before the first look. `camera`: the sensor, of whose rays those of every few rows and columns are kept."""
+        """The `Looks` before the first view. It keeps the rays of every few rows and columns of the sensor `camera`."""
         camera = camera.strided(math.ceil(math.sqrt(camera.num_rays / _RAYS)))
         far = jnp.full((grid.resolution,) * 3, _REACH * grid.spacing, jnp.result_type(float))
         return cls(far, jnp.zeros((max_views, camera.num_rays), far.dtype), camera, grid)
 
     @property
     def reach(self) -> float:
-        """The largest distance that is kept, in scene units."""
+        """The largest value of `distance`, in scene units."""
         return _REACH * self.grid.spacing
 
     @eqx.filter_jit
     def with_points(self, cloud: PointCloud, radii: Float[Array, " n"] | float = 0.0) -> "Looks":
-        """The looks with a cloud's points as hits.
+        """A copy with the points of a cloud added as hits.
 
-        - `radii`: how far each of them reaches, in scene units; a spacing of the grid at most counts.
+        - `radii`: radius of the measured surface around each point, in scene units; limited to a spacing of the grid.
         """
         radii = jnp.minimum(radii, self.grid.spacing)
         place = (cloud.points + self.grid.half_extent) / self.grid.spacing
@@ -69,11 +69,11 @@ class Looks(eqx.Module):
 
         def near(distance, offset):
             node = low + offset
-            away = jnp.maximum(self.grid.spacing * jnp.linalg.norm(node - place, axis=-1) - radii, 0.0)
+            to_point = jnp.maximum(self.grid.spacing * jnp.linalg.norm(node - place, axis=-1) - radii, 0.0)
             # A negative index would count from the other end.
-            there = cloud.mask & jnp.all(node >= 0, axis=-1)
-            index = jnp.where(there[:, None], node, self.grid.resolution)
-            return distance.at[tuple(index.T)].min(away, mode="drop"), None
+            is_node = cloud.mask & jnp.all(node >= 0, axis=-1)
+            index = jnp.where(is_node[:, None], node, self.grid.resolution)
+            return distance.at[tuple(index.T)].min(to_point, mode="drop"), None
 
         offsets = np.array(list(itertools.product(range(1 - _REACH, _REACH + 1), repeat=3)))
         return dataclasses.replace(self, distance=jax.lax.scan(near, self.distance, offsets)[0])
@@ -86,12 +86,13 @@ class Looks(eqx.Module):
         camera: Camera,
         barrier: Float[Array, " rays"] | None = None,
     ) -> "Looks":
-        """The looks with those of one view.
+        """A copy with one more view.
 
-        - `index`: of the view, from 0; `camera`: the one that took it.
-        - `barrier`: how far along each of its rays an obstacle stands; what is behind it was not looked at.
+        - `index`: index of the view, from 0.
+        - `pose`, `scan`, `camera`: the view's pose, its scan, and the camera that took it.
+        - `barrier`: distance along each of its rays to an obstacle; the view saw nothing behind it.
         """
-        # Half the diagonal of a pixel on the surface: what lies between the rays of few pixels is not new.
+        # Half the diagonal of a pixel on the surface, so that surface between the rays of a coarse image is not new.
         looks = self.with_points(scan, jnp.sqrt(jnp.maximum(0.5 * pixel_area(scan, camera, pose, STEEP), 0.0)))
         if scan.sight is None:
             return looks
@@ -102,46 +103,48 @@ class Looks(eqx.Module):
         return dataclasses.replace(looks, sight=looks.sight.at[index].set(sight.astype(looks.sight.dtype)))
 
     def __call__(self, x: Float[Array, "*n 3"]) -> Float[Array, "*n"]:
-        """Distance of points to the nearest hit, at most `reach`: linear between nodes, so that at a hit itself it is
-        up to half a spacing. Differentiable in x."""
+        """Distance from each point to the nearest hit, at most `reach`. Linear between nodes, so it can be up to half a
+        spacing at a hit itself. Differentiable in x."""
         places = list(jnp.moveaxis((x + self.grid.half_extent) / self.grid.spacing, -1, 0))
         return jax.scipy.ndimage.map_coordinates(self.distance, places, order=1, mode="nearest")
 
     @eqx.filter_jit
     def measurable(self, surfaces: GridSurface, poses: PoseList) -> GridSurface:
-        """Sampled surfaces, along a leading axis, less what a view looked at and has not measured, and what lies within
-        a cell of it: the view saw as far as the surface, which faces it, but no hit lies within a spacing.
+        """The sampled surfaces (a batch along a leading axis) without the cells of `cells_in_vain` and the cells next
+        to these, for every view.
 
-        - `poses`: of the views.
+        - `poses`: the poses of the views.
         """
         return surfaces.void(shared_map(_looked_at_in_vain, surfaces, self, poses))
 
     def cells_in_vain(self, surface: Surface, index: Int[Array, ""] | int, pose: Pose) -> Int[Array, "rays 3"]:
-        """The cells of the grid that hold what one view looked at of a surface and has not measured, see `measurable`;
-        beyond the grid's cells for a ray that shows none.
+        """The cell of each ray's hit on a surface, if the view should have measured the hit and did not. The view saw
+        as far as the surface, which faces it, but no measured hit lies within a spacing. Other rays get an index beyond
+        the grid's cells.
 
-        - `index`: of the view, from 0; `pose`: its own.
+        - `index`: index of the view, from 0.
+        - `pose`: the view's pose.
         """
         spacing = self.grid.spacing
-        seen = scan(surface, self.camera, pose)
-        offset = seen.points - pose.position
-        away = jnp.linalg.norm(offset, axis=-1)
-        cosine, sight = -jnp.sum(offset * seen.normals, axis=-1) / away, self.sight[index]
-        # Steep ones need not return; but a ray that was met by something deeper has passed.
-        passed = jnp.isfinite(sight) & ((sight - away) * cosine > spacing)
-        in_vain = seen.mask & (passed | (cosine >= STEEP) & (away <= sight + spacing))
-        in_vain &= self(seen.points) > spacing
-        return jnp.where(in_vain[:, None], self.grid.cell_of(seen.points), self.grid.resolution)
+        hits = scan(surface, self.camera, pose)
+        offset = hits.points - pose.position
+        distance = jnp.linalg.norm(offset, axis=-1)
+        cosine, sight = -jnp.sum(offset * hits.normals, axis=-1) / distance, self.sight[index]
+        # Steep surface may return nothing. But a ray that hit something deeper has passed through it.
+        passed = jnp.isfinite(sight) & ((sight - distance) * cosine > spacing)
+        in_vain = hits.mask & (passed | (cosine >= STEEP) & (distance <= sight + spacing))
+        in_vain &= self(hits.points) > spacing
+        return jnp.where(in_vain[:, None], self.grid.cell_of(hits.points), self.grid.resolution)
 
 
 def _looked_at_in_vain(surface: GridSurface, looks: Looks, poses: PoseList) -> Bool[Array, "m m m"]:
-    def look(index, found):
+    def look(index, in_vain):
         cells = looks.cells_in_vain(surface, index, jax.tree.map(lambda rows: rows[index], poses.rows))
-        return found.at[tuple(cells.T)].set(True, mode="drop")
+        return in_vain.at[tuple(cells.T)].set(True, mode="drop")
 
-    found = jax.lax.fori_loop(0, poses.count, look, jnp.zeros(surface.distance.shape, bool))
-    # Rays are farther apart than cells.
+    in_vain = jax.lax.fori_loop(0, poses.count, look, jnp.zeros(surface.distance.shape, bool))
+    # Include neighbouring cells, since rays are farther apart than cells.
     for axis in range(3):
         window = tuple(3 if own == axis else 1 for own in range(3))
-        found = jax.lax.reduce_window(found, False, jax.lax.bitwise_or, window, (1, 1, 1), "SAME")
-    return found
+        in_vain = jax.lax.reduce_window(in_vain, False, jax.lax.bitwise_or, window, (1, 1, 1), "SAME")
+    return in_vain
