@@ -1,6 +1,6 @@
 """jaxnbv: task-specific next-best-view selection with uncertain geometry, in differentiable JAX.
 
-The public names are those of `__init__.pyi`. Each is imported when it is first used, for JAX takes seconds to import.
+The public names are listed in `__init__.pyi`. Each is imported at its first use, since JAX takes seconds to import.
 """
 
 import importlib.metadata
@@ -18,7 +18,7 @@ _named, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 __getattr__ = explained_imports()(_named)
 
 
-# What a notebook shows by a small picture and a line of facts.
+# Classes that notebooks show as a small picture with a line of facts.
 _SHOWN = {
     "jaxnbv.geometry.cloud": "PointCloud",
     "jaxnbv.planning.episode": "Episode",
@@ -30,14 +30,14 @@ _SHOWN = {
 }
 
 
-def _html_of(shown: Any) -> str:
+def _html_of(value: Any) -> str:
     from jaxnbv.viz.notebook import html_of
 
-    return html_of(shown)
+    return html_of(value)
 
 
 def _show_in_notebooks() -> None:
-    """Tell IPython, where it runs, how these kinds are shown; until one is, nothing more is imported."""
+    """Register the formatters of `_SHOWN` with IPython, if it runs. Their modules are imported at first display."""
     ipython = sys.modules.get("IPython")
     shell = None if ipython is None else ipython.get_ipython()
     if shell is not None:

@@ -1,4 +1,4 @@
-"""Checks at the boundary: values are checked where they are known, and errors name the value and the remedy."""
+"""Checks of arguments and fields. Traced values are not checked. Errors name the value and the remedy."""
 
 import dataclasses
 import functools
@@ -26,37 +26,37 @@ AnyArray = Array | np.ndarray
 _F = TypeVar("_F", bound=Callable[..., Any])
 _LONGEST_SHOWN = 60
 _hints_of = functools.cache(get_type_hints)
-# Where what runs is not a user's.
+# Folders of code that is not the user's.
 _OWN = tuple(
     f"{Path(str(file)).parent}{os.sep}" for file in (jax.__file__, equinox.__file__, jaxtyping.__file__, __file__)
 )
 _NUMBERS = {tuple[float, float]: "two", tuple[float, float, float]: "three"}
 _REAL = (jnp.bool_, jnp.integer, jnp.floating)
-# What a function does that JAX cannot trace, by JAX's errors, and what to do instead.
+# For each JAX tracing error, the operation that causes it and the remedy.
 _UNTRACEABLE: dict[type[Exception], tuple[str, str]] = {
     jax.errors.TracerArrayConversionError: ("calls NumPy or other code outside JAX", "write it with jax.numpy"),
     jax.errors.NonConcreteBooleanIndexError: (
-        "picks rows by a mask, of which JAX cannot know how many there are",
-        "keep all rows and leave out by jnp.where(cloud.mask, ..., 0.0), or jnp.mean(..., where=cloud.mask)",
+        "picks rows by a mask, and JAX cannot know their number",
+        "keep all rows and use jnp.where(cloud.mask, ..., 0.0), or jnp.mean(..., where=cloud.mask)",
     ),
     jax.errors.TracerIntegerConversionError: (
-        "counts or indexes in Python by a value that JAX traces",
+        "counts or indexes in Python with a value that JAX traces",
         "write it with jax.numpy, or jax.lax.fori_loop",
     ),
     jax.errors.ConcretizationTypeError: (
-        "decides in Python by a value that JAX traces",
+        "branches in Python on a value that JAX traces",
         "write it with jnp.where, or jax.lax.cond",
     ),
 }
-# Of 32 bits. What is larger is infinite there.
+# The largest 32-bit float. Larger numbers become infinite when they are converted.
 _LARGEST = float(np.finfo(np.float32).max)
 
 
 def check_device() -> None:
-    """**Raises:** `ValueError` if JAX finds no device of the kind that JAX_PLATFORMS asks for."""
+    """**Raises:** `ValueError` if JAX finds no device of the kind in JAX_PLATFORMS."""
     try:
         jax.devices()
-    # With a plugin or without, they are of several kinds.
+    # The type of the error depends on the plugins that are installed.
     except Exception as error:
         raise InputError(
             f"JAX_PLATFORMS is {os.environ.get('JAX_PLATFORMS', '')!r}, but JAX finds no such device here: leave it "
@@ -71,14 +71,14 @@ def require(condition: bool | np.bool_, message: str) -> None:
 
 
 def is_traced(*trees) -> bool:
-    """Whether any leaf is a tracer, that is, has no value yet because a JAX transformation is under way."""
+    """Whether any leaf is a tracer, which has no value during a JAX transformation."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
 
 
 def check_fields(module: Any) -> None:
-    """Check what is annotated by a plain type: whole numbers, numbers, truths, text, and instances of classes.
+    """Check the fields of a module that are annotated by plain types, see `check_type`.
 
-    To be called first in `__check_init__`, so that the checks after it compare numbers with numbers.
+    Call it first in `__check_init__`, so that later checks compare numbers with numbers.
 
     **Raises:** `ValueError` that names the field.
     """
@@ -89,17 +89,16 @@ def check_fields(module: Any) -> None:
 
 @contextmanager
 def own_settings() -> Iterator[None]:
-    """Where JAX promotes ranks and types and moves arrays as this package expects, whatever `jax.config` says. Also a
-    decorator of a function.
+    """Context manager or decorator: allow rank promotion, type promotion and transfers, whatever `jax.config` says.
 
-    A user's strict settings are for code of the user's. `jax_debug_nans` stays as it is.
+    Strict settings of a user are meant for the user's own code. `jax_debug_nans` stays as it is.
     """
     with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"), jax.transfer_guard("allow"):
         yield
 
 
 def checked(function: _F) -> _F:
-    """A function whose arguments are checked as the fields of a module are, and which has JAX's `own_settings`."""
+    """Decorator: check the arguments by `check_type`, and run the function under `own_settings`."""
     signature = inspect.signature(function)
 
     @functools.wraps(function)
@@ -117,7 +116,7 @@ def checked(function: _F) -> _F:
 
 
 def check_type(value: Any, hint: Any, name: str) -> None:
-    """**Raises:** `ValueError` unless the value is what a plain type hint says; of other hints nothing is known."""
+    """**Raises:** `ValueError` unless the value agrees with a plain type hint. Other hints are not checked."""
     if hint is int:
         whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
         require(whole, f"{name} is {shown(value)}; it must be a whole number")
@@ -140,33 +139,35 @@ def check_type(value: Any, hint: Any, name: str) -> None:
 
 
 def check_index(index: Any, batch: tuple[int, ...], name: str) -> None:
-    """**Raises:** `ValueError` for a number into what is no batch, or beyond its length, which JAX would clamp."""
+    """**Raises:** `ValueError` for a number that indexes no batch or is out of range, where JAX would clamp it."""
     if isinstance(index, int | np.integer):
         check_batch(batch, name)
         require(-batch[0] <= index < batch[0], f"{name} has {batch[0]} along its first axis: there is no index {index}")
 
 
 def check_batch(batch: tuple[int, ...], name: str) -> None:
-    """**Raises:** `ValueError` for what has no axes of a batch."""
+    """**Raises:** `ValueError` if there are no batch axes."""
     require(len(batch) > 0, f"{name} is a single one, not a batch: it can be neither indexed nor iterated")
 
 
 def check_key(key: Any) -> None:
-    """**Raises:** `ValueError` for what is not one key of JAX's random numbers."""
-    known = isinstance(key, Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.ndim == 0
-    require(known, f"the key is {shown(key)}: make one with jax.random.key(seed)")
+    """**Raises:** `ValueError` unless this is a single typed JAX random key."""
+    is_key = isinstance(key, Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.ndim == 0
+    require(is_key, f"the key is {shown(key)}: make one with jax.random.key(seed)")
 
 
 def native(value: Any) -> Any:
-    """An array of NumPy's in the byte order and precision that JAX has; anything else as it is. Under `jit` JAX reads
-    the bytes of another order as if they were in its own."""
+    """A NumPy array converted to native byte order and at most double precision. Anything else is returned as it is.
+
+    Under `jit`, JAX reads arrays of the other byte order without swapping bytes.
+    """
     if isinstance(value, np.ndarray) and (value.dtype.char == "g" or not value.dtype.isnative):
         return value.astype(np.float64 if value.dtype.char == "g" else value.dtype.newbyteorder("="))
     return value
 
 
 def takes_native(function: _F) -> _F:
-    """A function whose arguments pass through `native`."""
+    """Decorator: pass all arguments through `native`."""
 
     @functools.wraps(function)
     def call(*arguments: Any, **named: Any) -> Any:
@@ -179,28 +180,30 @@ def takes_native(function: _F) -> _F:
 def as_floats(value: Any, name: str) -> Array:
     """The numbers as an array of JAX's default floating-point type.
 
-    **Raises:** `ValueError` for what is not an array of numbers.
+    **Raises:** `ValueError` if this is not an array of real numbers.
     """
-    # An array of real numbers that lies on a device stays there.
-    known = isinstance(value, Array) and any(jnp.issubdtype(value.dtype, kind) for kind in _REAL)
-    return jnp.asarray(value if known or is_traced(value) else as_numbers(value, name), dtype=jnp.result_type(float))
+    # A JAX array of real numbers stays on its device.
+    is_real = isinstance(value, Array) and any(jnp.issubdtype(value.dtype, kind) for kind in _REAL)
+    return jnp.asarray(value if is_real or is_traced(value) else as_numbers(value, name), dtype=jnp.result_type(float))
 
 
 def as_numbers(value: Any, name: str, dtype: Any = float) -> np.ndarray:
-    """The numbers as a NumPy array of this type: `float` is JAX's default one, None that which they have.
+    """The numbers as a NumPy array.
 
-    **Raises:** `ValueError` for what is not an array of numbers, and for a masked array of which something is masked.
+    - `dtype`: `float` means JAX's default floating-point type. None keeps the type.
+
+    **Raises:** `ValueError` if this is not an array of real numbers, or if it is a masked array with masked entries.
     """
     masked = isinstance(value, np.ma.MaskedArray) and bool(np.ma.getmaskarray(value).any())
-    require(not masked, f"{name} is a masked array: give what is valid of it as a plain one")
+    require(not masked, f"{name} is a masked array: give what is valid in it as a plain array")
     try:
-        found = native(np.asarray(value))
-        # Of text, dates, complex numbers and None NumPy would make numbers.
-        real = found.dtype.kind in "biuf" or jnp.issubdtype(found.dtype, jnp.floating)
-        real = real or (found.dtype.kind == "O" and all(isinstance(item, numbers.Real) for item in found.flat))
+        array = native(np.asarray(value))
+        # NumPy would convert text, dates, complex numbers and None to numbers.
+        real = array.dtype.kind in "biuf" or jnp.issubdtype(array.dtype, jnp.floating)
+        real = real or (array.dtype.kind == "O" and all(isinstance(item, numbers.Real) for item in array.flat))
         require(real, f"{name} is {shown(value)}; give real numbers")
         with np.errstate(over="ignore"):
-            return found.astype(jnp.result_type(float) if dtype is float else dtype or found.dtype, copy=False)
+            return array.astype(jnp.result_type(float) if dtype is float else dtype or array.dtype, copy=False)
     except InputError:
         raise
     except (TypeError, ValueError, OverflowError) as error:
@@ -209,30 +212,33 @@ def as_numbers(value: Any, name: str, dtype: Any = float) -> np.ndarray:
 
 @contextmanager
 def functions_of_users() -> Iterator[None]:
-    """Where functions of the user's run under JAX: what they do that it cannot trace is one error with its remedy.
+    """Context manager for calls of the user's functions: explains JAX's tracing errors and gives the remedy.
 
-    **Raises:** `ValueError` for a function that calls NumPy, picks rows by a mask, or decides in Python by a value.
+    **Raises:** `ValueError` for a function that calls NumPy, picks rows by a mask, or branches in Python on a value.
     """
     try:
         yield
     except tuple(_UNTRACEABLE) as error:
-        theirs = [frame for frame in traceback.extract_tb(error.__traceback__) if not frame.filename.startswith(_OWN)]
-        if not theirs:
+        user_frames = [
+            frame for frame in traceback.extract_tb(error.__traceback__) if not frame.filename.startswith(_OWN)
+        ]
+        if not user_frames:
             raise
-        at = f"{theirs[-1].filename}:{theirs[-1].lineno}"
+        at = f"{user_frames[-1].filename}:{user_frames[-1].lineno}"
         problem, remedy = next(words for kind, words in _UNTRACEABLE.items() if isinstance(error, kind))
         raise InputError(
-            f"{theirs[-1].name} {problem} ({at}): {remedy}, or wrap a network that is not of JAX in HostClassifier or "
+            f"{user_frames[-1].name} {problem} ({at}): {remedy}, or wrap a network from outside JAX in HostClassifier or "
             "HostSegmenter"
         ) from error
 
 
 def returned(value: Any, name: str, axes: int, wanted: str) -> Any:
-    """What a function of the user's gave, as it is.
+    """The value itself, after a check of what a function of the user's returned.
 
-    - `name`: of what it gave, and `wanted`: what it should give, for the error.
+    - `axes`: the number of axes. For 0 a plain number will do.
+    - `name`, `wanted`: the name of the value and what the function should return, for the error.
 
-    **Raises:** `ValueError` unless it is an array of real numbers with so many axes, or a number for none.
+    **Raises:** `ValueError` unless the value is an array of real numbers with this number of axes.
     """
     dtype = getattr(value, "dtype", None)
     real = isinstance(value, numbers.Real) if dtype is None else any(jnp.issubdtype(dtype, kind) for kind in _REAL)
@@ -241,7 +247,7 @@ def returned(value: Any, name: str, axes: int, wanted: str) -> Any:
 
 
 def shown(value: Any) -> str:
-    """A value in an error: short, and of an array its shape."""
+    """Short text for a value in an error message: shape and type for an array."""
     if isinstance(value, AnyArray):
         return f"an array of shape {value.shape} and type {value.dtype}" if value.ndim else str(value)
     if isinstance(value, str | int | float | complex | tuple | list | dict | None):
@@ -263,8 +269,8 @@ def _is_number(value: Any) -> bool:
 
 
 def _classes(hint: Any) -> tuple[type, ...]:
-    """The classes that a hint names, if it names classes alone."""
+    """The classes in a hint, or none if the hint holds anything else than classes."""
     kinds = get_args(hint) if isinstance(hint, types.UnionType) or get_origin(hint) is Union else (hint,)
-    # A jaxtyping annotation is a class too; what it says of shapes is checked where it matters.
+    # A jaxtyping annotation is a class too, but `isinstance` does not apply: shapes are checked elsewhere.
     plain = all(isinstance(kind, type) and not hasattr(kind, "dim_str") and kind is not object for kind in kinds)
     return kinds if plain else ()

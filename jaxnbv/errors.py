@@ -1,4 +1,4 @@
-"""Errors that users can mend."""
+"""Errors that users can fix, and imports of optional dependencies."""
 
 import importlib
 from collections.abc import Iterator
@@ -19,23 +19,23 @@ EXTRAS = {
     "threadpoolctl": "cluster",
     "viser": "view",
 }
-"""Which extra brings what a part of the package needs beyond the dependencies that all of it has."""
+"""The extra that installs each optional module."""
 
 
 def install(extra: str) -> str:
-    """The command that installs an extra: from a clone, for there is no release on a package index yet."""
+    """The command that installs an extra from a clone, since no release is on a package index yet."""
     return f'pip install ".[{extra}]" in a clone of jaxnbv'
 
 
 class InputError(ValueError):
-    """Something that the user gave cannot be used; the message says what, and what to do."""
+    """An input from the user that cannot be used. The message names the value and the remedy."""
 
 
 @contextmanager
 def explained_imports() -> Iterator[None]:
-    """Where parts of the package are imported that need an extra.
+    """Context manager for imports of modules that need an extra.
 
-    **Raises:** `ValueError` that says how to install one that is missing.
+    **Raises:** `ValueError` with the command that installs a missing extra.
     """
     try:
         yield
@@ -47,9 +47,9 @@ def explained_imports() -> Iterator[None]:
 
 
 def optional(module: str) -> Any:
-    """A module of an extra.
+    """Import a module of an extra.
 
-    **Raises:** `ValueError` that says how to install it, if it is missing.
+    **Raises:** `ValueError` with the command that installs it, if it is missing.
     """
     with explained_imports():
         return importlib.import_module(module)

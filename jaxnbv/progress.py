@@ -1,4 +1,4 @@
-"""How far long work has come: a bar with its stage and the time that has passed, on a terminal alone."""
+"""A progress bar with stage and elapsed time, shown on terminals only."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -9,10 +9,12 @@ from tqdm import tqdm
 def progress_bar(
     items: Iterable[Any] | None = None, wanted: bool = True, leave: bool = False, **settings: Any
 ) -> "tqdm[Any]":
-    """A bar over some items, or of a `total`; none where it is not wanted, or what is written goes to a file.
+    """A progress bar over `items`, or over a `total` among the settings. Hidden if the output is not a terminal.
 
-    - `leave`: whether it stays once it is full; `settings`: others of tqdm, such as `desc`.
+    - `wanted`: False hides the bar.
+    - `leave`: whether the bar stays on the screen once it is full.
+    - `settings`: further arguments of tqdm, such as `desc`.
     """
-    # What remains is a guess, and a poor one: the first of some steps compiles.
+    # No remaining time: the first step compiles, so the estimate would be poor.
     form = "{desc}: {n_fmt} of {total_fmt} |{bar:20}| {elapsed}"
     return tqdm(items, leave=leave, disable=None if wanted else True, bar_format=form, **settings)

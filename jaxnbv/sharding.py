@@ -1,11 +1,11 @@
-"""Samples and candidates shared among devices.
+"""Sharing of samples and candidates among devices.
 
     with jax.set_mesh(jax.sharding.Mesh(jax.devices(), "devices")):
         proposal = planner.propose(observations, key)
 
-What is computed for each sample is computed for an equal share of them on each device; so is what is computed for each
-candidate where samples are fewer than devices. Values are those of one device but for the order of sums. Axes that JAX
-does not shard by itself (`AxisType.Explicit`, or of a `shard_map` around this) are left to who has set them.
+Each device computes an equal share of the samples, or of the candidates if there are fewer samples than devices. Values
+equal those of one device up to the order of sums. Mesh axes that JAX does not shard automatically (`AxisType.Explicit`,
+or axes of an enclosing `shard_map`) are not used.
 """
 
 import math
@@ -19,9 +19,9 @@ from jax.sharding import AxisType, PartitionSpec, get_abstract_mesh
 
 
 def shared_map(function: Callable[..., Any], rows: Any, *common: Any, at_once: int = 1) -> Any:
-    """`function(row, *common)` for each row of a tree, as `jax.lax.map`, with a share of the rows on each device.
+    """`function(row, *common)` for each row of a tree, like `jax.lax.map`, with a share of the rows on each device.
 
-    - `at_once`: rows that a device takes together.
+    - `at_once`: number of rows that a device computes together.
     """
 
     def each(share: Any, *common: Any) -> Any:
@@ -31,21 +31,21 @@ def shared_map(function: Callable[..., Any], rows: Any, *common: Any, at_once: i
 
 
 def batched_map(function: Callable[..., Any], rows: Any, at_once: int) -> Any:
-    """`jax.lax.map`, so many rows together, or one by one: XLA takes half as long again for a batch of one."""
+    """`jax.lax.map` over batches of `at_once` rows. Not batched for 1, since XLA is 50 % slower on batches of one."""
     return jax.lax.map(function, rows, batch_size=at_once if at_once > 1 else None)
 
 
 def shared(function: Callable[..., Any], rows: Any, *common: Any) -> Any:
-    """`function(rows, *common)`, which treats all leading rows alike, with a share of them on each device, and the
-    result on all of them. Where devices are more than rows, all rows are computed on each.
+    """`function(rows, *common)` with a share of the leading rows on each device, and the result on all devices.
 
-    The function gets all arrays as arguments: those that it closes over do not reach the devices.
+    The function must treat the rows independently. With more devices than rows, each device computes all rows.
+    All arrays must be arguments, since arrays in a closure do not reach the devices.
     """
     axes, devices = _axes()
     count = len(jax.tree.leaves(rows)[0])
     if devices == 1 or count < devices:
         return function(rows, *common)
-    # The last devices take some of the first rows again where they do not come out even.
+    # If the rows do not divide evenly, the last devices compute some of the first rows again.
     rows = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf[: -count % devices]]), rows)
     arrays, rest = eqx.partition((rows, common), eqx.is_array)
 
@@ -59,19 +59,19 @@ def shared(function: Callable[..., Any], rows: Any, *common: Any) -> Any:
 
 
 def share_of(count: int) -> int:
-    """How many of so many rows each device takes."""
+    """Number of rows that each device computes out of `count`."""
     _, devices = _axes()
     return count if count < devices else -(-count // devices)
 
 
 def on_cpu() -> bool:
-    """Whether programs run on the CPU: `jax_default_device` says so, or else what JAX found."""
+    """Whether programs run on the CPU, by `jax_default_device` or else by JAX's default backend."""
     device = jax.config.jax_default_device  # type: ignore[attr-defined]
     return (jax.default_backend() if device is None else getattr(device, "platform", device)) == "cpu"
 
 
 def _axes() -> tuple[tuple[str, ...], int]:
-    """Axes of the mesh over which rows are shared, and how many devices they are."""
+    """Names of the mesh axes that share rows, and their number of devices."""
     mesh = get_abstract_mesh()
     sizes = {
         name: size

@@ -8,11 +8,11 @@ __version__ = importlib.metadata.version("jaxnbv")
 
 
 def check_jax(installed: str) -> None:
-    """Refuse a version of jaxlib that the distribution leaves out, since it computes wrong values on CPUs.
+    """Refuse a version of jaxlib that the package's requirements exclude, since it computes wrong values on CPUs.
 
-    `pip` keeps such versions away, but not those that it installs after jaxnbv.
+    `pip` does not install such versions with jaxnbv, but may do so afterwards.
 
-    **Raises:** `ImportError` that says which versions will do.
+    **Raises:** `ImportError` with the accepted versions.
     """
     needed = map(Requirement, importlib.metadata.requires("jaxnbv") or ())
     accepted = next(need.specifier for need in needed if need.name == "jax")
