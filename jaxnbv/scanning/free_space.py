@@ -26,7 +26,7 @@ _STRAY = 0.01
 
 
 class Carving(eqx.Module):
-    """Makes samples empty in space that the sensor saw empty, and outside the volume that holds the object.
+    """Makes samples empty where the sensor saw empty space, and outside the volume that holds the object.
 
     - `volume`: where the object can be, see `jaxnbv.geometry.volume`; by default the box that scenes are scaled to.
     - `margin_voxels`: margin in spacings of the grid. A node is seen empty if every ray that passes within the margin
@@ -85,8 +85,10 @@ class Carving(eqx.Module):
         return on_tensor_grid(self.volume, axis) > self._beyond_volume(grid)
 
     def with_room(self, box: Box, grid: Grid, frame: Frame) -> Box:
-        """A box in world coordinates, widened by the distance at which points still count as the object's. A scan
-        cropped to the wider box shows that the surface goes on where the box cuts it."""
+        """The box (world coordinates), widened by the distance at which points still count as the object's.
+
+        A scan cropped to the wider box shows that the surface goes on where the box cuts it.
+        """
         return frame.to_world(frame.to_scene(box).widened(self._beyond_volume(grid) / math.sqrt(3.0)))
 
     def _beyond_volume(self, grid: Grid) -> float:
@@ -98,8 +100,9 @@ class Carving(eqx.Module):
         return on_tensor_grid(self.volume, jnp.asarray(grid.axis, jnp.result_type(float))) < 0
 
     def check_inside(self, cloud: PointCloud, grid: Grid) -> None:
-        """Check that the volume, widened by two margins, holds the cloud, so that no object is cut silently. One point
-        in a hundred may lie outside because of noise.
+        """Check that the volume, widened by two margins, holds the cloud, so that no object is cut silently.
+
+        One point in a hundred may lie outside because of noise.
 
         **Raises:** `ValueError` if more do.
         """

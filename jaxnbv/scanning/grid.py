@@ -1,4 +1,4 @@
-"""GridSurface: the level set of a function sampled on the regular grid that posterior samples are traced on."""
+"""GridSurface: the level set of a function on a regular grid, the form in which posterior samples are traced."""
 
 import dataclasses
 import warnings
@@ -19,15 +19,15 @@ from jaxnbv.scanning import tracing
 from jaxnbv.scanning.scanner import Hits, Surface, scan
 from jaxnbv.sharding import on_cpu, shared_map
 
-# The cosine of two normals that look in opposite directions, and the share of the points that is worth a warning.
+# Normals with a smaller cosine point in opposite directions; the share of points on thin parts that gives a warning.
 _OPPOSITE, _THIN_SHARE = -0.8, 0.05
 
 
 class Grid(eqx.Module):
     """The regular grid of `resolution`^3 nodes that spans [-half_extent, half_extent]^3 of the scene.
 
-    The defaults are the paper's: 100^3 nodes on [-1.75, 1.75]^3. A part thinner than a cell, `spacing`, may lie between
-    the nodes and be missed: take a finer grid for thin things.
+    The defaults are the paper's: 100^3 nodes on [-1.75, 1.75]^3. A part thinner than a cell (`spacing`) may lie between
+    nodes and be missed. Use a finer grid for thin parts.
     """
 
     resolution: int = eqx.field(static=True, default=100)
@@ -44,13 +44,16 @@ class Grid(eqx.Module):
         return 2.0 * self.half_extent / (self.resolution - 1)
 
     def cell_of(self, points: Float[Array, "*n 3"]) -> Int[Array, "*n 3"]:
-        """The cell that each of some points (scene units) lies in; `resolution - 1` or more along an axis on which it
-        is outside the grid: no cell, and no negative index, which would count from the other end."""
+        """Index of the cell that holds each point (scene units).
+
+        Along an axis on which the point is outside the grid, the index is `resolution - 1` or more, which is no cell.
+        It is never negative, since that would count from the other end.
+        """
         cell = jnp.floor((points + self.half_extent) / self.spacing).astype(jnp.int32)
         return jnp.where(cell < 0, self.resolution, cell)
 
     def check(self, cloud: PointCloud) -> None:
-        """Warn of parts that are thinner than a cell: points within one that look in opposite directions."""
+        """Warn of parts thinner than a cell, where points closer than a cell have opposite normals."""
         points, normals = cloud.to_numpy()
         pairs = cKDTree(points).query_pairs(self.spacing, output_type="ndarray")
         opposite = np.sum(normals[pairs[:, 0]] * normals[pairs[:, 1]], axis=1) < _OPPOSITE
@@ -69,14 +72,16 @@ class Grid(eqx.Module):
 
 
 class GridSurface(Surface):
-    """The zero set of the trilinear interpolant of node values, traced exactly. Leading axes make a batch of surfaces.
+    """The zero set of the trilinear interpolant of node values, traced exactly.
+
+    Leading axes make a batch of surfaces.
 
     - `values`: f minus its level at the nodes; positive outside.
-    - `distance`: how far each cell is from one with a change of sign (`tracing.free_distance`).
-    - `is_void`: the cells whose change of sign is no surface that a sensor sees: a ray that meets one has met nothing.
-      None where there are none.
+    - `distance`: number of cells from each cell to one with a change of sign (`tracing.free_distance`).
+    - `is_void`: cells whose surface a sensor does not see. A ray whose first zero is in such a cell misses. None if
+      there are none.
 
-    Nothing is hit outside the grid's box, which a ray enters where it meets it.
+    Rays hit nothing outside the grid's box. A ray that starts outside is traced from the point where it enters.
     """
 
     in_jit: ClassVar[bool] = True
@@ -90,15 +95,15 @@ class GridSurface(Surface):
     def from_values(
         cls, values: Float[AnyArray, "*s g g g"], level: Float[AnyArray, ""] | float, grid: Grid
     ) -> "GridSurface":
-        """The surface, or batch of surfaces, where a function with these values at the grid's nodes equals `level`.
+        """The surface, or batch of surfaces, where a function with these node values equals `level`.
 
-        **Raises:** `ValueError` if the values are not the grid's, or one of them or the level is not finite.
+        **Raises:** `ValueError` if the values do not fit the grid, or if a value or the level is not finite.
         """
         g = grid.resolution
         values, level = as_floats(values, "the values"), as_floats(level, "the level")
         require(
             values.shape[-3:] == (g, g, g),
-            f"values of shape {values.shape} do not fit a grid of {g}^3 nodes: evaluate on grid.axis, three times",
+            f"values of shape {values.shape} do not fit a grid of {g}^3 nodes: evaluate with x, y and z on grid.axis",
         )
         relative, finite, distances = _prepared(values, level)
         if not is_traced(finite):
@@ -106,7 +111,7 @@ class GridSurface(Surface):
         return cls(relative, distances, grid)
 
     def void(self, cells: Bool[Array, "*s m m m"]) -> "GridSurface":
-        """The surface less what lies in some of its cells."""
+        """The surface without the parts in these cells: rays that hit them miss."""
         return dataclasses.replace(self, is_void=cells if self.is_void is None else self.is_void | cells)
 
     @eqx.filter_jit
@@ -114,12 +119,12 @@ class GridSurface(Surface):
         """First zeros along the rays inside the box; see `Surface.trace`.
 
         A hit is where the interpolant first differs in sign from its sign at the ray's start (its origin, or where it
-        enters the box), zero counted as negative. Normals are central differences interpolated linearly, so they are
+        enters the box). Zero counts as negative. Normals are central differences interpolated linearly, so they are
         continuous.
 
         Differentiable in origins, directions and values: at a hit x = o + t d the implicit function theorem gives
-        dt = -(df + grad f . (do + t dd)) / (grad f . d), its denominator kept from zero where the ray grazes, so that
-        |dt| is at most about 34 |dx|.
+        dt = -(df + grad f . (do + t dd)) / (grad f . d). The denominator is kept away from zero for grazing rays, so
+        that |dt| is at most about 34 |dx|.
 
         **Raises:** `ValueError` for a batch of surfaces.
         """
@@ -148,25 +153,24 @@ class GridSurface(Surface):
 def scan_samples(
     surfaces: GridSurface, camera: Camera, poses: Pose, barrier: Float[Array, "poses rays"] | None = None
 ) -> PointCloud:
-    """What the camera sees of each of a batch of surfaces from each of a batch of poses.
-
-    For s surfaces and p poses, clouds with leading axes (s, p); rows as `scan` gives them, and `barrier` as it takes.
-    """
+    """The `scan` of each surface of a batch from each pose of a batch: leading axes (surfaces, poses)."""
     return shared_map(scan, surfaces, camera, poses, barrier, at_once=samples_at_once(camera, poses))
 
 
 def samples_at_once(camera: Camera, poses: Pose) -> int:
-    """How many samples are scanned together from a batch of poses: one on a CPU, lest its scans leave the cache; on a
-    GPU as many as make eight million rays."""
+    """The number of samples to scan together from a batch of poses.
+
+    It is one on a CPU, so that the scans stay in its cache. On a GPU it is as many as make eight million rays.
+    """
     return 1 if on_cpu() else max(1, 2**23 // (poses.position.shape[0] * camera.num_rays))
 
 
 @jax.debug_nans(False)
 @eqx.filter_jit
 def mean_depth(scans: PointCloud, pose: Pose) -> Float[Array, " rays"]:
-    """Mean depth along the camera's axis (scene units) over the samples that a ray hits; NaN where it misses most.
+    """Mean depth along the camera's axis over the samples that a ray hits (scene units); NaN if most miss.
 
-    `scans`: of all samples from the pose, along a leading axis.
+    - `scans`: scans of all samples from the pose, along a leading axis.
     """
     depth = jnp.einsum("snd,d->sn", scans.points - pose.position, pose.forward, precision="highest")
     count = jnp.sum(scans.mask, axis=0)
@@ -178,13 +182,13 @@ def mean_depth(scans: PointCloud, pose: Pose) -> Float[Array, " rays"]:
 def _prepared(
     values: Float[Array, "*s g g g"], level: Float[Array, ""]
 ) -> tuple[Float[Array, "*s g g g"], Bool[Array, ""], Int8[Array, "*s m m m"]]:
-    """Values less the level, whether they are finite, and how far each cell is from a change of sign."""
+    """Values minus the level, whether all are finite, and `tracing.free_distance` of each cell."""
     values = values - level
     distances = shared_map(tracing.free_distance, values.reshape(-1, *values.shape[-3:]))
     return values, jnp.isfinite(values).all(), distances.reshape(*values.shape[:-3], *distances.shape[1:])
 
 
 def touched_cells(nodes: Bool[Array, "*s g g g"]) -> Bool[Array, "*s m m m"]:
-    """The cells of a grid that have one of some nodes as a corner."""
+    """Whether each cell of a grid has a corner among the nodes that are True."""
     windows = (1,) * (nodes.ndim - 3) + (2,) * 3, (1,) * nodes.ndim
     return jax.lax.reduce_window(nodes, False, jax.lax.bitwise_or, *windows, "VALID")

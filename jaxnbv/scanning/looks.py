@@ -47,7 +47,7 @@ class Looks(eqx.Module):
 
     @classmethod
     def none(cls, grid: Grid, camera: Camera, max_views: int) -> "Looks":
-        """The `Looks` before the first view. It keeps the rays of every few rows and columns of the sensor `camera`."""
+        """The `Looks` before the first view, with rays of every few rows and columns of the sensor."""
         camera = camera.strided(math.ceil(math.sqrt(camera.num_rays / _RAYS)))
         far = jnp.full((grid.resolution,) * 3, _REACH * grid.spacing, jnp.result_type(float))
         return cls(far, jnp.zeros((max_views, camera.num_rays), far.dtype), camera, grid)
@@ -110,17 +110,20 @@ class Looks(eqx.Module):
 
     @eqx.filter_jit
     def measurable(self, surfaces: GridSurface, poses: PoseList) -> GridSurface:
-        """The sampled surfaces (a batch along a leading axis) without the cells of `cells_in_vain` and the cells next
-        to these, for every view.
+        """The sampled surfaces without the cells that a view should have measured and did not.
 
+        These are the cells of `cells_in_vain` for all views, and the cells next to them.
+
+        - `surfaces`: a batch along a leading axis.
         - `poses`: the poses of the views.
         """
         return surfaces.void(shared_map(_looked_at_in_vain, surfaces, self, poses))
 
     def cells_in_vain(self, surface: Surface, index: Int[Array, ""] | int, pose: Pose) -> Int[Array, "rays 3"]:
-        """The cell of each ray's hit on a surface, if the view should have measured the hit and did not. The view saw
-        as far as the surface, which faces it, but no measured hit lies within a spacing. Other rays get an index beyond
-        the grid's cells.
+        """The cell of each ray's hit on a surface, if the view should have measured it and did not.
+
+        That is, the view saw as far as the surface, which faces it, but no measured hit lies within a spacing. Other
+        rays get an index beyond the grid's cells.
 
         - `index`: index of the view, from 0.
         - `pose`: the view's pose.

@@ -1,4 +1,4 @@
-"""TriangleMesh: real objects as they come, soups and open sheets included, whose rays are traced on the host."""
+"""TriangleMesh: meshes of any quality, triangle soups and open sheets included, traced on the host."""
 
 import dataclasses
 import warnings
@@ -24,15 +24,16 @@ from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.scanning.sdf.sampled import checked_triangles, winding_number
 from jaxnbv.scanning.triangle_rays import FirstFaces, first_faces
 
-# A piece of a mesh with fewer may stand on stray points alone.
+# A piece of a mesh with fewer points may be due to stray points alone.
 _FEWEST_POINTS = 4
 
 
 @dataclasses.dataclass(unsafe_hash=True)
 class _Tree:
-    """The tree of the triangles it was last asked for: it is no array, so it stays out of the pytree's leaves.
+    """Cache of the ray tracer for the triangles of the last call. It is not an array, so it is no leaf of the pytree.
 
-    It has no fields, for it follows from the triangles: any two are equal, are described alike, and a copy is empty.
+    It has no fields, since its content follows from the triangles: all instances are equal and have the same repr, and
+    a copy is empty.
     """
 
     _built = None
@@ -53,10 +54,10 @@ class TriangleMesh(Surface):
     Build it with `load_mesh` or `from_arrays`, which check the triangles and fit the frame.
 
     - `vertices`: corners in scene coordinates, float64 on the host.
-    - `faces`: three rows of `vertices` for each triangle.
-    - `frame`: from the world that the mesh was given in to the scene.
+    - `faces`: indices of three rows of `vertices` for each triangle.
+    - `frame`: maps the mesh's original world coordinates to the scene.
 
-    Rays are traced by host code: `trace` cannot run under JAX transformations.
+    Host code traces the rays, so `trace` cannot run under JAX transformations.
     """
 
     vertices: Float[np.ndarray, "v 3"]
@@ -79,7 +80,7 @@ class TriangleMesh(Surface):
     def from_arrays(
         cls, vertices: Float[AnyArray, "v 3"] | list, faces: Int[AnyArray, "f 3"] | list, up: str = "y"
     ) -> "TriangleMesh":
-        """The mesh of world coordinates and corner indices, in the frame that makes its longest side 2.5.
+        """The mesh with these vertices (world coordinates) and faces, in a frame of longest side 2.5.
 
         - `up`: the world's axis that is upward, see `Frame`.
 
@@ -120,7 +121,7 @@ class TriangleMesh(Surface):
         cosine = np.sum(normals * directions, axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = np.sum(normals * (a - origins), axis=1) / cosine
-        # A triangle seen edge-on has no well-defined place on its plane; the tracer's distance stays in the triangle.
+        # For a triangle seen edge-on, the intersection with its plane is ill-defined. The tracer's distance is not.
         depth = np.where(np.abs(depth - near) < 1e-3, depth, near)
         mask = np.zeros(len(rows), dtype=bool)
         mask[hit] = True
@@ -153,21 +154,25 @@ class TriangleMesh(Surface):
 
     @checked
     def contains(self, points: Float[AnyArray, "n 3"]) -> Bool[np.ndarray, " n"]:
-        """Which points (scene coordinates) lie inside: where the winding number is above 1/2 in magnitude, so that a
-        mesh that is wound inside out has an inside too. An open sheet encloses nothing."""
+        """Whether each point (scene coordinates) lies inside: the winding number's magnitude is above 1/2.
+
+        So a mesh that is wound inside out has an inside too. An open sheet encloses nothing.
+        """
         points = np.asarray(points, dtype=np.float64)
         return np.abs(winding_number(points, self.vertices, self.faces)) > 0.5
 
     def to_trimesh(self) -> trimesh.Trimesh:
-        """The mesh in scene coordinates as trimesh's own, to show, measure or export."""
+        """The mesh in scene coordinates as a `trimesh.Trimesh`, to show, measure or export."""
         return trimesh.Trimesh(self.vertices, self.faces, process=False)
 
 
 def level_triangles(
     values: Float[np.ndarray, "g g g"], grid: Grid
 ) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"], Float[np.ndarray, "v 3"]] | None:
-    """Vertices, faces wound outward and outward unit normals where values at the grid's nodes, positive outside, cross
-    zero, by marching cubes; None if they do not."""
+    """Vertices, faces and vertex normals of a grid function's zero set; None if it does not change sign.
+
+    By marching cubes. Values are positive outside, faces are wound outward, and normals are unit and point outward.
+    """
     if not values.min() < 0 < values.max():
         return None
     marching_cubes, spacing = optional("skimage.measure").marching_cubes, (grid.spacing,) * 3
@@ -179,10 +184,11 @@ def level_triangles(
 def held_pieces(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], points: Float[np.ndarray, "n 3"], size: float
 ) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "k 3"], int]:
-    """Vertices and faces of the connected pieces on which four points lie or more, and how many other pieces there are.
-    If no piece has four, those that have the most.
+    """Vertices and faces of connected pieces with at least four points, and the number of other pieces.
 
-    - `size`: how far from a vertex a point of its piece may be.
+    If no piece has four points, the pieces with the most are kept.
+
+    - `size`: largest distance from a point to the nearest vertex of its piece.
     """
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
     graph = coo_array((np.ones(len(edges), bool), edges.T), (len(vertices), len(vertices)))
@@ -196,16 +202,18 @@ def held_pieces(
 
 @checked
 def mesh_from_sdf(sdf: SignedDistance, grid: Grid) -> TriangleMesh:
-    """The surface of a solid as triangles in scene coordinates (the frame is the identity), by marching cubes.
+    """The surface of a solid as a mesh in scene coordinates (its frame is the identity).
+
+    By marching cubes.
 
     **Raises:** `ValueError` if no surface lies within the grid.
     """
     values = np.array(on_tensor_grid(sdf, jnp.asarray(grid.axis, jnp.result_type(float))))
-    found = level_triangles(values, grid)
-    if found is None:
+    triangles = level_triangles(values, grid)
+    if triangles is None:
         raise InputError(
             f"the solid's distances on the grid run from {values.min():.4g} to {values.max():.4g}: no surface lies "
             f"within [-{grid.half_extent}, {grid.half_extent}]^3; move the solid, or give Grid(half_extent=...) that "
             "holds it"
         )
-    return TriangleMesh(found[0], found[1], Frame())
+    return TriangleMesh(triangles[0], triangles[1], Frame())

@@ -1,4 +1,4 @@
-"""Meshes, and their parts, from files of any format that trimesh reads."""
+"""Meshes and their parts from files of any format that trimesh reads."""
 
 import os
 from io import BytesIO
@@ -24,19 +24,20 @@ from jaxnbv.scanning.sphere_tracing import SDFSurface
 
 @checked
 def load_mesh(path: str | Path | trimesh.Trimesh | trimesh.Scene, up: str = "y") -> TriangleMesh:
-    """The mesh in a file of any format that trimesh reads, or a mesh or scene of trimesh's; the geometries of a scene
-    are joined where it places them.
+    """The mesh in a file of any format that trimesh reads, or of a trimesh mesh or scene.
+
+    The geometries of a scene are joined where it places them.
 
     - `up`: the file's axis that is upward, see `Frame`.
 
-    **Raises:** `ValueError` if the file is missing, cannot be read, or holds what is not read of it (a skeleton or
-    sparse accessors of glTF, say), and as `TriangleMesh.from_arrays` does.
+    **Raises:** `ValueError` if the file is missing, cannot be read, or has features that the reader would ignore (such
+    as a skeleton or sparse accessors in glTF), and as `TriangleMesh.from_arrays` does.
     """
     return joined_nodes(path, [mesh for _, mesh in read_nodes(path)], up)
 
 
 def as_surface(scene: Surface | SignedDistance | trimesh.Trimesh | trimesh.Scene) -> Surface:
-    """A surface as it is; of a solid its boundary; of trimesh's meshes what `load_mesh` makes, with y upward.
+    """The surface of a scene: itself, the boundary of a solid, or a trimesh object by `load_mesh` (y up).
 
     **Raises:** `ValueError` as `load_mesh` does.
     """
@@ -48,8 +49,9 @@ def as_surface(scene: Surface | SignedDistance | trimesh.Trimesh | trimesh.Scene
 class MeshParts(eqx.Module):
     """A mesh whose file has a node for each part.
 
-    - `mesh`: the whole.
-    - `parts`: the triangles of each, in the scene coordinates of the whole; `names`: those of the nodes.
+    - `mesh`: the whole mesh.
+    - `parts`: the triangles of each part, in the scene coordinates of the whole.
+    - `names`: name of each part's node.
     """
 
     mesh: TriangleMesh
@@ -57,34 +59,35 @@ class MeshParts(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
 
     def distances(self, grid: Grid) -> Float[Array, "parts g g g"]:
-        """From the grid's nodes to the surface of each part, in scene units."""
+        """Unsigned distance from each of the grid's nodes to the surface of each part, in scene units."""
         nodes = np.stack(np.meshgrid(*[grid.axis] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-        found = [distance_to_triangles(nodes, part.vertices, part.faces) for part in self.parts]
+        distances = [distance_to_triangles(nodes, part.vertices, part.faces) for part in self.parts]
         shape = len(self.parts), *(grid.resolution,) * 3
-        return jnp.asarray(np.stack(found).reshape(shape), jnp.result_type(float))
+        return jnp.asarray(np.stack(distances).reshape(shape), jnp.result_type(float))
 
 
 def load_parts(path: str | Path | trimesh.Scene, up: str = "y") -> MeshParts:
-    """The mesh in a file, or a scene of trimesh's, and its parts, one for each node that has a face of positive area,
-    in the order of names.
+    """The mesh in a file or trimesh scene and its parts.
+
+    There is one part for each node with a face of positive area, sorted by name.
 
     - `up`: the file's axis that is upward, see `Frame`.
 
-    **Raises:** `ValueError` as `load_mesh` does, or if there is one part alone.
+    **Raises:** `ValueError` as `load_mesh` does, or if there is only one part.
     """
     nodes = read_nodes(path)
     mesh = joined_nodes(path, [node for _, node in nodes], up)
     solid = [(name, node, node.faces[node.area_faces > 0]) for name, node in sorted(nodes, key=lambda node: node[0])]
     whole = [(name, node, faces) for name, node, faces in solid if len(faces)]
-    require(len(whole) > 1, f"{path} has one node: a file has parts if each of them is a node")
+    require(len(whole) > 1, f"{path} has one node, and so no parts: save each part as a node of its own")
     parts = tuple(TriangleMesh(mesh.frame.to_scene(node.vertices), faces, mesh.frame) for _, node, faces in whole)
     return MeshParts(mesh, parts, tuple(name for name, *_ in whole))
 
 
 def joined_nodes(path: str | Path | trimesh.Geometry, meshes: list[trimesh.Trimesh], up: str) -> TriangleMesh:
-    """The mesh that the nodes of a file make together.
+    """The single mesh of all nodes of a file.
 
-    **Raises:** `ValueError` as `TriangleMesh.from_arrays` does, for the file.
+    **Raises:** `ValueError` as `TriangleMesh.from_arrays` does, with the path in the message.
     """
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
     vertices = np.concatenate([mesh.vertices for mesh in meshes])
@@ -96,9 +99,10 @@ def joined_nodes(path: str | Path | trimesh.Geometry, meshes: list[trimesh.Trime
 
 
 def read_nodes(path: str | Path | trimesh.Geometry) -> list[tuple[str, trimesh.Trimesh]]:
-    """The nodes of a file or scene that have faces, by name, where they are placed, in the file's coordinates.
+    """Name and placed mesh of each node with faces in a file or scene, in the file's coordinates.
 
-    **Raises:** `ValueError` if the file is missing, cannot be read, has no faces, or holds what its reader passes over.
+    **Raises:** `ValueError` if the file is missing, cannot be read, has no faces, or has features that its reader would
+    ignore.
     """
     meshes = _read_file(Path(path)) if isinstance(path, str | Path) else _placed(path)
     meshes = [(name, mesh) for name, mesh in meshes if len(mesh.faces)]
@@ -132,7 +136,7 @@ def _read(path: Path) -> list[tuple[str, trimesh.Trimesh]]:
 
 
 def _placed(thing: trimesh.Geometry) -> list[tuple[str, trimesh.Trimesh]]:
-    """The meshes of a scene by their nodes' names, or a mesh alone."""
+    """Name of the node and placed mesh, for each mesh of a scene or for a single mesh."""
     parts = thing.dump() if isinstance(thing, trimesh.Scene) else [thing]
     meshes = [part for part in parts if isinstance(part, trimesh.Trimesh)]
     return [(str(mesh.metadata.get("node", index)), mesh) for index, mesh in enumerate(meshes)]

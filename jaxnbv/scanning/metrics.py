@@ -48,8 +48,10 @@ def coverage(views: Iterable[Any], truth: Float[AnyArray, "n 3"], size: float = 
 def shows(
     scan: PointCloud, camera: Camera, pose: Pose, truth: Float[np.ndarray, "n 3"], size: float
 ) -> Bool[np.ndarray, " n"]:
-    """Whether a scan shows each point of the true surface. It does if the point's distance from the camera differs from
-    that of its pixel's hit by at most `size` plus the change of distance on the hit's plane within half a pixel.
+    """Whether a scan shows each point of the true surface.
+
+    It does if the point's distance from the camera differs from that of its pixel's hit by at most `size` plus the
+    change of distance on the hit's plane within half a pixel.
 
     **Raises:** `ValueError` if the scan does not have one row per ray of the camera.
     """
@@ -81,8 +83,10 @@ def truth_points(scene: Surface, key: PRNGKeyArray, count: int = SURFACE_POINTS)
 
 
 def true_mesh(scene: Surface) -> TriangleMesh | None:
-    """The surface as triangles in scene coordinates: a mesh is returned unchanged, a signed distance goes through
-    marching cubes on the default grid. None for another kind of surface."""
+    """The surface as triangles in scene coordinates; None for a surface of another kind.
+
+    A mesh is returned unchanged. A signed distance goes through marching cubes on the default grid.
+    """
     if isinstance(scene, SDFSurface):
         return mesh_from_sdf(scene.sdf, Grid())
     return scene if isinstance(scene, TriangleMesh) else None
@@ -109,10 +113,11 @@ class SurfaceDistance(NamedTuple):
 
 
 def surface_distance(reconstruction: Float[AnyArray, "n 3"], truth: Float[AnyArray, "m 3"]) -> SurfaceDistance:
-    """Chamfer and Hausdorff distance between two surfaces, from points of each (`TriangleMesh.sample_points`).
+    """Chamfer and Hausdorff distance between two surfaces, from points of each.
 
-    The distance between two samples of the same surface is not zero: n points that are uniform on an area A have a mean
-    distance of about sqrt(A / n) / 2 to another sample. Their Chamfer distance is twice that.
+    Sample the points with `TriangleMesh.sample_points`. The distance between two samples of the same surface is not
+    zero: n points that are uniform on an area A have a mean distance of about sqrt(A / n) / 2 to another sample. Their
+    Chamfer distance is twice that.
 
     **Raises:** `ValueError` if either has no points or points that are not finite.
     """

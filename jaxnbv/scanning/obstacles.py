@@ -1,4 +1,4 @@
-"""Known obstacles: what they hide, and where a camera may not stand because of them."""
+"""Known obstacles, which hide the scene behind them and keep cameras away."""
 
 import dataclasses
 import functools
@@ -20,27 +20,27 @@ from jaxnbv.scanning.grid import Grid
 from jaxnbv.scanning.sdf import Rotated, SignedDistance
 from jaxnbv.scanning.sphere_tracing import SDFSurface
 
-# Beyond this distance from the scene's origin nothing stands in the way of a camera.
+# Obstacles farther than this from the scene's origin hide nothing.
 _FAR = 8.0
 
 
 class Obstacles(eqx.Module):
-    """Known solids, and how near a camera may come to things; in scene units within a `Planner`.
+    """Known solids, and the distance that a camera keeps from things; in scene units within a `Planner`.
 
-    An obstacle hides what is behind it, from the sensor and from imagined scans; it is never counted as the object, and
-    no imagined surface is within it.
+    An obstacle hides everything behind it, both from the sensor and in scans of samples. It never counts as the object,
+    and samples are empty inside it.
 
-    - `solids`: solids of `jaxnbv.scanning.sdf`: a table is a `HalfSpace`, a mesh is made one by `solid_of_mesh`.
-    - `margin`: points nearer than this to an obstacle are taken for its own.
-    - `clearance`: no camera comes nearer than this to an obstacle, nor to a point that was seen.
-    - `clutter`: what else stands there, known coarsely: it hides and keeps cameras away as solids do, but no point is
-      taken for its own and imagined surfaces may go through it. A session finds it in its images.
+    - `solids`: solids of `jaxnbv.scanning.sdf`, such as a `HalfSpace` for a table or `solid_of_mesh` for a mesh.
+    - `margin`: points nearer than this to a solid count as points of the solid.
+    - `clearance`: least distance of a camera from an obstacle and from a scanned point.
+    - `clutter`: other things nearby, known coarsely. Clutter hides and keeps cameras away as solids do, but no point
+      counts as its own and samples may go through it. A session derives it from its images.
 
-    **Raises:** `ValueError` for solids that are not solids, or a negative length.
+    **Raises:** `ValueError` if `solids` holds anything else, or for a negative length.
     """
 
     solids: tuple[SignedDistance, ...] = ()
-    # Arrays, so that what was compiled for one scale runs for any.
+    # Arrays, so that a program compiled for one scale runs for any.
     margin: float = eqx.field(converter=np.float64, default=0.03)
     clearance: float = eqx.field(converter=np.float64, default=0.1)
     clutter: SignedDistance | None = None
@@ -55,7 +55,7 @@ class Obstacles(eqx.Module):
             require(value >= 0, f"the {name} is {value}; it must not be negative")
 
     def in_scene(self, frame: Frame) -> "Obstacles":
-        """From world units to those of the scene."""
+        """The same obstacles in the scene, if these are in world coordinates."""
 
         def moved(solid: SignedDistance) -> SignedDistance:
             return Rotated(solid.translate(-np.asarray(frame.center)), frame.rotation).scale(frame.scale)
@@ -65,42 +65,46 @@ class Obstacles(eqx.Module):
         return Obstacles(solids, frame.scale * self.margin, frame.scale * self.clearance, clutter)
 
     def with_clutter(self, clutter: SignedDistance | None) -> "Obstacles":
-        """The same solids with other clutter, None for none."""
-        # Runs under jit, where a new one would convert its lengths.
-        return eqx.tree_at(lambda known: known.clutter, self, clutter, is_leaf=lambda leaf: leaf is None)
+        """A copy with other clutter; None removes it."""
+        # Not the constructor, whose conversion of lengths fails under jit.
+        return eqx.tree_at(lambda obstacles: obstacles.clutter, self, clutter, is_leaf=lambda leaf: leaf is None)
 
     def distance(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
-        """Signed distance to the nearest solid, infinite where there is none."""
+        """Signed distance from each point to the nearest solid; infinite if there is none."""
         return _distance(self.solids, x)
 
     def barrier(self, camera: Camera, poses: Pose) -> Float[Array, "*batch rays"] | None:
-        """How far along each ray of a camera the first obstacle stands, clutter included; infinite where none does,
-        None without any."""
+        """Distance along each ray of a camera to the first obstacle, clutter included.
+
+        Infinite for a ray that meets none; None if there are no obstacles.
+        """
         if not self._all:
             return None
         origins, directions = camera.rays(poses)
         surface = SDFSurface(functools.reduce(operator.or_, self._all), bounding_radius=_FAR)
         hits = surface.trace(origins.reshape(-1, 3), directions.reshape(-1, 3))
-        along = jnp.linalg.norm(hits.points - origins.reshape(-1, 3), axis=-1)
-        return jnp.where(hits.mask, along, jnp.inf).reshape(origins.shape[:-1])
+        distance = jnp.linalg.norm(hits.points - origins.reshape(-1, 3), axis=-1)
+        return jnp.where(hits.mask, distance, jnp.inf).reshape(origins.shape[:-1])
 
     def remove_points(self, scan: PointCloud) -> PointCloud:
-        """A scan less the points of solids; of an image, their rays met nothing of the object."""
+        """The scan without the points that belong to solids. In a sensor's image their rays become missed."""
         own = scan.mask & (self.distance(scan.points) < self.margin)
         missed = None if scan.missed is None else scan.missed | own
         return dataclasses.replace(scan.only(~own), missed=missed)
 
     @eqx.filter_jit
     def within(self, grid: Grid) -> Bool[Array, "g g g"]:
-        """The nodes of a grid that lie within an obstacle."""
+        """Whether each node of a grid lies inside a solid."""
         axis = jnp.asarray(grid.axis, jnp.result_type(float))
         return on_tensor_grid(lambda x: self.distance(x) < 0, axis)
 
     def violation(self, poses: Pose, cloud: PointCloud) -> Float[Array, " poses"]:
-        """By how much each of a batch of cameras is too near to an obstacle or to D, in scene units; zero where it is
-        not. Differentiable."""
-        seen = jnp.sqrt(jnp.maximum(nearest_squared_distance(poses.position, cloud), 1e-12))
-        return jnp.maximum(self.clearance - jnp.minimum(_distance(self._all, poses.position), seen), 0.0)
+        """How far each camera violates `clearance` to the obstacles and the cloud D, in scene units.
+
+        It is zero for a camera that is far enough away. Differentiable.
+        """
+        to_cloud = jnp.sqrt(jnp.maximum(nearest_squared_distance(poses.position, cloud), 1e-12))
+        return jnp.maximum(self.clearance - jnp.minimum(_distance(self._all, poses.position), to_cloud), 0.0)
 
     @property
     def _all(self) -> tuple[SignedDistance, ...]:
@@ -114,5 +118,5 @@ def _distance(solids: tuple[SignedDistance, ...], x: Float[AnyArray, "*n 3"]) ->
 
 
 def barrier_of(obstacles: Obstacles | None, camera: Camera, poses: Pose) -> Float[Array, "*batch rays"] | None:
-    """`Obstacles.barrier`; None without obstacles."""
+    """`Obstacles.barrier` of these obstacles; None if there are none."""
     return None if obstacles is None else obstacles.barrier(camera, poses)

@@ -51,9 +51,10 @@ class Surface(eqx.Module):
 
     @abstractmethod
     def trace(self, origins: Float[AnyArray, "rays 3"], directions: Float[AnyArray, "rays 3"]) -> Hits:
-        """First hits of the rays origin + t direction, t >= 0, with unit directions. Both sides of the surface count.
+        """First hits of the rays origin + t direction, t >= 0, with unit directions.
 
-        A ray that starts inside the surface hits it from within. Normals point to the side of the origin there too.
+        Rays hit both sides of the surface, so a ray that starts inside hits it from within. Normals point to the side
+        of the origin there too.
         """
 
     def contains(self, points: Float[AnyArray, "n 3"]) -> Bool[AnyArray, " n"]:
@@ -71,12 +72,14 @@ class Surface(eqx.Module):
 
     @property
     def world_frame(self) -> Frame | None:
-        """The frame that maps the surface's original world coordinates to the scene; None if these are the scene's."""
+        """The frame that maps the surface's world to the scene; None if it was built in scene coordinates."""
         return None
 
 
 class SensorNoise(eqx.Module):
-    """Gaussian sensor noise: x + eps with eps ~ N(0, points^2 I). Normals become n + eps and are normalised again.
+    """Gaussian sensor noise: x + eps with eps ~ N(0, points^2 I).
+
+    Normals become n + eps, with noise of their own, and are normalised again.
 
     - `points`: standard deviation of each coordinate, in scene units.
     - `normals`: standard deviation of each component of the unit normals.
@@ -116,8 +119,9 @@ class SensorNoise(eqx.Module):
 
 
 class DepthNoise(eqx.Module):
-    """Noise and rounding of a depth camera that triangulates. A disparity is 1/z times a constant, so both are the same
-    at all depths z in 1/z and grow as z^2 in z:
+    """Noise and rounding of a depth camera that triangulates.
+
+    A disparity is 1/z times a constant, so both are the same at all depths z in 1/z and grow as z^2 in z:
 
         1/z' = step round((1/z + deviation eps) / step),   eps ~ N(0, 1).
 
@@ -147,9 +151,11 @@ class DepthNoise(eqx.Module):
 
     @classmethod
     def realsense_d435(cls, scale: float = 1.0) -> "DepthNoise":
-        """Noise of 3.8 mm at 1 m, in steps of 1.5 mm: disparities have an error of 0.08 pixels and a resolution of
-        1/32, with a baseline of 50 mm and 848 pixels across 90 degrees (Intel's papers on tuning and on subpixel
-        linearity)."""
+        """Noise of 3.8 mm at 1 m, in steps of 1.5 mm (Intel's papers on tuning and on subpixel linearity).
+
+        Disparities have an error of 0.08 pixels and steps of 1/32, with a baseline of 50 mm and 848 pixels across 90
+        degrees.
+        """
         pixels_times_metres = 848 / 2 / math.tan(math.radians(45.0)) * 0.05
         return cls(0.08 / pixels_times_metres, 1 / 32 / pixels_times_metres, scale)
 
@@ -188,7 +194,7 @@ Noise: TypeAlias = SensorNoise | DepthNoise
 
 
 def far_from_scene(pose: Pose) -> str | None:
-    """An error message if a pose (not traced) is implausibly far from the scene; None if all are near enough."""
+    """A message if a pose is too far from the scene to be meant, else None. Poses must not be traced."""
     distance = float(np.linalg.norm(np.asarray(pose.position), axis=-1).max(initial=0.0))
     if distance <= _FAR_OFF:
         return None
@@ -202,14 +208,16 @@ def far_from_scene(pose: Pose) -> str | None:
 def scan(
     surface: Surface, camera: Camera, pose: Pose, barrier: Float[Array, "*batch rays"] | None = None
 ) -> PointCloud:
-    """The scan of a surface from a pose, one row per pixel. A row is missed if its ray hits nothing within the camera's
-    range. It is invalid if the hit is too near or at too large an angle of incidence.
+    """The scan of a surface from a pose, one row per pixel, without noise.
+
+    A row is missed if its ray hits nothing within the camera's range. It is invalid if the hit is too near or at too
+    large an angle of incidence. Points are in scene coordinates. Normals are unit and point towards the sensor. Poses
+    with leading axes give clouds with the same leading axes. Apply a `SensorNoise` to the result for noise.
 
     - `barrier`: distance along each ray to an obstacle (`Obstacles.barrier`); hits behind it are missed.
 
-    Poses with leading axes give clouds with the same leading axes. Points are in scene coordinates. Normals are unit
-    and point towards the sensor. There is no noise: apply a `SensorNoise` to the result. Runs under `jit` if
-    `surface.in_jit`. Warns if the scan is empty and the camera so far away that its pose must be in other units.
+    Runs under `jit` if `surface.in_jit`. Warns if the scan is empty and the camera so far away that its pose must be in
+    other units.
     """
     origins, directions = camera.rays(pose)
     hits = surface.trace(origins.reshape(-1, 3), directions.reshape(-1, 3))
