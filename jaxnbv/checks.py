@@ -227,8 +227,8 @@ def functions_of_users() -> Iterator[None]:
         at = f"{user_frames[-1].filename}:{user_frames[-1].lineno}"
         problem, remedy = next(words for kind, words in _UNTRACEABLE.items() if isinstance(error, kind))
         raise InputError(
-            f"{user_frames[-1].name} {problem} ({at}): {remedy}, or wrap a network from outside JAX in HostClassifier or "
-            "HostSegmenter"
+            f"{user_frames[-1].name} {problem} ({at}): {remedy}, or wrap a network from outside JAX in HostClassifier "
+            "or HostSegmenter"
         ) from error
 
 

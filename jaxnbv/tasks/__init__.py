@@ -1,4 +1,4 @@
-"""One file a task: its utility or its acquisition, and what it answers."""
+"""Tasks, one file each: the utility or acquisition, and the answer."""
 
 from jaxnbv.tasks.classification import ClassAcquisition as ClassAcquisition
 from jaxnbv.tasks.classification import Classifier as Classifier

@@ -1,6 +1,6 @@
 """Classification: which class is the object of?
 
-A classifier is any function from a `PointCloud` (rows, masked) to log-probabilities, log p = classifier(cloud): a
+A classifier is any function from a `PointCloud` (masked rows) to log-probabilities, log p = classifier(cloud): a
 network of `jaxnbv.networks`, one of your own, or a `HostClassifier`. A `Classifier` may also name its classes.
 """
 
@@ -21,19 +21,19 @@ from jaxnbv.scanning import Surface
 from jaxnbv.utility import Answer, Quantity, default_batch_size, plain_function
 
 _LOG_P = "give log-probabilities, one for each of two classes or more"
-# Their shape is checked by `Acquisition.check`.
+# D and log p. `ClassAcquisition.check` checks the shape of log p.
 Context: TypeAlias = tuple[PointCloud, Array]
 
 
 class Classifier(eqx.Module):
-    """Log-probabilities of the classes of a cloud. Only `__call__` must be given.
+    """Base class of classifiers of clouds. Subclasses must define `__call__` only.
 
-    `classes`: their names; None where they have none.
+    - `classes`: names of the classes, or None.
     """
 
     @abstractmethod
     def __call__(self, cloud: PointCloud) -> Float[Array, " classes"]:
-        """log p of one cloud (rows, masked)."""
+        """log p of one cloud (masked rows)."""
 
     @property
     def classes(self) -> tuple[str, ...] | None:
@@ -41,29 +41,29 @@ class Classifier(eqx.Module):
 
     @property
     def batch_size(self) -> int:
-        """How many clouds are classified together."""
+        """Number of clouds to classify together."""
         return default_batch_size()
 
 
 class FunctionClassifier(Classifier):
-    """A plain function of a cloud as a classifier."""
+    """A classifier from a plain function of a cloud."""
 
     function: Callable[[PointCloud], Float[Array, " classes"]]
 
-    # What it returns is checked by `Acquisition.check`, which names it.
+    # `Acquisition.check` checks the result, since it can name the function in the error.
     def __call__(self, cloud: PointCloud) -> Any:
         return self.function(cloud)
 
 
 def as_classifier(value: Any) -> Classifier:
-    """A classifier as it is; a plain function as one.
+    """The value itself if it is a classifier, else a plain function wrapped as one.
 
     **Raises:** `ValueError` for anything else.
     """
     return value if isinstance(value, Classifier) else FunctionClassifier(plain_function(value, "the classifier"))
 
 
-# Functions are converted on the way in, which mypy cannot see.
+# A converter accepts plain functions too, which mypy cannot see.
 if TYPE_CHECKING:
     AnyClassifier: TypeAlias = Any
 else:
@@ -71,23 +71,23 @@ else:
 
 
 def entropy(log_p: Float[Array, "*batch classes"]) -> Float[Array, "*batch"]:
-    """-sum_c p_c log p_c in nats, of log-probabilities; a class of probability zero adds nothing."""
+    """-sum_c p_c log p_c in nats, from log-probabilities. A class of probability zero adds nothing."""
     return cross_entropy(log_p, log_p)
 
 
 def cross_entropy(
     log_p: Float[Array, "*batch classes"], log_q: Float[Array, "*batch classes"]
 ) -> Float[Array, "*batch"]:
-    """-sum_c p_c log q_c in nats, of log-probabilities. Finite: log 0 counts as the logarithm of the least float."""
+    """-sum_c p_c log q_c in nats, from log-probabilities. Finite: log q_c is at least that of the smallest float."""
     least = jnp.log(jnp.finfo(log_p.dtype).tiny)
     return -jnp.sum(jnp.exp(log_p) * jnp.maximum(log_q, least), axis=-1)
 
 
 class ClassAcquisition(Acquisition):
-    """An acquisition that compares what a classifier says of D and of D u scan.
+    """Base class of acquisitions that compare a classifier's results on D and on D u scan.
 
     - `classifier`: a `Classifier`, or a function from a cloud to log-probabilities.
-    - `num_points`: D is thinned to so many by farthest point sampling, once a step, before scans are added to it.
+    - `num_points`: D is thinned to this number by farthest point sampling, once a step, before scans are added.
     """
 
     cloud_only: ClassVar[bool] = True
@@ -95,7 +95,7 @@ class ClassAcquisition(Acquisition):
     num_points: int = eqx.field(static=True, default=1024)
 
     def context(self, step: StepInputs) -> Context:
-        """D, thinned, and log p^(t)."""
+        """D, thinned to `num_points`, and log p^(t)."""
         thinned = limit_capacity(step.observations.cloud, self.num_points)
         return thinned, self._log_p(thinned)
 
@@ -104,16 +104,16 @@ class ClassAcquisition(Acquisition):
 
     @abstractmethod
     def compare(self, log_p: Float[Array, " classes"], log_q: Float[Array, " classes"]) -> Float[Array, "*values"]:
-        """The value, in nats, of a scan that takes the classifier's answer from log p^(t) to log p^(t+1)."""
+        """Value in nats of a scan that changes the classifier's result from `log_p`, at t, to `log_q`, at t + 1."""
 
     def score(self, context: Context, view: ImaginedView) -> Float[Array, "*values"]:
-        """`compare`; zero for a scan that sees nothing."""
+        """`compare` on D and D u scan. Zero for an empty scan."""
         cloud, log_p = context
         return zero_if_empty(view.scan, self.compare(log_p, self._log_p(concatenate(cloud, view.scan))))
 
     @property
     def batch_size(self) -> int:
-        """As the classifier prefers."""
+        """The classifier's batch size."""
         return self.classifier.batch_size
 
     def answer(self, cloud: PointCloud) -> "ClassAnswer":
@@ -127,7 +127,7 @@ class ClassAcquisition(Acquisition):
         return jnp.exp(context_of(self, cloud)[1])
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> "ClassAnswer | None":
-        """The object's own class, where it says one that the classifier knows."""
+        """The scene's class label, or None if it has none or the classifier has no such class."""
         label = scene.class_label
         if label is None:
             return None
@@ -135,8 +135,8 @@ class ClassAcquisition(Acquisition):
         return ClassAnswer(names, np.eye(len(names))[int(label)]) if 0 <= int(label) < len(names) else None
 
     def check(self, cloud: PointCloud) -> None:
-        """**Raises:** `ValueError` if the classifier's answer on D is not a vector of log-probabilities, one for each
-        of the classes that it names."""
+        """**Raises:** `ValueError` unless the classifier's result on D is a vector of log-probabilities, one for each
+        class that it names."""
         log_p = context_of(self, cloud)[1]
         require(len(log_p) >= 2, f"the classifier's answer has shape {jnp.shape(log_p)}: {_LOG_P}")
         total = float(jnp.sum(jnp.exp(log_p)))
@@ -153,14 +153,16 @@ class ClassAcquisition(Acquisition):
 
 
 class CrossEntropy(ClassAcquisition):
-    """The paper's alpha^(CE): -sum_c p_c^(t) log p_c^(t+1), of the classes' probabilities given D and given D u scan.
+    """Cross-entropy of the class probabilities given D and given D u scan, -sum_c p_c^(t) log p_c^(t+1).
+
+    The paper's alpha^(CE).
 
     - `classifier`: a function from a cloud to log-probabilities.
-    - `num_points`: D is thinned to so many by farthest point sampling, once a step.
+    - `num_points`: D is thinned to this number by farthest point sampling, once a step.
     """
 
     def compare(self, log_p: Float[Array, " classes"], log_q: Float[Array, " classes"]) -> Float[Array, ""]:
-        """In nats; zero is the least there is."""
+        """Cross-entropy in nats, at least zero."""
         return cross_entropy(log_p, log_q)
 
     @property
@@ -170,13 +172,13 @@ class CrossEntropy(ClassAcquisition):
 
 
 class EntropyReduction(ClassAcquisition):
-    """max(0, H(p^(t)) - H(p^(t+1))): the expected improvement of the paper's u_E(D) = sum_c p_c log p_c.
+    """Reduction of entropy, max(0, H(p^(t)) - H(p^(t+1))): the improvement of the paper's u_E(D) = sum_c p_c log p_c.
 
-    - `classifier`, `num_points`: as of `CrossEntropy`.
+    - `classifier`, `num_points`: see `CrossEntropy`.
     """
 
     def compare(self, log_p: Float[Array, " classes"], log_q: Float[Array, " classes"]) -> Float[Array, ""]:
-        """In nats."""
+        """Reduction of entropy in nats, at least zero."""
         return jnp.maximum(0.0, entropy(log_p) - entropy(log_q))
 
     @property
@@ -186,11 +188,11 @@ class EntropyReduction(ClassAcquisition):
 
 
 class MixedEntropy(ClassAcquisition):
-    """Cross-entropy while the class is open, entropy reduction once it is nearly settled (the authors' code).
+    """Cross-entropy while the class is uncertain, entropy reduction once it is nearly certain (the authors' code).
 
-    `CrossEntropy` where the entropy of p^(t) is above `threshold` (nats), else `EntropyReduction`.
+    `CrossEntropy` if the entropy of p^(t) is above `threshold` (nats), else `EntropyReduction`.
 
-    - `classifier`, `num_points`: as of `CrossEntropy`.
+    - `classifier`, `num_points`: see `CrossEntropy`.
     """
 
     threshold: float = eqx.field(static=True, default=0.75)
@@ -200,7 +202,7 @@ class MixedEntropy(ClassAcquisition):
         require(self.threshold >= 0, f"the entropy's threshold is {self.threshold}; it must not be negative")
 
     def compare(self, log_p: Float[Array, " classes"], log_q: Float[Array, " classes"]) -> Float[Array, ""]:
-        """In nats."""
+        """Cross-entropy or reduction of entropy, in nats."""
         before = entropy(log_p)
         reduction = jnp.maximum(0.0, before - entropy(log_q))
         return jnp.where(before > self.threshold, cross_entropy(log_p, log_q), reduction)
@@ -212,6 +214,6 @@ class MixedEntropy(ClassAcquisition):
 
 
 class ClassAnswer(Answer):
-    """The probabilities of the classes."""
+    """The probability of each class."""
 
     form: str = "{:.2f}"

@@ -1,4 +1,4 @@
-"""Coverage: how much of the surface has been seen, and how much more a view would show."""
+"""Coverage: acquisitions for new surface, and the share of the surface that has been seen."""
 
 from typing import ClassVar
 
@@ -20,26 +20,29 @@ from jaxnbv.scanning.visibility import sees, spread_points
 from jaxnbv.sharding import on_cpu, shared_map
 from jaxnbv.utility import Quantity
 
-# Scene units: s without looks.
+# Default s without looks, in scene units.
 _SIZE = 0.05
-# By which the share that was seen is told, of each sample: to a percent.
+# Points on each sample for the seen share, which is then accurate to a percent.
 _POINTS = 1024
 
 
 def _many() -> int:
-    """Scans at once, where little is computed of each."""
+    """Batch size of scans with a cheap score."""
     return 128 if on_cpu() else 2048
 
 
 class Coverage(Acquisition):
-    """The paper's alpha^(CD): sum over the points x of the scan of min_{y in D} |x - y|^2, in squared scene units."""
+    """Chamfer distance from scan to D, sum_{x in scan} min_{y in D} |x - y|^2, in squared scene units.
+
+    The paper's alpha^(CD).
+    """
 
     def context(self, step: StepInputs) -> PointCloud:
         """D itself."""
         return step.observations.cloud
 
     def score(self, context: PointCloud, view: ImaginedView) -> Float[Array, ""]:
-        """Unidirectional Chamfer distance from the scan to D; zero for a scan that sees nothing."""
+        """Unidirectional Chamfer distance from the scan to D. Zero for an empty scan."""
         return jnp.sum(jnp.where(view.scan.mask, nearest_squared_distance(view.scan.points, context), 0.0))
 
     @property
@@ -49,41 +52,42 @@ class Coverage(Acquisition):
 
     @property
     def batch_size(self) -> int:
-        """Many scans at once: the loop over D runs once for all of them."""
+        """Many scans at once, since a single loop over D serves all of them."""
         return _many()
 
 
 class Unseen(eqx.Module):
-    """Where surface would be new, given what has been observed.
+    """How new a point on a surface is, given the observations.
 
-    - `seen`: distances to all that was measured, or to D where looks are not kept; `size`: see `NewSurface`.
+    - `seen`: distance field to all hits of earlier views, or to D if the observations keep no looks.
+    - `size`: see `NewSurface`.
     """
 
     seen: Looks | DistanceField
     size: Float[Array, ""]
 
     def __call__(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
-        """How new surface at some points is, from 0 to 1."""
+        """Newness of surface at each point, from 0 to 1."""
         return jnp.clip(self.seen(points) / self.size - 1.0, 0.0, 1.0)
 
 
 class NewSurface(Acquisition):
-    """Expected new area: how much surface an imagined scan shows that was not measured yet, in squared scene units.
+    """Expected new area: surface that an imagined scan shows and no view has measured yet, in squared scene units.
 
         alpha(D, scan) = sum_x a(x) clip(d(x) / s - 1, 0, 1)
 
-    over the hits x of the scan, where d is the distance to the nearest pixel of any view so far, as large as it is on
-    the surface (`Looks`), and a(x) = r^2 omega / cos the area of the pixel on the surface: omega its solid angle, r the
-    distance, cos that of the angle of incidence, at least 0.5. The rays of one scan do not overlap, so no part of the
-    surface counts twice; and neither near surfaces, which fill more pixels, nor a single point far from all others
-    outweighs the rest, as in the paper's `Coverage`. It is differentiable in the pose wherever `Coverage` is, but its
-    derivative lacks the jumps that make most of a gain: search over candidates.
+    over the hits x of the scan. d is the distance to the nearest pixel footprint of any earlier view (`Looks`), and
+    a(x) = r^2 omega / cos is the pixel's area on the surface: omega its solid angle, r the distance, and cos the cosine
+    of the angle of incidence, at least 0.5. Rays of one scan do not overlap, so no surface counts twice. In the paper's
+    `Coverage` near surfaces, which fill more pixels, or a single far point can outweigh the rest. Here they cannot. It
+    is differentiable in the pose wherever `Coverage` is, but most of a gain comes from jumps, which the derivative
+    misses: search over candidates.
 
-    - `size`: s, what lies within this distance of a hit has been seen; what is twice as far is new. In scene units, in
-      a session too; by default, and at least, the spacing of the grid on which looks are kept.
+    - `size`: s. Surface within s of a hit has been seen, and surface farther than 2 s is new. In scene units, also in
+      sessions. The spacing of the grid of `Looks` is both the default and the minimum.
 
-    Observations that keep no looks, such as a cloud alone, have D in place of all hits; then s is 0.05 by default, and
-    at least the median of how far points of D are from their nearest neighbours.
+    Observations without looks, such as a cloud alone, use D in place of all hits. Then s is 0.05 by default, and at
+    least the median distance from points of D to their nearest neighbours.
 
     **Raises:** `ValueError` if the size is not positive.
     """
@@ -97,7 +101,7 @@ class NewSurface(Acquisition):
         require(self.size is None or self.size > 0, f"the size is {self.size}; it must be positive, in scene units")
 
     def context(self, step: StepInputs) -> Unseen:
-        """What has been seen."""
+        """The newness of points, from the looks or from D."""
         cloud, looks = step.observations.cloud, step.observations.looks
         if looks is not None and 2.0 * (self.size or 0.0) <= looks.reach:
             return Unseen(looks, jnp.asarray(max(looks.grid.spacing, self.size or 0.0), cloud.points.dtype))
@@ -105,7 +109,7 @@ class NewSurface(Acquisition):
         return Unseen(DistanceField.of(cloud, 2.0 * size), size)
 
     def score(self, context: Unseen, view: ImaginedView) -> Float[Array, ""]:
-        """The new area of one scan; zero for a scan that sees nothing."""
+        """New area of one scan. Zero for an empty scan."""
         return jnp.sum(pixel_area(view.scan, view.camera, view.pose, STEEP) * context(view.scan.points))
 
     @property
@@ -115,12 +119,12 @@ class NewSurface(Acquisition):
 
     @property
     def batch_size(self) -> int:
-        """Many scans at once."""
+        """Many scans at once, since the score is cheap."""
         return _many()
 
 
 def newness_of(acquisition: Acquisition) -> NewSurface:
-    """What counts as new to an acquisition: itself, if it looks for new surface, or the default."""
+    """The acquisition itself if it is a `NewSurface`, else the default one."""
     return acquisition if isinstance(acquisition, NewSurface) else NewSurface()
 
 
@@ -133,16 +137,17 @@ def seen_share(
     taken: PoseList,
     barrier: Float[Array, "poses rays"] | None = None,
 ) -> Float[Array, ""]:
-    """The share, by area, that has been seen of what a camera sees of the sampled surfaces from some poses together.
-    A point has been seen if it is not new and, where looks are kept, a view that was taken shows it: what is near to
-    what was measured may lie round an edge.
+    """Share of the area visible from `poses` on the sampled surfaces that earlier views have seen.
 
-    - `taken`: where views were taken.
-    - `barrier`: of `poses`, see `scan`.
+    A point has been seen if it is not new and, if the observations keep looks, is visible from the pose of a view. A
+    point near to a measured one may still be hidden behind an edge.
+
+    - `taken`: poses of the views so far.
+    - `barrier`: distances to obstacles from `poses`, see `scan`.
     """
     areas = shared_map(_areas_shown, surfaces, unseen, camera, poses, taken, barrier)
-    seen, shown = jnp.sum(areas, axis=0)
-    return jnp.where(shown > 0, seen / jnp.where(shown > 0, shown, 1.0), 1.0)
+    seen_area, visible_area = jnp.sum(areas, axis=0)
+    return jnp.where(visible_area > 0, seen_area / jnp.where(visible_area > 0, visible_area, 1.0), 1.0)
 
 
 def _areas_shown(
@@ -150,15 +155,15 @@ def _areas_shown(
     unseen: Unseen,
     camera: Camera,
     poses: Pose,
-    taken: PoseList,
+    views: PoseList,
     barrier: Float[Array, "poses rays"] | None,
 ) -> Float[Array, "2"]:
-    """The area of one sample that was seen, and that the poses show."""
+    """Areas of one sample: seen and visible from the poses, and visible from the poses."""
     points = spread_points(surface, _POINTS)
     tolerance = surface.grid.spacing
-    shown = jnp.any(sees(surface, camera, poses, points, tolerance, barrier), axis=0)
-    seen = unseen(points.points) <= 0
+    is_visible = jnp.any(sees(surface, camera, poses, points, tolerance, barrier), axis=0)
+    is_seen = unseen(points.points) <= 0
     if isinstance(unseen.seen, Looks):
-        own = sees(surface, unseen.seen.camera, taken.rows, points, tolerance)
-        seen &= jnp.any(own & taken.is_filled[:, None], axis=0)
-    return jnp.stack([jnp.sum(points.areas, where=seen & shown), jnp.sum(points.areas, where=shown)])
+        own = sees(surface, unseen.seen.camera, views.rows, points, tolerance)
+        is_seen &= jnp.any(own & views.is_filled[:, None], axis=0)
+    return jnp.stack([jnp.sum(points.areas, where=is_seen & is_visible), jnp.sum(points.areas, where=is_visible)])

@@ -2,8 +2,8 @@
 
     du/dt = Delta u + f,     (M + h L) u_{k+1} = M (u_k + h f)
 
-with the Laplacian of Sharp and Crane (2020, "A Laplacian for Nonmanifold Triangle Meshes"): that of the tufted cover of
-the triangles, or for points of a triangulation of each one's neighbours. Open edges let no heat through.
+with the Laplacian of Sharp and Crane (2020, "A Laplacian for Nonmanifold Triangle Meshes"). It is built on the tufted
+cover of the triangles. Point clouds use a local triangulation of each point's neighbours. No heat crosses open edges.
 """
 
 from collections.abc import Callable
@@ -20,24 +20,24 @@ from scipy.sparse.linalg import splu
 from jaxnbv.checks import AnyArray, as_numbers, check_fields, is_traced, require
 from jaxnbv.errors import optional
 
-# A point's neighbours in its local triangulation: what Sharp and Crane use.
+# Neighbours of a point in its local triangulation, as many as Sharp and Crane use.
 _NEIGHBOURS = 30
 
 
 def _array(source) -> AnyArray:
-    # Stays off JAX's devices, which worker processes have no use for.
+    # Other arrays become NumPy's, off JAX's devices, since worker processes do not use these.
     return source if isinstance(source, Array) else as_numbers(source, "the heat source")
 
 
 class HeatProblem(eqx.Module):
-    """A body at one temperature that is heated near a point for a while: the paper's du/dt = Delta u + f, u(0) = u0.
+    """A body of uniform temperature that is heated near a point: the paper's du/dt = Delta u + f, u(0) = u0.
 
-    - `source`: where, in scene coordinates; f is `power` within `radius` of it and zero elsewhere, smoothed at the rim
-      by what area a point stands for (`heating`). A body with no point there is not heated.
+    - `source`: point in scene coordinates. f is `power` within `radius` of it and zero elsewhere, smoothed at the rim
+      according to the area of each point (`heating`). A body without a point there is not heated.
     - `radius`: in scene units.
-    - `power`: f in degrees per unit of time; the unit of time is that in which Delta, in scene units, has factor one.
-    - `duration`: T, how long it is heated.
-    - `steps`: of implicit Euler, h = T / steps.
+    - `power`: f in degrees per unit of time. Time has the unit in which the factor of Delta, in scene units, is one.
+    - `duration`: T, the time of heating.
+    - `steps`: number of steps of implicit Euler, h = T / steps.
     - `initial`: u0, in degrees.
 
     **Raises:** `ValueError` for a source that is not one finite point, a radius or duration that is not positive, less
@@ -64,16 +64,15 @@ class HeatProblem(eqx.Module):
 
     @property
     def highest(self) -> float:
-        """No point gets warmer: u0 + T max(0, power), by the maximum principle."""
+        """Upper bound of the temperature, u0 + T max(0, power), by the maximum principle."""
         return self.initial + self.duration * max(0.0, self.power)
 
     def heating(self, points: Float[np.ndarray, "n 3"], areas: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """f at points that stand for the given areas: `power` times the share of a point's disc, of radius rho, that
-        lies within `radius` of the source, as far as that follows from its distance d: 1/2 + (radius - d) / (2 rho)
-        within [0, 1].
+        """f at points: `power` times the approximate share of a point's disc that lies within `radius` of the source.
 
-        To the authors a point is within or not, which is the same for dense points. With 1,024 points on an object the
-        least temperatures of two samplings then differed by a third; with shares by a tenth.
+        The share is 1/2 + (radius - d) / (2 rho), clipped to [0, 1], for the distance d and the disc's radius rho. In
+        the authors' code a point is within or not, which is the same for dense points. For 1,024 points on an object,
+        the lowest temperatures of two samplings then differed by a third, and differ by a tenth with shares.
         """
         distance = np.linalg.norm(points - np.asarray(self.source, np.float64), axis=1)
         return self.power * np.clip(0.5 + 0.5 * (self.radius - distance) / np.sqrt(areas / np.pi), 0.0, 1.0)
@@ -83,7 +82,7 @@ class Laplacian(NamedTuple):
     """The weak Laplacian of n points: Delta u = -u @ weak / mass.
 
     - `weak`: L, (n, n), symmetric and positive semidefinite; its rows sum to zero, so that heat is conserved.
-    - `mass`: the diagonal of M, the area that each point stands for; positive.
+    - `mass`: the diagonal of M, the positive area that belongs to each point.
     """
 
     weak: sparse.csc_matrix
@@ -94,28 +93,27 @@ class Temperature(NamedTuple):
     """The solution of a `HeatProblem` at time T.
 
     - `values`: u in degrees.
-    - `reached`: which points the source warms, as they are connected to a point that it heats. The others keep the
-      initial temperature for ever.
+    - `reached`: whether each point is connected to a heated point. Other points stay at the initial temperature.
     """
 
     values: Float[np.ndarray, " n"]
     reached: Bool[np.ndarray, " n"]
 
     def coldest(self, reached_only: bool) -> int | None:
-        """Index of the coldest point, the first of equals; None if there is none, or none was reached."""
+        """Index of the coldest point, the first of equals, or None if there is no point to choose from."""
         candidates = np.flatnonzero(self.reached) if reached_only else np.arange(len(self.values))
         return int(candidates[np.argmin(self.values[candidates])]) if len(candidates) else None
 
 
 def cloud_laplacian(points: Float[np.ndarray, "n 3"]) -> Laplacian:
-    """The Laplacian of a point cloud in which no two points coincide.
+    """Laplacian of a point cloud without coincident points.
 
-    A point is tied to some of its 30 nearest (to all others, if they are fewer), however far they are: pieces of more
-    points are separate once they are far from one another. Points without a triangle, such as those of a lone line,
-    conduct no heat.
+    A point is connected to some of its 30 nearest neighbours (to all others, if they are fewer), at any distance. So
+    pieces of more points than that are separate once they are far apart. Points without a triangle, such as points on
+    a lone line, conduct no heat.
     """
     if len(points) == 3:
-        # Of two neighbours the library makes what happens to lie in memory.
+        # With two neighbours the library reads uninitialised memory.
         one = np.linalg.matrix_rank(points[1:] - points[0]) == 2
         return mesh_laplacian(points, np.array([[0, 1, 2]])) if one else _nothing(3)
     neighbours = min(_NEIGHBOURS, len(points) - 1)
@@ -124,12 +122,12 @@ def cloud_laplacian(points: Float[np.ndarray, "n 3"]) -> Laplacian:
 
 
 def mesh_laplacian(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Laplacian:
-    """The Laplacian of triangles, manifold or not: heat flows where they share vertices."""
+    """Laplacian of triangles, manifold or not. Heat flows where they share vertices."""
     return _assemble(lambda: optional("robust_laplacian").mesh_laplacian(vertices, faces), len(vertices))
 
 
 def _nothing(count: int) -> Laplacian:
-    """Of points that conduct no heat."""
+    """Laplacian of points that conduct no heat."""
     return Laplacian(sparse.csc_matrix((count, count)), np.ones(count))
 
 
@@ -139,11 +137,11 @@ def _assemble(build: Callable, count: int) -> Laplacian:
     try:
         weak, mass = build()
     except RuntimeError as error:
-        # The library's way to say that there is not one triangle.
+        # The library raises this if there is no triangle at all.
         if "unreferenced vertex" not in str(error):
             raise
         return _nothing(count)
-    # The library ties a point without triangles to zero degrees; rows that sum to zero leave it alone.
+    # The library couples a point without triangles to zero degrees. Rows that sum to zero leave it alone.
     flow = weak - sparse.diags(weak.diagonal())
     flow.eliminate_zeros()
     return Laplacian((flow - sparse.diags(np.asarray(flow.sum(axis=1)).ravel())).tocsc(), mass.diagonal())
@@ -158,10 +156,10 @@ def diffuse(
 ) -> Float[np.ndarray, " n"]:
     """u after `duration`, by implicit Euler: (M + h L) u_{k+1} = M (u_k + h f), factorised once.
 
-    Stable for any h, with an error of order h. The heat, mass @ u, grows by h mass @ f each step.
+    It is stable for any h, with an error of order h. The heat, mass @ u, grows by h mass @ f each step.
     """
     step = duration / steps
-    # Symmetric and positive definite, so pivots may stay on the diagonal and the order keep the factors sparse.
+    # The system is symmetric positive definite, so it needs no pivoting and the order can keep the factors sparse.
     system = sparse.diags(laplacian.mass) + step * laplacian.weak
     factors = splu(system.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     u = initial
@@ -171,7 +169,7 @@ def diffuse(
 
 
 def cloud_temperature(points: Float[np.ndarray, "n 3"], heat: HeatProblem) -> Temperature:
-    """Temperature of a point cloud, in scene coordinates. Points that coincide count as one.
+    """Temperature of a point cloud in scene coordinates. Coincident points count as one.
 
     **Raises:** `ValueError` for points that are not finite.
     """
@@ -182,9 +180,9 @@ def cloud_temperature(points: Float[np.ndarray, "n 3"], heat: HeatProblem) -> Te
 def mesh_temperature(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], heat: HeatProblem
 ) -> Temperature:
-    """Temperature at the vertices of a mesh, in scene coordinates, linear between them: see `refine`.
+    """Temperature at the vertices of a mesh in scene coordinates. It is linear between vertices: see `refine`.
 
-    Vertices that coincide count as one, so that heat crosses the seams of a triangle soup.
+    Coincident vertices count as one, so that heat crosses the seams of a triangle soup.
 
     **Raises:** `ValueError` for vertices that are not finite.
     """
@@ -210,7 +208,7 @@ def _solve(laplacian: Laplacian, points: np.ndarray, place: np.ndarray, heat: He
     values = np.full(len(points), float(heat.initial))
     if reached.any():
         values = diffuse(laplacian, values, heating, heat.duration, heat.steps)
-        # Exactly: solving would round it.
+        # The solver rounds, and these must be exact.
         values[~reached] = heat.initial
     return Temperature(values[place], reached[place])
 
@@ -218,9 +216,10 @@ def _solve(laplacian: Laplacian, points: np.ndarray, place: np.ndarray, heat: He
 def refine(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], longest: float
 ) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]:
-    """The same surface in triangles whose edges are at most `longest`, by halving edges in all their triangles at once.
+    """The same surface in triangles with edges no longer than `longest`, by bisection of longer edges.
 
-    The vertices that were there stay first. Triangles may become slivers, which this Laplacian forgives.
+    Each edge is halved in all its triangles at once. The original vertices come first. Triangles may become slivers,
+    which this Laplacian tolerates.
 
     **Raises:** `ValueError` if `longest` is not positive.
     """
@@ -238,9 +237,12 @@ def refine(
 
 
 def _split_faces(faces: np.ndarray, halves: np.ndarray) -> np.ndarray:
-    """Triangles cut at the midpoints of their edges (i, i + 1), a vertex each, or -1 for an edge that stays."""
+    """Triangles, cut at the midpoints of their edges.
+
+    - `halves`: index of the midpoint's vertex on each edge (i, i + 1), or -1 for an edge that stays whole.
+    """
     count = (halves >= 0).sum(axis=1)
-    # Rotated so that one midpoint lies on the first edge, and two on the first and second.
+    # Rotate each triangle: one midpoint is then on the first edge, and two are on the first and second edges.
     first = np.where(count == 2, np.argmin(halves, axis=1) + 1, np.argmax(halves, axis=1))
     turn = (first[:, None] + np.arange(3)) % 3
     (a, b, c), (x, y, z) = (np.take_along_axis(rows, turn, axis=1).T for rows in (faces, halves))

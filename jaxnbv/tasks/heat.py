@@ -1,4 +1,4 @@
-"""Heat diffusion: where does a body that is heated at one place stay coldest?"""
+"""Heat diffusion: the coldest point of a body that is heated at one place."""
 
 import math
 import multiprocessing
@@ -21,29 +21,31 @@ from jaxnbv.tasks.diffusion import HeatProblem, Temperature, cloud_temperature, 
 from jaxnbv.tasks.host import call_on_host
 from jaxnbv.utility import Answer, Quantity, Utility
 
-# Longest edge, in scene units, of the triangles on which the true temperature is computed: within 2 % of that on ever
-# finer ones at the default radius, in seconds.
+# Longest edge, in scene units, of the triangles for the true temperature. At the default radius it is within 2 % of the
+# limit of finer triangles, and takes seconds.
 _LONGEST_EDGE = 0.025
-# Workers wait for the next candidates while the rest of a step is computed.
+# Workers stay alive this long between calls, while the rest of a step is computed.
 _IDLE_SECONDS = 120
-# They import jaxnbv, and with it JAX, but leave the accelerator and each other's cores alone.
+# Workers import JAX, but must not take the accelerator or each other's cores.
 _WORKER_ENVIRONMENT = {"JAX_PLATFORMS": "cpu", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
 
 class ColdestPoint(Utility):
-    """The paper's u_H(D) = -min u^(T), a utility for `ExpectedUtilityImprovement`.
+    """Negative lowest temperature, u_H(D) = -min u^(T), a utility for `ExpectedUtilityImprovement`.
 
-    Its Laplacian runs on the host, so it has no gradient: search over candidates, as in the paper. Values are equal to
-    the last bit whatever the order of the points and the number of workers.
+    The paper's u_H. The Laplacian runs on the host, so there is no gradient: search over candidates, as in the paper.
+    The order of the points and the number of workers do not change a bit of the values.
 
     - `heat`: the `HeatProblem`, or its source alone, (3,) in scene coordinates, with the authors' values for the rest.
       Scenes that differ in the source alone share one compilation.
-    - `reached_only`: take the minimum over the points that the source can warm. The paper takes it over all, where it
-      stays at u0, the least there can be, from the moment that D or an imagined scan has one piece that is not
-      connected to the source: no view improves on that.
-    - `workers`: processes that share the candidates, by default one a core; with 1, this process does the work.
+    - `reached_only`: take the minimum over the points that the source can warm. The paper takes it over all points.
+      Once D or an imagined scan has a piece that is not connected to the source, that minimum stays at u0, and no view
+      improves on it.
+    - `workers`: number of processes that share the candidates, by default one for each core. For 1, this process does
+      the work.
 
-    **Raises:** `ValueError` for less than one worker, as `HeatProblem` does, and when a gradient is asked for.
+    **Raises:** `ValueError` for fewer than one worker, for a source that `HeatProblem` refuses, and when it is
+    differentiated.
     """
 
     heat: HeatProblem
@@ -60,29 +62,29 @@ class ColdestPoint(Utility):
     ):
         workers = optional("loky").cpu_count() if workers is None else workers
         require(workers >= 1, f"the number of workers is {workers}; it must be at least 1")
-        # A list is converted on the way in, which mypy cannot see.
+        # `HeatProblem` converts a list, which mypy cannot see.
         self.heat = heat if isinstance(heat, HeatProblem) else HeatProblem(heat)  # type: ignore[arg-type]
         self.reached_only, self.workers = reached_only, workers
 
     def __call__(self, cloud: PointCloud) -> Float[Array, ""]:
-        """u_H in degrees, of one cloud; under `vmap`, of all of them in one call.
+        """u_H of one cloud in degrees. Under `vmap` all clouds are computed in one call.
 
-        With no point to take the minimum over it is the least there can be, -(u0 + T power): any point improves on it.
+        Without a point to take the minimum over, it is the lower bound -(u0 + T power), and any point improves on it.
         """
         source = jnp.asarray(self.heat.source, cloud.points.dtype)
-        # The source is passed with each cloud: here it may be a value that JAX does not know yet.
+        # The source may be traced, so it is passed as an array with each cloud.
         heat = replace(self.heat, source=np.zeros(3))
         values = partial(_values, heat=heat, reached_only=self.reached_only, workers=self.workers)
         return call_on_host(values, (), "ColdestPoint", cloud.points, cloud.mask, source)
 
     @property
     def improvement(self) -> Quantity:
-        """What its expected improvement is."""
+        """Name, unit and meaning of the expected improvement."""
         meaning = "how much colder than now the coldest point is with an imagined scan, mean over posterior samples."
         return Quantity("expected fall of the least temperature", "degrees", meaning)
 
     def answer(self, cloud: PointCloud) -> "Coldest":
-        """Where the cloud is coldest, and its temperature there."""
+        """The coldest point of the cloud and its temperature."""
         return coldest_point(cloud, self.heat, self.reached_only)
 
 
@@ -101,7 +103,7 @@ def _value(points: np.ndarray, heat: HeatProblem, reached_only: bool) -> float:
 
 
 def _map(function: Callable, clouds: list, problems: list, workers: int) -> list[float]:
-    # A worker of Dask's is a daemon, which Python lets start no processes.
+    # A Dask worker is a daemon, and Python does not let daemons start processes.
     if workers == 1 or len(clouds) == 1 or multiprocessing.current_process().daemon:
         return list(map(function, clouds, problems))
     executor = optional("loky").get_reusable_executor(workers, timeout=_IDLE_SECONDS, env=_WORKER_ENVIRONMENT)
@@ -111,11 +113,10 @@ def _map(function: Callable, clouds: list, problems: list, workers: int) -> list
 def body_temperature(
     body: PointCloud | TriangleMesh, heat: HeatProblem
 ) -> tuple[Float[np.ndarray, "n 3"], Temperature]:
-    """Points of a body, in scene coordinates, and their temperature: of a cloud its points; of a mesh its vertices,
-    and as many more as it takes to resolve the heat.
+    """Points of a body, in scene coordinates, and their temperature.
 
-    Of a mesh in separate parts, which may meet but share no vertices, only those with the source get warm; give a dense
-    cloud of points of it where heat shall pass between parts that touch.
+    They are the points of a cloud, or the vertices of a mesh after refinement to resolve the heat. Heat does not cross
+    between parts of a mesh that touch but share no vertices: if it should, give a dense cloud of the mesh.
     """
     if isinstance(body, PointCloud):
         points = np.asarray(body.to_numpy()[0], np.float64)
@@ -125,9 +126,9 @@ def body_temperature(
 
 
 class Coldest(Answer):
-    """The coldest point (scene coordinates), and its temperature in degrees, which is the answer's one value.
+    """The coldest point, in scene coordinates, and its temperature in degrees, the only value of the answer.
 
-    - `frame`: of the world in which the point is said.
+    - `frame`: frame of the world for the point's coordinates in words.
     """
 
     point: Float[np.ndarray, "3"] = eqx.field(default_factory=lambda: np.zeros(3))
@@ -143,12 +144,12 @@ class Coldest(Answer):
 
 @checked
 def coldest_point(body: PointCloud | TriangleMesh, heat: HeatProblem, reached_only: bool = False) -> Coldest:
-    """The coldest point of a cloud, which is the estimate, or of a mesh, which is the truth; the first of equals.
+    """The coldest point of a cloud (the estimate) or of a mesh (the truth). The first one if several are equal.
 
-    - `reached_only`: as in `ColdestPoint`. Without it, where some points are not connected to the source, the answer is
-      any one of them.
+    - `reached_only`: see `ColdestPoint`. If False, and some points are not connected to the source, the result is one
+      of these.
 
-    **Raises:** `ValueError` if there is no point, or none that the source can warm.
+    **Raises:** `ValueError` if there is no point, or for `reached_only` none that the source can warm.
     """
     points, temperature = body_temperature(body, heat)
     coldest = temperature.coldest(reached_only)

@@ -1,5 +1,7 @@
-"""Functions that run outside JAX, on the host: a PyTorch model, a solver. They have no derivative, so a search over
-candidates alone can use them."""
+"""Functions that run outside JAX, on the host: a PyTorch model or a solver, say.
+
+They have no derivative, so only searches over candidates can use them.
+"""
 
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -17,16 +19,16 @@ from jaxnbv.tasks.segmentation import Segmenter
 
 
 class HostClassifier(Classifier):
-    """A classifier that runs outside JAX, a PyTorch model say: for search over candidates only.
+    """A classifier that runs outside JAX, a PyTorch model say, for searches over candidates only.
 
     - `function`: from points (b, n, 3), unit normals (b, n, 3) and mask (b, n), as NumPy arrays, to log-probabilities
       (b, num_classes). It is called with up to 128 scans at once.
-    - `num_classes`: how many classes it tells apart.
-    - `version`: a text or number that you change whenever the function changes, "2026-11" say. A run that is stored
-      needs it unless the function's source and all that it reads can be described, which weights of PyTorch cannot.
+    - `num_classes`: number of classes.
+    - `version`: a text or number, such as "2026-11", that you change whenever the function changes. Stored runs need it
+      unless the function's source and all that it reads can be described. PyTorch weights cannot.
 
-    **Raises:** `ValueError` when a gradient is asked for. A function that returns another shape, or fails, fails within
-    JAX, which raises its own `RuntimeError` with the message in its text.
+    **Raises:** `ValueError` when it is differentiated. If the function fails or returns another shape, JAX raises its
+    own `RuntimeError`, whose text has the message.
     """
 
     function: Callable = eqx.field(static=True)
@@ -36,22 +38,22 @@ class HostClassifier(Classifier):
 
     def __check_init__(self):
         check_fields(self)
-        require(self.num_classes >= 2, f"num_classes is {self.num_classes}; a classifier tells at least two apart")
+        require(self.num_classes >= 2, f"num_classes is {self.num_classes}; it must be at least 2")
 
     def __call__(self, cloud: PointCloud) -> Float[Array, " classes"]:
-        """Log-probabilities of one cloud; under `vmap`, of all of them in one call."""
+        """Log-probabilities of one cloud. Under `vmap` the function gets all clouds in one call."""
         return _of_cloud(self.function, (self.num_classes,), "HostClassifier", cloud)
 
 
 class HostSegmenter(Segmenter):
-    """A segmenter that runs outside JAX, a PyTorch model say: for search over candidates only.
+    """A segmenter that runs outside JAX, a PyTorch model say, for searches over candidates only.
 
-    - `function`: as of `HostClassifier`, to probabilities of the parts (b, n, num_parts); rows that the mask leaves out
-      count for nothing, whatever it says of them.
-    - `num_parts`: how many parts it tells apart.
-    - `version`: as of `HostClassifier`.
+    - `function`: from the arrays of `HostClassifier` to probabilities of the parts (b, n, num_parts). Masked rows of
+      its result are ignored.
+    - `num_parts`: number of parts.
+    - `version`: see `HostClassifier`.
 
-    **Raises:** as `HostClassifier`.
+    **Raises:** as `HostClassifier` does.
     """
 
     function: Callable = eqx.field(static=True)
@@ -61,10 +63,10 @@ class HostSegmenter(Segmenter):
 
     def __check_init__(self):
         check_fields(self)
-        require(self.num_parts >= 1, f"num_parts is {self.num_parts}; a segmenter knows one part at least")
+        require(self.num_parts >= 1, f"num_parts is {self.num_parts}; it must be at least 1")
 
     def __call__(self, cloud: PointCloud) -> Float[Array, "points parts"]:
-        """Probabilities of the parts of one cloud's points; under `vmap`, of all clouds in one call."""
+        """Part probabilities of one cloud's points. Under `vmap` the function gets all clouds in one call."""
         p = _of_cloud(self.function, (cloud.capacity, self.num_parts), "HostSegmenter", cloud)
         return jnp.where(cloud.mask[:, None], p, 0.0)
 
@@ -76,10 +78,12 @@ def _of_cloud(function: Callable, shape: tuple[int, ...], name: str, cloud: Poin
 def call_on_host(
     function: Callable, shape: tuple[int, ...], name: str, *arrays: Shaped[Array, "..."]
 ) -> Float[Array, "..."]:
-    """A function of NumPy arrays with a leading axis more than here: of one entry or, under `vmap`, of all of them.
+    """The result of a NumPy function for these arrays.
 
-    - `shape`: of the result of one entry; it has the type of the first array.
-    - `name`: of what is called, for errors.
+    The function gets the arrays with an extra leading axis, of length one or, under `vmap`, the number of entries.
+
+    - `shape`: shape of the result for one entry. Its type is that of the first array.
+    - `name`: name of the caller, for errors.
 
     **Raises:** `ValueError` when it is differentiated.
     """
@@ -90,12 +94,12 @@ def call_on_host(
 def _call(arrays: tuple[Any, ...], function: Callable, shape: tuple[int, ...], name: str) -> Float[Array, "..."]:
     own_axes, dtype = arrays[0].ndim, arrays[0].dtype
 
-    def call(*given):
-        batch = given[0].shape[: given[0].ndim - own_axes]
-        flat = [np.asarray(array).reshape(-1, *array.shape[len(batch) :]) for array in given]
-        found, expected = np.asarray(function(*flat), dtype), (len(flat[0]), *shape)
-        require(found.shape == expected, f"the function of {name} returned shape {found.shape}, not {expected}")
-        return found.reshape((*batch, *shape))
+    def call(*inputs):
+        batch = inputs[0].shape[: inputs[0].ndim - own_axes]
+        flat = [np.asarray(array).reshape(-1, *array.shape[len(batch) :]) for array in inputs]
+        result, expected = np.asarray(function(*flat), dtype), (len(flat[0]), *shape)
+        require(result.shape == expected, f"the function of {name} returned shape {result.shape}, not {expected}")
+        return result.reshape((*batch, *shape))
 
     return jax.pure_callback(call, jax.ShapeDtypeStruct(shape, dtype), *arrays, vmap_method="broadcast_all")
 

@@ -1,4 +1,4 @@
-"""Which of some known parts an object is, and how it lies: views by what they tell about the hypotheses."""
+"""Identification: find out which known part an object is and how it lies, by the expected information of views."""
 
 from collections.abc import Sequence
 from typing import Any, ClassVar, TypeAlias
@@ -22,21 +22,22 @@ from jaxnbv.surfaces.part_hypotheses import NONE, PartHypotheses, hypotheses_of
 from jaxnbv.surfaces.shape_bank import ShapeBank
 from jaxnbv.utility import Answer, Quantity
 
-# Nodes along an axis of the surfaces that are imagined.
+# Nodes along each axis of the grid for the hypotheses' surfaces.
 _RESOLUTION = 64
-# What a view tells about how a part lies counts for so much of what it tells about which it is.
+# Weight of the information about how a part lies, relative to that about which part it is.
 _HOW = 0.1
-# How far each ray goes to a part, the cosine of its incidence, and whether it meets the part.
+# For each ray: distance to the part, cosine of the angle of incidence, and whether it hits the part.
 _Image: TypeAlias = tuple[Float[Array, "..."], Float[Array, "..."], Bool[Array, "..."]]
 
 
 class ImaginedParts(eqx.Module):
-    """What the value of a view depends on.
+    """The context of `Identify`.
 
-    - `surfaces`: of the likeliest hypotheses; `weights`: theirs, which sum to one.
-    - `classes`: (h, c) what each hypothesis counts as, a one in each row.
-    - `tau`: how far a measured point may lie from the surface, in scene units.
-    - `how`: what information about how a part lies counts, zero if it does not.
+    - `surfaces`: surfaces of the likeliest hypotheses, along a leading axis.
+    - `weights`: their probabilities, which sum to one.
+    - `classes`: class c of each hypothesis h, one-hot.
+    - `tau`: how far a measured point may lie from the surface, in scene units, see `part_evidence`.
+    - `how`: weight of the information about how a part lies, or zero.
     """
 
     surfaces: GridSurface
@@ -47,22 +48,22 @@ class ImaginedParts(eqx.Module):
 
 
 class Identify(Acquisition):
-    """Expected information about which part the object is, and then how it lies, in nats:
+    """Expected information about which part the object is, and to a lesser degree about how it lies, in nats:
 
         alpha(theta) = I(c) + 0.1 I(h | c),   I(c) = H(c) - sum_h w_h H(c | z_h),
         w_h' | z_h  proportional to  w_h' exp(-L(z_h, z_h'))
 
-    over the hypotheses h of a model that knows parts (`KnownShapes` with a bank at true size): c is the name of h, and
-    I(h | c) what a view tells about h beyond c; z_h is the depth image of h from theta, and L the misfit of images by
-    which the hypotheses are weighed, see `part_evidence`. Every hypothesis is rendered once a pose, and images are
-    compared in pairs. It needs no posterior. Information about the name goes first: views that settle how an object
-    lies before they look at what tells the name put that off.
+    over the hypotheses h of a model with known parts (`KnownShapes` with a bank at true size). c is the name of h, and
+    I(h | c) the information about h beyond c. z_h is the depth image of h from theta, and L the misfit of two images,
+    the same as in the weights of the hypotheses (`part_evidence`). Every hypothesis is rendered once for each pose, and
+    images are compared in pairs. It needs no posterior. The name has the larger weight, since views that first settle
+    how the object lies delay finding its name.
 
-    - `pose`: whether how it lies counts at all.
-    - `group`: what each part of the bank counts as where the question is another one, "left" or "right" say:
-      `[name.split("-")[0] for name in bank.names]`. How it lies does not count then.
+    - `pose`: whether information about how the object lies counts at all.
+    - `group`: a class name for each part of the bank, to ask for the class ("left" or "right", say) instead of the
+      part: `[name.split("-")[0] for name in bank.names]`. How the object lies then does not count.
 
-    **Raises:** `ValueError` for a group that is no list of names.
+    **Raises:** `ValueError` for a group that is not a list of names.
     """
 
     needs_hypotheses: ClassVar[bool] = True
@@ -73,7 +74,7 @@ class Identify(Acquisition):
         check_fields(self)
 
     def context(self, step: StepInputs) -> ImaginedParts:
-        """The hypotheses as surfaces."""
+        """Surfaces, weights and classes of the hypotheses."""
         observations, hypotheses = step.observations, hypotheses_of(step.observations)
         grid = Grid() if observations.grid is None else observations.grid
         grid = Grid(min(_RESOLUTION, grid.resolution), grid.half_extent)
@@ -93,8 +94,8 @@ class Identify(Acquisition):
         return jax.nn.one_hot(jnp.asarray(numbers)[shapes], int(numbers.max()) + 1)
 
     def score(self, context: Any, view: ImaginedView) -> Float[Array, ""]:
-        """**Raises:** `ValueError` always: a view is worth what it tells hypotheses apart, not what it shows of one."""
-        raise InputError("Identify scores no single scan: ask its sample_scores")
+        """**Raises:** `ValueError` always. The value of a view depends on the scans of all hypotheses together."""
+        raise InputError("Identify cannot score a single scan: use its sample_scores")
 
     def sample_scores(
         self,
@@ -104,7 +105,7 @@ class Identify(Acquisition):
         poses: Pose,
         barrier: Float[Array, "poses rays"] | None = None,
     ) -> Float[Array, "1 poses"]:
-        """The information that is expected of each pose; the surfaces are those of the context."""
+        """Expected information of each pose, from the surfaces in the context. `surfaces` is not used."""
         at_once = samples_at_once(camera, poses)
         images = shared_map(_image, context.surfaces, camera, poses, barrier, at_once=at_once)
         by_pose = jax.tree.map(lambda rows: jnp.moveaxis(rows, 1, 0), images)
@@ -117,13 +118,13 @@ class Identify(Acquisition):
 
 
 class IdentityAnswer(Answer):
-    """The probability of each part of a bank by its name, or of each group of parts, and last of "none of these"."""
+    """The probability of each part of a bank, or of each group of parts, and last of "none of these"."""
 
     form: str = "{:.2f}"
 
 
 def identity_answer(hypotheses: PartHypotheses, acquisition: Acquisition) -> IdentityAnswer:
-    """Which part the object is; which group of parts, for `Identify(group=...)`."""
+    """Probabilities of the parts, or of the groups of parts for `Identify(group=...)`."""
     names, values = weights_by_name(hypotheses.bank, np.asarray(hypotheses.part_weights), acquisition)
     return IdentityAnswer((*names, NONE), values)
 
@@ -131,8 +132,9 @@ def identity_answer(hypotheses: PartHypotheses, acquisition: Acquisition) -> Ide
 def weights_by_name(
     bank: ShapeBank, weights: Float[np.ndarray, "*batch k_and_none"], acquisition: Acquisition
 ) -> tuple[list[str], Float[np.ndarray, "*batch n"]]:
-    """The names of a bank's parts in alphabetical order, and the weight of each and last of none; groups in place of
-    names for `Identify(group=...)`.
+    """Names of a bank's parts in alphabetical order, and the weight of each and last of "none of these".
+
+    For `Identify(group=...)` the names are those of the groups.
 
     - `weights`: `PartHypotheses.part_weights`, with any leading axes.
     """
@@ -144,7 +146,7 @@ def weights_by_name(
 
 
 def _image(surface: GridSurface, camera: Camera, poses: Pose, barrier: Float[Array, "poses rays"] | None) -> _Image:
-    """What a part shows from each of a batch of poses."""
+    """Image of a part from each pose of a batch."""
     scans = scan(surface, camera, poses, barrier)
     offset = scans.points - poses.position[:, None]
     away = jnp.linalg.norm(offset, axis=-1)
@@ -153,7 +155,7 @@ def _image(surface: GridSurface, camera: Camera, poses: Pose, barrier: Float[Arr
 
 
 def _information(images: _Image, context: ImaginedParts, camera: Camera) -> Float[Array, ""]:
-    """alpha of one pose, given the images of all hypotheses from there."""
+    """alpha of one pose, from the images of all hypotheses from there."""
     (reach, _, hits), weights = images, context.weights
     weight = weight_of(jnp.sum(jnp.where(hits, reach, 0.0)) / jnp.maximum(jnp.sum(hits), 1), camera)
 
@@ -163,17 +165,19 @@ def _information(images: _Image, context: ImaginedParts, camera: Camera) -> Floa
 
     after_each = jax.lax.map(after, images)
 
-    def told(of):
-        left = entropy(jnp.matmul(after_each, of, precision="highest"))
-        return entropy(weights @ of) - jnp.sum(weights * left)
+    def information(classes):
+        entropies = entropy(jnp.matmul(after_each, classes, precision="highest"))
+        return entropy(weights @ classes) - jnp.sum(weights * entropies)
 
-    which = told(context.classes)
-    return which + context.how * (told(jnp.eye(len(weights))) - which)
+    about_class = information(context.classes)
+    return about_class + context.how * (information(jnp.eye(len(weights))) - about_class)
 
 
 def _misfits(image: _Image, others: _Image, tau: Float[Array, ""]) -> Float[Array, "h rays"]:
-    """The misfit of each ray where one part is there and others are expected: by how far apart their surfaces are, and
-    C where a ray meets one of them only."""
+    """Misfit of each ray between the image of one part and those of others.
+
+    It grows with the distance between the surfaces, and is C (`MOST`) where the ray hits only one of the two parts.
+    """
     (reach, _, hits), (expected, cosine, are_expected) = image, others
     both = hits & are_expected
     apart = misfit_of(jnp.where(both, (reach - expected) * cosine, 0.0), tau)
@@ -181,13 +185,16 @@ def _misfits(image: _Image, others: _Image, tau: Float[Array, ""]) -> Float[Arra
 
 
 def entropy(weights: Float[Array, "*n c"]) -> Float[Array, "*n"]:
-    """In nats."""
+    """-sum_c w_c log w_c in nats, over the last axis."""
     return -jnp.sum(jax.scipy.special.xlogy(weights, jnp.maximum(weights, 1e-30)), axis=-1)
 
 
 def _as_group(names: Sequence[str] | None) -> tuple[str, ...] | None:
     if names is None:
         return None
-    given = tuple(names)
-    require(all(isinstance(name, str) for name in given), "the group must name what each part of the bank counts as")
-    return given
+    group = tuple(names)
+    require(
+        all(isinstance(name, str) for name in group),
+        "the group must be a list with a class name for each part of the bank",
+    )
+    return group

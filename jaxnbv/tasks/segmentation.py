@@ -1,9 +1,9 @@
 """Semantic parts: have all parts of the object been found?
 
-A segmenter is any function from a `PointCloud` (rows, masked) to the probabilities p_ic that point i belongs to part c,
-with rows of zeros for points that are not there: p = segmenter(cloud), (points, parts). The points may be fewer than
-the cloud's, where the segmenter thins it; `jaxnbv.networks.CloudSegmenter` makes one of a network, `HostSegmenter` of a
-function outside JAX. A `Segmenter` may also name the parts that it is asked for.
+A segmenter is any function p = segmenter(cloud) from a `PointCloud` (masked rows) to an array (points, parts): p_ic is
+the probability that point i belongs to part c. Rows without a point hold zeros. There may be fewer rows than in the
+cloud, if the segmenter thins it. `jaxnbv.networks.CloudSegmenter` wraps a network, and `HostSegmenter` a function
+outside JAX. A `Segmenter` may also name its parts.
 """
 
 import dataclasses
@@ -22,19 +22,19 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.scanning import Surface
 from jaxnbv.utility import Answer, Quantity, Utility, default_batch_size, plain_function
 
-# Of probabilities in 32 bits, or less.
+# Tolerance for the sums of probabilities in 32 bits or fewer.
 _SLACK = 1e-2
 
 
 class Segmenter(eqx.Module):
-    """Probabilities of the parts of an object, point by point. Only `__call__` must be given.
+    """Base class of segmenters: part probabilities of each point. Subclasses must define `__call__` only.
 
-    `part_names`: the parts that it is asked for, by their index; None where they have no names.
+    - `part_names`: names of the parts to find, by index, or None.
     """
 
     @abstractmethod
     def __call__(self, cloud: PointCloud) -> Float[Array, "points parts"]:
-        """p of one cloud (rows, masked); zeros in rows without a point."""
+        """p of one cloud (masked rows). Zeros in rows without a point."""
 
     @property
     def part_names(self) -> Mapping[int, str] | None:
@@ -42,29 +42,29 @@ class Segmenter(eqx.Module):
 
     @property
     def batch_size(self) -> int:
-        """How many clouds are segmented together."""
+        """Number of clouds to segment together."""
         return default_batch_size()
 
 
 class FunctionSegmenter(Segmenter):
-    """A plain function of a cloud as a segmenter."""
+    """A segmenter from a plain function of a cloud."""
 
     function: Callable[[PointCloud], Float[Array, "points parts"]]
 
-    # What it returns is checked by `SoftPartCount.check`, which names it.
+    # `SoftPartCount.check` checks the result.
     def __call__(self, cloud: PointCloud) -> Any:
         return self.function(cloud)
 
 
 def as_segmenter(value: Any) -> Segmenter:
-    """A segmenter as it is; a plain function as one.
+    """The value itself if it is a segmenter, else a plain function wrapped as one.
 
     **Raises:** `ValueError` for anything else.
     """
     return value if isinstance(value, Segmenter) else FunctionSegmenter(plain_function(value, "the segmenter"))
 
 
-# Functions are converted on the way in, which mypy cannot see.
+# A converter accepts plain functions too, which mypy cannot see.
 if TYPE_CHECKING:
     AnySegmenter: TypeAlias = Any
 else:
@@ -72,13 +72,13 @@ else:
 
 
 class SoftPartCount(Utility):
-    """The paper's u_S(D) = sum_c tanh(sum_i p_ic / N_target), a utility for `ExpectedUtilityImprovement`.
+    """Soft number of parts found, u_S(D) = sum_c tanh(sum_i p_ic / N_target), for `ExpectedUtilityImprovement`.
 
-    A part of which far more than N_target points are seen adds nothing any more, so the value of a view is what it
-    shows of parts not found yet.
+    The paper's u_S. A part saturates once far more than N_target of its points are seen, so a view gains by showing
+    parts that have not been found yet.
 
-    - `segmenter`: a `Segmenter`, or a function from a cloud to the probabilities of the parts, point by point.
-    - `target`: N_target, in points that the segmenter looks at; the default is the authors'.
+    - `segmenter`: a `Segmenter`, or a function from a cloud to part probabilities of each point.
+    - `target`: N_target, in points that the segmenter gets. The default is the authors'.
     """
 
     segmenter: AnySegmenter = eqx.field(converter=as_segmenter)
@@ -89,15 +89,15 @@ class SoftPartCount(Utility):
         require(self.target > 0, f"N_target is {self.target}; it must be positive")
 
     def __call__(self, cloud: PointCloud) -> Float[Array, ""]:
-        """u_S, between zero and the number of parts."""
+        """u_S(D), between zero and the number of parts."""
         return jnp.sum(jnp.tanh(jnp.sum(_probabilities(self.segmenter, cloud), axis=0) / self.target))
 
     def check(self, cloud: PointCloud) -> None:
-        """**Raises:** `ValueError` if what the segmenter gives of the cloud are not probabilities, a row a point."""
+        """**Raises:** `ValueError` unless the segmenter returns probabilities of the parts, one row for each point."""
         with functions_of_users():
             p = _probabilities(self.segmenter, cloud)
         total = jnp.sum(p, axis=1)
-        # Rows of points that are not there hold zeros.
+        # Rows without a point hold zeros.
         proper = jnp.all(p >= -_SLACK) & jnp.all((jnp.abs(total - 1.0) < _SLACK) | (jnp.abs(total) < _SLACK))
         require(
             bool(proper),
@@ -108,30 +108,30 @@ class SoftPartCount(Utility):
 
     @property
     def batch_size(self) -> int:
-        """As the segmenter prefers."""
+        """The segmenter's batch size."""
         return self.segmenter.batch_size
 
     @property
     def improvement(self) -> Quantity:
-        """What its expected improvement is."""
+        """Name, unit and meaning of the expected improvement."""
         meaning = "how much an imagined scan raises the soft count of the parts, mean over posterior samples."
         return Quantity("expected gain in parts", "parts", meaning)
 
     def answer(self, cloud: PointCloud) -> "PartAnswer":
-        """How many points are predicted of each part: of those that the segmenter names, or of those that it finds."""
+        """Number of points predicted for each part. It shows the parts that the segmenter names, or else has found."""
         counts = np.asarray(self.answer_values(cloud), np.float64)
-        known = self.segmenter.part_names
-        names = tuple((known or {}).get(index, f"part {index}") for index in range(len(counts)))
-        asked = tuple(np.flatnonzero(counts > 0).tolist() if known is None else known)
-        return PartAnswer(names, counts, asked=asked, target=self.target)
+        part_names = self.segmenter.part_names
+        names = tuple((part_names or {}).get(index, f"part {index}") for index in range(len(counts)))
+        parts = tuple(np.flatnonzero(counts > 0).tolist() if part_names is None else part_names)
+        return PartAnswer(names, counts, asked=parts, target=self.target)
 
     def answer_values(self, cloud: PointCloud) -> Float[Array, " parts"]:
-        """How many points are predicted of each part."""
+        """Number of points predicted for each part."""
         return _counts(self.segmenter, cloud).astype(cloud.points.dtype)
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> "PartAnswer":
-        """Of a solid with labels, how many points of its surface belong to each; of others, the answer on all of it.
-        One point is enough for a part to be there."""
+        """Number of surface points of each part by the scene's labels, or the answer on all of the surface without
+        labels. A part is present if it has at least one point."""
         answer = dataclasses.replace(self.answer(cloud), target=1.0)
         labels = scene.part_labels(cloud.points)
         if labels is None:
@@ -141,7 +141,11 @@ class SoftPartCount(Utility):
 
 
 class PartAnswer(Answer):
-    """How many points are predicted of each part; `asked`: the parts that are shown; `target`: N_target."""
+    """Number of points predicted for each part.
+
+    - `asked`: indices of the parts to show.
+    - `target`: N_target.
+    """
 
     form: str = "{:.0f}"
     asked: tuple[int, ...] = ()
@@ -159,6 +163,6 @@ def _counts(segmenter: Segmenter, cloud: PointCloud) -> Int[Array, " parts"]:
 
 
 def part_counts(p: Float[Array, "points parts"]) -> Int[Array, " parts"]:
-    """N_c = sum_i 1[argmax_c' p_ic' = c]: how many points are predicted to belong to each part; empty rows to none."""
+    """N_c = sum_i 1[argmax_c' p_ic' = c], the number of points predicted for each part. Rows of zeros do not count."""
     predicted = jax.nn.one_hot(jnp.argmax(p, axis=1), p.shape[1], dtype=jnp.int32)
     return jnp.sum(jnp.where(jnp.any(p > 0, axis=1)[:, None], predicted, 0), axis=0)
