@@ -1,4 +1,4 @@
-"""Poses, cameras, clouds, and the frame that they are in."""
+"""Poses, cameras, clouds, frames and boxes."""
 
 from jaxnbv.geometry.camera import Camera as Camera
 from jaxnbv.geometry.cloud import PointCloud as PointCloud

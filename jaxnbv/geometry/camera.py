@@ -1,4 +1,4 @@
-"""The sensor: a pinhole depth camera, its rays, and what it measures.
+"""The sensor: a pinhole depth camera, its rays and its limits.
 
 OpenCV convention: in the camera's own frame x points right, y down and z forward, along the view.
 """
@@ -18,40 +18,40 @@ from jaxnbv.geometry.distortion import check_distortion
 from jaxnbv.geometry.pose import Pose
 
 _Places = TypeVar("_Places", Float[Array, "*n 2"], Float[np.ndarray, "*n 2"])
-# Of the focal length: what a calibration without skew is written down to.
+# Skew below this fraction of fx counts as zero.
 _SKEW = 1e-6
 
 
-# Rays of a window farther off the axis (70 degrees) are no depth camera's; how far, as a share, a principal point is
-# off an image's centre.
+# Depth cameras have no rays more than 70 degrees off the axis. A principal point this close to an image's centre, as a
+# share of half the image, may be meant as the centre.
 _WIDEST, _OFF_CENTER = math.tan(math.radians(70.0)), 0.2
-# Where both shares of the principal point are this large, the image is a part of what the matrix is for.
+# If both shares of the principal point are at least this, the matrix is for a larger image.
 _SURELY = 0.96
 
 
 def _limit(depth: Any) -> Any:
-    """A limit of the range as an array, so that what is compiled for one scale of a scene runs for any. No limit stays
-    0.0 or None, which programs may ask for."""
+    """A limit of the range as an array, so that a program compiled for one scale of a scene runs for any. No limit
+    stays 0.0 or None, so that programs can branch on it."""
     is_number = isinstance(depth, int | float) and not isinstance(depth, bool) and depth != 0
     return np.float64(depth) if is_number else depth
 
 
 class Camera(eqx.Module):
-    """A pinhole depth camera. Pixels are counted from the image's top left corner: their centres are at 0.5, 1.5, ...
+    """A pinhole depth camera. The centres of pixels are at 0.5, 1.5, ... from the image's top left corner.
 
     - `fov`: vertical field of view in radians, within (0, pi), as if the principal point were at the image's centre.
-    - `height`, `width`: pixels; one ray through the centre of each.
+    - `height`, `width`: number of pixels; one ray through the centre of each.
     - `aspect`: focal length across over focal length down, in pixels; 1 for square pixels.
     - `center`: the principal point, as shares of the width and the height.
     - `nearest`, `farthest`: depths along the viewing direction between which the sensor measures, in scene units; None
-      is no limit. A hit before `nearest` is invalid; a ray without a hit before `farthest` met nothing up to there.
+      is no limit. A hit before `nearest` is invalid; a ray without a hit up to `farthest` is missed and empty up to it.
     - `max_incidence`: largest angle in radians, within (0, pi/2], between a ray and the normal at which a hit returns.
-    - `distortion`: of the lens, see `from_intrinsics`. All rays are those of the pinhole; `PointCloud.from_depth`
-      undoes the distortion of an image first.
+    - `distortion`: coefficients of the lens, see `from_intrinsics`. All rays are those of the pinhole;
+      `PointCloud.from_depth` first undoes the distortion of an image.
 
     The defaults are the paper's: 30 degrees, 50 x 50, no limits.
 
-    **Raises:** `ValueError` for a value outside what is said here.
+    **Raises:** `ValueError` for a value outside these limits.
     """
 
     fov: float = eqx.field(static=True, default=math.radians(30.0))
@@ -73,7 +73,7 @@ class Camera(eqx.Module):
         require(
             is_traced(self.nearest, self.farthest)
             or 0 <= self.nearest < (math.inf if self.farthest is None else self.farthest),
-            f"the camera measures from {self.nearest} to {self.farthest}: give depths of which the second is greater",
+            f"the camera measures from {self.nearest} to {self.farthest}: give 0 <= nearest < farthest",
         )
         require(
             0 < self.max_incidence <= 0.5 * math.pi,
@@ -95,32 +95,35 @@ class Camera(eqx.Module):
         max_incidence: float = 0.5 * math.pi,
         distortion: Float[AnyArray, " k"] | list | tuple = (),
     ) -> "Camera":
-        """The camera of an intrinsic matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels, as OpenCV and the makers
-        of depth cameras give it: the centre of the first pixel is at (0, 0). The limits are those of the camera. The
-        principal point may lie outside the image, which may be a window of a larger one. A `UserWarning` says where the
-        matrix is likely that of another image size.
+        """The camera with intrinsic matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels.
 
+        As in OpenCV and the data of camera makers, the centre of the first pixel is at (0, 0). The principal point may
+        lie outside the image, which may be a window of a larger one. Warns if the matrix is probably for another image
+        size.
+
+        - `nearest`, `farthest`, `max_incidence`: see `Camera`.
         - `distortion`: OpenCV's coefficients k1, k2, p1, p2[, k3[, k4, k5, k6]].
 
-        **Raises:** `ValueError` for another matrix, such as one with skew or surely of another image size; for other
-        numbers of coefficients, or ones that fold the image.
+        **Raises:** `ValueError` for another matrix, such as one with skew or certainly for another image size; for
+        another number of coefficients, or coefficients that fold the image.
         """
-        found = as_numbers(matrix, "the intrinsic matrix", np.float64)
-        require(found.shape == (3, 3), f"the intrinsic matrix has shape {found.shape}: give one of (3, 3)")
-        (fx, skew, cx), (zero, fy, cy), last = found.tolist()
+        intrinsics = as_numbers(matrix, "the intrinsic matrix", np.float64)
+        require(intrinsics.shape == (3, 3), f"the intrinsic matrix has shape {intrinsics.shape}: give one of (3, 3)")
+        (fx, skew, cx), (zero, fy, cy), last = intrinsics.tolist()
         require(
             0 < fx < math.inf and 0 < fy < math.inf and last == [0.0, 0.0, 1.0] and zero == 0.0,
-            f"the intrinsic matrix is {found.tolist()}; it must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive "
-            "focal lengths, in pixels",
+            f"the intrinsic matrix is {intrinsics.tolist()}; it must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with "
+            "positive focal lengths, in pixels",
         )
         require(
             fy > 0.01 * height,
-            f"the intrinsic matrix has a focal length of {fy:.4g} for {height} rows: give it in pixels, and no inverse",
+            f"the intrinsic matrix has a focal length of {fy:.4g} for {height} rows: give the matrix in pixels, not "
+            "its inverse",
         )
         require(abs(skew) <= _SKEW * fx, f"the intrinsic matrix has a skew of {skew}: undistort the image first")
         fov = 2.0 * math.atan(0.5 * height / fy)
         center = ((cx + 0.5) / width, (cy + 0.5) / height)
-        _check_image_size(found, height, width, center)
+        _check_image_size(intrinsics, height, width, center)
         coefficients = tuple(as_numbers(distortion, "the distortion", np.float64).reshape(-1).tolist())
         return cls(fov, height, width, fx / fy, center, nearest, farthest, max_incidence, coefficients)
 
@@ -132,13 +135,13 @@ class Camera(eqx.Module):
 
     @checked
     def resized(self, height: int, width: int) -> "Camera":
-        """The camera of the same field of view with another number of pixels, to imagine with fewer rays, say."""
+        """The camera with the same field of view and another number of pixels, such as fewer rays for samples."""
         aspect = self.aspect * (width / self.width) / (height / self.height)
         return dataclasses.replace(self, height=height, width=width, aspect=aspect)
 
     @checked
     def strided(self, stride: int) -> "Camera":
-        """The camera of every so many-th row and column, the first ones half as far from the border.
+        """The camera of every `stride`-th row and column, starting at `stride // 2`.
 
         **Raises:** `ValueError` for a stride below one, or one that leaves no pixel.
         """
@@ -165,13 +168,13 @@ class Camera(eqx.Module):
 
     @property
     def edges(self) -> tuple[float, float, float, float]:
-        """Where the image ends to the left, above, to the right and below, in the plane z = 1 of the camera's frame."""
+        """Left, top, right and bottom edge of the image in the plane z = 1 of the camera's frame."""
         (fx, fy), (cx, cy) = self.focal_lengths, self.center
         return -cx * self.width / fx, -cy * self.height / fy, (1 - cx) * self.width / fx, (1 - cy) * self.height / fy
 
     @property
     def limited(self) -> bool:
-        """Whether the sensor has a range, or an angle beyond which hits do not return."""
+        """Whether the sensor has a limited range or a limited angle of incidence."""
         has_range = is_traced(self.nearest) or bool(self.nearest > 0) or self.farthest is not None
         return has_range or self.max_incidence < 0.5 * math.pi
 
@@ -185,13 +188,13 @@ class Camera(eqx.Module):
         return jnp.asarray(directions, dtype=jnp.result_type(float))
 
     def to_pixels(self, image: _Places) -> _Places:
-        """Columns and rows (the first pixel's centre at 0.5) of places (x / z, y / z) of the camera's frame."""
+        """Columns and rows (first pixel's centre at 0.5) of image points (x / z, y / z) in the camera's frame."""
         (fx, fy), (cx, cy) = self.focal_lengths, self.center
         return image * np.array([fx, fy], image.dtype) + np.array([cx * self.width, cy * self.height], image.dtype)
 
     @eqx.filter_jit
     def rays(self, pose: Pose) -> tuple[Float[Array, "*batch rays 3"], Float[Array, "*batch rays 3"]]:
-        """Origins and unit directions of all rays in the scene, for one pose or a batch."""
+        """Origins and unit directions of all rays in scene coordinates, for one pose or a batch."""
         directions = self.pixel_directions()
         directions = directions / jnp.linalg.norm(directions, axis=-1, keepdims=True)
         directions = jnp.einsum("...ij,rj->...ri", pose.rotation, directions, precision="highest")
@@ -201,7 +204,8 @@ class Camera(eqx.Module):
 def _check_image_size(matrix: np.ndarray, height: int, width: int, center: tuple[float, float]) -> None:
     """Warn of a principal point that is the centre of an image of another size.
 
-    **Raises:** `ValueError` if it is the corner of this image or beyond, or a window ends beyond 70 degrees.
+    **Raises:** `ValueError` if it is then at the corner of this image or beyond, or if the image ends more than 70
+    degrees off the axis.
     """
     (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
     across, down = (
@@ -210,16 +214,15 @@ def _check_image_size(matrix: np.ndarray, height: int, width: int, center: tuple
     require(
         all(0 <= share <= 1 for share in center) or max(across, down) < _WIDEST,
         f"the principal point ({cx}, {cy}) lies outside the image of {width} x {height}, which would end "
-        f"{math.degrees(math.atan(max(across, down))):.0f} degrees off the axis: give the matrix that is of this image "
-        "size",
+        f"{math.degrees(math.atan(max(across, down))):.0f} degrees off the axis: give the matrix for this image size",
     )
     for ratio in (0.5, 2.0, 3.0, 4.0):
         if not all(abs(2.0 * share / ratio - 1.0) <= _OFF_CENTER for share in center):
             continue
         problem = (
             f"the principal point ({cx:.5g}, {cy:.5g}) is the centre of an image of {2 * cx + 1:.0f} x "
-            f"{2 * cy + 1:.0f}, but this one is {width} x {height}: if it was binned, decimated or resized, the matrix "
-            f"is that of the other size, divide its first two rows by {ratio:g}. If it is a window of a larger image"
+            f"{2 * cy + 1:.0f}, but this one is {width} x {height}. If it was binned, decimated or resized, the matrix "
+            f"is for the other size: divide its first two rows by {ratio:g}. If it is a window of a larger image"
         )
-        require(min(center) < _SURELY, f"{problem}, make it Camera(fov, height, width, aspect, center)")
-        warnings.warn(f"{problem}, all is well", stacklevel=4)
+        require(min(center) < _SURELY, f"{problem}, use Camera(fov, height, width, aspect, center)")
+        warnings.warn(f"{problem}, ignore this warning", stacklevel=4)

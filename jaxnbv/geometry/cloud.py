@@ -28,23 +28,24 @@ from jaxnbv.geometry.farthest_points import farthest_point_indices
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
 
-# Of a cloud: what an index of 32 bits counts, and far beyond any memory that a planner has.
+# The most rows that an index of 32 bits can count, far more than a planner can hold in memory.
 _MOST_ROWS = 2**31 - 1
 _LONGEST_NORMAL = 10.0
 
 
 class PointCloud(eqx.Module):
-    """Oriented points (x, n): the paper's D. Rows whose mask is False hold nothing; their values are zero.
+    """Oriented points (x, n), the paper's D. Rows whose mask is False are empty; their values are zero.
 
-    The number of rows is the cloud's capacity, a shape and so fixed under `jit`; `mask` says which rows are filled.
-    Leading axes make a batch of clouds.
+    The number of rows is the cloud's capacity. It is a shape and so fixed under `jit`. Leading axes make a batch of
+    clouds.
 
-    - `points`: positions, in scene units unless said otherwise.
+    - `points`: positions, in scene units unless stated otherwise.
     - `normals`: unit outward normals.
-    - `missed`: of a sensor's scan, whose rows are its pixels: where the ray met nothing, so that all of it is empty. A
-      row that is neither filled nor missed is invalid. None for a cloud that is no sensor's image.
-    - `sight`: how far each ray of a scan saw, in units of the points: to what it met, though that be no point of the
-      cloud, and without end where nothing came back. None where this is not known.
+    - `mask`: whether each row is filled.
+    - `missed`: for a sensor's scan, with one row per pixel: whether the ray met nothing, so that all of it is empty. A
+      row that is neither filled nor missed is invalid. None for a cloud that is not a sensor's image.
+    - `sight`: how far each ray of a scan saw, in units of the points: the distance to its hit, even if the hit is not a
+      point of the cloud, and infinite where nothing came back. None if unknown.
     """
 
     points: Float[Array, "*batch n 3"] = eqx.field(converter=native)
@@ -63,7 +64,7 @@ class PointCloud(eqx.Module):
             "PointCloud.from_arrays",
         )
         for leaf, name in ((self.mask, "mask"), (self.missed, "missed")):
-            require(leaf is None or leaf.dtype == bool, f"a cloud's {name} is {shown(leaf)}: give an array of truths")
+            require(leaf is None or leaf.dtype == bool, f"a cloud's {name} is {shown(leaf)}: give a boolean array")
 
     @classmethod
     @own_settings()
@@ -73,9 +74,9 @@ class PointCloud(eqx.Module):
         normals: Float[AnyArray, "n 3"] | list,
         capacity: int | None = None,
     ) -> "PointCloud":
-        """A cloud of the given points and outward normals, padded to `capacity` rows (default: as many as there are).
+        """A cloud of points with outward normals, padded to `capacity` rows (default: the number of points).
 
-        Normals are scaled to unit length, with a `UserWarning` where that changes one by more than 1 %.
+        Normals are scaled to unit length, with a `UserWarning` if that changes one by more than 1 %.
 
         **Raises:** `ValueError` for shapes other than (n, 3), no points at all, an entry that is not finite, a normal
         of length zero, or more points than the capacity.
@@ -131,29 +132,30 @@ class PointCloud(eqx.Module):
         stride: int = 1,
         box: Box | None = None,
     ) -> "PointCloud":
-        """The cloud that a depth image shows, in the coordinates of the pose: one row a pixel, row by row.
+        """The cloud of a depth image in the coordinates of the pose, one row per pixel, row by row.
 
-        A pixel of +infinity met nothing within the sensor's reach, which is taken to be the whole scene; one that is
-        zero, negative or NaN is invalid and says nothing. Out of the camera's range a pixel is invalid where it is too
-        near, and met nothing so far where it is too far. Points and normals are those of planes fitted to what lies
-        around a pixel on the same surface, in a window that grows with the noise there (`geometry/plane_fit.py`);
-        normals are turned to the camera. A pixel whose neighbours have no plane is invalid, and so is one that
-        six of the eight beside it disagree with: at an edge sensors mix the depths of two surfaces. Of an image with
-        gaps between its pixels, a lidar's say, each block of the gap's size gives a sample, and planes are evaluated on
-        the rays of the rows. Distortion is undone first (`Camera.from_intrinsics`). A value beyond the range, or beyond
-        what lies about the box, that fills far more pixels than any other near it stands for "not measured" and is
-        invalid, with a `UserWarning`; so is the largest value of an integer type.
+        A pixel of +infinity is missed: its ray met nothing in the whole scene. A pixel that is zero, negative or NaN is
+        invalid and says nothing. A depth below the camera's range is invalid, and one beyond the range is missed. The
+        largest value of an integer type is invalid. So is a value beyond the range, or well beyond the box, that fills
+        far more pixels than any other near it: it stands for "not measured" (with a `UserWarning`).
 
-        - `depth`: along the camera's forward axis; `depth_scale` times it is in units of the pose: 0.001 where the
-          image is in millimetres and the pose in metres. The range of the camera, and the box, are in these units too.
-          Whole numbers are known to be rounded.
-        - `stride`: take every so many-th row and column alone; the cloud is an image of `camera.strided(stride)`.
+        Distortion is undone first (`Camera.from_intrinsics`). Points and normals are those of planes fitted to the
+        pixels around each pixel on the same surface, in a window that grows with the noise (`geometry/plane_fit.py`).
+        Normals point towards the camera. A pixel is invalid if its neighbours do not define a plane, or if six of the
+        eight beside it disagree with it, since sensors mix the depths of two surfaces at edges. In an image with gaps
+        between its pixels, such as a lidar's, each block of the gap's size gives one sample, and planes are evaluated
+        on the rays of the rows.
+
+        - `depth`: depths along the camera's forward axis. Integers count as rounded.
+        - `depth_scale`: units of the pose per unit of depth: 0.001 for an image in millimetres and a pose in metres.
+          The camera's range and the box are in units of the pose too.
+        - `stride`: keep every `stride`-th row and column; the cloud is then an image of `camera.strided(stride)`.
           Planes are fitted to all pixels.
-        - `box`: keep points in it alone. A ray that hits behind the box has crossed it, and met nothing; one that hits
+        - `box`: keep only points inside. A ray that hits behind the box has crossed it and is missed. A ray that hits
           before it is invalid.
 
-        **Raises:** `ValueError` if the image's shape is not the camera's, or its values cannot be meant: all of them
-        out of the camera's range, a box behind the camera, or depths of another order than the box is away.
+        **Raises:** `ValueError` if the image's shape is not the camera's, all depths are out of the camera's range, the
+        box is behind the camera, or the depths are of another order of magnitude than the box's distance.
         """
         return cls(*points_of_depth(depth, camera, pose, depth_scale, stride, box))
 
@@ -179,7 +181,7 @@ class PointCloud(eqx.Module):
 
     @own_settings()
     def only(self, kept: Bool[Array, "*batch n"]) -> "PointCloud":
-        """The cloud with those of its rows that are kept; as an image it says what it said, `missed` and `sight`."""
+        """The cloud with only the rows where `kept` is True. `missed` and `sight` stay as they are."""
         mask = self.mask & kept
         points, normals = (jnp.where(mask[..., None], rows, 0.0) for rows in (self.points, self.normals))
         return PointCloud(points, normals, mask, self.missed, self.sight)
@@ -188,7 +190,7 @@ class PointCloud(eqx.Module):
     def __getitem__(self, index) -> "PointCloud":
         """The cloud, or clouds, at an index of the leading axes.
 
-        **Raises:** `ValueError` of a single cloud, or if there is no such index.
+        **Raises:** `ValueError` for a single cloud, or if there is no such index.
         """
         check_index(index, self.mask.shape[:-1], "the cloud")
         return jax.tree.map(lambda leaf: leaf[index], self)
@@ -200,25 +202,31 @@ class PointCloud(eqx.Module):
 
 
 def some_rows(cloud: PointCloud, count: int) -> Int[Array, " count"]:
-    """Filled rows of a single cloud, evenly taken, some of them twice where it has fewer; row 0 where it has none."""
+    """Indices of `count` evenly spaced filled rows of a single cloud.
+
+    Rows repeat if fewer are filled. All indices are 0 if the cloud is empty.
+    """
     order = jnp.argsort(~cloud.mask, stable=True)
     return order[(jnp.arange(count) * cloud.count) // count]
 
 
 def check_single(cloud: PointCloud, name: str = "the cloud") -> None:
-    """**Raises:** `ValueError` for a batch of clouds where one is needed."""
+    """Check that a cloud is not a batch.
+
+    **Raises:** `ValueError` if it is.
+    """
     batch = cloud.mask.shape[:-1]
     require(not batch, f"{name} is a batch {batch} of clouds: give one, or use jax.vmap")
 
 
 def check_oriented(cloud: PointCloud, name: str, limit: float, unit: bool = True) -> None:
-    """Check that a cloud whose values are known has oriented points in the scene.
+    """Check that a cloud, which must not be traced, has oriented points within the scene.
 
-    - `limit`: of the magnitude of their coordinates, in scene units.
-    - `unit`: whether normals must be of unit length (to 1 %); else they may be as long as 10: draws of a prior are not
-      of unit length, and a model may be conditioned on them.
+    - `limit`: largest magnitude of a coordinate, in scene units.
+    - `unit`: whether normals must have unit length (to 1 %). Otherwise a length of up to 10 is allowed, since a model
+      may be conditioned on prior samples, whose normals do not have unit length.
 
-    **Raises:** `ValueError` if it is empty, or has a row that is not finite, not so oriented, or beyond the limit.
+    **Raises:** `ValueError` if it is empty, or if a row is not finite, has a wrong normal, or is beyond the limit.
     """
     points, normals = cloud.to_numpy()
     require(
@@ -245,7 +253,10 @@ def check_oriented(cloud: PointCloud, name: str, limit: float, unit: bool = True
 
 @checked
 def concatenate(first: PointCloud, second: PointCloud) -> PointCloud:
-    """The union D u D' of the paper, with the capacities added; rows keep their places. It is no sensor's image."""
+    """The paper's union D u D', whose capacity is the sum of both.
+
+    Rows keep their order. The result is not a sensor's image: `missed` and `sight` are None.
+    """
     for cloud in (first, second):
         check_single(cloud)
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=0), _without_rays(first), _without_rays(second))
@@ -258,10 +269,10 @@ def _without_rays(cloud: PointCloud) -> PointCloud:
 @checked
 @functools.partial(jax.jit, static_argnames="count")
 def farthest_point_subsample(cloud: PointCloud, count: int) -> PointCloud:
-    """`count` points, each as far as can be from those chosen before it, in order of choice (Eldar et al. 1997).
+    """`count` points by farthest point sampling, in order of choice (Eldar et al. 1997).
 
-    Starts at the first filled row. Where the cloud has fewer points than `count`, all of them come first and the rest
-    of the rows are masked.
+    Starts at the first filled row. If the cloud has fewer points than `count`, all of them come first and the other
+    rows are masked.
 
     **Raises:** `ValueError` if `count` < 1.
     """
@@ -275,7 +286,7 @@ def farthest_point_subsample(cloud: PointCloud, count: int) -> PointCloud:
 @own_settings()
 @functools.partial(jax.jit, static_argnames="capacity")
 def limit_capacity(cloud: PointCloud, capacity: int) -> PointCloud:
-    """The cloud in `capacity` rows, the filled ones first: all its points where they fit, else farthest point samples.
+    """The cloud in `capacity` rows, filled ones first: all points if they fit, else farthest points.
 
     **Raises:** `ValueError` if `capacity` < 1.
     """
