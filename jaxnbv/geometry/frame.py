@@ -1,4 +1,4 @@
-"""The frame that carries the user's world into the scene: where its origin is, its unit of length, and what is up."""
+"""The frame that maps the user's world to the scene: its origin, unit of length and upward axis."""
 
 import dataclasses
 
@@ -13,7 +13,7 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
 
-# 1 % of the sensor's noise.
+# Largest rounding of coordinates, in scene units: 1 % of the sensor noise.
 _ROUNDING = 1e-4
 # Rotations whose second row, the scene's up, is an axis of the world.
 _UP = {
@@ -32,8 +32,8 @@ class Frame(eqx.Module):
 
     - `scale`: scene units per world unit.
     - `center`: the world point that becomes the scene's origin.
-    - `up`: the world's axis that becomes the y of the scene, upward in pictures: "y" (R is the identity), "z" as with
-      most robots, "x", or one of these with a minus.
+    - `up`: the world's axis that becomes the scene's y, upward in pictures: "y" (R is the identity), "z" (most robots),
+      "x", or one of these with a minus.
 
     **Raises:** `ValueError` for a scale that is not positive, or another axis.
     """
@@ -50,9 +50,9 @@ class Frame(eqx.Module):
     @classmethod
     @checked
     def fit(cls, points: Float[AnyArray, "n 3"], longest_side: float = 2.5, up: str = "y") -> "Frame":
-        """The frame in which the points' bounding box is centred and its longest side is `longest_side`.
+        """The frame in which the points' bounding box is centred and has this longest side.
 
-        **Raises:** `ValueError` if there are no points, or they all coincide, or one is not finite.
+        **Raises:** `ValueError` if there are no points, if all coincide, or if one is not finite.
         """
         points = as_numbers(points, "points", np.float64)
         require(points.ndim == 2 and points.shape[1] == 3, f"the points must be (n, 3), got {points.shape}")
@@ -66,26 +66,26 @@ class Frame(eqx.Module):
 
     @property
     def unit(self) -> str:
-        """What a length in the world is counted in: scene units, where the world is the scene."""
+        """The name of the world's unit of length: "scene units" if the world is the scene, else "world units"."""
         identity = self.scale == 1.0 and self.center == (0.0, 0.0, 0.0) and self.up == "y"
         return "scene units" if identity else "world units"
 
     @own_settings()
     def length_to_world(self, length: Float[AnyArray, "*n"] | float, power: int = 1):
-        """A length, area or volume (by its power of length) from scene units to world units."""
+        """A length (power 1), area (power 2) or volume (power 3) in scene units, converted to world units."""
         return length / self.scale**power
 
     @property
     def rotation(self) -> Float[np.ndarray, "3 3"]:
-        """R, from directions of the world to those of the scene."""
+        """The rotation R, which maps directions of the world to the scene."""
         return np.array(_UP[self.up], np.float64)
 
     @own_settings()
     def to_scene(self, thing):
-        """World to scene: an array of points (..., 3), a `PointCloud`, a `Pose`, a `Box`, or the range of a `Camera`.
+        """Points (..., 3), a `PointCloud`, a `Pose`, a `Box` or a `Camera`'s range, from world to scene.
 
-        Clouds and poses are kept in JAX's floating-point type; far from the world's origin, as in coordinates of a map,
-        bring arrays to the scene before they are made of them.
+        Clouds and poses have JAX's floating-point type. For coordinates far from the world's origin, such as a map's,
+        bring arrays to the scene first and make clouds and poses of the result.
 
         **Raises:** `ValueError` for a cloud or a pose whose coordinates are rounded by more than 1e-4 scene units.
         """
@@ -96,7 +96,7 @@ class Frame(eqx.Module):
 
     @own_settings()
     def to_world(self, thing):
-        """Scene to world, for what `to_scene` takes."""
+        """The inverse of `to_scene`, for the same types."""
         center = np.asarray(self.center)
         return _apply(thing, lambda points: self._back(points / self.scale) + center, self._back, 1.0 / self.scale)
 
@@ -118,7 +118,7 @@ class Frame(eqx.Module):
 
 
 def _apply(thing, place, turn, scale: float):
-    """A thing whose points are placed, whose directions are turned, and whose lengths are scaled."""
+    """The thing with `place` applied to its points, `turn` to its directions, and its lengths scaled."""
     if isinstance(thing, PointCloud):
         points = jnp.where(thing.mask[..., None], place(thing.points), 0.0).astype(thing.points.dtype)
         sight = None if thing.sight is None else scale * thing.sight
@@ -134,6 +134,6 @@ def _apply(thing, place, turn, scale: float):
         return dataclasses.replace(thing, nearest=scale * thing.nearest, farthest=farthest)
     if isinstance(thing, Array) and is_traced(thing):
         return place(thing)
-    found = as_numbers(thing, "the points", None)
-    require(found.shape[-1:] == (3,), f"the points are {shown(thing)}: give an array (..., 3), a cloud or a pose")
-    return place(found)
+    array = as_numbers(thing, "the points", None)
+    require(array.shape[-1:] == (3,), f"the points are {shown(thing)}: give an array (..., 3), a cloud or a pose")
+    return place(array)

@@ -1,4 +1,4 @@
-"""Poses, `look_at`, and places on a sphere.
+"""Poses, `look_at`, and points on a sphere.
 
 OpenCV convention: in the camera's own frame x points right, y down and z forward, along the view.
 A pose is camera-to-scene. Angles are in radians, lengths in scene units.
@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxnbv.checks import AnyArray, as_floats, check_batch, check_index, checked, is_traced, own_settings, require
 
-# |R R^T - I| of a matrix that is taken for a rotation; of one written to three digits, which is made one.
+# Largest |R R^T - I| of a matrix that counts as a rotation, and of one written to three digits, which is corrected.
 _ORTHONORMAL, _ROUNDED = 1e-3, 5e-3
 # Signs of the camera's axes, given as right, down and forward.
 _CONVENTIONS = {"opencv": (1.0, 1.0, 1.0), "opengl": (1.0, -1.0, -1.0)}
@@ -28,7 +28,7 @@ class Pose(eqx.Module):
     camera's right, down and forward axes in scene coordinates.
 
     **Raises:** `ValueError` for other shapes, if the rotation is not orthonormal with determinant +1 (tolerance 1e-3),
-    or if an entry is not finite; under `jit` values are not known and only shapes are checked.
+    or if an entry is not finite. Under `jit` only shapes are checked.
     """
 
     rotation: Float[Array, "*batch 3 3"]
@@ -58,22 +58,22 @@ class Pose(eqx.Module):
         **Raises:** `ValueError` for another convention, a last row other than (0, 0, 0, 1), or as `Pose` does.
         """
         axes = _axes(convention)
-        found = as_floats(matrix, "the matrix of a pose")
-        require(found.shape[-2:] == (4, 4), f"the matrix of a pose has shape {found.shape}; give (..., 4, 4)")
-        if not is_traced(found):
-            last = np.asarray(found)[..., 3, :]
+        matrices = as_floats(matrix, "the matrix of a pose")
+        require(matrices.shape[-2:] == (4, 4), f"the matrix of a pose has shape {matrices.shape}; give (..., 4, 4)")
+        if not is_traced(matrices):
+            last = np.asarray(matrices)[..., 3, :]
             require(
                 bool(np.all(np.abs(last - [0.0, 0.0, 0.0, 1.0]) < 1e-6)),
                 f"the last row of a pose's matrix is {last}, not (0, 0, 0, 1): give camera-to-world, not its transpose "
                 "or a projection",
             )
-            rotation = np.asarray(found)[..., :3, :3]
-            rounded = ((error := _off_rotation(rotation)) > _ORTHONORMAL) & (error <= _ROUNDED)
-            if rounded.any():
-                found = found.at[..., :3, :3].set(
-                    np.where(rounded[..., None, None], _nearest_rotation(rotation), rotation)
+            rotation = np.asarray(matrices)[..., :3, :3]
+            is_rounded = ((error := _off_rotation(rotation)) > _ORTHONORMAL) & (error <= _ROUNDED)
+            if is_rounded.any():
+                matrices = matrices.at[..., :3, :3].set(
+                    np.where(is_rounded[..., None, None], _nearest_rotation(rotation), rotation)
                 )
-        return cls(found[..., :3, :3] * axes.astype(found.dtype), found[..., :3, 3])
+        return cls(matrices[..., :3, :3] * axes.astype(matrices.dtype), matrices[..., :3, 3])
 
     @property
     def matrix(self) -> Float[Array, "*batch 4 4"]:
@@ -82,7 +82,7 @@ class Pose(eqx.Module):
 
     @own_settings()
     def to_matrix(self, convention: str = "opencv") -> Float[Array, "*batch 4 4"]:
-        """The camera-to-scene matrix that `from_matrix` takes.
+        """The camera-to-scene matrix in the given convention, as `from_matrix` takes it.
 
         **Raises:** `ValueError` for another convention.
         """
@@ -98,14 +98,14 @@ class Pose(eqx.Module):
 
     @own_settings()
     def to_scene(self, points: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
-        """Points of the camera's frame in scene coordinates (a single pose)."""
+        """Points from the camera's frame to scene coordinates. Needs a single pose."""
         return jnp.matmul(points, self.rotation.T, precision="highest") + self.position
 
     @own_settings()
     def __getitem__(self, index) -> "Pose":
         """The pose, or poses, at an index of the leading axes.
 
-        **Raises:** `ValueError` of a single pose, or if there is no such index.
+        **Raises:** `ValueError` for a single pose, or if there is no such index.
         """
         check_index(index, self.position.shape[:-1], "the pose")
         return jax.tree.map(lambda leaf: leaf[index], self)
@@ -124,8 +124,10 @@ def _axes(convention: str) -> np.ndarray:
 def rigid_matrices(
     matrices: Float[np.ndarray, "n 4 4"],
 ) -> tuple[Float[np.ndarray, "n 4 4"], Bool[np.ndarray, " n"]]:
-    """Matrices [[R, t], [0, 1]] with R made orthonormal, and which of them are rigid motions, if written to three
-    digits; the others are as they were."""
+    """Matrices [[R, t], [0, 1]] with R made orthonormal, and whether each is a rigid motion.
+
+    R may be written to three digits. Matrices that are not rigid motions are returned unchanged.
+    """
     is_rigid = np.isfinite(matrices).all(axis=(1, 2)) & (_off_rotation(matrices[:, :3, :3]) <= _ROUNDED)
     is_rigid &= (np.abs(matrices[:, 3] - [0.0, 0.0, 0.0, 1.0]) < 1e-6).all(axis=1)
     rigid = np.array(matrices)
@@ -134,10 +136,10 @@ def rigid_matrices(
 
 
 def _off_rotation(rotation: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n"]:
-    """The largest entry of |R R^T - I|; infinite for a reflection and for what is not finite."""
-    known = np.where(np.isfinite(rotation).all(axis=(-1, -2), keepdims=True), rotation, 0.0)
-    error = np.abs(known @ np.swapaxes(known, -1, -2) - np.eye(3)).max(axis=(-1, -2))
-    return np.where(np.linalg.det(known) > 0, error, np.inf)
+    """The largest entry of |R R^T - I|; infinite for a reflection and for entries that are not finite."""
+    finite = np.where(np.isfinite(rotation).all(axis=(-1, -2), keepdims=True), rotation, 0.0)
+    error = np.abs(finite @ np.swapaxes(finite, -1, -2) - np.eye(3)).max(axis=(-1, -2))
+    return np.where(np.linalg.det(finite) > 0, error, np.inf)
 
 
 def _nearest_rotation(rotation: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n 3 3"]:
@@ -166,8 +168,8 @@ def look_at(
     """The pose at `position` whose forward axis points to `target`.
 
     **Arguments** (scene coordinates, anything `jnp.asarray` takes): `position` (*batch, 3); `target` (3,), by default
-    the origin; `up` (3,), the direction that is up in the image. Looking along `up`, the image is turned so that the
-    axis on which `up` is smallest takes its place.
+    the origin; `up` (3,), the direction that is up in the image. If the camera looks along `up`, the coordinate axis
+    with the smallest component of `up` replaces it.
 
     **Raises:** `ValueError` for other shapes, if `position` equals `target`, or `up` is zero.
     """
@@ -194,7 +196,7 @@ def look_at(
         )
         require(
             0 < float(length) < math.inf,
-            f"look_at needs an up direction whose length is not zero and finite, such as (0, 1, 0), got {up}",
+            f"look_at needs an up direction with a finite length above zero, such as (0, 1, 0), got {up}",
         )
     return Pose(rotation, position)
 
@@ -203,7 +205,7 @@ def look_at(
 def _facing(
     position: Float[Array, "*batch 3"], target: Float[Array, "3"], up: Float[Array, "3"]
 ) -> tuple[Float[Array, "*batch 3 3"], Float[Array, "*batch 1"], Float[Array, ""]]:
-    """The rotation of `look_at`, the distance to the target and the length of the upward direction."""
+    """The rotation of `look_at`, the distance to the target, and the length of `up`."""
     offset, length = target - position, jnp.linalg.norm(up)
     distance = jnp.linalg.norm(offset, axis=-1, keepdims=True)
     forward = offset / distance
@@ -216,9 +218,11 @@ def _facing(
 
 @checked
 def fibonacci_sphere(count: int, radius: float = 1.0, min_elevation: float = -0.5 * math.pi) -> Float[Array, "count 3"]:
-    """`count` almost evenly spaced points on a sphere about the origin (spherical Fibonacci lattice; Gonzalez 2010).
+    """`count` almost evenly spaced points on a sphere about the origin.
 
-    `min_elevation`: radians above the plane y = 0; from there to the pole, the whole sphere by default.
+    By the spherical Fibonacci lattice (Gonzalez 2010).
+
+    - `min_elevation`: least elevation above the plane y = 0, in radians. The default gives the whole sphere.
 
     **Raises:** `ValueError` if `count` < 1, `radius` <= 0 or the elevation is not within [-pi/2, pi/2).
     """

@@ -1,4 +1,4 @@
-"""A list of poses of fixed room, so that nothing recompiles as it grows."""
+"""A list of poses with fixed capacity, so that nothing recompiles as it grows."""
 
 import dataclasses
 
@@ -15,7 +15,10 @@ _SAME = 1e-3
 
 
 class PoseList(eqx.Module):
-    """The first `count` rows of `rows`, in scene coordinates; the other rows are the identity."""
+    """A list of poses in scene coordinates, with fixed capacity.
+
+    - `rows`: a batch of poses. The first `count` are the list; the others are the identity.
+    """
 
     rows: Pose
     count: Int[Array, ""]
@@ -29,12 +32,12 @@ class PoseList(eqx.Module):
 
     @property
     def room(self) -> int:
-        """How many poses fit."""
+        """The capacity: the number of poses that fit."""
         return self.rows.position.shape[0]
 
     @property
     def last(self) -> Pose:
-        """The pose that was appended last; the identity of an empty list."""
+        """The last pose; the identity for an empty list."""
         return jax.tree.map(lambda rows: rows[self.count - 1], self.rows)
 
     def append(self, pose: Pose) -> "PoseList":
@@ -58,6 +61,6 @@ class PoseList(eqx.Module):
 
 
 def is_same_view(poses: Pose, others: Pose) -> Bool[Array, "*batch"]:
-    """Whether poses equal others, which broadcast, to 1e-3 in position (scene units) and viewing direction."""
+    """Whether poses equal others to 1e-3 in position (scene units) and viewing direction. Broadcasts."""
     near = jnp.linalg.norm(poses.position - others.position, axis=-1) < _SAME
     return near & (jnp.linalg.norm(poses.forward - others.forward, axis=-1) < _SAME)

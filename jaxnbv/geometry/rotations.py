@@ -1,4 +1,4 @@
-"""Rotations, and norms and directions of vectors whose derivatives are finite at zero."""
+"""Rotations, and norms and directions of vectors with finite derivatives at zero."""
 
 import jax
 import jax.numpy as jnp
@@ -22,15 +22,19 @@ def _safe_norm_jvp(components, tangents):
 
 @jax.jit
 def rotation_about(axis: Float[Array, "3"], angle: Float[Array, ""]) -> Float[Array, "3 3"]:
-    """The right-handed rotation about a direction by an angle in radians: cos I + sin [k]_x + (1 - cos) k k^T about the
-    unit axis k (Rodrigues' formula). NaN about an axis of zero."""
+    """The right-handed rotation about an axis by an angle in radians; NaN for an axis of zero.
+
+    Rodrigues' formula with the unit axis k: cos I + sin [k]_x + (1 - cos) k k^T.
+    """
     unit = axis / safe_norm(*axis)
     return jnp.cos(angle) * jnp.eye(3) + jnp.sin(angle) * _cross(unit) + (1.0 - jnp.cos(angle)) * unit[:, None] * unit
 
 
 def rotation_from_vector(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """The rotation about a vector by its length in radians: the same formula in w = angle k, which has derivatives at
-    zero too."""
+    """The rotation about a vector by its length in radians.
+
+    Rodrigues' formula in terms of w = angle k, which has derivatives at zero too.
+    """
     square = jnp.sum(vector**2)
     small = square < 1e-12
     angle = jnp.sqrt(jnp.where(small, 1.0, square))
@@ -49,23 +53,23 @@ def _cross(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
 
 @jax.jit
 def rotation_to_6d(rotation: Float[AnyArray, "*batch 3 3"]) -> Float[Array, "*batch 6"]:
-    """The first two columns of a rotation, one after the other: the continuous representation of Zhou et al. (2019)."""
+    """The first two columns of a rotation, concatenated: the 6-D representation of Zhou et al. (2019)."""
     rotation = jnp.asarray(rotation)
     return jnp.concatenate([rotation[..., :, 0], rotation[..., :, 1]], axis=-1)
 
 
 @jax.jit
 def rotation_from_6d(columns: Float[AnyArray, "*batch 6"]) -> Float[Array, "*batch 3 3"]:
-    """The rotation whose first two columns are a pair (a, b) of vectors made orthonormal (Zhou et al. 2019).
+    """The rotation whose first two columns are two vectors (a, b) made orthonormal (Zhou et al. 2019).
 
-    b_1 = a / |a|;  b_2 = b - (b_1 . b) b_1, normalised;  b_3 = b_1 x b_2. Every pair gives a rotation: where a is zero,
-    or b is zero or parallel to a, a coordinate axis takes its place.
+    b_1 = a / |a|;  b_2 = b - (b_1 . b) b_1, normalised;  b_3 = b_1 x b_2. Every pair gives a rotation: if a is zero, or
+    if b is zero or parallel to a, a coordinate axis replaces it.
     """
     columns = jnp.asarray(columns, dtype=jnp.result_type(float))
     first = normalise(columns[..., :3], jnp.asarray([1.0, 0.0, 0.0], columns.dtype))
     spare = _any_orthogonal(first)
     second = normalise(_reject(normalise(columns[..., 3:], spare), first), spare, _rounding(columns))
-    # The difference of nearly parallel vectors has lost digits and is not orthogonal; the second time it is.
+    # For nearly parallel vectors the difference has lost digits and is not orthogonal. Repeating the step mends that.
     second = normalise(_reject(second, first), spare)
     return jnp.stack([first, second, jnp.cross(first, second)], axis=-1)
 
@@ -74,10 +78,10 @@ def rotation_from_6d(columns: Float[AnyArray, "*batch 6"]) -> Float[Array, "*bat
 def rotation_between(
     start: Float[AnyArray, "*batch 3"], end: Float[AnyArray, "*batch 3"]
 ) -> Float[Array, "*batch 3 3"]:
-    """The least rotation that takes one unit vector to another; one of the many, where they are opposite."""
+    """The smallest rotation that maps one unit vector to another; any one of these if they are opposite."""
     start, end = jnp.asarray(start), jnp.asarray(end)
     halfway = normalise(start + end, _any_orthogonal(start), _rounding(start))
-    # The sum of nearly opposite vectors has lost digits; it is orthogonal to their difference, which has not.
+    # The sum of nearly opposite vectors has lost digits. Their difference has not, and the sum is orthogonal to it.
     opposed = jnp.sum(start * end, axis=-1, keepdims=True) < 0
     apart = normalise(jnp.where(opposed, start - end, 0.0), jnp.zeros_like(start))
     halfway = normalise(_reject(halfway, apart), halfway)
@@ -92,8 +96,8 @@ def _reflection(unit: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
 def normalise(
     vector: Float[Array, "*batch n"], spare: Float[Array, "*#batch n"], least: float = 0.0
 ) -> Float[Array, "*batch n"]:
-    """The unit vector along a vector, or `spare` where no entry of it is above `least`, or normal as a float."""
-    # In units of the largest entry no square overflows.
+    """The unit vector along a vector, or `spare` if no entry exceeds `least` and the least normal float."""
+    # In units of the largest entry, no square overflows.
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(vector), axis=-1, keepdims=True))
     usable = largest > max(least, float(jnp.finfo(vector.dtype).tiny))
     vector = vector / jnp.where(usable, largest, 1.0)
@@ -102,7 +106,7 @@ def normalise(
 
 
 def _rounding(unit: Float[Array, "*batch n"]) -> float:
-    """Well above the rounding of sums of unit vectors: the direction of a shorter sum is not known."""
+    """A length well above the rounding of sums of unit vectors. A shorter sum has no reliable direction."""
     return 16.0 * float(jnp.finfo(unit.dtype).eps)
 
 

@@ -1,26 +1,26 @@
-"""Values of a depth image that stand for "not measured", such as 65535, 10000 or 2047."""
+"""Sentinels: values of a depth image that stand for "not measured", such as 65535, 10000 or 2047."""
 
 import warnings
 
 import numpy as np
 from jaxtyping import Bool, Real
 
-# A sentinel fills this many rows or columns, as the image of a floor without noise does not, and this many times the
-# pixels of any value within a share of it.
+# A sentinel fills more pixels than this many rows or columns, which a noise-free image of a floor does not. It fills
+# this many times as many pixels as any value within this share of it.
 _ROWS, _ABOVE, _NEAR = 2, 20, 0.05
-# Where nothing says how far a sensor reaches, a sentinel is this many times any other value.
+# If the sensor's reach is unknown, a sentinel is at least this many times any other value.
 _BEYOND = 2.0
 
 
 def sentinel_pixels(image: Real[np.ndarray, "h w"], reach: float) -> Bool[np.ndarray, "h w"]:
-    """Which pixels hold a value that a sensor writes where it measured nothing: the largest of an integer type, or one
-    beyond the reach that fills far more pixels than any value near it. A `UserWarning` names the second kind.
+    """Whether each pixel holds a sentinel, a value that a sensor writes where it measured nothing.
 
-    Where all pixels hold one value, it is no sentinel: it may be a wall.
+    A sentinel is the largest value of an integer type, or a value beyond the reach that fills far more pixels than any
+    value near it (with a `UserWarning`). If all pixels hold the same value, it is no sentinel, since it may be a wall.
 
-    - `image`: in its own units, sentinels included.
-    - `reach`: the value beyond which nothing that counts is measured; infinite where this is not known: then a sentinel
-      is twice any other value at least.
+    - `image`: depths in any units.
+    - `reach`: the largest depth that matters, in the image's units; infinite if unknown. A sentinel is then at least
+      twice any other value.
     """
     is_integer = np.issubdtype(image.dtype, np.integer)
     largest = image == np.iinfo(image.dtype).max if is_integer else np.zeros(image.shape, bool)
@@ -39,7 +39,7 @@ def sentinel_pixels(image: Real[np.ndarray, "h w"], reach: float) -> Bool[np.nda
         sentinels.append(index)
         warnings.warn(
             f"the depth image has the value {values[index]:g} in {counts[index]} pixels, as no measured surface would: "
-            "it is taken for a mark of pixels that were not measured. Give infinity where a ray met nothing",
+            "these pixels count as not measured. Give infinity where a ray met nothing",
             stacklevel=5,
         )
     return largest | np.isin(image, values[sentinels])

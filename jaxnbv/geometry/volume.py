@@ -1,4 +1,4 @@
-"""Where the object can be: a region of the scene by its signed distance, and points on its boundary."""
+"""The volume that can hold the object, as a signed distance, and points on its boundary."""
 
 import functools
 import math
@@ -15,11 +15,11 @@ from jaxnbv.checks import AnyArray, InputError, require, shown, takes_native
 from jaxnbv.geometry.pose import fibonacci_sphere
 
 Volume = Callable[[Float[Array, "n 3"]], Float[Array, " n"]]
-"""A function of points (scene coordinates): negative inside the volume, positive outside, at most the distance to its
-boundary in magnitude. A solid of `jaxnbv.scanning.sdf` is one; so is `Box`."""
+"""A function of points (scene coordinates): negative inside the volume, positive outside. Its magnitude is at most the
+distance to the boundary. `Box` and the solids of `jaxnbv.scanning.sdf` are volumes."""
 
 _BISECTIONS = 40
-# Beyond the corners of the cube in which a scene may lie.
+# A radius beyond the corners of the cube that a scene may fill, in scene units.
 _FAR = 3.0
 
 
@@ -31,7 +31,7 @@ def _corner(values) -> Float[np.ndarray, " 3"]:
 
 
 class Box(eqx.Module):
-    """The volume between two opposite corners, in scene coordinates. The default holds every scene of `Frame.fit`.
+    """The box between two opposite corners, in scene coordinates. The default holds any `Frame.fit` scene.
 
     - `low`, `high`: three numbers each. They become arrays (3,), so that a program compiled for one box runs for any.
 
@@ -56,11 +56,14 @@ class Box(eqx.Module):
         return f"from {low} to {high}"
 
     def widened(self, by: float) -> "Box":
-        """The box with its faces moved outward, but for the lower one (y is up): what the object stands on is below."""
+        """The box with all faces but the lower one moved outward by a length (y is up).
+
+        The lower face stays, since the support of the object is below.
+        """
         return Box(self.low - np.array([by, 0.0, by]), self.high + by)
 
     def passed(self, points: Float[np.ndarray, "n 3"], by: float) -> dict[str, float]:
-        """The share of some points that lies beyond each face, "+x" say, by more than a length."""
+        """The share of points that lie more than a length beyond each face, by its name such as "+x"."""
         if len(points) == 0:
             return {}
         beyond = {"-": points < self.low - by, "+": points > self.high + by}
@@ -69,13 +72,13 @@ class Box(eqx.Module):
 
     @classmethod
     def cube(cls, side: float) -> "Box":
-        """The cube of this side about the origin."""
+        """The cube with sides of this length about the origin."""
         return cls((-0.5 * side,) * 3, (0.5 * side,) * 3)
 
     @takes_native
     @eqx.filter_jit
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
-        """The signed distance at the points x; exact."""
+        """The exact signed distance at the points x."""
         x = jnp.asarray(x)
         low, high = jnp.asarray(self.low, x.dtype), jnp.asarray(self.high, x.dtype)
         center, half = 0.5 * (low + high), 0.5 * (high - low)
@@ -90,10 +93,12 @@ def ray_interval(
     low: Sequence[float] | Float[AnyArray, "3"],
     high: Sequence[float] | Float[AnyArray, "3"],
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
-    """Where rays enter a box and leave it, in lengths of their directions (Kay and Kajiya 1986). A ray that enters
-    after it leaves misses the box.
+    """Ray parameters t at which rays origin + t direction enter and leave a box (Kay and Kajiya 1986).
 
-    - `origin`, `direction`: their three components, each an array; `low`, `high`: the corners.
+    A ray misses the box if it enters after it leaves.
+
+    - `origin`, `direction`: three components, each an array.
+    - `low`, `high`: two opposite corners of the box.
     """
     safe = [jnp.where(jnp.abs(d) < 1e-9, 1e-9, d) for d in direction]
     sides = [((a - x) / d, (b - x) / d) for x, d, a, b in zip(origin, safe, low, high, strict=True)]
@@ -104,11 +109,12 @@ def ray_interval(
 
 @eqx.filter_jit
 def boundary_points(volume: Volume, count: int, beyond: float = 0.0) -> Float[Array, "count 3"]:
-    """Where `count` evenly spread rays from the origin cross the volume's boundary: found by bisection between the
-    origin and a sphere beyond the scene. A ray of a volume that is not star-shaped about the origin has several
-    crossings, of which this is any one.
+    """Points where `count` evenly spread rays from the origin cross the volume's boundary.
 
-    - `beyond`: how far outside the boundary the points lie instead, in scene units.
+    By bisection between the origin and a sphere beyond the scene. If the volume is not star-shaped about the origin, a
+    ray may have several crossings, and any one of them is returned.
+
+    - `beyond`: move the points outward to this distance from the boundary, in scene units.
     """
     directions = fibonacci_sphere(count)
 
@@ -124,7 +130,7 @@ def boundary_points(volume: Volume, count: int, beyond: float = 0.0) -> Float[Ar
 
 
 def bounding_box(volume: Volume) -> Box:
-    """The box about a volume's boundary, found along a thousand rays; of a `Box` itself."""
+    """The bounding box of a volume's boundary points along a thousand rays; a `Box` stays unchanged."""
     if isinstance(volume, Box):
         return volume
     points = np.asarray(boundary_points(volume, 1000), np.float64)
