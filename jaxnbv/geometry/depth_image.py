@@ -1,4 +1,4 @@
-"""From a depth image to oriented points, and to what its rays have crossed."""
+"""Conversion of a depth image to oriented points, missed rays and the range that each ray saw."""
 
 import math
 import warnings
@@ -19,24 +19,24 @@ from jaxnbv.geometry.sentinels import sentinel_pixels
 from jaxnbv.geometry.volume import Box, ray_interval
 
 Rows = tuple[Float[Array, "n 3"], Float[Array, "n 3"], Bool[Array, " n"], Bool[Array, " n"], Float[Array, " n"]]
-# Depths that are so many times what they should be are in other units, not of another object.
+# Depths that differ from the box's by more than this factor are in other units.
 _OTHER_UNITS = 20.0
-# What an object stands on is near the end of its box; a value beyond this factor of its depth may be a sentinel.
+# A value beyond this factor of the box's far depth may be a sentinel. The support of the object is nearer than that.
 _BEHIND = 1.1
-# The share of depths that shows their units.
+# Share of depths within that factor that shows the units to be right.
 _SOME = 1e-3
 
 
 class NothingInside(UserWarning):
-    """No point of a depth image lies in the box that it is to show."""
+    """Warns that no point of a depth image lies in the box."""
 
 
 def points_of_depth(
     depth: Real[AnyArray, "height width"], camera: Camera, pose: Pose, scale: float, stride: int, box: Box | None
 ) -> Rows:
-    """Points, normals, which rows are filled, which rays met nothing, and how far each saw: `PointCloud.from_depth`."""
+    """The fields of `PointCloud.from_depth`: points, normals, mask, missed and sight."""
     shape = (camera.height, camera.width)
-    # Before large numbers are rounded to infinity.
+    # Before a conversion that may round large numbers to infinity.
     numbers = depth if is_traced(depth) else as_numbers(depth, "the depth image", None)
     missed = numbers == np.inf
     rounding = scale / math.sqrt(12.0) if np.issubdtype(numbers.dtype, np.integer) else 0.0
@@ -47,20 +47,20 @@ def points_of_depth(
         "the image",
     )
     require(scale > 0, f"the depth's scale is {scale}; it must be positive")
-    require(pose.position.ndim == 1, f"the pose is a batch {pose.position.shape[:-1]}: give one, poses[0] say")
-    # Before any work is done for a stride that is none.
+    require(pose.position.ndim == 1, f"the pose is a batch {pose.position.shape[:-1]}: give one, such as poses[0]")
+    # Reject a wrong stride before any work is done.
     camera.strided(stride)
     if not is_traced(depth, pose):
         ahead = None if box is None else _depths_of(box, pose)
-        known = np.where(_is_sentinel(np.asarray(numbers), camera, scale, ahead), 0.0, depth)
-        depth = jnp.asarray(known)
-        _check_meaning(known[np.isfinite(known) & (known > 0)], camera, ahead)
+        cleaned = np.where(_is_sentinel(np.asarray(numbers), camera, scale, ahead), 0.0, depth)
+        depth = jnp.asarray(cleaned)
+        _check_meaning(cleaned[np.isfinite(cleaned) & (cleaned > 0)], camera, ahead)
     if camera.distortion:
         place = camera.pixel_directions().reshape(*shape, 3)[..., :2]
         matrix = jnp.asarray(camera.intrinsics, depth.dtype)
         depth, missed = undistorted(depth, jnp.asarray(missed), place, matrix, camera.distortion)
     gap = 1 if is_traced(depth) else gap_of(np.isfinite(depth) & (np.asarray(depth) > 0))
-    # An array, so that what is compiled for one unit runs for any.
+    # The rounding is an array, so that a program compiled for one unit runs for any.
     image = depth, jnp.asarray(missed), camera, pose, stride, jnp.asarray(rounding, depth.dtype), box, gap
     points, normals, mask, missed, inside, sight = _oriented(*image)
     if box is not None and not is_traced(points):
@@ -88,11 +88,11 @@ def _oriented(
     Bool[Array, " n"],
     Float[Array, " n"],
 ]:
-    """Points, normals, which of them are valid, which rays met nothing in the box, which points lie in it, and how far
-    each ray saw."""
+    """Points, normals, whether each is valid, whether each ray met nothing in the box, whether each point lies in the
+    box, and how far each ray saw."""
     rows, strided = slice(stride // 2, None, stride), camera.strided(stride)
-    seen = _rows_of(depth, jnp.isfinite(depth) & (depth > 0), stride, gap)[0]
-    sight = jnp.where(seen > 0, seen, jnp.inf).reshape(-1) * jnp.linalg.norm(strided.pixel_directions(), axis=-1)
+    samples = _rows_of(depth, jnp.isfinite(depth) & (depth > 0), stride, gap)[0]
+    sight = jnp.where(samples > 0, samples, jnp.inf).reshape(-1) * jnp.linalg.norm(strided.pixel_directions(), axis=-1)
     valid = jnp.isfinite(depth) & (depth > 0)
     if camera.farthest is not None:
         missed = missed | (valid & (depth > camera.farthest))
@@ -116,8 +116,10 @@ def _oriented(
 def _rows_of(
     depth: Float[Array, "h w"], valid: Bool[Array, "h w"], stride: int, gap: int
 ) -> tuple[Float[Array, "k l"], Bool[Array, "k l"], Float[Array, "k l"]]:
-    """Depths of every `stride`-th row and column, which are valid, and the least depth that a ray there may have met:
-    of the samples of their blocks, and with gaps of the blocks beside them."""
+    """Depth of every `stride`-th row and column, whether it is valid, and the least depth that the ray may have met.
+
+    The depth is the sample of the pixel's block. With gaps, the least depth includes the blocks beside it.
+    """
     samples, is_sample, _ = block_samples(depth, valid, gap)
     nearest = jnp.where(is_sample, samples, jnp.inf)
     if gap > 1:
@@ -128,7 +130,7 @@ def _rows_of(
 
 
 def _depth_behind(box: Box, camera: Camera, pose: Pose) -> Float[Array, " n"]:
-    """The depth at which each ray leaves a box; minus infinity for a ray that does not meet it."""
+    """The depth at which each ray leaves a box; minus infinity for a ray that misses the box."""
     directions = jnp.matmul(camera.pixel_directions(), pose.rotation.T, precision="highest")
     enter, leave = ray_interval(list(pose.position), list(directions.T), box.low, box.high)
     return jnp.where(leave > jnp.maximum(enter, 0.0), leave, -jnp.inf)
@@ -137,7 +139,7 @@ def _depth_behind(box: Box, camera: Camera, pose: Pose) -> Float[Array, " n"]:
 def without_sentinels(
     depth: Real[np.ndarray, "height width"], camera: Camera, pose: Pose, scale: float, box: Box
 ) -> Real[np.ndarray, "height width"]:
-    """The image with zeros where its value stands for "not measured", as `points_of_depth` finds them with the box.
+    """The image with zeros in place of sentinels, the same that `points_of_depth` finds with this box.
 
     **Raises:** `ValueError` if the box lies behind the camera.
     """
@@ -152,7 +154,7 @@ def _is_sentinel(
 
 
 def _depths_of(box: Box, pose: Pose) -> tuple[float, float]:
-    """Between which depths a box lies, the first one positive.
+    """The least and greatest depth of a box, both positive.
 
     **Raises:** `ValueError` if it lies behind the camera.
     """
@@ -168,12 +170,12 @@ def _depths_of(box: Box, pose: Pose) -> tuple[float, float]:
 
 
 def _check_meaning(depth: Float[np.ndarray, " valid"], camera: Camera, ahead: tuple[float, float] | None) -> None:
-    """Check the units of the depths that were measured: one in a thousand of those in the camera's range is of the
-    order of the box's. What else there is may be a far background, or glare.
+    """Check the units of the measured depths: at least one in a thousand of those in the camera's range must be of the
+    order of the box's. The others may be a far background, or glare.
 
-    - `ahead`: between which depths the box lies.
+    - `ahead`: least and greatest depth of the box.
 
-    **Raises:** `ValueError` for depths that cannot be meant.
+    **Raises:** `ValueError` if the units must be wrong.
     """
     if not len(depth):
         return
@@ -196,7 +198,7 @@ def _check_meaning(depth: Float[np.ndarray, " valid"], camera: Camera, ahead: tu
 
 
 def _warn_of_nothing_inside(points: Float[np.ndarray, "valid 3"], inside: Bool[np.ndarray, " n"], box: Box) -> None:
-    """An image may show none of the object; more often its pose is wrong."""
+    """Warn if no point lies in the box. The image may show nothing of the object, but more often its pose is wrong."""
     if len(points) and not inside.any():
         low, high = points.min(axis=0), points.max(axis=0)
         warnings.warn(

@@ -14,17 +14,17 @@ from jaxtyping import Array, Bool, Float
 from jaxnbv.checks import AnyArray, as_numbers, require
 
 _SHAPES = ((4,), (5,), (8,))
-# Depths of neighbouring pixels that differ by more, as a share and by pixels of the focal length, are not averaged.
+# Neighbouring depths are not averaged if their relative difference exceeds both _ALIKE and _STEEPEST / focal length.
 _ALIKE, _STEEPEST = 0.01, 4.0
-# Lenses of depth cameras move a place by a third of its distance from the axis at most, and each iteration leaves about
-# such a share of the error.
+# Lenses of depth cameras move a point by at most a third of its distance from the axis. Each iteration leaves about
+# this share of the error.
 _ITERATIONS = 25
 
 
 def distorted(
     x: Float[AnyArray, "*n"], y: Float[AnyArray, "*n"], coefficients: tuple[float, ...]
 ) -> tuple[Float[AnyArray, "*n"], Float[AnyArray, "*n"]]:
-    """Where places (x, y) of the plane Z = 1 appear in it through the lens."""
+    """Distorted coordinates in the plane Z = 1 of points (x, y) of this plane."""
     k1, k2, p1, p2, k3, k4, k5, k6 = (*coefficients, *[0.0] * (8 - len(coefficients)))
     r2 = x**2 + y**2
     radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
@@ -36,8 +36,10 @@ def distorted(
 def straightened(
     x: Float[np.ndarray, "*n"], y: Float[np.ndarray, "*n"], coefficients: tuple[float, ...]
 ) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
-    """Places of the plane Z = 1 that appear at (x, y) through the lens: the inverse of `distorted`, by fixed-point
-    iteration as in OpenCV."""
+    """Undistorted coordinates in the plane Z = 1 of distorted points (x, y): the inverse of `distorted`.
+
+    By fixed-point iteration as in OpenCV.
+    """
     across, down = x, y
     for _ in range(_ITERATIONS):
         moved = distorted(across, down, coefficients)
@@ -48,15 +50,18 @@ def straightened(
 def pixels_of(
     place: Float[AnyArray, "*n 2"], matrix: Float[AnyArray, "3 3"], coefficients: tuple[float, ...]
 ) -> tuple[Float[AnyArray, "*n"], Float[AnyArray, "*n"]]:
-    """The column and the row at which each place of the plane Z = 1 appears through the lens, in pixels."""
+    """Column and row, in pixels, at which each point of the plane Z = 1 appears through the lens."""
     across, down = distorted(place[..., 0], place[..., 1], coefficients)
     return across * matrix[0, 0] + matrix[0, 2], down * matrix[1, 1] + matrix[1, 2]
 
 
 def check_distortion(coefficients: tuple[float, ...], radius: float) -> None:
-    """Check coefficients of a lens for an image that ends at a distance from the axis, in the plane Z = 1.
+    """Check the coefficients of a lens.
 
-    **Raises:** `ValueError` for another number of them, or a radius that grows no longer on the way to the border.
+    - `radius`: largest distance of the image from the axis, in the plane Z = 1.
+
+    **Raises:** `ValueError` for another number of coefficients, or if the distorted radius stops growing within the
+    image.
     """
     array = as_numbers(coefficients, "the distortion", np.float64)
     require(
@@ -80,11 +85,15 @@ def undistorted(
     matrix: Float[Array, "3 3"],
     coefficients: tuple[float, ...],
 ) -> tuple[Float[Array, "h w"], Bool[Array, "h w"]]:
-    """The depth image that a pinhole would have taken, and which of its rays met nothing. Linear in inverse depth among
-    four pixels of one surface, else that of the nearest pixel; 0 beyond the image.
+    """The depth image of a pinhole camera without distortion, and whether each of its rays met nothing.
 
-    - `depth`: through the lens; what is valid of it is positive and finite.
-    - `place`: of the pinhole's pixels in the plane Z = 1; `matrix`: intrinsics, of the pinhole and of the lens.
+    Depths are linear in inverse depth among four pixels of one surface, else those of the nearest pixel. They are 0
+    beyond the original image.
+
+    - `depth`: the distorted image; valid depths are positive and finite.
+    - `missed`: whether each ray of the distorted image met nothing.
+    - `place`: positions of the pinhole's pixels in the plane Z = 1.
+    - `matrix`: intrinsics of both the pinhole and the lens.
     """
     focal = jnp.diagonal(matrix)[:2]
     column, row = (jnp.asarray(pixel) for pixel in pixels_of(place, matrix, coefficients))
@@ -93,8 +102,8 @@ def undistorted(
     nearest = jnp.round(row).astype(int).clip(0, height - 1), jnp.round(column).astype(int).clip(0, width - 1)
 
     top, left = jnp.floor(row).astype(int).clip(0, height - 2), jnp.floor(column).astype(int).clip(0, width - 2)
-    known = jnp.where(jnp.isfinite(depth) & (depth > 0), depth, 0.0)
-    four = jnp.stack([known[top + i, left + j] for i in (0, 1) for j in (0, 1)])
+    valid = jnp.where(jnp.isfinite(depth) & (depth > 0), depth, 0.0)
+    four = jnp.stack([valid[top + i, left + j] for i in (0, 1) for j in (0, 1)])
     low, high = jnp.min(four, axis=0), jnp.max(four, axis=0)
     is_alike = (low > 0) & (high <= low * (1.0 + jnp.maximum(_ALIKE, _STEEPEST / jnp.min(focal))))
     below, right = row - top, column - left

@@ -1,4 +1,4 @@
-"""Farthest point sampling of the rows of a point set, in any number of dimensions (Eldar et al. 1997)."""
+"""Farthest point sampling in any number of dimensions (Eldar et al. 1997)."""
 
 import functools
 from collections.abc import Callable
@@ -12,11 +12,11 @@ from jaxnbv.checks import require
 
 @functools.partial(jax.jit, static_argnames="count")
 def farthest_point_indices(points: Float[Array, "n d"], mask: Bool[Array, " n"], count: int) -> Int[Array, " count"]:
-    """`count` rows, each as far as can be from those before it, in order of choice; of equals, the first.
+    """Indices of `count` rows, each as far as possible from those before it, in order of choice.
 
-    Starts at the first filled row. No row is chosen twice while another that is filled is left, duplicates included;
-    a cloud of fewer points than `count` gives each of them, then its first filled row again and again. The indices
-    carry no derivative; points get theirs through `points[indices]`.
+    Starts at the first filled row. Ties go to the first row. No row is chosen twice while a filled one is left, even if
+    points coincide. If there are fewer points than `count`, the first filled row repeats at the end. The indices carry
+    no derivative; `points[indices]` has the derivatives of the points.
 
     **Raises:** `ValueError` if `count` < 1.
     """
@@ -37,17 +37,16 @@ def farthest_point_indices(points: Float[Array, "n d"], mask: Bool[Array, " n"],
     return jax.lax.scan(choose, start, length=count)[1]
 
 
-# In place of a distance. The bits of -2.0, as an integer, are greater than those of -1.0, and less than any distance's.
+# Stand in for distances. In IEEE bits, -2.0 is a smaller integer than any distance, and a greater one than -1.0.
 _CHOSEN, _EMPTY = -2.0, -1.0
-# Elementwise operations between so many parts of an array run several times as fast on a CPU as its reduction.
+# On a CPU, elementwise operations between this many parts of an array are several times as fast as its reduction.
 _FOLDS = 8
 
 
 def _first_of_largest(distance: Float[Array, " n"], rows: Int[Array, " n"]) -> Int[Array, ""]:
-    """argmax in the order of the numbers' bits.
+    """argmax in the order of the numbers' bits, which is the order of floats that are not negative.
 
-    That is the order of floats that are not negative; and a maximum of integers, then a minimum of rows, runs several
-    times as fast on a CPU as `jnp.argmax`.
+    On a CPU a maximum of integers, then a minimum of rows, is several times as fast as `jnp.argmax`.
     """
     bits = jax.lax.bitcast_convert_type(distance, jnp.dtype(f"int{8 * distance.dtype.itemsize}"))
     largest = jnp.max(_folded(jnp.maximum, bits))

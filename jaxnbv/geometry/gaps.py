@@ -1,19 +1,23 @@
-"""Depth images with gaps between pixels: one sample a block, as lidars and images aligned to a finer camera need."""
+"""Samples of depth images with gaps between pixels, from lidars or images aligned to a finer camera."""
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.ndimage import correlate
 
-# Sides of blocks, and what share of the blocks of four times the side must be filled.
+# Sides of blocks. Blocks must be filled at least this share as often as blocks of four times the side.
 _SIDES, _FILLED = (2, 3, 4, 6, 8, 12, 16, 24), 0.7
-# Of the pixels the share that has neighbours enough for a plane, four of nine, where there are no gaps.
+# Without gaps, at least this share of the pixels has enough valid pixels around it for a plane: four of nine.
 _WITH_PLANE, _FEWEST = 0.8, 4
 
 
 def gap_of(valid: Bool[np.ndarray, "h w"]) -> int:
-    """1 for an image in which most pixels have neighbours enough for a plane, whatever holes it has; else the least
-    side of blocks that are filled about as often as blocks of four times the side: 8 for one of every eighth row."""
+    """The gap between a depth image's pixels: the side of blocks with one sample each; 1 for no gap.
+
+    There is no gap if most valid pixels have enough neighbours for a plane, whatever holes the image has. Otherwise it
+    is the least side for which blocks are filled about as often as blocks of four times the side: 8 if every eighth row
+    is valid.
+    """
     around = correlate(valid.astype(np.uint8), np.ones((3, 3), np.uint8), mode="constant")
     if not valid.any() or np.mean(around[valid] >= _FEWEST) >= _WITH_PLANE:
         return 1
@@ -29,8 +33,10 @@ def gap_of(valid: Bool[np.ndarray, "h w"]) -> int:
 def block_samples(
     depth: Float[Array, "h w"], valid: Bool[Array, "h w"], side: int
 ) -> tuple[Float[Array, "k l"], Bool[Array, "k l"], Int[Array, "k l 2"]]:
-    """The valid pixel of each block that is nearest to the block's middle: its depth, whether there is one, and its
-    column and row in the block."""
+    """Depth of each block's valid pixel nearest to its middle, whether there is one, and its place.
+
+    - `side`: side of the blocks in pixels. The place is the column and the row within the block.
+    """
     if side == 1:
         return depth, valid, jnp.zeros((*depth.shape, 2), int)
 

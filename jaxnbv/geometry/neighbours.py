@@ -8,39 +8,42 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxnbv.geometry.cloud import PointCloud, some_rows
 
 _UNROLL = 8
-# Points whose nearest neighbour is looked for.
+# Number of points whose nearest neighbour is computed.
 _ASKED = 256
 
 
 @jax.jit
 def nearest_squared_distance(x: Float[Array, "n 3"], cloud: PointCloud) -> Float[Array, " n"]:
-    """min_j |x - y_j|^2 over the filled rows of a cloud; infinite where the cloud is empty.
+    """min_j |x - y_j|^2 over the filled rows y_j of a cloud; infinite if the cloud is empty.
 
-    The loop runs over the cloud with all of x at hand, so memory stays linear and time follows the number of filled
-    rows, not the capacity. Differentiable once or more in x and in the cloud's points.
+    The loop runs over the rows of the cloud, so memory is linear, and time depends on the number of filled rows and not
+    on the capacity. Differentiable once or more in x and in the cloud's points.
     """
     return _nearest_squared_distance(x, cloud.points, cloud.mask)
 
 
 def spacing(cloud: PointCloud) -> Float[Array, ""]:
-    """How far a point of a cloud is from its nearest neighbour, in the cloud's units: the median over some of its
-    points, spread over its rows; zero for fewer than two points."""
+    """Median distance of a cloud's points to their nearest neighbours, in the cloud's units.
+
+    The median is over 256 evenly spaced rows. It is zero for fewer than two points.
+    """
     nearest = distance_to_others(cloud, some_rows(cloud, _ASKED))
     return jnp.where(cloud.count > 1, jnp.median(nearest), 0.0)
 
 
 def distance_to_others(cloud: PointCloud, rows: Int[Array, " r"]) -> Float[Array, " r"]:
-    """How far the points of some rows of a cloud are from their nearest neighbours in it; infinite where they have
-    none."""
+    """Distance from the points of these rows of a cloud to their nearest neighbours; infinite without one."""
     offsets = cloud.points[rows, None] - cloud.points
     other = cloud.mask & (jnp.arange(cloud.capacity) != rows[:, None])
     return jnp.sqrt(jnp.min(jnp.where(other, jnp.sum(offsets**2, axis=-1), jnp.inf), axis=1))
 
 
 class DistanceField(eqx.Module):
-    """Distances to a cloud, known at the nodes of a cube about it and linear between them, to be asked at many points.
+    """Distances to a cloud at the nodes of a cube, linear between them: fast at many points.
 
-    - `values`: at the nodes; `low`: the first node; `spacing`: between neighbouring ones.
+    - `values`: distance at each node.
+    - `low`: the first node.
+    - `spacing`: distance between neighbouring nodes.
     """
 
     values: Float[Array, "n n n"]
@@ -49,8 +52,11 @@ class DistanceField(eqx.Module):
 
     @classmethod
     def of(cls, cloud: PointCloud, margin: Float[Array, ""] | float, resolution: int = 64) -> "DistanceField":
-        """The distances to a cloud that is not empty, on so many nodes along each side of a cube that holds it with a
-        margin: what is outside is that far away."""
+        """The distance field of a cloud that is not empty.
+
+        - `margin`: distance between the cloud and the sides of the cube. Points outside are at least this far away.
+        - `resolution`: number of nodes along each side of the cube.
+        """
         rows = cloud.mask[:, None]
         low = jnp.min(jnp.where(rows, cloud.points, jnp.inf), axis=0) - margin
         high = jnp.max(jnp.where(rows, cloud.points, -jnp.inf), axis=0) + margin
@@ -61,7 +67,7 @@ class DistanceField(eqx.Module):
         return cls(jnp.sqrt(squared).reshape(nodes.shape[:-1]), low, spacing)
 
     def __call__(self, x: Float[Array, "n 3"]) -> Float[Array, " n"]:
-        """The distances, of points outside the cube those of its nearest node. Differentiable in x."""
+        """The distance at each point x; outside the cube, that of the nearest place inside. Differentiable in x."""
         places = jnp.moveaxis((x - self.low) / self.spacing, -1, 0)
         return jax.scipy.ndimage.map_coordinates(self.values, list(places), order=1, mode="nearest")
 

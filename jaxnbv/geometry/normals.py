@@ -1,4 +1,4 @@
-"""Normals of points that came without: those of planes through their neighbours."""
+"""Estimates of normals, from planes through the neighbours of each point."""
 
 import numpy as np
 from jaxtyping import Float
@@ -13,29 +13,30 @@ def estimate_normals(
     viewpoint: Float[AnyArray, "3"] | Float[AnyArray, "n 3"] | tuple | list,
     neighbours: int = 16,
 ) -> Float[np.ndarray, "n 3"]:
-    """Unit normals of points: each of the plane through it and its nearest neighbours by least squares, turned to where
-    it was seen from. All in the same coordinates. Of a depth image take `PointCloud.from_depth`, which knows its noise.
+    """Unit normals of points by least-squares planes through their nearest neighbours, towards the sensor.
 
-    - `viewpoint`: the sensor's place, or that of each point.
-    - `neighbours`: how many points make a plane, itself included; more smooth noise, and edges.
+    For a depth image use `PointCloud.from_depth`, which takes its noise into account.
 
-    **Raises:** `ValueError` if there are fewer points than that, fewer than three neighbours, a point or place that is
-    not finite, or a point where the sensor stands.
+    - `points`, `viewpoint`: the points, and the sensor's position for all or for each, in the same coordinates.
+    - `neighbours`: number of points that define a plane, the point itself included. More of them smooth noise, but
+      also edges.
+
+    **Raises:** `ValueError` for fewer points than `neighbours`, fewer than three neighbours, a point or viewpoint that
+    is not finite, or a point at the viewpoint.
     """
-    found = as_numbers(points, "the points", np.float64)
-    place = as_numbers(viewpoint, "the viewpoint", np.float64)
-    require(found.ndim == 2 and found.shape[1] == 3, f"the points have shape {found.shape}: give (n, 3)")
-    require(place.shape in ((3,), found.shape), f"the viewpoint has shape {place.shape}: give (3,), or one a point")
+    places = as_numbers(points, "the points", np.float64)
+    sensor = as_numbers(viewpoint, "the viewpoint", np.float64)
+    require(places.ndim == 2 and places.shape[1] == 3, f"the points have shape {places.shape}: give (n, 3)")
+    require(sensor.shape in ((3,), places.shape), f"the viewpoint has shape {sensor.shape}: give (3,) or one per point")
     require(
-        3 <= neighbours <= len(found),
-        f"a plane through {neighbours} of {len(found)} points cannot be fitted: take three at least, and as many as "
-        "there are",
+        3 <= neighbours <= len(places),
+        f"cannot fit planes to {neighbours} of {len(places)} points: take three at least, and no more than there are",
     )
-    require(bool(np.isfinite(found).all() and np.isfinite(place).all()), "a point or the viewpoint is not finite")
-    toward = place - found
+    require(bool(np.isfinite(places).all() and np.isfinite(sensor).all()), "a point or the viewpoint is not finite")
+    toward = sensor - places
     require(bool((np.linalg.norm(toward, axis=1) > 0).all()), "a point lies where the sensor stands: drop it")
-    _, index = cKDTree(found).query(found, neighbours)
-    around = found[index] - found[index].mean(axis=1, keepdims=True)
+    _, index = cKDTree(places).query(places, neighbours)
+    around = places[index] - places[index].mean(axis=1, keepdims=True)
     # Eigenvalues ascend: the first direction is the one in which the points vary least.
     _, directions = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
     normals = directions[:, :, 0]

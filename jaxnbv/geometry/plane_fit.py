@@ -1,12 +1,15 @@
-"""Planes fitted to a depth image: what a pixel's neighbours say of its depth and normal, through the sensor's noise.
+"""Planes fitted to the neighbours of each pixel of a depth image, for depths and normals with less noise.
 
-A plane is linear in inverse depth. With (u, v) where a ray meets the plane at depth 1 and z0 the pixel's depth,
+A plane is linear in inverse depth. With (u, v) the point where a ray meets depth 1, and z0 the pixel's depth,
 
     z0 / z(u, v) = a + b (u - u0) + c (v - v0),     normal towards  (b, c, a - b u0 - c v0)
 
-is fitted by least squares to the pixels of a window that can be of the same surface. The window grows with the noise: a
-slope fitted to (2 r + 1)^2 pixels that are p apart on the surface is off by sqrt(3) sigma / (p r (2 r + 1)), which is
-held below 2.5 degrees where windows of at most 21 pixels can.
+is fitted by least squares to the pixels of a window that can belong to the same surface. The window grows with the
+noise: a slope fitted to (2 r + 1)^2 pixels that are p apart on the surface has the error
+
+    sqrt(3) sigma / (p r (2 r + 1)),
+
+which is kept below 2.5 degrees if a window of at most 21 x 21 pixels can.
 """
 
 import math
@@ -21,11 +24,11 @@ from jaxnbv.geometry.gaps import block_samples
 
 _LARGEST_RADIUS = 10
 _SLOPE_ERROR = math.radians(2.5)
-# A neighbour on the same surface is no steeper away than this (76 degrees), noise of the pair aside.
+# A neighbour on the same surface is at most this steep (76 degrees), plus this many standard deviations of noise.
 _STEEPEST, _SPREAD = 4.0, 6.0
 _FEWEST = 4
-# The difference of two pixels of one surface, in standard deviations of one, is mostly less than this. A pixel of which
-# so many of the eight beside it measured something else is one that mixes a near and a far surface.
+# Two pixels of one surface mostly differ by less than this, in standard deviations of one. A pixel that differs by more
+# from over five of the eight beside it mixes a near and a far surface.
 _DIFFERENCE, _MOST_UNLIKE = 3.0 * math.sqrt(2.0), 5
 
 
@@ -37,13 +40,15 @@ def fitted_planes(
     least_noise: float | Float[Array, ""],
     gap: int = 1,
 ) -> tuple[Float[Array, "k l"], Float[Array, "k l 3"], Bool[Array, "k l"]]:
-    """Depths and normals of every so many-th row and column, in the camera's frame, and which have a plane.
+    """Depth and normal of every `stride`-th row and column, and whether there is a plane.
 
-    Normals look towards the camera. A depth moves to its plane by no more than three standard deviations of the noise.
+    Normals are in the camera's frame and point towards the camera. A depth moves to its plane by at most three standard
+    deviations of the noise.
 
-    - `depth`: positive and finite where it is `valid`. `camera`: of the whole image.
-    - `least_noise`: a standard deviation that is known, that of rounding say.
-    - `gap`: the side of the blocks of pixels of which one is fitted to, see `gaps`; windows are of so many blocks.
+    - `depth`: depths, positive and finite where `valid`.
+    - `camera`: the camera of the whole image.
+    - `least_noise`: lower bound of the noise's standard deviation, such as that of rounding.
+    - `gap`: side of the blocks of pixels that give one sample each, see `gaps`. Windows are then counted in blocks.
     """
     focal = jnp.asarray(camera.focal_lengths, depth.dtype)
     strided = slice(stride // 2, None, stride)
@@ -53,9 +58,9 @@ def fitted_planes(
     samples, is_sample, offset = block_samples(depth, valid, gap)
     sigma = depth_noise(samples, is_sample, least_noise)[(pixels[0] // gap)[:, None], pixels[1] // gap]
     padded = jnp.pad(jnp.where(is_sample, samples, 0.0), _LARGEST_RADIUS)
-    # How far each sample lies from the pixel of a row, in pixels: the column, then the row.
     offset = jnp.pad(offset, ((_LARGEST_RADIUS, _LARGEST_RADIUS), (_LARGEST_RADIUS, _LARGEST_RADIUS), (0, 0)))
     inside = jnp.stack(jnp.meshgrid(pixels[1] % gap, pixels[0] % gap), axis=-1)
+    # Offset (column, row) in pixels from each pixel to the sample of its block.
     own = offset[rows[:, None], columns[None]] - inside
     middle, has_middle = padded[rows[:, None], columns[None]], padded[rows[:, None], columns[None]] > 0
     middle = jnp.where(has_middle, middle, 1.0)
@@ -65,7 +70,7 @@ def fitted_planes(
     width = 2 * jnp.max(jnp.where(has_middle, radius, 1)) + 1
 
     def add(index, sums):
-        """A neighbour of each pixel, where it can be of the same surface, its place in units of the window."""
+        """Add a neighbour of each pixel to the sums if it can belong to the same surface. Places are in windows."""
         down, right = index // width - width // 2, index % width - width // 2
         near = padded[(rows + down)[:, None], (columns + right)[None]]
         place = gap * jnp.stack([right, down]) - inside
@@ -81,12 +86,12 @@ def fitted_planes(
 
     zeros = *(jnp.zeros(middle.shape + shape, depth.dtype) for shape in ((3, 3), (3,))), jnp.zeros(middle.shape, int)
     normal, right_hand, num_unlike = jax.lax.fori_loop(0, width * width, add, zeros)
-    # What lies along a line has no plane.
+    # Pixels along a line do not define a plane.
     has_plane = (normal[..., 0, 0] >= _FEWEST) & (_breadth(normal) > 1e-3) & (num_unlike <= _MOST_UNLIKE)
     regular = jnp.where(has_plane[..., None, None], normal, jnp.eye(3, dtype=depth.dtype))
     plane = jnp.linalg.solve(regular, right_hand[..., None])[..., 0]
     has_plane = has_plane & (plane[..., 0] > 0)
-    # From a slope a unit of the window to one a unit of (u, v).
+    # From slopes per window to slopes per unit of (u, v).
     slope = plane[..., 1:] * focal / window
     towards = jnp.concatenate([slope, plane[..., :1] - jnp.sum(slope * place, axis=-1, keepdims=True)], axis=-1)
     length = jnp.linalg.norm(towards, axis=-1, keepdims=True)
@@ -96,15 +101,14 @@ def fitted_planes(
 
 
 def _radius(spacing: Float[Array, "k l"], sigma: Float[Array, "k l"]) -> Int[Array, "k l"]:
-    """The least window, by its radius in pixels, whose slopes are sure enough."""
+    """Radius in pixels of the smallest window whose slope error is small enough."""
     radii = jnp.arange(1, _LARGEST_RADIUS + 1)
     error = math.sqrt(3.0) * sigma[..., None] / (spacing[..., None] * radii * (2 * radii + 1))
     return jnp.minimum(1 + jnp.sum(error > _SLOPE_ERROR, axis=-1), _LARGEST_RADIUS)
 
 
 def _breadth(normal: Float[Array, "k l 3 3"]) -> Float[Array, "k l"]:
-    """How much the places of the neighbours, about their mean, spread across the direction in which they spread most:
-    zero along a line, and one where they spread alike."""
+    """Spread of the neighbours about their mean: zero along a line, one if it is the same in all directions."""
     total = jnp.maximum(normal[..., 0, 0], 1e-12)
     mean = normal[..., 0, 1:] / total[..., None]
     spread = normal[..., 1:, 1:] / total[..., None, None] - mean[..., :, None] * mean[..., None, :]
