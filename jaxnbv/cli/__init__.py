@@ -1,4 +1,4 @@
-"""The command line. Commands are entry points of the group `jaxnbv.commands`, functions for typer by their names."""
+"""The command line. Commands are typer functions, the entry points of the group `jaxnbv.commands`."""
 
 import sys
 from importlib.metadata import EntryPoint, entry_points
@@ -16,13 +16,13 @@ from jaxnbv.errors import InputError, explained_imports
 app = typer.Typer(
     help="""Where should the sensor look next, for what you want to know?
 
-    jaxnbv scans an object from a first view, imagines what it may look like where it was not seen, and picks the view
-    that is expected to tell the most; then it scans from there and asks again. Each run leaves a folder with the
-    episode (poses, scans, the values of all candidates), its point cloud as PLY, and a report.html that opens offline.
+    jaxnbv scans an object from a first view, imagines its unseen surface, and picks the view with the highest expected
+    value. Then it scans from there and repeats. Each run writes a folder with the episode (poses, scans, values of all
+    candidates), the point cloud as PLY, and a report.html that opens offline.
 
     Try `jaxnbv demo`, then `jaxnbv run MESH --views 5 --out runs/mine`.
     """,
-    epilog="A run that was interrupted continues with the same command after its last finished view or scene.",
+    epilog="To continue an interrupted run after its last finished view or scene, repeat its command.",
     no_args_is_help=True,
     rich_markup_mode="markdown",
     add_completion=False,
@@ -30,11 +30,11 @@ app = typer.Typer(
 )
 
 
-def _show_version(asked: bool) -> bool:
-    if asked:
+def _show_version(is_set: bool) -> bool:
+    if is_set:
         typer.echo(f"jaxnbv {jaxnbv.__version__}")
         raise typer.Exit
-    return asked
+    return is_set
 
 
 @app.callback()
@@ -43,7 +43,7 @@ def _options(
         bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
     ] = False,
 ) -> None:
-    """What is asked of `jaxnbv` itself."""
+    """Options of `jaxnbv` itself."""
     try:
         keep_compiled()
     except InputError as error:
@@ -55,25 +55,25 @@ def _is_own(point: EntryPoint) -> bool:
 
 
 def _add_commands() -> None:
-    """Add the commands of this package, then those of others under names that are free."""
+    """Add the commands of this package, then those of other packages under names that are free."""
     named = {point.name: point for point in sorted(entry_points(group="jaxnbv.commands"), key=_is_own)}
     for point in sorted(named.values(), key=lambda point: (not _is_own(point), point.name)):
         try:
             app.command(point.name, cls=Command)(point.load())
-        # Whatever a module of somebody else does as it is imported.
+        # Modules of other packages can fail in any way at import.
         except (Exception, SystemExit) as error:
             package = point.dist.name if point.dist else point.module
             reason = " ".join(f"{type(error).__name__}: {error}".split())
-            typer.echo(f"warning: {package} has no command {point.name} ({reason}): mend it or uninstall it", err=True)
+            typer.echo(f"warning: {package} has no command {point.name} ({reason}): fix it or uninstall it", err=True)
 
 
 _add_commands()
 
 
 def answer() -> None:
-    """Answer the words of this process: errors that the user can mend are one line, without a traceback.
+    """Run the command line of this process. Errors that the user can fix print one line, without a traceback.
 
-    **Raises:** `SystemExit` with the code.
+    **Raises:** `SystemExit` with the exit code.
     """
     write_readable()
     try:
@@ -85,10 +85,10 @@ def answer() -> None:
 
 
 def main() -> None:
-    """Entry point: answer, then end the process, whatever still runs beside."""
+    """Entry point: run the command line, then end the process even if background work still runs."""
     try:
         answer()
-    except SystemExit as leaving:
+    except SystemExit as end:
         if is_working():
-            end_process(leaving.code if isinstance(leaving.code, int) else 0)
+            end_process(end.code if isinstance(end.code, int) else 0)
         raise

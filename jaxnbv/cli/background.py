@@ -1,4 +1,4 @@
-"""Work beside the main thread, which never keeps the process from ending."""
+"""Background threads that do not keep the process from ending."""
 
 import os
 import sys
@@ -11,7 +11,7 @@ _NAME = "jaxnbv-background"
 
 
 def in_background(function: Callable[..., Any], *arguments: Any, **settings: Any) -> "Future[Any]":
-    """The result to come of a call in a thread of its own. The thread lets go of the arguments when the call ends."""
+    """Start a call in its own thread and return its future. The thread drops the arguments when the call ends."""
     future: Future[Any] = Future()
 
     def call() -> None:
@@ -20,18 +20,18 @@ def in_background(function: Callable[..., Any], *arguments: Any, **settings: Any
         except BaseException as error:
             future.set_exception(error)
 
-    # The threads of an executor are joined when the process ends; a daemon is not.
+    # The process joins an executor's threads at its end, but not daemon threads.
     threading.Thread(target=call, name=_NAME, daemon=True).start()
     return future
 
 
 def is_working() -> bool:
-    """Whether a call is still under way."""
+    """Whether a background call still runs."""
     return any(thread.name == _NAME for thread in threading.enumerate())
 
 
 def end_process(code: int) -> NoReturn:
-    """End the process at once. Threads in compiled code abort a process that Python winds up beneath them."""
+    """End the process at once. A normal exit would abort while threads run compiled code."""
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(code)

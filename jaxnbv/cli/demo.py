@@ -1,4 +1,4 @@
-"""`jaxnbv demo`: an episode on an object that ships."""
+"""`jaxnbv demo`: an episode on a built-in object."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -13,7 +13,9 @@ class DemoOptions(EpisodeOptions):
     task: TaskOption = "cross-entropy"
     search: SearchOption = "halving"
     seed: SeedOption = 2
-    scene: Annotated[int, asking(metavar="N", min=0, max=2**31 - 1, help="Which object: the number of a scene.")] = 0
+    scene: Annotated[
+        int, asking(metavar="N", min=0, max=2**31 - 1, help="Number of the scene, which selects the object.")
+    ] = 0
 
 
 @command(DemoOptions)
@@ -32,9 +34,9 @@ def demo(options: DemoOptions) -> None:
 
 demo.__doc__ = "\n\n".join(
     [
-        "Find out what a truck carries, which the first view does not show: no file, no network.",
-        "Farthest view, which knows nothing of the task, then starts from the same view.",
-        "The object by --task: "
+        "Find out what a truck carries, which the first view does not show. Needs no file and no network.",
+        "Farthest view, a baseline that ignores the task, starts from the same view.",
+        "The object for each --task: "
         + listed((names, example) for example, names in by_task(lambda task: task.example).items()),
     ]
 )

@@ -1,4 +1,4 @@
-"""What `jaxnbv demo` and `jaxnbv run` are both asked."""
+"""Options that `jaxnbv demo` and `jaxnbv run` share."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from jaxnbv.cli.tasks.base import Task
 
 T = TypeVar("T")
 
-# One of some names, which type checkers do not read.
+# Literals are built at run time, so type checkers see plain strings.
 if TYPE_CHECKING:
     TaskName: TypeAlias = str
     SearchName: TypeAlias = str
@@ -31,18 +31,18 @@ KnownOption = Annotated[
     str | None,
     imagining(
         metavar="BANK",
-        help=f"Shapes known before: a folder of upright meshes, or one of {', '.join(BANKS)}; or none.",
-        show_default="none; demo, but for --model paper: others of the kind",
+        help=f"Known shapes: a folder of upright meshes, one of {', '.join(BANKS)}, or none.",
+        show_default="none; for demo the bank of the object's kind, unless --model paper",
     ),
 ]
 
 
 def by_task(of: Callable[[type[Task]], T]) -> dict[T, str]:
-    """What tasks say, each with the names of those that say it."""
+    """The values of a function of the tasks, each with the names of the tasks that have it."""
     names: dict[T, list[str]] = {}
     for name, task in TASKS.items():
         names.setdefault(of(task), []).append(name)
-    return {said: "/".join(tasks) for said, tasks in names.items()}
+    return {value: "/".join(tasks) for value, tasks in names.items()}
 
 
 _ENOUGH = [f"{' '.join(until)} for {names}" for until, names in by_task(lambda task: task.until).items() if until]
@@ -50,7 +50,7 @@ _ENOUGH = [f"{' '.join(until)} for {names}" for until, names in by_task(lambda t
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeOptions:
-    """Options of a command that plays an episode."""
+    """Options of a command that simulates an episode."""
 
     task: TaskOption
     views: Annotated[int, asking(metavar="N", help="Views in all, the first one included.")] = 5
@@ -58,7 +58,7 @@ class EpisodeOptions:
         list[str] | None,
         asking(
             metavar="RULE=N",
-            help="End once a rule holds; can be given several times. "
+            help="End once a rule holds. Can be repeated. "
             + listed((name, stop.about) for name, stop in STOPS.items())
             + " Or never.",
             show_default=f"never; demo: {', '.join(_ENOUGH)}",
@@ -69,7 +69,7 @@ class EpisodeOptions:
         seeing(
             metavar="X Y Z",
             help="Where the first camera stands, in scene units; it looks at the origin.",
-            show_default="from 0.8 0.9 2.2, as far as the others; demo: where the answer hides",
+            show_default="towards 0.8 0.9 2.2, at the distance of the candidates; demo: a view that hides the answer",
         ),
     ] = None
     noise: Annotated[float, seeing(metavar="X", help="Standard deviation of points and normals.")] = 0.01
@@ -80,5 +80,5 @@ class EpisodeOptions:
     out: Annotated[
         Path | None, running(metavar="DIR", help="Output folder.", show_default="runs/NAME-TASK-SEARCH[-MODEL]-seedN")
     ] = None
-    quick: Annotated[bool, running("--quick", help="Small settings, for a first look; not the paper's.")] = False
+    quick: Annotated[bool, running("--quick", help="Small settings for a first look, not the paper's.")] = False
     report: Annotated[bool, running("--report/--no-report", help="Write report.html.")] = True

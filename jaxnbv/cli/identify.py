@@ -1,4 +1,4 @@
-"""`jaxnbv identify RECORDING`: which of some known parts were recorded, and where they lie."""
+"""`jaxnbv identify RECORDING`: names and poses of known parts in a recording."""
 
 import dataclasses
 import json
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from jaxnbv.surfaces.part_pose import ObjectPose
 
 _NAMES_SAID, _BAR = 4, 24
-# A frame of which fewer pixels than this fall into the box shows no object.
+# A frame with fewer pixels than this in the box shows no object.
 _FEWEST = 20
 _NO_FOLDER = (
-    "is a file: identify needs depth images with the poses that they were taken from, since what rays pass through "
-    "tells parts apart too. Give the folder of a recording (frames.json, 7-Scenes or TUM RGB-D); or scan a mesh by "
+    "is a file: identify needs depth images with the poses of the camera, since the empty space along rays also tells "
+    "parts apart. Give the folder of a recording (frames.json, 7-Scenes or TUM RGB-D), or scan a mesh with "
     "jaxnbv run MESH --task identify --parts FOLDER"
 )
 
@@ -32,16 +32,16 @@ _NO_FOLDER = (
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class IdentifyOptions:
     recording: Annotated[
-        Path, typer.Argument(metavar="RECORDING", help="A folder of depth images with poses, see RecordedFrames.")
+        Path, typer.Argument(metavar="RECORDING", help="Folder of depth images with poses, see RecordedFrames.")
     ]
-    parts: Annotated[Path, asking(metavar="FOLDER", help="A folder with a mesh of each part that the object may be.")]
+    parts: Annotated[Path, asking(metavar="FOLDER", help="Folder with a mesh of each part that the object may be.")]
     parts_scale: Annotated[
         str,
-        asking(metavar="UNIT", help="The parts' unit: mm, cm, m, in, ft where poses are in metres; else a number."),
+        asking(metavar="UNIT", help="Unit of the parts: mm, cm, m, in or ft if poses are in metres, else a number."),
     ] = "m"
     upright: Annotated[bool, asking("--upright", help="The object stands as its part's mesh does.")] = False
-    parts_up: Annotated[str, asking(metavar="AXIS", help="The parts' axis that is upward, for --upright.")] = "y"
-    views: Annotated[int, asking(metavar="N", min=1, help="How many frames are looked at, evenly spaced.")] = 8
+    parts_up: Annotated[str, asking(metavar="AXIS", help="Upward axis of the parts, for --upright.")] = "y"
+    views: Annotated[int, asking(metavar="N", min=1, help="Number of frames to use, evenly spaced.")] = 8
     until: Annotated[
         list[str] | None,
         asking(
@@ -51,32 +51,35 @@ class IdentifyOptions:
         ),
     ] = None
     up: Annotated[
-        str, seeing(metavar="AXIS", help="The recording's axis that is upward: x, y or z, or one of these with a -.")
+        str, seeing(metavar="AXIS", help="Upward axis of the recording: x, y or z, or one of these with a -.")
     ] = "z"
-    several: Annotated[
-        bool, asking("--several", help="There are several objects on a table, apart from one another.")
-    ] = False
+    several: Annotated[bool, asking("--several", help="Several objects stand apart from each other on a table.")] = (
+        False
+    )
     masks: Annotated[
         Path | None,
         asking(
             metavar="FOLDER",
-            help="Images that say which object each pixel shows: FRAME.png with a number a pixel, or FRAME.OBJECT.png, "
-            "a mask for each object.",
+            help="Folder of label images: FRAME.png with an object number in each pixel, or FRAME.OBJECT.png, a mask "
+            "for each object.",
             show_default="none",
         ),
     ] = None
     out: Annotated[
         Path | None,
-        running(metavar="DIR", help="A folder for identity.json and a report of each object.", show_default="none"),
+        running(
+            metavar="DIR", help="Output folder for identity.json and a report of each object.", show_default="none"
+        ),
     ] = None
 
 
 @command(IdentifyOptions, {name: RECORDING[name] for name in ("box", "intrinsics", "depth_scale")})
 def identify(options: IdentifyOptions, box: Any, intrinsics: Any, depth_scale: Any) -> None:
-    """Say which part of a folder was recorded and where it lies: names with probabilities after each frame, then the
-    pose in the recording's world. With --several or --masks, this of each object.
+    """Find out which part of a folder was recorded, and where it lies.
 
-    Nothing is trained. A part is a mesh at its true size; "none of these" is among the answers.
+    Prints the parts' names with probabilities after each frame, then the pose in the recording's world. With --several
+    or --masks it does so for each object. Nothing is trained. A part is a mesh at its true size, and "none of these"
+    is one of the answers.
     """
     if options.recording.is_file():
         raise InputError(f"{options.recording} {_NO_FOLDER}")
@@ -99,38 +102,38 @@ def identify(options: IdentifyOptions, box: Any, intrinsics: Any, depth_scale: A
     frames = RecordedFrames(options.recording, None, intrinsics, depth_scale)
     corners = np.array(box or bounds_of(frames), np.float64).reshape(2, 3)
     bank = bank_of(options.parts, options.parts_scale, float(np.ptp(corners, axis=0).max()), options.parts_up)
-    chosen = np.unique(np.linspace(0, len(frames) - 1, min(options.views, len(frames))).round().astype(int)).tolist()
+    indices = np.unique(np.linspace(0, len(frames) - 1, min(options.views, len(frames))).round().astype(int)).tolist()
     planner = Planner.for_parts(bank, Upright() if options.upright else FreeRotation())
-    planner = dataclasses.replace(planner, max_views=len(chosen))
+    planner = dataclasses.replace(planner, max_views=len(indices))
     masks = None if options.masks is None else Segmentation(options.masks, frames.files)
     kind = Session if masks is None and not options.several else Sessions
-    looked = kind(frames.camera, corners, planner, options.up, until=rule(options.until or ()))
+    sessions = kind(frames.camera, corners, planner, options.up, until=rule(options.until or ()))
     names: dict[int, str] = {} if masks is None else masks.names
-    for index in chosen:
+    for index in indices:
         labels = None if masks is None else masks.labels(index)
         if not _shows(frames, index, corners) or (masks is not None and labels is None):
             typer.echo(f"frame {index:<5} shows no object in the box")
             continue
         image = frames.depth(index), frames.matrices[index], frames.depth_scale
-        if isinstance(looked, Sessions):
-            looked.add(*image, labels=labels)
+        if isinstance(sessions, Sessions):
+            sessions.add(*image, labels=labels)
         else:
-            looked.add(*image)
-        for name, session in _objects(looked, names).items():
+            sessions.add(*image)
+        for name, session in _objects(sessions, names).items():
             likely = ", ".join(f"{part} {100 * share:.0f} %" for part, share in _likely(session))
             typer.echo(f"frame {index:<5} {f'{name}: ' if name else ''}{likely}")
-        if (reason := looked.done()) is not None:
+        if (reason := sessions.done()) is not None:
             typer.echo(f"enough      {reason}")
             break
-    if not _objects(looked, names) or (isinstance(looked, Session) and not looked.views):
+    if not _objects(sessions, names) or (isinstance(sessions, Session) and not sessions.views):
         raise InputError(
-            f"none of the {len(chosen)} frames of {options.recording} shows an object in the box: give --box, or more "
+            f"none of the {len(indices)} frames of {options.recording} shows an object in the box: give --box, or more "
             "--views"
         )
-    # A named unit is one of a world in metres.
+    # Named units imply a world in metres.
     unit = "m" if isinstance(as_unit(options.parts_scale), str) else None
     answers = {}
-    for name, session in _objects(looked, names).items():
+    for name, session in _objects(sessions, names).items():
         answers[name or "object"] = _say(name, session, unit)
         if options.out is not None:
             _write(options.out / name, name or options.recording.resolve().name, session)
@@ -141,7 +144,7 @@ def identify(options: IdentifyOptions, box: Any, intrinsics: Any, depth_scale: A
 
 
 def _shows(frames: "RecordedFrames", index: int, corners: "np.ndarray") -> bool:
-    """Whether a frame shows something of a box."""
+    """Whether a frame shows at least `_FEWEST` points in a box."""
     import numpy as np
 
     from jaxnbv.geometry.pose import Pose
@@ -153,12 +156,12 @@ def _shows(frames: "RecordedFrames", index: int, corners: "np.ndarray") -> bool:
     return int(inside.sum()) >= _FEWEST
 
 
-def _objects(looked: Any, names: dict[int, str]) -> "dict[str, Session]":
-    """The session of each object by its name: "" for one alone."""
-    several = getattr(looked, "objects", None)
-    if several is None:
-        return {"": looked}
-    return {names.get(number, str(number)): session for number, session in several.items()}
+def _objects(sessions: Any, names: dict[int, str]) -> "dict[str, Session]":
+    """The session of each object by its name, which is "" for a single object."""
+    objects = getattr(sessions, "objects", None)
+    if objects is None:
+        return {"": sessions}
+    return {names.get(number, str(number)): session for number, session in objects.items()}
 
 
 def _likely(session: "Session") -> list[tuple[str, float]]:
@@ -175,12 +178,15 @@ def _say(name: str, session: "Session", unit: str | None) -> dict[str, Any]:
         typer.echo(f"{'█' * round(_BAR * share):{_BAR}} {100 * share:3.0f} %  {part}")
     pose, is_none = session.object_pose, next(iter(session.identity)) == NONE
     typer.echo("It is most likely none of these." if is_none else told(pose, unit or session.frame.unit))
-    held = {of: getattr(pose, of).tolist() for of in ("matrix", "covariance", "alternatives")}
-    return {"names": session.identity, "name": NONE if is_none else pose.name, **held}
+    arrays = {field: getattr(pose, field).tolist() for field in ("matrix", "covariance", "alternatives")}
+    return {"names": session.identity, "name": NONE if is_none else pose.name, **arrays}
 
 
 def told(pose: "ObjectPose", unit: str) -> str:
-    """Where a part lies and how sure that is, in lines; `unit`: of the world."""
+    """Lines of text with the pose of a part and its standard deviations.
+
+    - `unit`: unit of the world.
+    """
     import numpy as np
 
     turn, shift = np.sqrt(np.diag(pose.covariance)).reshape(2, 3).max(axis=1).tolist()
@@ -191,7 +197,7 @@ def told(pose: "ObjectPose", unit: str) -> str:
         [
             f"{pose.name}: from its mesh, in the unit of the world, to the world",
             *("  ".join(f"{value:+.5f}" for value in row) for row in pose.matrix),
-            f"Standard deviations along and about the axes known least: {length}, {np.degrees(turn):.2g} degrees.",
+            f"Standard deviations along and about the least certain axes: {length}, {np.degrees(turn):.2g} degrees.",
             alike,
         ]
     )

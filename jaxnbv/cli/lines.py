@@ -1,4 +1,4 @@
-"""What the terminal says of each view of an episode, once it is done."""
+"""Lines on the terminal about each finished view of an episode."""
 
 import sys
 
@@ -12,7 +12,7 @@ from jaxnbv.viz.answers import label_of, number, words_of
 
 
 class Lines:
-    """Prints two lines a view, within a hundred columns: where from and why; what it answered."""
+    """Prints two lines for each view, within 100 columns: its position and why it was chosen, and the answer."""
 
     def __init__(self, planner: Planner):
         self.planner, self.count = planner, 0
@@ -31,12 +31,12 @@ class Lines:
 
 
 def _print(line: str) -> None:
-    """Above the bar that shows progress."""
+    """Print above the progress bar."""
     tqdm.write(line, file=sys.stdout)
 
 
 def _why(planner: Planner, view: View) -> str:
-    """By which value it was chosen, and how that stands among the others."""
+    """The value of the chosen view and its rank among the candidates."""
     if view.proposal is None:
         return "given"
     value, values = float(view.proposal.value), np.asarray(view.proposal.values, np.float64)

@@ -1,4 +1,4 @@
-"""How commands declare what they are asked: a dataclass a command, whose fields are its arguments and options."""
+"""Declaration of commands: the fields of a dataclass are the arguments and options of its command."""
 
 import dataclasses
 import inspect
@@ -12,23 +12,23 @@ from typer.core import TyperCommand
 Position: TypeAlias = tuple[float, float, float]
 T = TypeVar("T")
 
-# An option in each group of the help.
-asking = partial(typer.Option, rich_help_panel="What to find out")
+# One kind of option for each group of the help.
+asking = partial(typer.Option, rich_help_panel="Task")
 seeing = partial(typer.Option, rich_help_panel="Sensor")
-imagining = partial(typer.Option, rich_help_panel="What is imagined")
-finding = partial(typer.Option, rich_help_panel="How views are found")
-running = partial(typer.Option, rich_help_panel="The run")
+imagining = partial(typer.Option, rich_help_panel="Imagined surfaces")
+finding = partial(typer.Option, rich_help_panel="Search")
+running = partial(typer.Option, rich_help_panel="Run")
 
 
 def listed(choices: Iterable[tuple[str, str]]) -> str:
-    """Names and what they mean, as one sentence of the help."""
+    """Names and their meanings as one sentence of the help."""
     return "; ".join(f"{name}: {about}" for name, about in choices) + "."
 
 
 def command(options: type[T], more: Mapping[str, Any] = {}) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Decorator: a command for typer of a function that takes a dataclass of options.
+    """Decorator: make a typer command from a function that takes a dataclass of options.
 
-    - `more`: annotations of further options by name, passed by keyword; None where they are not given.
+    - `more`: annotations of further options by name. They are passed by keyword, None for those that are not given.
     """
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
@@ -50,17 +50,19 @@ def command(options: type[T], more: Mapping[str, Any] = {}) -> Callable[[Callabl
 
 
 class Command(TyperCommand):
-    """A command that reads `--option A B` as `--option A --option B` where the option's metavar ends in dots: a shell
-    writes out a pattern of files as several words."""
+    """A command that reads `--option A B` as `--option A --option B` if the option's metavar ends in dots.
+
+    A shell expands a pattern of files to several words.
+    """
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """The words that are left, as in click."""
-        several = {flag for one in self.params if str(one.metavar).endswith("...") for flag in one.opts}
+        """Parse the words and return those that are left over, as in click."""
+        repeated = {flag for one in self.params if str(one.metavar).endswith("...") for flag in one.opts}
         words: list[str] = []
         flag = None
         for word in args:
             if word.startswith("-"):
-                flag = word if word in several else None
+                flag = word if word in repeated else None
             elif flag and words[-1] != flag:
                 words.append(flag)
             words.append(word)

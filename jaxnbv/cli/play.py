@@ -1,4 +1,4 @@
-"""How a command plays an episode: its planner, its race with another search, what it prints and draws."""
+"""Simulation of an episode by a command: its planner, the race with a baseline, output and drawings."""
 
 import dataclasses
 import functools
@@ -43,8 +43,14 @@ from jaxnbv.viz.task import race_words
 
 
 class Sizes(NamedTuple):
-    """Posterior samples, candidates (None: as many as the sensor's setting has), points of D that are kept, the grid of
-    the samples (None: the task's own), and rays along a side of an image (None: the sensor's own)."""
+    """Sizes of a planner.
+
+    - `samples`: number of posterior samples.
+    - `candidates`: number of candidates, or None for that of the sensor's setting.
+    - `capacity`: number of points to keep in D.
+    - `grid`: grid of the samples, or None for the task's.
+    - `rays`: rays along each side of an image, or None for the sensor's.
+    """
 
     samples: int
     candidates: int | None
@@ -55,14 +61,14 @@ class Sizes(NamedTuple):
 
 USUAL, QUICK = Sizes(16, None, 8192), Sizes(4, 40, 1024, Grid(56), 24)
 DEMO = Sizes(16, 60, 2048)
-# Views of the baseline that races the demo, at most.
+# Maximum number of views of the baseline in the demo.
 _RACE_VIEWS = 10
 
 
 def rule(texts: Sequence[str]) -> StopRule | None:
-    """The rule that some options make together, "sure=0.95" say; None for none, or "never".
+    """The rule that stops once any of some rules such as "sure=0.95" does. None for no rules or for "never".
 
-    **Raises:** `ValueError` for a name that is not known, or what is no number.
+    **Raises:** `ValueError` for an unknown name, or a value that is not a number or out of range.
     """
     if not texts or list(texts) == ["never"]:
         return None
@@ -78,7 +84,11 @@ def rule(texts: Sequence[str]) -> StopRule | None:
 
 
 def search_of(name: str, radius: float, count: int) -> Search:
-    """The search of a name, about cameras so far away."""
+    """The search with a name of `SEARCHES`.
+
+    - `radius`: distance of the candidates in scene units.
+    - `count`: number of candidates.
+    """
     candidates = SphereCandidates(count, radius)
     if name == "tie-break":
         return TieBreakSearch(candidates, second=Coverage())
@@ -86,10 +96,12 @@ def search_of(name: str, radius: float, count: int) -> Search:
 
 
 def imagined(model: str, quick: bool, known: str | ShapeBank | None) -> SurfaceSampler:
-    """The surfaces of a model's name, by one who knows the shapes of a bank that ships, or upright ones of a folder of
-    meshes, or parts that lie anyhow; none of None or "none".
+    """The sampler of a model with a name of `MODELS`, with a bank of known shapes if there is one.
 
-    **Raises:** `ValueError` if there is no such bank or folder, or no mesh in it that can be used.
+    - `known`: a shipped bank, a folder of upright meshes, or a bank of parts in any rotation. None or "none" for no
+      bank.
+
+    **Raises:** `ValueError` if there is no such bank or folder, or if no mesh in the folder can be used.
     """
     sampler = SurfaceSampler.preset(model, quick=quick)
     if known is None or known == "none":
@@ -100,7 +112,7 @@ def imagined(model: str, quick: bool, known: str | ShapeBank | None) -> SurfaceS
         return sampler.with_bank(shape_bank(known), bank_poses(known))
     require(
         os.path.isdir(known),
-        f"--known {known}: there is no such folder of meshes; or give {', '.join(SHIPPED_BANKS)}, none",
+        f"--known {known}: there is no such folder of meshes: give one, or {', '.join(SHIPPED_BANKS)} or none",
     )
     return sampler.with_bank(ShapeBank.from_meshes(known), Upright(by_axis=True))
 
@@ -108,16 +120,16 @@ def imagined(model: str, quick: bool, known: str | ShapeBank | None) -> SurfaceS
 def planner_of(
     setting: Setting, acquisition: Acquisition, search: str, sampler: SurfaceSampler, sizes: Sizes
 ) -> Planner:
-    """A planner of a task."""
+    """A planner for a task."""
     grid = sizes.grid or sampler.grid
     sampler = dataclasses.replace(sampler, grid=grid, num_samples=sizes.samples)
-    found = search_of(search, setting.radius, sizes.candidates or setting.num_candidates)
+    searcher = search_of(search, setting.radius, sizes.candidates or setting.num_candidates)
     camera = setting.camera if sizes.rays is None else setting.camera.resized(sizes.rays, sizes.rays)
-    return Planner(acquisition, found, camera, sampler, capacity=sizes.capacity)
+    return Planner(acquisition, searcher, camera, sampler, capacity=sizes.capacity)
 
 
 def first_pose(place: Position, surface: Surface) -> Pose:
-    """Where the first view was asked for, looking at the origin.
+    """Pose of the first view at a position, looking at the origin.
 
     **Raises:** `ValueError` for a position inside the object.
     """
@@ -127,10 +139,9 @@ def first_pose(place: Position, surface: Surface) -> Pose:
 
 
 def play(options: EpisodeOptions, subject: Subject, setting: Setting, sizes: Sizes, until: Sequence[str] = ()) -> None:
-    """Simulate an episode into a folder, tell of each view as it is done, and report.
+    """Simulate an episode into a folder, print each view when it is done, and write the report.
 
-    - `until`: what is enough by default, as in `--until`; where it is given, farthest view races the episode from the
-      same first view.
+    - `until`: default of `--until`. If it is not empty, a baseline, farthest view, runs from the same first view.
     """
     began = time.perf_counter()
     if options.quick:
@@ -138,7 +149,7 @@ def play(options: EpisodeOptions, subject: Subject, setting: Setting, sizes: Siz
         sizes = QUICK
     if subject.note:
         typer.echo(subject.note)
-    # The paper's model knows no shapes.
+    # The paper's model has no known shapes.
     bank = options.known or ("none" if options.model == "paper" else subject.bank)
     sampler = dataclasses.replace(imagined(options.model, options.quick, bank), grid=subject.grid or Grid())
     planner, rival = (
@@ -154,33 +165,33 @@ def play(options: EpisodeOptions, subject: Subject, setting: Setting, sizes: Siz
     race: Future[Episode] | None = None
     drawing: Future[None] | None = None
 
-    # While the next view is planned, the last one is drawn and the rival runs.
-    def tell(step: Step) -> None:
+    # Drawing and the baseline run in the background while the next view is planned.
+    def report_step(step: Step) -> None:
         nonlocal race, drawing
         lines(step.view)
         if sketches is not None:
-            # One at a time: a step that waited would keep its posterior.
+            # Draw one step at a time, since each waiting step would keep its posterior in memory.
             if drawing is not None:
                 drawing.result()
             drawing = in_background(sketches.add, step)
-        # Not before the first view: both would compile what that needs.
+        # Start the baseline after the first view. Earlier, both would compile the same programs.
         if race is None and races:
             start = subject.surface, subject.first, _RACE_VIEWS, key, noise, folder / "farthest"
             race = in_background(simulate, rival, *start, progress=False, until=enough)
 
     start = subject.surface, subject.first, options.views, key, noise, folder
-    episode = simulate(planner, *start, until=enough, each=tell)
-    raced = None if race is None else race.result()
+    episode = simulate(planner, *start, until=enough, each=report_step)
+    rival_episode = None if race is None else race.result()
     if drawing is not None:
         drawing.result()
     if episode.stopped is not None:
         views, saved = len(episode.views), options.views - len(episode.views)
         typer.echo(f"enough   after view {views}: {episode.stopped}. Views saved: {saved} of {options.views}")
-    if raced is not None:
-        words = race_words(raced, episode)
+    if rival_episode is not None:
+        words = race_words(rival_episode, episode)
         typer.echo(textwrap.fill(words, 100, initial_indent="race     ", subsequent_indent="         "))
     if options.report:
-        page = viz.write_report(episode, folder, title=subject.name, rival=raced, sketches=sketches)
+        page = viz.write_report(episode, folder, title=subject.name, rival=rival_episode, sketches=sketches)
         typer.echo(f"report   {page}")
     typer.echo(f"episode  {folder}   ({time.perf_counter() - began:.0f} s)")
 

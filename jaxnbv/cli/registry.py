@@ -1,10 +1,10 @@
-"""The names of models, searches and rules on the command line, known before anything heavy is imported."""
+"""Names of models, searches and stop rules on the command line. Imports nothing heavy."""
 
 import importlib
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-# Its names load what they stand for once they are used.
+# Lazy: the modules of its names are imported when these are used.
 import jaxnbv as nbv
 
 if TYPE_CHECKING:
@@ -12,30 +12,34 @@ if TYPE_CHECKING:
 
 
 MODELS = {
-    "screened": "knows what was seen to be empty too",
-    "paper": "knows the scanned normals alone",
+    "screened": "also uses space that was seen empty",
+    "paper": "uses only the scanned normals",
 }
 
-STUDY_MODELS = {"known": "screened, and has seen other objects of the kind", **MODELS}
+STUDY_MODELS = {"known": "screened, with a bank of other objects of the kind", **MODELS}
 
 BANKS = ("pyramid", "truck", "household", "parts", "heat", "household-real")
 """The banks of known shapes that ship."""
 
 SEARCHES = {
     "discrete": "the best of all candidates",
-    "halving": "the same, sooner: drops the worse half again and again",
-    "tie-break": "coverage decides where candidates are level",
-    "gradient-2dof": "climbs over the sphere",
-    "gradient-constrained": "climbs over positions and rotations",
-    "hybrid": "climbs from the best candidates",
+    "halving": "the same, faster: drops the worse half repeatedly",
+    "tie-break": "coverage decides between tied candidates",
+    "gradient-2dof": "gradient ascent on the sphere",
+    "gradient-constrained": "gradient ascent over positions and rotations",
+    "hybrid": "gradient ascent from the best candidates",
     "farthest": "a baseline, far from all views",
     "random": "a baseline",
-    "uncertainty": "a baseline, where the surface is least known",
+    "uncertainty": "a baseline, where the surface is least certain",
 }
 
 
 class Stop(NamedTuple):
-    """A rule of `--until`: what its number is, and the rule of a number."""
+    """A rule of `--until`.
+
+    - `about`: meaning of its number, for the help.
+    - `rule`: makes the rule from the number.
+    """
 
     about: str
     rule: "Callable[[float], StopRule]"
@@ -44,16 +48,16 @@ class Stop(NamedTuple):
 STOPS = {
     "sure": Stop("probability of the class", lambda probability: nbv.Sure(probability)),
     "found": Stop("points of every part", lambda points: nbv.Found(int(points))),
-    "covered": Stop("share seen of what can be seen", lambda share: nbv.Covered(share)),
+    "covered": Stop("share of the visible surface that was seen", lambda share: nbv.Covered(share)),
     "identified": Stop("probability of the part", lambda probability: nbv.Identified(probability)),
-    "placed": Stop("how far its surface may be off", lambda length: nbv.Placed(length)),
+    "placed": Stop("root mean square error of the part's surface", lambda length: nbv.Placed(length)),
     "value-below": Stop("value of the best view", lambda value: nbv.ValueBelow(value)),
-    "seconds": Stop("passed", lambda seconds: nbv.Budget(seconds=seconds)),
-    "travel": Stop("length of the way", lambda length: nbv.Budget(cost=length)),
+    "seconds": Stop("elapsed time", lambda seconds: nbv.Budget(seconds=seconds)),
+    "travel": Stop("length of the camera's path", lambda length: nbv.Budget(cost=length)),
 }
 
 
 def resolve(text: str) -> Any:
-    """What a registry names, module:name, imported."""
+    """Import an object by its text "module:name"."""
     module, _, name = text.partition(":")
     return getattr(importlib.import_module(module), name)

@@ -1,4 +1,4 @@
-"""`jaxnbv report DIR`: studies on one page."""
+"""`jaxnbv report DIR`: results of studies on one page."""
 
 from pathlib import Path
 from typing import Annotated
@@ -8,11 +8,11 @@ import typer
 
 def report(
     folder: Annotated[
-        Path, typer.Argument(metavar="DIR", help="A folder of studies, or one in which such folders lie.")
+        Path, typer.Argument(metavar="DIR", help="Folder of a study, or a folder that contains such folders.")
     ],
-    out: Annotated[Path | None, typer.Option(help="The page, an HTML file.", show_default="DIR/report.html")] = None,
+    out: Annotated[Path | None, typer.Option(help="Output page, an HTML file.", show_default="DIR/report.html")] = None,
 ) -> None:
-    """Gather studies on one page: tables, figures, pictures, settings, versions and times. Nothing is run."""
+    """Gather studies on one page: tables, figures, pictures, settings, versions and times. It runs nothing."""
     from jaxnbv.studies.engine.page import write_page
 
     typer.echo(f"{write_page(folder, out or folder / 'report.html')}")

@@ -1,4 +1,4 @@
-"""`jaxnbv run MESH`: an episode on a user's mesh."""
+"""`jaxnbv run MESH`: an episode on a mesh of the user's."""
 
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
@@ -20,11 +20,15 @@ class RunOptions(EpisodeOptions):
     ]
     task: TaskOption = "coverage"
     search: SearchOption = "discrete"
-    up: Annotated[
-        str, seeing(metavar="AXIS", help="The mesh's axis that is upward: x, y or z, or one of these with a -.")
-    ] = "y"
+    up: Annotated[str, seeing(metavar="AXIS", help="Upward axis of the mesh: x, y or z, or one of these with a -.")] = (
+        "y"
+    )
     paper: Annotated[
-        bool, seeing("--paper", help="The paper's close-up: 30 degrees, from 2 to 3 scene units by the task.")
+        bool,
+        seeing(
+            "--paper",
+            help="The paper's close-up: 30 degrees wide, from 2 to 3 scene units away, depending on the task.",
+        ),
     ] = False
 
 
@@ -34,7 +38,7 @@ _OF_TASKS = {
     for name, hint in get_type_hints(task, include_extras=True).items()
     if name in {field.name for field in fields(task)}
 }
-"""Annotations of the options that tasks declare."""
+"""Annotations of the tasks' own options."""
 
 
 @command(RunOptions, _OF_TASKS)
@@ -42,7 +46,7 @@ def run(options: RunOptions, **of_tasks: Any) -> None:
     """Choose views of a mesh, scanned by a simulated depth camera.
 
     The mesh may be open, a soup of triangles or inconsistently wound. It is scaled and centred so that its longest side
-    is 2.5 scene units; cameras stand as far from its centre as it takes to see all of it.
+    is 2.5 scene units. Cameras stand far enough from its centre to see all of it.
     """
     task = _task(options.task, {name: value for name, value in of_tasks.items() if value is not None})
 
@@ -63,16 +67,16 @@ def run(options: RunOptions, **of_tasks: Any) -> None:
     play(options, Subject(options.mesh.stem, surface, acquisition, first, task.bank(surface)), setting, USUAL)
 
 
-def _task(name: str, given: dict[str, Any]) -> Task:
-    """The task of a name with its own options.
+def _task(name: str, settings: dict[str, Any]) -> Task:
+    """The task with this name and its own options.
 
-    **Raises:** `ValueError` for an option that is not the task's, or one that it requires and that is not given.
+    **Raises:** `ValueError` for an option of another task, or for a required option that is missing.
     """
     declared = {field.name: field for field in fields(TASKS[name])}
-    for option in given.keys() - declared.keys():
+    for option in settings.keys() - declared.keys():
         takers = ", ".join(other for other, task in TASKS.items() if option in {field.name for field in fields(task)})
         raise InputError(f"--task {name} takes no --{option}: it is for {takers}")
-    for option in declared.keys() - given.keys():
+    for option in declared.keys() - settings.keys():
         if declared[option].default is MISSING:
             raise InputError(f"--task {name} needs --{option}")
-    return TASKS[name](**given)
+    return TASKS[name](**settings)

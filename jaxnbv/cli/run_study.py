@@ -1,4 +1,4 @@
-"""Run a study by its command: its scenes, tables, chart and pictures."""
+"""Body of `jaxnbv study`: runs the scenes and writes tables, a chart and pictures."""
 
 import functools
 import os
@@ -30,15 +30,15 @@ from jaxnbv.studies.registry import Entry, studies
 
 
 def run_study(options: StudyOptions, **of_studies: Any) -> None:
-    """Run a study, or each of those that it consists of, and write its results.
+    """Run all parts of a study and write the results.
 
-    - `of_studies`: options of single studies; None where they are not given.
+    - `of_studies`: options of single studies, None for those that are not given.
 
-    **Raises:** `ValueError` for no scenes, unknown methods, an option that the study does not take, or a method of
-    one's own that cannot be imported; and, once all is written, if scenes failed.
+    **Raises:** `ValueError` for no scenes, unknown methods, an option that the study does not take, or a user's method
+    that cannot be imported. Also if scenes failed, after all results are written.
     """
     entry = studies()[options.name]
-    given = _given(options.name, entry, of_studies)
+    settings = _settings(options.name, entry, of_studies)
     kind: type[Study] = entry.load()
     model = options.model or entry.model
     names = None if options.methods is None else [name.strip() for name in options.methods.split(",")]
@@ -47,24 +47,26 @@ def run_study(options: StudyOptions, **of_studies: Any) -> None:
     of_model = "" if model == entry.model else f"-{model}"
     folder = options.out or Path("runs") / f"study-{options.name}{of_model}{'-quick' if options.quick else ''}"
     if options.quick:
-        typer.echo("--quick: small settings and few scenes. This is not the full study; leave it out for that.")
+        typer.echo("--quick: small settings and few scenes. This is not the full study: leave it out for that.")
         scenes = scenes[: kind.quick_scenes]
     failures: dict[str, str] = {}
     count = 0
-    studies_by_part = kind.configured(model, options.views or entry.views, options.quick, **given)
+    studies_by_part = kind.configured(model, options.views or entry.views, options.quick, **settings)
     sources = _sources(options.join or (), studies_by_part)
     with _executor(options) as executor:
         for part, study in studies_by_part.items():
             arrays: dict[str, np.ndarray] = {}
             config = {"study": describe(study, arrays, "study"), "methods": sorted(methods)}
             config |= {"own": {text: describe(make) for text, make in own.items()}} if own else {}
-            there = scenes if study.num_scenes is None else [index for index in scenes if index < study.num_scenes]
+            indices = scenes if study.num_scenes is None else [index for index in scenes if index < study.num_scenes]
             run = functools.partial(run_scene, study, methods=methods, own=own)
-            held = RecordFolder(folder / part, config, executor, arrays)
-            held.join(sources[part])
-            records = held.collect(there, run)
-            failures |= {f"{part} scene {index}".strip(): error for index, error in held.failures(there).items()}
-            count += len(there)
+            results_folder = RecordFolder(folder / part, config, executor, arrays)
+            results_folder.join(sources[part])
+            records = results_folder.collect(indices, run)
+            failures |= {
+                f"{part} scene {index}".strip(): error for index, error in results_folder.failures(indices).items()
+            }
+            count += len(indices)
             if records:
                 table = results(records, type(study))
                 write_text(folder / part / "results.csv", table.round(6).to_csv(index=False))
@@ -75,13 +77,13 @@ def run_study(options: StudyOptions, **of_studies: Any) -> None:
     if failures:
         where, error = next(iter(failures.items()))
         raise InputError(
-            f"{len(failures)} of {count} scenes failed, the first {where} ({error}): {folder} has scene_*.failed that "
-            "tell how, and the same command tries them again"
+            f"{len(failures)} of {count} scenes failed, the first {where} ({error}): scene_*.failed in {folder} "
+            "have the reasons, and the same command tries them again"
         )
 
 
 def _executor(options: StudyOptions) -> AbstractContextManager[Executor | None]:
-    """What runs the scenes; None for this process."""
+    """The executor that runs the scenes, or None for this process."""
     require(
         options.cluster is None or options.workers == 1,
         f"--workers {options.workers} and --cluster {options.cluster} exclude each other: leave one out",
@@ -92,7 +94,7 @@ def _executor(options: StudyOptions) -> AbstractContextManager[Executor | None]:
 
 
 def _sources(folders: Iterable[Path], parts: Iterable[str]) -> dict[str, list[Path]]:
-    """The folders of records to join, by the part of the study that they are of."""
+    """The folders of records to join, for each part of the study."""
     sources = {part: [folder / part for folder in folders if (folder / part / "study.json").exists()] for part in parts}
     for folder in folders:
         require(
@@ -102,39 +104,42 @@ def _sources(folders: Iterable[Path], parts: Iterable[str]) -> dict[str, list[Pa
     return sources
 
 
-def _given(name: str, entry: Entry, of_studies: dict[str, Any]) -> dict[str, Any]:
-    """The options that a study is given, all of which it takes."""
-    given = {option: value for option, value in of_studies.items() if value is not None}
-    for option in given:
+def _settings(name: str, entry: Entry, of_studies: dict[str, Any]) -> dict[str, Any]:
+    """The options that were given.
+
+    **Raises:** `ValueError` for an option that the study does not take, or for a missing argument.
+    """
+    settings = {option: value for option, value in of_studies.items() if value is not None}
+    for option in settings:
         takers = {other: one for other, one in studies().items() if option in one.options}
         flag = next(iter(takers.values())).flag(option)
         require(option in entry.options, f"the study {name} takes no {flag}: it is for {', '.join(takers)}")
     for option in entry.arguments:
         flag = entry.flag(option)
-        require(option in given, f"the study {name} needs a {option}: jaxnbv study {name} {flag}")
-    return given
+        require(option in settings, f"the study {name} needs a {option}: jaxnbv study {name} {flag}")
+    return settings
 
 
-def _scenes(asked: str) -> Sequence[int]:
-    """The first N, or from A up to but without B."""
-    found = re.fullmatch(r"(?:(\d{1,9}):)?(\d{1,9})", asked.strip())
-    scenes = range(int(found[1] or 0), int(found[2])) if found else range(0)
+def _scenes(text: str) -> Sequence[int]:
+    """Indices of scenes: the first N for "N", or A to B - 1 for "A:B"."""
+    match = re.fullmatch(r"(?:(\d{1,9}):)?(\d{1,9})", text.strip())
+    scenes = range(int(match[1] or 0), int(match[2])) if match else range(0)
     if not scenes:
-        raise InputError(f"--scenes {asked} names no scenes: give how many, such as 60, or which, such as 100:130")
+        raise InputError(f"--scenes {text} names no scenes: give how many, such as 60, or which, such as 100:130")
     return scenes
 
 
 def _own(text: str) -> Factory:
-    """A function of a module that may lie in the current folder."""
+    """A user's function by its text "module:function". The module may be in the current folder."""
     if (here := os.getcwd()) not in sys.path:
         sys.path.insert(0, here)
     try:
-        made = resolve(text)
-    # Whatever a module of the user's does as it is imported.
+        factory = resolve(text)
+    # A module of the user's can fail in any way at import.
     except (Exception, SystemExit) as error:
         raise InputError(
             f"--method {text} cannot be found ({type(error).__name__}: {error}): write module:function, such as "
-            "mine:planner, and start where the module lies"
+            "mine:planner, and start in the module's folder"
         ) from error
-    require(callable(made), f"--method {text} is a {type(made).__name__}; give a function of a study and a scene")
-    return made
+    require(callable(factory), f"--method {text} is a {type(factory).__name__}; give a function of a study and a scene")
+    return factory

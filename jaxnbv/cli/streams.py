@@ -1,4 +1,4 @@
-"""Output that any encoding can take: where it is redirected, that is often the system's, of few characters."""
+"""Output for any encoding. Redirected output often has the system's encoding, which may lack some characters."""
 
 import codecs
 import io
@@ -31,7 +31,7 @@ _READABLE = str.maketrans(
 
 
 def _readable(error: UnicodeError) -> tuple[str, int]:
-    """What stands for the characters that an encoding lacks: a likeness, else their code."""
+    """Replacement for characters that an encoding lacks: a similar text, or else their code."""
     assert isinstance(error, UnicodeEncodeError)
     text = error.object[error.start : error.end].translate(_READABLE)
     return text.encode("ascii", "backslashreplace").decode("ascii"), error.end
@@ -41,8 +41,8 @@ codecs.register_error("readable", _readable)
 
 
 def write_readable() -> None:
-    """Let the standard streams write a likeness of what their encoding lacks, "m2" for "m²", and refuse nothing."""
+    """Let the standard streams replace characters that their encoding lacks ("m2" for "m²") instead of failing."""
     for stream in (sys.stdout, sys.stderr):
-        # Those of tests and of notebooks are others, which take all characters.
+        # Streams of tests and notebooks have another type, and take all characters.
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="readable")

@@ -1,4 +1,4 @@
-"""`jaxnbv study NAME`: the runs behind the paper's tables and figures, and studies of one's own."""
+"""`jaxnbv study NAME`: the runs behind the paper's tables and figures, and studies of the user's."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ from jaxnbv.cli.study_options import StudyOptions
 from jaxnbv.studies.registry import Entry, studies
 
 _OF_STUDIES = {name: hint for entry in studies().values() for name, hint in entry.options.items()}
-"""Annotations of the options that studies declare."""
+"""Annotations of the studies' own options."""
 
 
 @command(StudyOptions, _OF_STUDIES)
@@ -28,7 +28,7 @@ def _about(name: str, entry: Entry) -> str:
 study.__doc__ = "\n\n".join(
     [
         "Measure a claim of the paper on many scenes, with the same scenes, first views and noise for all methods.",
-        "Writes a record a scene, tables, a chart and pictures. Interrupted, it continues with the next scene.",
+        "Writes a record of each scene, tables, a chart and pictures. An interrupted run continues where it stopped.",
         *(_about(name, entry) for name, entry in studies().items()),
     ]
 )

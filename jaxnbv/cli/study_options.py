@@ -1,4 +1,4 @@
-"""What `jaxnbv study` is asked of any study."""
+"""Options of `jaxnbv study` that all studies take."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,28 +20,28 @@ else:
 @dataclass(frozen=True, kw_only=True)
 class StudyOptions:
     name: Annotated[
-        StudyName, typer.Argument(metavar="NAME", help=f"Which: {', '.join(studies())}.", show_default=False)
+        StudyName, typer.Argument(metavar="NAME", help=f"One of {', '.join(studies())}.", show_default=False)
     ]
     scenes: Annotated[
         str | None,
         typer.Option(
             metavar="N|A:B",
-            help="Scenes of the test split: the first N, or from A up to but without B.",
-            show_default="as many as the study has by default",
+            help="Scenes of the test split: the first N, or A to B - 1.",
+            show_default="the study's number of scenes",
         ),
     ] = None
     views: Annotated[
         int | None, typer.Option(min=2, help="Views in all, the first one included.", show_default="the study's")
     ] = None
     methods: Annotated[
-        str | None, typer.Option(help="Which methods, separated by commas.", show_default="those of the table")
+        str | None, typer.Option(help="Methods to run, separated by commas.", show_default="those of the table")
     ] = None
     own: Annotated[
         list[str] | None,
         typer.Option(
             "--method",
-            help="A method of your own in the same table, module:function. The function makes a Planner from the study "
-            "and a scene of it; the module is looked for in the current folder too. Can be given several times.",
+            help="A method of your own for the same table, module:function. The function makes a Planner from the "
+            "study and one of its scenes. The module may be in the current folder. Can be repeated.",
             show_default=False,
         ),
     ] = None
@@ -49,26 +49,28 @@ class StudyOptions:
         StudyModel | None,
         typer.Option(
             metavar="MODEL",
-            help="By what surfaces are imagined. " + listed(STUDY_MODELS.items()),
-            show_default="known, where there are known shapes",
+            help="Model of the imagined surfaces. " + listed(STUDY_MODELS.items()),
+            show_default="known if the study has known shapes",
         ),
     ] = None
     out: Annotated[
         Path | None,
         running(
-            help="Output folder; the scenes already in it are not run again.",
+            help="Output folder. Scenes that it already has are not run again.",
             show_default="runs/study-NAME[-MODEL][-quick]",
         ),
     ] = None
     quick: Annotated[
-        bool, running("--quick", help="Small settings and few scenes: minutes, and not the full study.")
+        bool, running("--quick", help="Small settings and few scenes. Takes minutes, and is not the full study.")
     ] = False
-    workers: Annotated[int, running(min=1, help="Scenes at a time, in as many processes, which share the cores.")] = 1
+    workers: Annotated[
+        int, running(min=1, help="Number of processes, which run one scene each at a time and share the cores.")
+    ] = 1
     cluster: Annotated[
         str | None,
         running(
             metavar="tcp://HOST:PORT",
-            help="Address of a Dask scheduler. Its workers run the scenes; this process writes the records.",
+            help="Address of a Dask scheduler. Its workers run the scenes, and this process writes the records.",
             show_default=False,
         ),
     ] = None
@@ -76,7 +78,7 @@ class StudyOptions:
         list[Path] | None,
         running(
             metavar="FOLDER...",
-            help="Output folders of the same study, whose records are first copied into this run's.",
+            help="Output folders of the same study. Their records are first copied into this run's folder.",
             show_default=False,
         ),
     ] = None

@@ -1,4 +1,4 @@
-"""`jaxnbv view RUN`: a look at an episode."""
+"""`jaxnbv view RUN`: an episode or a session in the browser."""
 
 import time
 from dataclasses import dataclass
@@ -12,16 +12,16 @@ from jaxnbv.cli.options import command
 
 @dataclass(frozen=True, kw_only=True)
 class ViewOptions:
-    folder: Annotated[Path, typer.Argument(metavar="RUN", help="The folder of a run or a session.")]
-    html: Annotated[
-        Path | None, typer.Option(help="Write the scene into one HTML file, which opens offline, and end.")
-    ] = None
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Where the page is served.")] = 8080
+    folder: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run or a session.")]
+    html: Annotated[Path | None, typer.Option(help="Write the scene to one HTML file that opens offline, and end.")] = (
+        None
+    )
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page.")] = 8080
 
 
 @command(ViewOptions)
 def view(options: ViewOptions) -> None:
-    """Look at a run or a session in the browser: points, cameras, the surface, what is imagined, where to look next."""
+    """Look at a run or a session in the browser: points, cameras, surface, imagined surfaces and the next view."""
     from jaxnbv.checks import check_device
 
     check_device()
@@ -30,10 +30,10 @@ def view(options: ViewOptions) -> None:
     from jaxnbv.viz import LiveView
 
     is_session = (options.folder / "session.json").exists()
-    shown = Session.load(options.folder) if is_session else Episode.load(options.folder)
+    run = Session.load(options.folder) if is_session else Episode.load(options.folder)
     page = LiveView(options.port)
     try:
-        page.update(shown)
+        page.update(run)
         if options.html is not None:
             typer.echo(f"page     {page.save(options.html)}")
             return

@@ -1,4 +1,4 @@
-"""`jaxnbv warm-up`: compile what a session runs, before the camera is there."""
+"""`jaxnbv warm-up`: compile the programs of a session in advance."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -16,25 +16,22 @@ class WarmUpOptions:
     intrinsics: Annotated[
         tuple[float, float, float, float], seeing(metavar="FX FY CX CY", help="Intrinsics of the camera, in pixels.")
     ]
-    size: Annotated[tuple[int, int], seeing(metavar="HEIGHT WIDTH", help="Rows and columns of its images.")]
-    nearest: Annotated[float, seeing(min=0.0, help="The least depth that it measures, in world units.")] = 0.0
-    farthest: Annotated[float | None, seeing(help="The largest depth that it measures.", show_default="no limit")] = (
-        None
-    )
+    size: Annotated[tuple[int, int], seeing(metavar="HEIGHT WIDTH", help="Numbers of rows and columns of its images.")]
+    nearest: Annotated[float, seeing(min=0.0, help="Least depth that it measures, in world units.")] = 0.0
+    farthest: Annotated[float | None, seeing(help="Largest depth that it measures.", show_default="no limit")] = None
     box: Annotated[
         tuple[float, float, float, float, float, float],
         seeing(
-            metavar="LOW HIGH", help="Two corners of the object's box, z up. It matters with --nearest, --farthest."
+            metavar="LOW HIGH", help="Two corners of the object's box, z up. Needed only with --nearest or --farthest."
         ),
     ] = _BOX
 
 
 @command(WarmUpOptions)
 def warm_up(options: WarmUpOptions) -> None:
-    """Compile what a session with this camera runs, and keep it, so that its first view comes at once.
+    """Compile the programs of a session with this camera and keep them, so that its first view comes at once.
 
-    A session of your program finds it after nbv.keep_compiled(). With another planner, compile it there:
-    session.rehearse().
+    A session of your program uses them after nbv.keep_compiled(). For another planner, call session.rehearse() there.
     """
     import jaxnbv as nbv
 

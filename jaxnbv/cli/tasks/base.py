@@ -1,4 +1,4 @@
-"""What a task of the command line is. Nothing here loads JAX, nor does a task before it is chosen."""
+"""Base class of tasks of the command line. Neither this module nor a task that is not chosen imports JAX."""
 
 import math
 from abc import ABC, abstractmethod
@@ -16,16 +16,16 @@ if TYPE_CHECKING:
     from jaxnbv.surfaces import ShapeBank
 
 network_option = asking(
-    metavar="FILE", help="A classifier, .pth or .safetensors, which tasks about the class need; for parts a segmenter."
+    metavar="FILE", help="Network, .pth or .safetensors: a classifier for tasks about the class, a segmenter for parts."
 )
 
 
 class Subject(NamedTuple):
-    """An object that an episode is played on.
+    """The object of an episode.
 
-    - `bank`: the shapes that are known of it, as in `--known`; or parts at the size that they have in the scene.
-    - `grid`: of the imagined surfaces; None for the usual one.
-    - `note`: what is said of it before the first view.
+    - `bank`: known shapes as in `--known`, or a bank of parts at their size in the scene.
+    - `grid`: grid of the imagined surfaces, or None for the usual one.
+    - `note`: text to print before the first view.
     """
 
     name: str
@@ -39,11 +39,12 @@ class Subject(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Task(ABC):
-    """A task of `jaxnbv run` and `jaxnbv demo`. Its fields are options of `run`, required where they have no default.
+    """A task of `jaxnbv run` and `jaxnbv demo`. Its fields are options of `run`, and required without a default.
 
-    - `name`: in `--task`; `about`: what is asked, a clause for the help.
+    - `name`: name in `--task`.
+    - `about`: the question, a clause for the help.
     - `example`: the object of the demo, a clause for the help.
-    - `until`: what is enough for the demo, as in `--until`; farthest view then races it.
+    - `until`: default of `--until` in the demo. If it is not empty, farthest view runs too, for comparison.
     """
 
     name: ClassVar[str]
@@ -53,27 +54,34 @@ class Task(ABC):
 
     @classmethod
     def setting(cls) -> "Setting":
-        """The sensor."""
+        """The sensor's setting."""
         from jaxnbv.scanning.sensors import USUAL_SETTING
 
         return USUAL_SETTING
 
     @abstractmethod
     def acquisition(self, mesh: "TriangleMesh", camera: "Camera", first: "Pose") -> "Acquisition":
-        """What views of a user's mesh are chosen by; `first`: where the first view is taken."""
+        """The acquisition for views of a user's mesh.
+
+        - `first`: pose of the first view.
+        """
 
     def bank(self, mesh: "TriangleMesh") -> "str | ShapeBank":
-        """The shapes that are known of a user's mesh, as of a `Subject`."""
+        """Known shapes for a user's mesh, see `Subject`."""
         return "none"
 
     @classmethod
     @abstractmethod
     def demo(cls, scene: int, seed: int) -> Subject:
-        """One of the objects that ship, by the numbers of a scene and of a seed."""
+        """A built-in object.
+
+        - `scene`: number that selects the object.
+        - `seed`: seed of the first view.
+        """
 
 
 def usual_first(radius: float | None = None) -> "Pose":
-    """The pose of a first view by default: from the usual side, this far away (scene units)."""
+    """Default pose of a first view, from (0.8, 0.9, 2.2) or at distance `radius` in this direction (scene units)."""
     from jaxnbv.geometry.pose import look_at
 
     usual = (0.8, 0.9, 2.2)

@@ -1,4 +1,4 @@
-"""The object's class."""
+"""Tasks about the object's class."""
 
 from abc import abstractmethod
 from dataclasses import dataclass
@@ -14,13 +14,13 @@ if TYPE_CHECKING:
     from jaxnbv.scanning import TriangleMesh
     from jaxnbv.tasks.classification import Classifier
 
-# Points of a cloud that the demo's classifier is fed.
+# Number of points that the demo's classifier gets.
 _NUM_POINTS = 512
 
 
 @dataclass(frozen=True, kw_only=True)
 class ClassTask(Task):
-    """A task whose acquisition compares the answers of a classifier."""
+    """A task with an acquisition that compares the results of a classifier."""
 
     example = "a truck, whose cargo the first view does not show"
     until = ("sure=0.95",)
@@ -29,7 +29,7 @@ class ClassTask(Task):
     @classmethod
     @abstractmethod
     def compared(cls, classifier: "Classifier") -> "Acquisition":
-        """The acquisition that compares a classifier's answers."""
+        """The acquisition with this classifier."""
 
     def acquisition(self, mesh: "TriangleMesh", camera: "Camera", first: "Pose") -> "Acquisition":
         from jaxnbv.networks import CloudClassifier, load_checkpoint, network_scale
@@ -39,8 +39,10 @@ class ClassTask(Task):
 
     @classmethod
     def demo(cls, scene: int, seed: int) -> Subject:
-        """A truck; only what it carries tells the class, and the first view, from above the ground, does not show it.
-        The grid is that of the surfaces that the classifier was trained on."""
+        """A truck. Its class is its cargo, which the first view, from above the ground, does not show.
+
+        The grid is that of the surfaces in the classifier's training.
+        """
         import jax
         import numpy as np
 
@@ -71,7 +73,7 @@ class CrossEntropyTask(ClassTask):
 
 class EntropyTask(ClassTask):
     name = "entropy"
-    about = "its class, by the entropy that a view removes"
+    about = "its class, by reduction of entropy"
 
     @classmethod
     def compared(cls, classifier: "Classifier") -> "Acquisition":
@@ -82,7 +84,7 @@ class EntropyTask(ClassTask):
 
 class MixedTask(ClassTask):
     name = "mixed"
-    about = "its class, by one and then the other"
+    about = "its class, first by cross-entropy, then by reduction of entropy"
 
     @classmethod
     def compared(cls, classifier: "Classifier") -> "Acquisition":

@@ -1,4 +1,4 @@
-"""The object's shape."""
+"""Task about the object's shape."""
 
 from typing import TYPE_CHECKING
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 class CoverageTask(Task):
     name = "coverage"
     about = "its shape"
-    example = "a mug, to be seen all round"
+    example = "a mug"
 
     def acquisition(self, mesh: "TriangleMesh", camera: "Camera", first: "Pose") -> "Acquisition":
         from jaxnbv.tasks import NewSurface
@@ -23,7 +23,7 @@ class CoverageTask(Task):
 
     @classmethod
     def demo(cls, scene: int, seed: int) -> Subject:
-        """A mug, the only one."""
+        """A mug, the same for all numbers."""
         from jaxnbv.studies.scenes import demo_object
         from jaxnbv.tasks import NewSurface
 

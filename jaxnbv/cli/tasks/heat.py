@@ -1,4 +1,4 @@
-"""The coldest point of an object that is heated at one place."""
+"""Task about the coldest point of an object that is heated at one place."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
@@ -23,12 +23,12 @@ _NUM_POINTS = 2048
 class HeatTask(Task):
     name = "heat"
     about = "its coldest point when it is heated"
-    example = "a procedural one of four kinds, heated at one place"
+    example = "a procedural body of one of four kinds, heated at one place"
     source: Annotated[
         Position | None,
         asking(
             metavar="X Y Z",
-            help="For heat: the object is heated at its point nearest to this, in scene units.",
+            help="For heat: position in scene units. The object is heated at its nearest point to this.",
             show_default="the middle of the first view",
         ),
     ] = None
@@ -62,7 +62,7 @@ def _heated_at(source: "Float[np.ndarray, '3']") -> "Acquisition":
 
 
 def _source(place: Position | None, mesh: "TriangleMesh", camera: "Camera", first: "Pose") -> "Float[np.ndarray, '3']":
-    """The object's point nearest to a place, by default the one in the middle of the first view."""
+    """The object's point nearest to a position, or else the point in the middle of the first view."""
     import jax
     import numpy as np
 

@@ -1,4 +1,4 @@
-"""Which of some known parts the object is."""
+"""Task to find out which known part the object is."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from jaxnbv.scanning.sensors import Setting
     from jaxnbv.surfaces import ShapeBank
 
-# Parts so many times smaller or larger than the object are of another unit.
+# Parts that are this many times smaller or larger than the object have another unit.
 _OTHER_UNIT = 20.0
-# Nearly all of a housing is seen from so far away, in scene units; the first view is from this side of it.
+# Distance in scene units from which nearly all of a housing is seen, and direction of the first view.
 _RADIUS, _FIRST = 5.5, (-0.75, -0.42, 0.5)
 
 
@@ -30,13 +30,13 @@ class IdentifyTask(Task):
     until = ("identified=0.95",)
     parts: Annotated[
         Path,
-        asking(metavar="FOLDER", help="For identify: a folder with a mesh of each part that the object may be."),
+        asking(metavar="FOLDER", help="For identify: folder with a mesh of each part that the object may be."),
     ]
     parts_scale: Annotated[
         str,
         asking(
             metavar="UNIT",
-            help="For identify: the parts' unit in that of MESH, a number; or mm, cm, m, in, ft for a MESH in metres.",
+            help="For identify: unit of the parts, a number of MESH units, or mm, cm, m, in, ft for a MESH in metres.",
             show_default="1",
         ),
     ] = "1"
@@ -61,7 +61,7 @@ class IdentifyTask(Task):
 
     @classmethod
     def demo(cls, scene: int, seed: int) -> Subject:
-        """One of the housings in a random rotation, from a side that does not show what tells them apart."""
+        """One of the housings in a random rotation, first seen from a side that does not show the difference."""
         import numpy as np
         from scipy.spatial.transform import Rotation
 
@@ -87,10 +87,11 @@ class IdentifyTask(Task):
 def bank_of(folder: Path, scale: str, size: float, up: str = "y") -> "ShapeBank":
     """The parts of a folder, in units of a world.
 
-    - `scale`: the parts' unit, as in `--parts-scale`; `size`: of the object in the world, about; `up`: the parts' axis
-      that is upward.
+    - `scale`: unit of the parts, as in `--parts-scale`.
+    - `size`: approximate size of the object in the world.
+    - `up`: upward axis of the parts.
 
-    **Raises:** `ValueError` as `ShapeBank.from_meshes` does, and if no part is about as large as the object.
+    **Raises:** `ValueError` if `ShapeBank.from_meshes` does, or if no part is about as large as the object.
     """
     import numpy as np
 
@@ -116,7 +117,7 @@ def as_unit(text: str) -> float | str:
 
 
 def _housings() -> "dict[str, SignedDistance]":
-    """Housings whose longest side is 2.5, by what stands at the bottom of their pocket, which opens upward."""
+    """Housings with longest side 2.5 and a pocket that opens upward, by the bosses at the bottom of the pocket."""
     from jaxnbv.scanning.sdf import Cuboid, Cylinder
 
     body = Cuboid([1.0, 1.25, 0.9], 0.05) - Cuboid([0.8, 0.6, 0.7]).translate([0.0, 0.85, 0.0])

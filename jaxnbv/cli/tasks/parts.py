@@ -1,4 +1,4 @@
-"""The object's parts."""
+"""Task about the object's parts."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from jaxnbv.scanning import TriangleMesh
     from jaxnbv.scanning.sensors import Setting
 
-# Categories of no object that the shipped segmenter was trained on.
+# Categories that the shipped segmenter was not trained on.
 _UNKNOWN_TO_SEGMENTER = ("cap", "car", "knife")
 
 
@@ -23,13 +23,13 @@ _UNKNOWN_TO_SEGMENTER = ("cap", "car", "knife")
 class PartTask(Task):
     name = "parts"
     about = "its parts"
-    example = "a procedural one of thirteen categories"
+    example = "a procedural object of one of thirteen categories"
     until = ("found=60",)
     category: Annotated[
         str,
         asking(
             metavar="NAME",
-            help="For parts: what the object is, one of ShapeNet-part's categories; upright along y, facing x.",
+            help="For parts: category of the object in ShapeNet-part. It must stand upright along y and face x.",
         ),
     ]
     network: Annotated[Path | None, network_option] = None
@@ -49,7 +49,7 @@ class PartTask(Task):
             return _counting(CloudSegmenter(network, self.category, scale=network_scale(network)))
         require(
             self.category not in _UNKNOWN_TO_SEGMENTER,
-            f"--category {self.category}: the segmenter that ships was not trained on it: give --network FILE",
+            f"--category {self.category}: the shipped segmenter was not trained on it: give --network FILE",
         )
         return _counting(part_segmenter(self.category))
 
