@@ -1,4 +1,4 @@
-"""The trilinear function of a grid's cell along a ray: a cubic, and its first root.
+"""The trilinear interpolant of a grid cell along a ray, which is a cubic, and its first root.
 
 Vectors are lists of their components (n,), in coordinates local to the cell.
 """
@@ -13,9 +13,12 @@ _ROOT_ITERATIONS = 8
 
 
 def cubic(corners: list, a: list, b: list) -> list[Float[Array, " n"]]:
-    """Coefficients c_0, ..., c_3 in s of the trilinear function along a + s b, in coordinates local to the cell.
+    """Coefficients c_0, ..., c_3 in s of the trilinear function along a + s b.
 
-    Linear interpolation along z, y and x in turn, each time with polynomials one degree higher.
+    Interpolates linearly along z, y and x in turn. Each step raises the degree of the polynomials by one.
+
+    - `corners`: values at the cell's corners, in the order of `CORNERS`.
+    - `a`, `b`: start and direction of the rays, in coordinates local to the cell.
     """
     polynomials = [[corner] for corner in corners]
     for x, dx in ((a[2], b[2]), (a[1], b[1]), (a[0], b[0])):
@@ -30,14 +33,14 @@ def cubic(corners: list, a: list, b: list) -> list[Float[Array, " n"]]:
 
 
 def first_bracket(c: list) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
-    """For cubics positive at 0: whether they have a root in [0, 1], and an s so that [0, s] holds the first one alone.
+    """For cubics positive at 0: an s with only the first root in [0, s], and whether [0, 1] holds a root.
 
-    A cubic positive at 0 that is not positive at its local minimum has one root before that. Else it has at most one
-    in [0, 1], and only if it is not positive at 1. One not positive at 0 has its root there.
+    A cubic that is positive at 0 but not at its local minimum has one root before the minimum. Otherwise it has at most
+    one root in [0, 1], and only if it is not positive at 1. A cubic that is not positive at 0 counts as zero there.
     """
     discriminant = c[2] * c[2] - 3.0 * c[3] * c[1]
     root = jnp.sqrt(jnp.maximum(discriminant, 0.0))
-    # Both are the larger root of the derivative over c_3; each avoids cancellation for one sign of c_2.
+    # The minimum is a root of the derivative. Each of the two forms avoids cancellation for one sign of c_2.
     numerator = jnp.where(c[2] > 0, -c[1], root - c[2])
     denominator = jnp.where(c[2] > 0, c[2] + root, 3.0 * c[3])
     minimum = numerator / jnp.where(denominator == 0, 1.0, denominator)
@@ -47,10 +50,10 @@ def first_bracket(c: list) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
 
 
 def first_root(c: list) -> Float[Array, " n"]:
-    """The first root in [0, 1] of cubics that have one and are positive at 0; 0 where they are not.
+    """The first root in [0, 1] of cubics that have one; 0 for cubics that are not positive at 0.
 
-    Newton's method, and bisection where it leaves the bracket by more than rounding explains: a compiler may compute a
-    value twice, a little differently, and the bracket then ends beside the root.
+    Newton's method, with bisection for steps that leave the bracket by more than rounding. Compiled code may compute a
+    value twice with different rounding, so that the bracket ends beside the root.
     """
     high, _ = first_bracket(c)
     drop = c[0] - _polynomial(c, high)

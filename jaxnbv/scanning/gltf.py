@@ -1,4 +1,4 @@
-"""glTF files by trimesh: what it passes over is refused by name, and what it has read is what the file declares."""
+"""Reader of glTF files by trimesh. Rejects features that trimesh ignores, and content that differs from the header."""
 
 import importlib.util
 import json
@@ -15,28 +15,30 @@ from trimesh.resolvers import Resolver
 
 from jaxnbv.checks import require
 
-# What normalised integers are divided by, by the type of their accessor.
+# Divisor of normalised integers, by the component type of their accessor.
 _LARGEST = {5120: 127.0, 5121: 255.0, 5122: 32767.0, 5123: 65535.0}
+# Modes of primitives: the ones that trimesh reads, triangles and strips among them, and fans.
 _KEPT, _TRIANGLES, _FANS = (0, 1, 4, 5), (4, 5), 6
-# A file may require these: they change no shape, or trimesh reads them.
+# Required extensions that are allowed, since trimesh reads them or they do not change the shape.
 _HARMLESS = re.compile("material|texture|light|mesh_quantization|xmp|KHR_draco_mesh_compression")
 _ROUNDING = 1e-3
-_REMEDY = "export it again without, from Blender say"
+_REMEDY = "export the file again without these, for example from Blender"
 
 
 def read_gltf(content: bytes, kind: str, resolver: Resolver) -> trimesh.Scene:
-    """The scene of a file.
+    """The scene in a glTF file.
 
-    - `kind`: "gltf" or "glb"; `resolver`: of the files that it names.
+    - `kind`: "gltf" or "glb".
+    - `resolver`: trimesh's resolver of the files that this one refers to.
 
-    **Raises:** `ValueError` for what trimesh does not read, and for counts or bounds that are not the declared ones.
+    **Raises:** `ValueError` for features that trimesh does not read, and for counts or bounds other than declared.
     """
     text = content[20 : 20 + struct.unpack("<I", content[12:16])[0]] if kind == "glb" else content
     header = json.loads(text)
     unread = sorted(set(_unread(header)))
     require(not unread, f"has {', '.join(unread)}, which trimesh does not read: {_REMEDY}")
     scene = trimesh.load_scene(BytesIO(content), kind, resolver, process=False)
-    # trimesh keeps primitives in their order.
+    # trimesh keeps the order of primitives.
     kept = [(index, part) for index, part in _primitives(header) if part.get("mode", 4) in _KEPT]
     require(len(kept) == len(scene.geometry), f"has {len(kept)} primitives, but trimesh reads {len(scene.geometry)}")
     boxes: dict[int, list[Float[np.ndarray, "8 3"]]] = {}
@@ -58,21 +60,23 @@ def read_gltf(content: bytes, kind: str, resolver: Resolver) -> trimesh.Scene:
         boxes.setdefault(index, []).append(trimesh.bounds.corners(bounds))
     expected = [trimesh.transform_points(box, to) for index, to in _placed(header) for box in boxes.get(index, [])]
     placed = [part.bounds for part in scene.dump() if isinstance(part, trimesh.Trimesh)]
-    require(len(placed) == len(expected), f"places {len(expected)} meshes, but trimesh reads {len(placed)}: {_REMEDY}")
+    require(
+        len(placed) == len(expected), f"places {len(expected)} meshes, but trimesh reads {len(placed)}: export it again"
+    )
     if placed:
         low, high = np.min(expected, axis=(0, 1)), np.max(expected, axis=(0, 1))
         slack = _ROUNDING * np.abs([low, high]).max()
-        found = np.min(placed, axis=0)[0], np.max(placed, axis=0)[1]
+        extent = np.min(placed, axis=0)[0], np.max(placed, axis=0)[1]
         require(
-            bool((found[0] >= low - slack).all() and (found[1] <= high + slack).all()),
-            f"places its meshes within {low.tolist()} to {high.tolist()}, but trimesh in {found[0].tolist()} to "
-            f"{found[1].tolist()}: apply the nodes' transforms and export it again",
+            bool((extent[0] >= low - slack).all() and (extent[1] <= high + slack).all()),
+            f"places its meshes within {low.tolist()} to {high.tolist()}, but trimesh within {extent[0].tolist()} to "
+            f"{extent[1].tolist()}: apply the nodes' transforms and export it again",
         )
     return scene
 
 
 def _unread(header: dict[str, Any]) -> Iterator[str]:
-    """Names of what is in a file and changes its shape, but is passed over."""
+    """Names of features in a file that change its shape but that trimesh ignores."""
     yield from (name for name in header.get("extensionsRequired", []) if not _HARMLESS.search(name))
     for node in header.get("nodes", []):
         if "mesh" in node and "skin" in node:
@@ -101,7 +105,7 @@ def _primitives(header: dict[str, Any]) -> list[tuple[int, dict[str, Any]]]:
 
 
 def _placed(header: dict[str, Any]) -> Iterator[tuple[int, Float[np.ndarray, "4 4"]]]:
-    """The meshes of the scene, and where its nodes place each."""
+    """Index and matrix (mesh to scene) of each mesh that a node of the scene places."""
     scenes = header.get("scenes", [])
     roots = scenes[header.get("scene", 0)].get("nodes", []) if scenes else []
     waiting = [(root, np.eye(4)) for root in roots]

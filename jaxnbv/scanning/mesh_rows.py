@@ -1,4 +1,4 @@
-"""Vertices and faces of formats that are rows of text: OBJ and OFF."""
+"""Readers of vertices and faces from text formats: OBJ and OFF."""
 
 import codecs
 import io
@@ -13,7 +13,7 @@ from jaxnbv.checks import InputError, require
 
 Triangles: TypeAlias = tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]
 
-# Longer marks first: that of UTF-32 begins with that of UTF-16.
+# Longer marks come first, since the mark of UTF-32 begins with that of UTF-16.
 _MARKS = (
     (codecs.BOM_UTF32_LE, "utf-32"),
     (codecs.BOM_UTF32_BE, "utf-32"),
@@ -24,7 +24,7 @@ _MARKS = (
 
 
 def without_mark(content: bytes) -> bytes:
-    """The bytes of a file, and of a text with a byte order mark the UTF-8 without it."""
+    """The bytes of a file; text with a byte order mark becomes UTF-8 without the mark."""
     for mark, encoding in _MARKS:
         if content.startswith(mark):
             return content.decode(encoding, "replace").encode()
@@ -32,9 +32,9 @@ def without_mark(content: bytes) -> bytes:
 
 
 def read_obj(content: bytes) -> dict[str, Triangles]:
-    """The triangles of each material; polygons are cut into fans.
+    """The triangles of each material of an OBJ file. Polygons are cut into fans.
 
-    **Raises:** `ValueError` for a vertex or a face that is no row of numbers.
+    **Raises:** `ValueError` for a vertex or a face that is not a row of numbers.
     """
     vertices: list[list[str]] = []
     polygons: dict[str, list[list[int]]] = {}
@@ -50,8 +50,8 @@ def read_obj(content: bytes) -> dict[str, Triangles]:
             try:
                 corners = [int(value.partition("/")[0]) for value in values]
             except ValueError as error:
-                raise InputError(f"has a face {line.strip()!r}, whose corners are no numbers of vertices") from error
-            # What is negative counts back from the last vertex so far.
+                raise InputError(f"has a face {line.strip()!r}, whose corners are not vertex numbers") from error
+            # Negative numbers count back from the last vertex so far.
             rows = [corner - 1 if corner > 0 else len(vertices) + corner if corner else -1 for corner in corners]
             polygons.setdefault(material, []).append(rows)
     places = numbers_of(vertices)
@@ -64,31 +64,31 @@ def read_obj(content: bytes) -> dict[str, Triangles]:
 def read_off(content: bytes) -> Triangles:
     """The triangles of an OFF file, with or without colours and normals.
 
-    **Raises:** `ValueError` for another kind of OFF, rows that are missing, or what is no number.
+    **Raises:** `ValueError` for another kind of OFF, missing rows, or entries that are not numbers.
     """
     text = re.sub("#.*", "", content.decode("utf-8", "replace"))
     head = re.match(r"\s*(ST)?C?N?OFF\b\s*|\s*(ST)?C?N?OFF(?=\d)", text)
     require(
         head is not None and not text[head.end() :].startswith("BINARY"),
-        "is no OFF file of text with three coordinates a vertex: save it as PLY",
+        "is not a text OFF file with three coordinates per vertex: save it as PLY",
     )
     rows = [line.split() for line in text[head.end() if head else 0 :].splitlines() if line.strip()]
-    require(bool(rows) and len(rows[0]) >= 2 and "".join(rows[0][:2]).isdigit(), "has no numbers of vertices and faces")
+    require(bool(rows) and len(rows[0]) >= 2 and "".join(rows[0][:2]).isdigit(), "declares no vertex and face counts")
     num_vertices, num_faces = int(rows[0][0]), int(rows[0][1])
     points, polygons = rows[1 : num_vertices + 1], rows[num_vertices + 1 : num_vertices + num_faces + 1]
     for rows, count, what in ((points, num_vertices, "vertices"), (polygons, num_faces, "faces")):
         require(len(rows) == count, cut_short(len(rows), count, what))
     corners = []
     for row in polygons:
-        named = row[1 : int(row[0]) + 1] if row[0].isdigit() else []
-        proper = row[0] == str(len(named)) and all(word.isdigit() for word in named)
-        require(proper, f"has a face {' '.join(row)!r}, which is not the number of its corners and their vertices")
-        corners.append([int(word) for word in named])
+        words = row[1 : int(row[0]) + 1] if row[0].isdigit() else []
+        proper = row[0] == str(len(words)) and all(word.isdigit() for word in words)
+        require(proper, f"has a face {' '.join(row)!r}, which is not a number of corners and their vertices")
+        corners.append([int(word) for word in words])
     return numbers_of([row[:3] for row in points]), triangles_of(corners)
 
 
 def triangles_of(polygons: Sequence[Sequence[int]] | Sequence[np.ndarray] | np.ndarray) -> Int[np.ndarray, "f 3"]:
-    """Fans about the first corners; what has fewer than three is no face."""
+    """Triangles of polygons, as fans about the first corner. Fewer than three corners give no triangle."""
     if isinstance(polygons, np.ndarray):
         alike = [polygons]
     else:
@@ -101,7 +101,7 @@ def triangles_of(polygons: Sequence[Sequence[int]] | Sequence[np.ndarray] | np.n
 
 
 def _used(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Triangles:
-    """The triangles with the vertices that they use."""
+    """The same triangles with only the vertices that they use."""
     if not len(faces) or faces.min() < 0 or faces.max() >= len(vertices):
         return vertices, faces
     rows, faces = np.unique(faces, return_inverse=True)
@@ -109,13 +109,16 @@ def _used(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> 
 
 
 def numbers_of(rows: list[list[str]]) -> Float[np.ndarray, "n k"]:
-    """**Raises:** `ValueError` for rows that differ in length or are no numbers."""
+    """Rows of words as an array of numbers.
+
+    **Raises:** `ValueError` for rows that differ in length or are not numbers.
+    """
     try:
         return np.array(rows, np.float64) if rows else np.zeros((0, 3))
     except ValueError as error:
         commas = any("," in word for row in rows for word in row)
         remedy = "write decimal points in place of commas" if commas else "it is damaged: fetch it again"
-        raise InputError(f"has rows that are not numbers of one count ({error}): {remedy}") from error
+        raise InputError(f"has rows that are not numbers or differ in length ({error}): {remedy}") from error
 
 
 def cut_short(count: int, declared: int, what: str) -> str:

@@ -1,4 +1,4 @@
-"""Vertices and faces of PLY files, of any encoding."""
+"""Reader of vertices and faces from PLY files of any encoding."""
 
 import re
 from collections.abc import Iterable
@@ -13,16 +13,16 @@ from jaxnbv.scanning.mesh_rows import Triangles, cut_short, numbers_of, triangle
 _TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
 _TYPES |= {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"}
 _TYPES |= {"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"}
-# Text is read as if its numbers had been stored in 64 bits.
+# Text is converted to 64-bit numbers first.
 _ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
-# Its name, its type, and for a list the type of its length.
+# Name of a property, its type, and for a list the type of its length.
 _Property: TypeAlias = tuple[str, np.dtype, np.dtype | None]
 
 
 def read_ply(content: bytes) -> Triangles:
     """The triangles of a PLY file: its faces, cut into fans, and its strips of triangles.
 
-    **Raises:** `ValueError` for a header that is none, and rows that are missing or no numbers.
+    **Raises:** `ValueError` for an invalid header, missing rows, or entries that are not numbers.
     """
     head = re.match(rb"ply\s.*?[\r\n]end_header[ \t]*(\r\n|\n|\r)", content, re.DOTALL)
     encoding, elements = _header(head.group().decode("latin1") if head else "")
@@ -42,31 +42,31 @@ def read_ply(content: bytes) -> Triangles:
 
 
 def _header(text: str) -> tuple[str, dict[str, tuple[int, list[_Property]]]]:
-    """The encoding, and the number and the properties of each element."""
+    """The encoding, and the count and properties of each element."""
     encoding, elements = "", dict[str, tuple[int, list[_Property]]]()
 
     def kind_of(word: str) -> np.dtype:
-        require(word in _TYPES, f"has values of a type {word!r}, which PLY does not have: save it again")
+        require(word in _TYPES, f"has values of type {word!r}, which PLY does not define: save it again")
         return np.dtype("<f8" if encoding == "ascii" else _ORDERS[encoding] + _TYPES[word])
 
     for line in re.split("[\\r\\n]+", text):
         words = line.split()
         if words[:1] == ["format"]:
             encoding = words[1]
-            require(encoding in _ORDERS, f"is a PLY file of an encoding {encoding!r}: save it as binary or ASCII")
+            require(encoding in _ORDERS, f"is a PLY file with encoding {encoding!r}: save it as binary or ASCII")
         elif words[:1] == ["element"]:
             elements[words[1]] = int(words[2]), []
         elif words[:1] == ["property"]:
             length = kind_of(words[2]) if words[1] == "list" else None
             elements[next(reversed(elements))][1].append((words[-1], kind_of(words[-2]), length))
-    require(encoding != "", "has no header of a PLY file")
+    require(encoding != "", "has no PLY header")
     return encoding, elements
 
 
 def _element(
     body: bytes, start: int, element: str, count: int, properties: list[_Property]
 ) -> tuple[dict[str, Any], int]:
-    """The columns of an element by name, of a list one array a row, and where it ends."""
+    """The columns of an element by name, and the byte at which it ends. Lists have one array per row."""
     if count == 0:
         return {name: [] for name, *_ in properties}, start
     what = f"{element!r} elements"
@@ -89,9 +89,9 @@ def _element(
 
 
 def _row(body: bytes, start: int, properties: list[_Property], message: str) -> tuple[list[np.ndarray], int]:
-    """The values of a row, and where it ends.
+    """The values of a row, and the byte at which it ends.
 
-    **Raises:** `ValueError` with this message where the file ends before.
+    **Raises:** `ValueError` with this message if the file ends before.
     """
     row: list[np.ndarray] = []
     for _, kind, length in properties:
@@ -106,7 +106,7 @@ def _row(body: bytes, start: int, properties: list[_Property], message: str) -> 
 
 
 def _of_strips(strips: Iterable[np.ndarray]) -> Int[np.ndarray, "f 3"]:
-    """Strips that -1 ends; every second triangle of one is wound the other way."""
+    """Triangles of strips that end with -1. Every second triangle of a strip is wound the other way."""
     faces = [np.zeros((0, 3), np.int64)]
     for strip in strips:
         whole = np.asarray(strip, np.int64)

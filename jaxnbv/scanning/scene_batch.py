@@ -1,4 +1,4 @@
-"""Scenes of one structure along a leading axis, for a program that scans any of them."""
+"""Stacking of scenes with the same structure, so that one compiled program scans any of them."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -17,9 +17,10 @@ from jaxnbv.scanning.sphere_tracing import SDFSurface
 
 
 def scene_batch(scenes: Any, count: int) -> Surface:
-    """The scenes with a leading axis on their arrays.
+    """The scenes as one surface whose arrays have a leading axis.
 
-    **Raises:** `ValueError` for a scene that JAX cannot trace, unless there are `count`, and for several structures.
+    **Raises:** `ValueError` for a scene that JAX cannot trace, a number of scenes other than `count`, or scenes with
+    different structures.
     """
     if not isinstance(scenes, Sequence):
         batch = _traceable(scenes, "the scene")
@@ -36,8 +37,8 @@ def scene_batch(scenes: Any, count: int) -> Surface:
     for index, surface in enumerate(surfaces):
         require(
             _structure(surface) == _structure(surfaces[0]),
-            f"scene {index} ({_kind(surface)}) has another structure, or other shapes of arrays, than scene 0 "
-            f"({_kind(surfaces[0])}), and one program scans scenes of one: sample them all on one grid, with "
+            f"scene {index} ({_kind(surface)}) has another structure or other shapes of arrays than scene 0 "
+            f"({_kind(surfaces[0])}), but one program needs the same for all: sample them all on one grid, with "
             "nbv.scanning.GridSurface.from_values",
         )
     return jax.tree.map(lambda *leaves: jnp.stack(leaves) if eqx.is_array(leaves[0]) else leaves[0], *surfaces)
@@ -47,7 +48,7 @@ def _traceable(scene: Any, name: str) -> Surface:
     is_mesh = isinstance(scene, trimesh.Geometry) or (isinstance(scene, Surface) and not scene.in_jit)
     require(
         not is_mesh,
-        f"{name} is {shown(scene)}, which host code scans, and a compiled program cannot: give it as a solid, "
+        f"{name} is {shown(scene)}, which a compiled program cannot scan: give it as a solid, "
         "nbv.sdf.solid_of_mesh(mesh.vertices, mesh.faces, cubic=True), or call simulate for each",
     )
     check_type(scene, Surface | SignedDistance, name)
@@ -55,7 +56,7 @@ def _traceable(scene: Any, name: str) -> Surface:
 
 
 def _structure(surface: Surface) -> Any:
-    """What surfaces must share to be stacked."""
+    """The structure, array shapes and static values that surfaces must share to be stacked."""
     arrays, rest = eqx.partition(surface, eqx.is_array)
     return jax.tree.structure(arrays), list(map(np.shape, jax.tree.leaves(arrays))), jax.tree.leaves(rest)
 

@@ -1,4 +1,4 @@
-"""From a cloud to a surface by screened Poisson surface reconstruction, for comparison."""
+"""Screened Poisson surface reconstruction of a cloud, for comparison."""
 
 import numpy as np
 
@@ -20,11 +20,12 @@ def has_poisson() -> bool:
 
 @checked
 def screened_poisson(cloud: PointCloud, depth: int = 8) -> TriangleMesh:
-    """Screened Poisson surface reconstruction (Kazhdan and Hoppe 2013) of an oriented cloud, as MeshLab has it.
+    """MeshLab's screened Poisson reconstruction (Kazhdan and Hoppe 2013) of an oriented cloud.
 
-    `depth` is that of the octree: details down to 1 / 2^depth of the cloud's size, where there are points for them.
-    The mesh is in scene coordinates (its frame is the identity), its faces wound outward, and the same from run to run.
-    It bridges what was not scanned, and is open where it leaves a cube 1.1 times the cloud's size.
+    The mesh is in scene coordinates (its frame is the identity), with faces wound outward, and the same in every run.
+    It bridges gaps in the scan, and is open where it leaves a cube 1.1 times the cloud's size.
+
+    - `depth`: depth of the octree. Details go down to 1 / 2^depth of the cloud's size if there are points for them.
 
     **Raises:** `ValueError` if `pymeshlab`, an optional dependency (GPL), is not installed, the depth is not within
     [1, 12], the cloud has fewer than four points, entries that are not finite, or no surface comes out.
@@ -47,10 +48,10 @@ def screened_poisson(cloud: PointCloud, depth: int = 8) -> TriangleMesh:
     require(finite, "the cloud has points or normals that are not finite: build it with PointCloud.from_arrays")
     meshes = pymeshlab.MeshSet(verbose=False)
     meshes.add_mesh(pymeshlab.Mesh(vertex_matrix=points, v_normals_matrix=normals))
-    # More threads than one change the last bits from run to run.
+    # With more than one thread the last bits change from run to run.
     meshes.generate_surface_reconstruction_screened_poisson(depth=depth, threads=1)
-    found = meshes.current_mesh()
-    vertices, faces = found.vertex_matrix(), found.face_matrix()
+    reconstruction = meshes.current_mesh()
+    vertices, faces = reconstruction.vertex_matrix(), reconstruction.face_matrix()
     require(
         len(faces) > 0,
         f"Poisson reconstruction at depth {depth} found no surface through {len(points)} points: scan more of the "
