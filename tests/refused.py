@@ -451,11 +451,11 @@ REFUSED = {
     "no samples of a posterior": (lambda: POSTERIOR.sample(KEY, 0), "asked for 0 samples"),
     "a target of no points": (lambda: nbv.SoftPartCount(lambda cloud: None, 0.0), "N_target is"),
     "no points for a classifier": (lambda: CloudClassifier(CLASSIFIER, num_points=0), "num_points is 0"),
-    "classes from a segmenter": (lambda: CloudClassifier(SEGMENTER), "a CloudSegmenter feeds it"),
+    "classes from a segmenter": (lambda: CloudClassifier(SEGMENTER), "give it to CloudSegmenter"),
     "objects without a side": (lambda: pretrained_classifier("pyramid", 0.0), "longest side is 0.0"),
     "a classifier that does not ship": (
         lambda: pretrained_classifier("teapot"),
-        "no classifier of 'teapot' ships: ",
+        "there is no shipped classifier 'teapot': ",
         "choose from pyramid",
     ),
     "a category that does not ship": (lambda: part_segmenter("spoon"), "category 'spoon'"),

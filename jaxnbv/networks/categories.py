@@ -1,6 +1,6 @@
-"""The categories and parts of ShapeNet-part (Yi et al. 2016), in the order that the published networks know them in.
+"""Categories and parts of ShapeNet-part (Yi et al. 2016), in the order of the published networks.
 
-The data set's files number the fifty parts but do not name them; the names here are descriptions.
+The data set's files number the fifty parts without naming them. The names here are descriptions.
 """
 
 from typing import NamedTuple
@@ -12,7 +12,7 @@ from jaxnbv.checks import require
 
 
 class Category(NamedTuple):
-    """A kind of object: its name, its folder in the data set, its parts' names, and the label of the first part."""
+    """A category of objects: its name, its folder in the data set, names of its parts, and label of the first part."""
 
     name: str
     synset: str
@@ -47,7 +47,7 @@ NUM_PARTS = 50
 
 
 def category_index(name: str) -> int:
-    """The place of a category, by its name, in `CATEGORIES` and in the networks' one-hot input.
+    """Index of a category in `CATEGORIES` and in the networks' one-hot input, by its name.
 
     **Raises:** `ValueError` for an unknown name.
     """
@@ -57,5 +57,5 @@ def category_index(name: str) -> int:
 
 
 def part_mask() -> Bool[np.ndarray, "categories parts"]:
-    """Which of the fifty parts belong to which of the sixteen categories."""
+    """Mask of the parts, out of fifty, that belong to each of the sixteen categories."""
     return np.array([[label in category.labels for label in range(NUM_PARTS)] for category in CATEGORIES])

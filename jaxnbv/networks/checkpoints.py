@@ -1,7 +1,7 @@
-"""Networks from files and back: published PointNet++ checkpoints, and the files of our own networks.
+"""Networks in files: published PointNet++ checkpoints, and the files of jaxnbv's own networks.
 
-Of our own a file holds the arrays, by attribute paths such as `pattern.pair.weight`, and in its metadata the kind of
-network and what it was made of.
+A file of a network of jaxnbv holds the arrays by attribute paths such as `pattern.pair.weight`. Its metadata hold the
+class of the network and the arguments of its constructor.
 """
 
 import functools
@@ -34,11 +34,11 @@ _KINDS: dict[str, type] = {kind.__name__: kind for kind in (InvariantClassifier,
 def load_checkpoint(path: str | Path) -> Network:
     """The network in a PyTorch (.pth, .pt) or .safetensors file.
 
-    That is a classifier or a part segmenter: PointNet++ as published, or one of our own that `save_checkpoint` wrote.
-    Nothing in the file is run, and PyTorch is not needed. `CloudClassifier` and `CloudSegmenter` feed it clouds.
+    It is a classifier or a part segmenter: PointNet++ as published, or a network of jaxnbv from `save_checkpoint`.
+    Nothing in the file is run, and PyTorch is not needed. Wrap the network in `CloudClassifier` or `CloudSegmenter`.
 
-    **Raises:** `ValueError` for another suffix, a file that is missing or damaged, and for tensors that make none of
-    these networks.
+    **Raises:** `ValueError` for another suffix, for a file that is missing or damaged, and for tensors that do not fit
+    any of these networks.
     """
     tensors, metadata = _read(path)
     try:
@@ -46,14 +46,14 @@ def load_checkpoint(path: str | Path) -> Network:
             return _filled(_blank(metadata["network"]), tensors)
         return published_network(tensors)
     except InputError as error:
-        raise InputError(f"{path} does not hold a network that is known here: {error}") from error
+        raise InputError(f"{path} does not hold a supported network: {error}") from error
 
 
 @checked
 def save_checkpoint(network: OwnNetwork, path: str | Path) -> None:
-    """Write one of our own networks as a safetensors file.
+    """Write a network of jaxnbv as a safetensors file.
 
-    **Raises:** `ValueError` for another network, and for a place that cannot be written.
+    **Raises:** `ValueError` for another network, or for a file that cannot be written.
     """
     settings = network.settings if isinstance(network, InvariantClassifier) else {}
     metadata = {"network": json.dumps({"kind": type(network).__name__, **settings})}
@@ -78,27 +78,27 @@ def _read(path: str | Path) -> tuple[_Tensors, Mapping[str, str]]:
         raise InputError(f"{path} is damaged or no safetensors file ({error}): fetch or write it again") from error
 
 
-def _blank(said: str) -> Any:
-    """The shapes of one of our own networks that a file's metadata tell of."""
+def _blank(text: str) -> Any:
+    """A network of jaxnbv with shapes in place of arrays, from the text in a file's metadata."""
     try:
-        found = json.loads(said)
-        kind = _KINDS[found.pop("kind")]
-        settings = {name: tuple(value) if isinstance(value, list) else value for name, value in found.items()}
+        arguments = json.loads(text)
+        kind = _KINDS[arguments.pop("kind")]
+        settings = {name: tuple(value) if isinstance(value, list) else value for name, value in arguments.items()}
         return eqx.filter_eval_shape(functools.partial(kind, key=jax.random.key(0), **settings))
     except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise InputError(f"its metadata say {said[:200]!r}, which makes no network ({error})") from error
+        raise InputError(f"its metadata are {text[:200]!r}, which makes no network ({error})") from error
 
 
 def _filled(blank: Any, arrays: _Tensors) -> Any:
-    """The network of the shapes of `blank`, with these arrays."""
+    """The network `blank` with these arrays in place of its shapes."""
     expected = {name: leaf.shape for name, leaf in _named(blank)}
     leaves: dict[str, np.ndarray] = {}
     for name in sorted(expected.keys() | arrays.keys()):
         require(name in arrays, f"the array {name} is missing")
         require(name in expected, f"the array {name} has no place in it")
-        found = arrays[name].shape
-        require(found == expected[name], f"the array {name} has shape {found}; expected {expected[name]}")
-        # Numbers of 64 bits may not be finite in the type that they are used in.
+        shape = arrays[name].shape
+        require(shape == expected[name], f"the array {name} has shape {shape}; expected {expected[name]}")
+        # 64-bit numbers may overflow in JAX's default type.
         with np.errstate(over="ignore"):
             leaves[name] = arrays[name].astype(jnp.result_type(float))
         require(bool(np.isfinite(leaves[name]).all()), f"the array {name} has entries that are not finite")

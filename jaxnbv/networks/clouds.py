@@ -1,4 +1,4 @@
-"""From a network on arrays to the classifier or the segmenter of clouds that the tasks take."""
+"""Classifiers and segmenters of clouds from networks on arrays."""
 
 from collections.abc import Callable
 
@@ -17,12 +17,13 @@ from jaxnbv.tasks.segmentation import Segmenter
 
 
 class CloudClassifier(Classifier):
-    """A network as a function from a `PointCloud` to log-probabilities.
+    """A classifier from a network: maps a `PointCloud` to log-probabilities.
 
     - `network`: called as `network(points, normals, mask)`.
-    - `num_points`: what it is fed, by farthest point sampling; a smaller cloud is fed as it is, masked.
+    - `num_points`: number of points of the network's input, by farthest point sampling. A smaller cloud is padded with
+      masked rows.
     - `scale`: network units per scene unit.
-    - `classes`: their names, where known; by default the network's own.
+    - `classes`: names of the classes, by default the network's own, or None.
 
     **Raises:** `ValueError` if `num_points` or `scale` is not positive, or for a network that segments parts.
     """
@@ -42,25 +43,26 @@ class CloudClassifier(Classifier):
         names = () if self.classes is None else self.classes
         proper = isinstance(names, tuple) and all(isinstance(name, str) for name in names)
         require(proper, f"the classes are {shown(self.classes)}; give a tuple of names")
-        require(not parts, "the network segments parts; a CloudSegmenter feeds it clouds")
+        require(not parts, "the network segments parts: give it to CloudSegmenter")
         require(self.num_points >= 1, f"num_points is {self.num_points}; the network needs at least one")
         require(self.scale > 0, f"the scale is {self.scale}; it must be positive")
 
     def __call__(self, cloud: PointCloud) -> Float[Array, " classes"]:
         """Log-probabilities of the classes of one cloud in scene coordinates."""
-        fed = farthest_point_subsample(cloud, self.num_points)
-        return self.network(self.scale * fed.points, fed.normals, fed.mask)
+        inputs = farthest_point_subsample(cloud, self.num_points)
+        return self.network(self.scale * inputs.points, inputs.normals, inputs.mask)
 
 
 class CloudSegmenter(Segmenter):
-    """A network as a function from a `PointCloud` to the probabilities of the parts of a known category, row by row.
+    """A segmenter from a network: maps a `PointCloud` to probabilities of the parts of a category, row by row.
 
     Category and scale are arrays, so objects that differ in them share one compilation.
 
-    - `network`: called as `network(points, normals, category, mask)`; gives log-probabilities of the fifty parts of
-      ShapeNet-part.
-    - `category`: what the object is, by its name in `CATEGORIES` or its index there.
-    - `num_points`: what the network is fed, by farthest point sampling; a smaller cloud is fed as it is, masked.
+    - `network`: called as `network(points, normals, category, mask)`. It returns log-probabilities of the fifty parts
+      of ShapeNet-part.
+    - `category`: category of the object, by its name or index in `CATEGORIES`.
+    - `num_points`: number of points of the network's input, by farthest point sampling. A smaller cloud is padded with
+      masked rows.
     - `scale`: network units per scene unit.
 
     **Raises:** `ValueError` for an unknown category, if `num_points` or `scale` is not positive, or for a network that
@@ -86,10 +88,10 @@ class CloudSegmenter(Segmenter):
         if not is_traced(index):
             index = index.item() if isinstance(index, AnyArray) and index.ndim == 0 else index
             check_type(index, int, "the category")
-            known = bool(0 <= index < len(CATEGORIES))
-            require(known, f"the category is {index}; choose 0 to {len(CATEGORIES) - 1}, or a name such as 'chair'")
+            is_valid = bool(0 <= index < len(CATEGORIES))
+            require(is_valid, f"the category is {index}; choose 0 to {len(CATEGORIES) - 1}, or a name such as 'chair'")
         whole = isinstance(network, PointNet2Classifier | InvariantClassifier)
-        require(not whole, "the network classifies whole clouds; a CloudClassifier feeds it clouds")
+        require(not whole, "the network classifies whole clouds: give it to CloudClassifier")
         require(num_points >= 1, f"num_points is {num_points}; the network needs at least one")
         require(is_traced(scale) or float(scale) > 0, f"the scale is {scale}; it must be positive")
         self.network, self.num_points = network, num_points
@@ -97,27 +99,27 @@ class CloudSegmenter(Segmenter):
 
     @property
     def part_names(self) -> dict[int, str]:
-        """The parts of the category, by their index among the fifty."""
+        """Names of the category's parts, by their index among the fifty."""
         category = CATEGORIES[int(self.category)]
         return dict(zip(category.labels, category.parts, strict=True))
 
     def __call__(self, cloud: PointCloud) -> Float[Array, "num_points parts"]:
-        """p(part) at the points that are fed; exactly zero for parts of other categories, and in rows without a point.
+        """p(part) at the network's input points. Zero for parts of other categories and in rows without a point.
 
-        The network's probabilities, given that the part is one of the category's.
+        These are the network's probabilities, conditioned on the parts of the category.
         """
         return self._probabilities(farthest_point_subsample(cloud, self.num_points))
 
     def predict(self, cloud: PointCloud) -> tuple[PointCloud, Int[Array, " num_points"]]:
-        """The points that are fed, in scene coordinates, and the likeliest part of each; -1 in rows without a point."""
-        fed = farthest_point_subsample(cloud, self.num_points)
-        labels = jnp.argmax(self._probabilities(fed), axis=-1).astype(jnp.int32)
-        return fed, jnp.where(fed.mask, labels, -1)
+        """The network's input points in scene coordinates, and the likeliest part of each (-1 in masked rows)."""
+        inputs = farthest_point_subsample(cloud, self.num_points)
+        labels = jnp.argmax(self._probabilities(inputs), axis=-1).astype(jnp.int32)
+        return inputs, jnp.where(inputs.mask, labels, -1)
 
-    def _probabilities(self, fed: PointCloud) -> Float[Array, "num_points parts"]:
-        log_p = self.network(self.scale * fed.points, fed.normals, self.category, fed.mask)
-        known = log_p.shape[-1]
-        require(known == NUM_PARTS, f"the network knows {known} parts; give one that knows the 50 of ShapeNet-part")
+    def _probabilities(self, inputs: PointCloud) -> Float[Array, "num_points parts"]:
+        log_p = self.network(self.scale * inputs.points, inputs.normals, self.category, inputs.mask)
+        count = log_p.shape[-1]
+        require(count == NUM_PARTS, f"the network has {count} parts; give one with the 50 parts of ShapeNet-part")
         allowed = jnp.asarray(part_mask())[self.category]
         p = jax.nn.softmax(jnp.where(allowed, log_p, -jnp.inf), axis=-1)
-        return jnp.where(fed.mask[:, None], p, 0.0)
+        return jnp.where(inputs.mask[:, None], p, 0.0)

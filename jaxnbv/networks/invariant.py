@@ -1,4 +1,4 @@
-"""Small classifiers that do not depend on how the object is turned, of pairs of oriented points."""
+"""Small rotation-invariant classifiers, on features of pairs of oriented points."""
 
 from typing import Any
 
@@ -12,19 +12,20 @@ from jaxnbv.geometry.farthest_points import farthest_point_indices
 from jaxnbv.networks.layers import ball_query, interpolate, product
 
 _POOLED = 192
-# Of `Focus`: the centres of its second level, and the points that it chooses.
+# `Focus`: number of centres of its second level, and number of points that it chooses.
 _CENTERS, _CHOSEN = 384, 320
 
 
 class PairLevel(eqx.Module):
-    """One level of grouping: pair features and the neighbours' features through a perceptron, then the maximum.
+    """One level of grouping: a perceptron of pair features and neighbours' features, then the maximum over neighbours.
 
-    A pair of oriented points enters as (|d|^2, n_i . d, n_j . d, n_i . n_j) with d = (x_j - x_i) / radius: the
-    point-pair features of Drost et al. (2010) without their square root and arc cosines, so that derivatives are
-    defined everywhere.
+    The features of a pair of oriented points are (|d|^2, n_i . d, n_j . d, n_i . n_j) with d = (x_j - x_i) / radius:
+    the point-pair features of Drost et al. (2010) without square root and arc cosines, so that derivatives exist
+    everywhere.
 
-    - `radius`: of a group, in the units of the points; it takes the first `neighbours` rows within.
-    - `groups`: how many centres it is meant for; its user chooses them.
+    - `radius`: radius of a group, in the units of the points.
+    - `groups`: intended number of centres, which the caller chooses.
+    - `neighbours`: maximum size of a group, the first rows within its radius.
     """
 
     pair: eqx.nn.Linear
@@ -49,7 +50,11 @@ class PairLevel(eqx.Module):
         neighbourhood: tuple[Float[Array, "n 3"], Float[Array, "n 3"], Float[Array, "n inputs"] | None],
         mask: Bool[Array, " n"],
     ) -> Float[Array, "m outputs"]:
-        """What is found around each centre, a point with its normal, of points with normals and features."""
+        """Features of each centre.
+
+        - `centers`: points and normals of the centres.
+        - `neighbourhood`: points, normals and features of all rows.
+        """
         points, normals, features = neighbourhood
         index = ball_query(centers[0], points, mask, self.radius, self.neighbours)
         d = (points[index] - centers[0][:, None]) / self.radius
@@ -57,22 +62,22 @@ class PairLevel(eqx.Module):
         pairs = jnp.stack([jnp.sum(a * b, axis=-1) for a, b in ((d, d), (here, d), (there, d), (here, there))], axis=-1)
         hidden = _affine(self.pair, pairs.reshape(-1, 4))
         if self.feature is not None and features is not None:
-            # Linear, so the features meet their weights once a point rather than once a pair.
+            # The map is linear, so it is computed once for each point and not for each pair.
             hidden = hidden + product(features, self.feature.weight.T)[index].reshape(hidden.shape)
         output = _affine(self.output, jax.nn.relu(hidden))
         return jax.nn.relu(jnp.max(output.reshape(*index.shape, -1), axis=1))
 
 
 def _affine(layer: Any, rows: Float[Array, "*rows inputs"]) -> Float[Array, "*rows outputs"]:
-    """A linear layer of all rows."""
+    """A linear layer, applied to all rows."""
     return product(rows, layer.weight.T) + layer.bias
 
 
 class Focus(eqx.Module):
-    """For every point, whether it is on the cue of the class; rotations and translations leave the answers as they are.
+    """Network that tells which points are on the cue of the class. Invariant under rotations and translations.
 
-    The edges around each point, what lies around farthest point samples of them, carried back to the points, and a
-    perceptron of both; about 12,000 parameters.
+    It computes features of each point's edges, groups them around farthest point samples, interpolates these back to
+    the points, and applies a perceptron to both. It has about 12,000 parameters.
     """
 
     edge: PairLevel
@@ -88,7 +93,7 @@ class Focus(eqx.Module):
     def __call__(
         self, points: Float[Array, "n 3"], normals: Float[Array, "n 3"], mask: Bool[Array, " n"]
     ) -> Float[Array, " n"]:
-        """The logarithm of the odds that a point is on the cue; of masked rows it means nothing."""
+        """Log-odds that each point is on the cue. Meaningless in masked rows."""
         edges = self.edge((points, normals), (points, normals, None), mask)
         order = farthest_point_indices(points, mask, self.around.groups)
         around = self.around((points[order], normals[order]), (points, normals, edges), mask)
@@ -99,27 +104,30 @@ class Focus(eqx.Module):
     def chosen(
         self, points: Float[Array, "n 3"], normals: Float[Array, "n 3"], mask: Bool[Array, " n"]
     ) -> tuple[Float[Array, "few 3"], Float[Array, "few 3"], Bool[Array, " few"]]:
-        """The first 320 points that are on the cue by better than even odds: in farthest point order they are farthest
-        point samples of it."""
+        """The first 320 points that are on the cue by better than even odds, with their normals and mask.
+
+        Points in farthest point order give farthest point samples of the cue.
+        """
         on_cue = mask & (self(points, normals, mask) > 0.0)
         index = jnp.argsort(~on_cue, stable=True)[:_CHOSEN]
         return points[index], normals[index], on_cue[index]
 
 
 class InvariantClassifier(eqx.Module):
-    """PointNet++ on point-pair features, which rotations and translations leave as they are.
+    """PointNet++ on point-pair features, which are invariant under rotations and translations.
 
-    Two levels of grouping, at the scale of an edge and at that of a pattern, and a maximum over all groups; about
-    75,000 parameters.
+    It has two levels of grouping, at the scale of an edge and of a pattern, a maximum over all groups, and about 75,000
+    parameters.
 
-    - `num_classes`, and their names `classes`, where known.
-    - `radii`: of the two levels, in the units of the points.
-    - `groups`: how many each level has; more see more of what is small beside the rest.
-    - `focused`: whether it sees those points alone that its `focus` chooses.
-    - `temperature`: divides the logits; above 1 it makes an over-confident network more careful (Guo et al. 2017).
+    - `num_classes`: number of classes.
+    - `radii`: radii of the two levels, in the units of the points.
+    - `classes`: names of the classes, or None.
+    - `groups`: number of groups of each level. More groups show smaller details.
+    - `focused`: whether it only gets the points that its `focus` chooses.
+    - `temperature`: divides the logits. Above 1 it makes an over-confident network more careful (Guo et al. 2017).
 
-    **Raises:** `ValueError` if the names are not as many as the classes, a radius is not positive, or the second level
-    has more groups than the first.
+    **Raises:** `ValueError` if the number of names is not that of the classes, a radius is not positive, or the second
+    level has more groups than the first.
     """
 
     edge: PairLevel
@@ -154,7 +162,7 @@ class InvariantClassifier(eqx.Module):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What it was made of, beside a key."""
+        """The arguments of the constructor, except the key."""
         levels = self.edge, self.pattern
         return {
             "num_classes": self.head[1].out_features,
@@ -167,11 +175,11 @@ class InvariantClassifier(eqx.Module):
     def __call__(
         self, points: Float[Array, "n 3"], normals: Float[Array, "n 3"], mask: Bool[Array, " n"] | None = None
     ) -> Float[Array, " classes"]:
-        """Log-probabilities of the classes; the normals are unit. Masked rows do not matter."""
+        """Log-probabilities of the classes. Normals must have length one. Masked rows are ignored."""
         mask = jnp.ones(len(points), bool) if mask is None else mask
         if self.focus is not None:
             points, normals, mask = self.focus.chosen(points, normals, mask)
-        # In farthest point order the first rows are themselves farthest point samples of all.
+        # The first rows in farthest point order are farthest point samples themselves.
         order = farthest_point_indices(points, mask, self.edge.groups)
         centers = points[order], normals[order]
         edges = self.edge(centers, (points, normals, None), mask)

@@ -1,13 +1,12 @@
-"""The layers of PointNet++ (Qi et al. 2017). From points with features to fewer points, set abstraction:
+"""The layers of PointNet++ (Qi et al. 2017). Set abstraction maps points with features to fewer points,
 
     g_i = max over j in the ball of c_i of MLP(x_j - c_i, f_j),   c_i by farthest point sampling,
 
-one MLP a radius, their outputs side by side. And from few points back to many, feature propagation:
+with one MLP for each radius and their outputs concatenated. Feature propagation maps back to more points,
 
     f(x) = sum_j w_j f_j / sum_j w_j,   w_j = 1 / (|x - y_j|^2 + 1e-8),   over the three nearest y_j.
 
-Weights are those of inference: batch normalisation is an affine map with fixed numbers there and is part of the layer
-before it.
+Weights are for inference: batch normalisation is then a fixed affine map, and is folded into the layer before it.
 """
 
 import functools
@@ -22,12 +21,12 @@ from jaxnbv.geometry.farthest_points import farthest_point_indices
 
 _WORD = 32
 _NEIGHBOURS = 3
-# Keeps the weight finite where a point and a coarse point coincide; the published number, in units of the points.
+# Keeps the weight finite if a point and a coarse point coincide. The published number, in squared units of the points.
 _SOFTENING = 1e-8
 
 
 def product(x: Float[Array, "*rows inputs"], weight: Float[Array, "inputs outputs"]) -> Float[Array, "*rows outputs"]:
-    """x W in full precision, as one matrix product of all rows."""
+    """x W in full precision, as one matrix product for all rows."""
     flat = jnp.matmul(x.reshape(-1, x.shape[-1]), weight, precision="highest")
     return flat.reshape(*x.shape[:-1], weight.shape[1])
 
@@ -48,24 +47,24 @@ class Linear(eqx.Module):
 
 
 class PooledMLP(eqx.Module):
-    """The same perceptron at each member of a group, then the maximum over the group: PointNet.
+    """PointNet: a perceptron shared by all members of a group, then the maximum over the group.
 
-    - `layers`: two or more, each followed by a rectifier. The first one's leading three inputs are coordinates.
+    - `layers`: two or more, each followed by a rectifier. The first three inputs of the first layer are coordinates.
     """
 
     layers: tuple[Linear, ...]
 
     def lift(self, points: Float[Array, "n 3"], features: Float[Array, "n inputs"] | None) -> Float[Array, "n outputs"]:
-        """[x, f] W of the first layer, without its bias: linear, so it is taken once a point and not once a group."""
+        """[x, f] W of the first layer without bias. It is linear, so once for each point is enough, for all groups."""
         inputs = points if features is None else jnp.concatenate([points, features], axis=-1)
         return product(inputs, self.layers[0].weight)
 
     def pool(self, lifted: Float[Array, "*groups members inputs"]) -> Float[Array, "*groups outputs"]:
-        """What follows the first product: rectifiers, the other layers and the maximum over the members."""
+        """The rest after the first product: rectifiers, the other layers and the maximum over the members."""
         hidden = jax.nn.relu(lifted + self.layers[0].bias)
         for layer in self.layers[1:-1]:
             hidden = jax.nn.relu(layer(hidden))
-        # max relu(x + b) = relu(max x + b): the last bias and rectifier need not see every member.
+        # max relu(x + b) = relu(max x + b): apply the last bias and rectifier once for each group.
         last = self.layers[-1]
         return jax.nn.relu(jnp.max(product(hidden, last.weight), axis=-2) + last.bias)
 
@@ -74,9 +73,9 @@ class SetAbstraction(eqx.Module):
     """One level of PointNet++, with a perceptron for each radius.
 
     - `branches`: the perceptron of each radius.
-    - `radii`: of the balls, in units of the points.
-    - `members`: rows in each ball's group.
-    - `centers`: how many centres are chosen.
+    - `radii`: radii of the balls, in units of the points.
+    - `members`: number of rows in each ball's group.
+    - `centers`: number of centres.
     """
 
     branches: tuple[PooledMLP, ...]
@@ -87,7 +86,7 @@ class SetAbstraction(eqx.Module):
     def __call__(
         self, points: Float[Array, "n 3"], features: Float[Array, "n inputs"] | None, mask: Bool[Array, " n"]
     ) -> tuple[Float[Array, "centers 3"], Float[Array, "centers outputs"]]:
-        """The centres, all filled (repeated where fewer points are), and what was found around each."""
+        """The centres, repeated if there are fewer points, and the features around each."""
         centers = points[farthest_point_indices(points, mask, self.centers)]
         outputs = []
         for branch, radius, members in zip(self.branches, self.radii, self.members, strict=True):
@@ -99,10 +98,10 @@ class SetAbstraction(eqx.Module):
 
 
 class FeaturePropagation(eqx.Module):
-    """One level of the way back: interpolation, then the same perceptron at every point.
+    """One level of feature propagation: interpolation, then a perceptron shared by all points.
 
-    - `layers`: each followed by a rectifier. The first one's inputs are the point's own features, then what is
-      interpolated.
+    - `layers`: each followed by a rectifier. Inputs of the first layer are the point's own features, then the
+      interpolated ones.
     """
 
     layers: tuple[Linear, ...]
@@ -116,7 +115,7 @@ class FeaturePropagation(eqx.Module):
     ) -> Float[Array, "n outputs"]:
         """Features of the points, from their own features and those of the coarse points."""
         first = self.layers[0]
-        # Interpolation is linear, so the first product is taken at the coarse points, which are fewer.
+        # Interpolation is linear, so take the first product at the coarse points, which are fewer.
         lifted = interpolate(points, coarse, product(features, first.weight[own.shape[1] :]))
         x = jax.nn.relu(product(own, first.weight[: own.shape[1]]) + lifted + first.bias)
         for layer in self.layers[1:]:
@@ -132,10 +131,10 @@ def ball_query(
     radius: float | Float[Array, ""],
     count: int,
 ) -> Int[Array, "m count"]:
-    """The first `count` rows within `radius` of each centre, in order of rows; the first of them fills what is left.
+    """Indices of the first `count` rows within `radius` of each centre, padded by the first of them.
 
-    A point at exactly `radius` is within. A centre that has no point within gets the first filled row. Indices carry no
-    derivative; points and features get theirs through `points[index]`.
+    A point at exactly `radius` counts. A centre without any point gets the first filled row. Indices carry no
+    derivative, but `points[index]` does.
 
     **Raises:** `ValueError` if `count` < 1.
     """
@@ -148,10 +147,10 @@ def ball_query(
 
 
 def _positions_of_true(flags: Bool[Array, "m n"], count: int) -> Int[Array, "m count"]:
-    """Columns of the first `count` true entries of each row, n or more where there are no more.
+    """Columns of the first `count` true entries of each row, padded by values of at least n.
 
-    The row is packed into words of 32 bits: the numbers of bits in the words say which word holds the k-th entry, and
-    five halvings of the word where in it. This costs one pass over the flags; sorting the columns costs many.
+    The row is packed into words of 32 bits. Bit counts of the words give the word of the k-th entry, and five halvings
+    of the word give its bit. This takes one pass over the flags, while sorting the columns takes many.
     """
     flags = jnp.pad(flags, ((0, 0), (0, -flags.shape[1] % _WORD))).reshape(len(flags), -1, _WORD)
     bit = jnp.left_shift(jnp.uint32(1), jnp.arange(_WORD, dtype=jnp.uint32))
@@ -179,22 +178,23 @@ def _bit_count(words):
 def interpolate(
     points: Float[Array, "n 3"], coarse: Float[Array, "m 3"], features: Float[Array, "m f"]
 ) -> Float[Array, "n f"]:
-    """The features of the three nearest coarse points at each point, weighted by inverse squared distance; where there
-    are fewer coarse points, of all of them.
+    """Features at each point, interpolated from the three nearest coarse points (or all, if fewer).
 
-    Differentiable in features and in both kinds of points; which are the nearest is taken as fixed.
+    Weights are inverse squared distances. Differentiable in features, points and coarse points, with the choice of
+    neighbours held fixed.
     """
-    index, is_found = _nearest(points, coarse)
+    index, is_valid = _nearest(points, coarse)
     squared = jnp.sum((points[:, None] - coarse[index]) ** 2, axis=-1)
-    weights = jnp.where(is_found, 1.0 / (squared + _SOFTENING), 0.0)
+    weights = jnp.where(is_valid, 1.0 / (squared + _SOFTENING), 0.0)
     weights = weights / jnp.sum(weights, axis=1, keepdims=True)
     return jnp.sum(weights[..., None] * features[index], axis=1)
 
 
 def _nearest(points: Float[Array, "n 3"], coarse: Float[Array, "m 3"]) -> tuple[Int[Array, "n 3"], Bool[Array, "n 3"]]:
-    """Rows of the three nearest coarse points, and whether there are as many.
+    """Rows of the three nearest coarse points, and whether each of the three exists.
 
-    A loop over the coarse points that keeps the three best: on a CPU two to three times as fast as `jax.lax.top_k`.
+    It loops over the coarse points and keeps the three best. On a CPU this is two to three times as fast as
+    `jax.lax.top_k`.
     """
     points, coarse = jax.lax.stop_gradient((points, coarse))
     x, y, z = points.T

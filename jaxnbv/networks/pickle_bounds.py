@@ -1,4 +1,4 @@
-"""What a pickle asks for, before it is read: memory that its file can fill, and nesting that Python can follow."""
+"""Checks of a pickle before it is read: it must not ask for more memory than its file can fill, or nest too deep."""
 
 import mmap
 import pickletools
@@ -9,20 +9,22 @@ from typing import Any
 from jaxnbv.checks import require
 
 _PUTS, _GETS = ("PUT", "BINPUT", "LONG_BINPUT"), ("GET", "BINGET", "LONG_BINGET")
-# These change the first thing that they take off the stack.
+# Operations that change the first object that they take off the stack.
 _CHANGES = ("APPEND", "APPENDS", "SETITEM", "SETITEMS", "ADDITEMS", "BUILD")
-# Tuples within tuples: Python hashes them by recursion that it does not limit.
+# Python hashes nested tuples by recursion without a limit.
 _DEEPEST = 500
 
 
 def skip_pickle(file: BytesIO | mmap.mmap, size: int) -> None:
-    """Pass over a pickle in a file of this many bytes, without making what it describes.
+    """Move a file past its next pickle without creating the objects.
 
-    **Raises:** `ValueError` for one that is damaged, asks for more memory than a file of its size can fill, or nests
-    too deep.
+    - `size`: size of the file in bytes.
+
+    **Raises:** `ValueError` for a pickle that is damaged, asks for more memory than a file of this size can fill, or
+    nests too deep.
     """
     start = file.tell()
-    # Of each thing on the stack, how deep it nests.
+    # Nesting depth of each object on the stack.
     stack: list[int] = []
     marks: list[int] = []
     memo: dict[int, int] = {}
@@ -48,10 +50,10 @@ def skip_pickle(file: BytesIO | mmap.mmap, size: int) -> None:
             first = len(stack) - len(takes)
             if pickletools.markobject in takes:
                 first = marks.pop() - takes.index(pickletools.markobject)
-            require(first >= 0, "takes more than it has made: it is damaged")
-            held = stack[first:]
+            require(first >= 0, "takes more objects than it has made: it is damaged")
+            depths = stack[first:]
             del stack[first:]
-            depth = 1 + max(held[code.name in _CHANGES :], default=-1)
-            depth = max([depth, *held[: code.name in _CHANGES]])
+            depth = 1 + max(depths[code.name in _CHANGES :], default=-1)
+            depth = max([depth, *depths[: code.name in _CHANGES]])
             require(depth <= _DEEPEST, f"nests {depth} deep, more than any model: it is damaged")
             stack += [depth] * len(code.stack_after)

@@ -1,5 +1,7 @@
-"""PointNet++ of one oriented point cloud, its class or its parts (Qi et al. 2017), in inference mode; and a small part
-segmenter in its manner, quick enough for hundreds of imagined scans a step."""
+"""PointNet++ classifier and part segmenter of a cloud (Qi et al. 2017) in inference mode, and a small part segmenter.
+
+The small one has similar layers, and is fast enough for hundreds of imagined scans in each step.
+"""
 
 import itertools
 from typing import Any, NamedTuple
@@ -15,14 +17,14 @@ from jaxnbv.networks.layers import FeaturePropagation, Linear, PooledMLP, SetAbs
 
 
 class Level(NamedTuple):
-    """How a set abstraction samples: centres, the balls' radii, and the rows of each ball's group."""
+    """Sizes of a set abstraction: number of centres, radii of the balls, and number of rows in each ball's group."""
 
     centers: int
     radii: tuple[float, ...]
     members: tuple[int, ...]
 
 
-# As published, for objects that are centred and fill the unit sphere.
+# The published sizes, for objects that are centred and fill the unit sphere.
 SINGLE_SCALE = (Level(512, (0.2,), (32,)), Level(128, (0.4,), (64,)))
 MULTI_SCALE = (Level(512, (0.1, 0.2, 0.4), (16, 32, 128)), Level(128, (0.2, 0.4, 0.8), (32, 64, 128)))
 SCALES = SINGLE_SCALE, MULTI_SCALE
@@ -32,7 +34,7 @@ PARTS_SCALES = SINGLE_SCALE, (Level(512, (0.1, 0.2, 0.4), (32, 64, 128)), Level(
 def _filled(
     points: Float[Array, "n 3"], normals: Float[Array, "n 3"], mask: Bool[Array, " n"] | None
 ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Bool[Array, " n"]]:
-    """Points and normals, zero in rows that are not filled, and which are."""
+    """Points and normals with zeros in masked rows, and the mask."""
     require(
         points.ndim == 2 and points.shape[1] == 3 and points.shape[0] > 0 and normals.shape == points.shape,
         f"points and normals must both be (n, 3) with n > 0, got {points.shape} and {normals.shape}: "
@@ -43,26 +45,29 @@ def _filled(
 
 
 def _down(network: Any, rows: Any, mask: Bool[Array, " n"]) -> tuple[list[Any], Float[Array, " outputs"]]:
-    """Centres and features of each level of a network, from points and their features, and those of the whole."""
-    found = []
+    """Centres and features of each level of a network, and the features of the whole cloud.
+
+    - `rows`: points and their features.
+    """
+    levels = []
     for level in network.levels:
         rows = level(*rows, mask)
         mask = jnp.ones(len(rows[0]), dtype=bool)
-        found.append(rows)
-    return found, network.whole.pool(network.whole.lift(*rows))
+        levels.append(rows)
+    return levels, network.whole.pool(network.whole.lift(*rows))
 
 
 class PointNet2Classifier(eqx.Module):
-    """From a cloud to log-probabilities of classes: set abstractions, a PointNet over what remains, a perceptron.
+    """Classifier of a cloud: set abstractions, a PointNet over the last centres, and a perceptron.
 
-    Expects the object centred and inside the unit sphere, as in training. Many clouds are a `vmap` or a `lax.map`: on
-    a CPU the latter is two to three times as fast, as one cloud's features stay in the cache. Reverse-mode
-    differentiable in points and normals; which points are sampled and grouped is taken as fixed.
+    Expects the object centred and inside the unit sphere, as in training. For many clouds use `vmap` or `lax.map`. On
+    a CPU the latter is two to three times as fast, since the features of one cloud stay in the cache. Reverse-mode
+    differentiable in points and normals, with the sampling and grouping of points held fixed.
 
     - `levels`: the set abstractions.
     - `whole`: the PointNet over the last level's centres, coordinates and features.
     - `hidden`: layers of the perceptron, each followed by a rectifier.
-    - `last`: its last layer, one output a class.
+    - `last`: its last layer, with one output for each class.
     """
 
     levels: tuple[SetAbstraction, ...]
@@ -72,17 +77,16 @@ class PointNet2Classifier(eqx.Module):
 
     @property
     def uses_normals(self) -> bool:
-        """Whether the network was made for oriented points; one that was not ignores the normals."""
+        """Whether the network uses normals. Otherwise it ignores them."""
         return self.levels[0].branches[0].layers[0].weight.shape[0] == 6
 
     def __call__(
         self, points: Float[Array, "n 3"], normals: Float[Array, "n 3"], mask: Bool[Array, " n"] | None = None
     ) -> Float[Array, " classes"]:
-        """log p(class) of one cloud, its rows all filled or those that `mask` names.
+        """log p(class) of one cloud. All rows are points if `mask` is None.
 
-        What stands in other rows, and how many there are, does not matter. The order of the filled rows does: the first
-        is the first centre, and crowded balls are cut to their first rows. A cloud with no filled row is seen as one
-        point at the origin.
+        Masked rows have no influence. The order of the others has: the first row is the first centre, and crowded balls
+        keep their first rows only. A cloud without points is treated as one point at the origin.
 
         **Raises:** `ValueError` if points and normals are not both (n, 3), or there are no rows.
         """
@@ -94,17 +98,17 @@ class PointNet2Classifier(eqx.Module):
 
 
 class PointNet2PartSegmenter(eqx.Module):
-    """From a cloud and its object's category to log-probabilities of parts, point by point.
+    """Part segmenter of a cloud for an object of known category.
 
-    Set abstractions down to one vector, feature propagations back up to the points, then a perceptron. Expects the
-    object centred and inside the unit sphere, as in training. Reverse-mode differentiable in points and normals; which
-    points are sampled, grouped and taken as neighbours is fixed.
+    Set abstractions reduce the cloud to one vector, feature propagations lead back to the points, and a perceptron
+    follows. Expects the object centred and inside the unit sphere, as in training. Reverse-mode differentiable in
+    points and normals, with the sampling, grouping and neighbours of points held fixed.
 
     - `levels`: the set abstractions.
     - `whole`: the PointNet over the last level's centres, coordinates and features.
-    - `propagations`: the way back, the coarsest level first.
+    - `propagations`: the feature propagations, the coarsest level first.
     - `hidden`: the perceptron's first layer, followed by a rectifier.
-    - `last`: its last layer, one output a part.
+    - `last`: its last layer, with one output for each part.
     """
 
     levels: tuple[SetAbstraction, ...]
@@ -115,14 +119,14 @@ class PointNet2PartSegmenter(eqx.Module):
 
     @property
     def num_categories(self) -> int:
-        """The number of categories."""
+        """The number of categories, from the shapes of the weights."""
         carried = self.propagations[-2].layers[-1].bias.shape[0]
         own = 3 + (6 if self.uses_normals else 3)
         return self.propagations[-1].layers[0].weight.shape[0] - carried - own
 
     @property
     def uses_normals(self) -> bool:
-        """Whether the network was made for oriented points; one that was not ignores the normals."""
+        """Whether the network uses normals. Otherwise it ignores them."""
         return self.levels[0].branches[0].layers[0].weight.shape[0] == 9
 
     def __call__(
@@ -132,11 +136,12 @@ class PointNet2PartSegmenter(eqx.Module):
         category: int | Int[AnyArray, ""],
         mask: Bool[Array, " n"] | None = None,
     ) -> Float[Array, "n parts"]:
-        """log p(part) at each point, over the parts of all categories; rows that `mask` does not name mean nothing.
+        """log p(part) at each point, over the parts of all categories. The values of masked rows mean nothing.
 
-        `category` is its index, which may be traced. What stands in rows that are not named, and how many there are,
-        does not matter to the others. The order of the filled rows does: the first is the first
-        centre, and crowded balls are cut to their first rows.
+        Masked rows have no influence on the others. The order of the others has: the first row is the first centre, and
+        crowded balls keep their first rows only.
+
+        - `category`: index of the category, which may be traced.
 
         **Raises:** `ValueError` if points and normals are not both (n, 3), there are no rows, or there is no such
         category.
@@ -145,9 +150,9 @@ class PointNet2PartSegmenter(eqx.Module):
         count = self.num_categories
         require(
             is_traced(category) or 0 <= int(category) < count,
-            f"the category is {category}; the network knows 0 to {count - 1}",
+            f"the category is {category}; the network has 0 to {count - 1}",
         )
-        # The published network gives the coordinates as features too, beside those relative to a ball's centre.
+        # The published network also has the coordinates as features, in addition to those relative to a ball's centre.
         features = jnp.concatenate([points, normals], axis=-1) if self.uses_normals else points
         one_hot = jnp.broadcast_to(jax.nn.one_hot(category, count, dtype=points.dtype), (len(points), count))
         levels, x = _down(self, (points, features), mask)
@@ -159,11 +164,11 @@ class PointNet2PartSegmenter(eqx.Module):
 
 
 class CompactPartSegmenter(eqx.Module):
-    """Two set abstractions, a maximum over all, and back to the points; about 100,000 parameters.
+    """Small part segmenter: two set abstractions, a maximum over all points, and three feature propagations.
 
-    For oriented points of upright objects that face one way, as in ShapeNet: coordinates enter as they are, beside
-    those relative to a group's centre. Reverse-mode differentiable in points and normals; which points are sampled and
-    grouped is taken as fixed.
+    It has about 100,000 parameters. It expects oriented points of upright objects that face one way, as in ShapeNet,
+    since absolute coordinates are features too. Reverse-mode differentiable in points and normals, with the sampling
+    and grouping of points held fixed.
     """
 
     fine: SetAbstraction
@@ -191,10 +196,12 @@ class CompactPartSegmenter(eqx.Module):
         category: Int[Array, ""] | int,
         mask: Bool[Array, " n"] | None = None,
     ) -> Float[Array, "n parts"]:
-        """Log-probabilities of the fifty parts, point by point, for an object of a category of `CATEGORIES`.
+        """Log-probabilities of the fifty parts at each point.
 
-        Points in units in which the object's longest side is 2; normals are unit. Masked rows do not matter, and what
-        is said of them means nothing.
+        - `points`: in units in which the object's longest side is 2.
+        - `normals`: of length one.
+        - `category`: index of the object's category in `CATEGORIES`.
+        - `mask`: masked rows have no influence, and their values mean nothing.
         """
         mask = jnp.ones(len(points), bool) if mask is None else mask
         own = jnp.where(mask[:, None], jnp.concatenate([points, normals], axis=-1), 0.0)
@@ -203,13 +210,13 @@ class CompactPartSegmenter(eqx.Module):
         everywhere = jnp.ones(len(centers), bool)
         coarse_centers, coarse = self.coarse(centers, fine, everywhere)
         whole = self.whole.pool(self.whole.lift(coarse_centers, coarse))
-        said = jnp.concatenate([whole, jax.nn.one_hot(category, len(CATEGORIES), dtype=whole.dtype)])
-        coarse = self.to_coarse(coarse_centers, jnp.zeros((1, 3), points.dtype), coarse, said[None])
+        context = jnp.concatenate([whole, jax.nn.one_hot(category, len(CATEGORIES), dtype=whole.dtype)])
+        coarse = self.to_coarse(coarse_centers, jnp.zeros((1, 3), points.dtype), coarse, context[None])
         fine = self.to_fine(centers, coarse_centers, fine, coarse)
         return jax.nn.log_softmax(self.last(self.to_points(points, centers, own, fine)))
 
 
 def _layers(keys: Any, *widths: int) -> tuple[Linear, ...]:
-    """Layers with the initial weights of He et al. (2015)."""
+    """Layers of these widths with initial weights by He et al. (2015)."""
     normal = jax.nn.initializers.he_normal()
     return tuple(Linear(normal(next(keys), pair), jnp.zeros(pair[1])) for pair in itertools.pairwise(widths))

@@ -1,4 +1,4 @@
-"""The networks that ship with jaxnbv; `scripts/train_classifier.py` and `scripts/train_parts.py` make their weights."""
+"""Shipped networks. `scripts/train_classifier.py` and `scripts/train_parts.py` make their weights."""
 
 from importlib import resources
 
@@ -9,33 +9,36 @@ from jaxnbv.networks.invariant import InvariantClassifier
 
 # Longest side of the box of a training object, in scene units.
 TRAINED_SIDE = 2.5
-# Points of a cloud that each classifier was trained on.
+# Number of points of a cloud in the training of each classifier.
 TRAINED_POINTS = {"pyramid": 1024, "truck": 2048, "household": 1024}
 
 
 def pretrained_classifier(
     name: str, longest_side: float = TRAINED_SIDE, num_points: int | None = None
 ) -> CloudClassifier:
-    """The shipped classifier of the procedural scenes of a name, whose boxes have this longest side, in scene units.
+    """The shipped classifier for a kind of procedural scenes.
 
     - `name`: "pyramid", "truck" or "household".
-    - `num_points`: what it is fed, by default as many as it was trained on; with half as many it is a little less often
-      right, and twice as fast.
+    - `longest_side`: longest side of the object's box, in scene units.
+    - `num_points`: number of its input points, by default that of its training. Half as many make it twice as fast and
+      a little less accurate.
 
     **Raises:** `ValueError` for another name, or if `longest_side` or `num_points` is not positive.
     """
-    known = ", ".join(TRAINED_POINTS)
-    require(name in TRAINED_POINTS, f"no classifier of {name!r} ships: give the file of one, or choose from {known}")
+    names = ", ".join(TRAINED_POINTS)
+    require(name in TRAINED_POINTS, f"there is no shipped classifier {name!r}: choose from {names}, or load your own")
     network = _shipped(name)
-    fed = TRAINED_POINTS[name] if num_points is None else num_points
-    return CloudClassifier(network, fed, network_scale(network, longest_side))
+    count = TRAINED_POINTS[name] if num_points is None else num_points
+    return CloudClassifier(network, count, network_scale(network, longest_side))
 
 
 def part_segmenter(category: str | int, num_points: int = 2048, longest_side: float = TRAINED_SIDE) -> CloudSegmenter:
-    """The shipped segmenter of procedural objects, for one of their categories.
+    """The shipped part segmenter for a category of procedural objects.
 
-    It was trained on objects whose box has the longest side 2.5, upright and facing one way, seen by parts; on none of
-    the categories cap, car and knife, of which it says nothing that can be relied on.
+    It was trained on partial views of upright objects that face one way, with a longest side of 2.5. The categories
+    cap, car and knife were not in its training, so do not rely on its results for them.
+
+    - `longest_side`: longest side of the object's box, in scene units.
 
     **Raises:** `ValueError` for an unknown category, or if `num_points` or `longest_side` is not positive.
     """
@@ -44,9 +47,10 @@ def part_segmenter(category: str | int, num_points: int = 2048, longest_side: fl
 
 
 def network_scale(network: Network, longest_side: float = TRAINED_SIDE) -> float:
-    """Network units per scene unit, for an object whose box has this longest side in the scene.
+    """Network units per scene unit, for an object with a box of this longest side in scene units.
 
-    `InvariantClassifier` takes objects 2.5 long, the others those that fill the unit sphere or its box.
+    `InvariantClassifier` expects objects of longest side 2.5. The other networks expect objects that fill the unit
+    sphere or its box.
 
     **Raises:** `ValueError` if `longest_side` is not positive.
     """

@@ -1,15 +1,15 @@
-"""The names and shapes of the tensors of the widely used PyTorch PointNet++, and the networks that they make.
+"""Networks from tensors of the widely used PyTorch implementation of PointNet++, which have these names:
 
     sa1, sa2     mlp_convs.<layer>, mlp_bns.<layer>              one radius
                  conv_blocks.<radius>.<layer>, bn_blocks. ...    several radii
     sa3          mlp_convs.<layer>, mlp_bns.<layer>              all points
     fc1, bn1, fc2, bn2, fc3                                      the classifier's perceptron
-    fp3, fp2, fp1    mlp_convs.<layer>, mlp_bns.<layer>          the part segmenter's way back
+    fp3, fp2, fp1    mlp_convs.<layer>, mlp_bns.<layer>          the part segmenter's feature propagations
     conv1, bn1, conv2                                            its perceptron
 
-Channels, layers, classes, parts and the use of normals are read off the shapes; the radii are those published for one
-radius or for several. Weights are kept in inference form, W' = W g / sqrt(v + eps), b' = (b - m) g / sqrt(v + eps) + h,
-with the batch normalisation's scale g, shift h and running mean m and variance v.
+Channels, layers, classes, parts and the use of normals follow from the shapes. The radii are those published for one
+radius or for several. Weights have inference form, W' = W g / sqrt(v + eps), b' = (b - m) g / sqrt(v + eps) + h, with
+scale g, shift h, running mean m and running variance v of the batch normalisation.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,9 +27,9 @@ _EPSILON = 1e-5
 
 
 def published_network(tensors: Tensors) -> PointNet2Classifier | PointNet2PartSegmenter:
-    """The network that the tensors make: a part segmenter where they carry features back to the points.
+    """The network with these tensors: a part segmenter if they include feature propagations, else a classifier.
 
-    **Raises:** `ValueError` that names the tensor which is missing, not of its shape, not finite or without a place.
+    **Raises:** `ValueError` with the name of a tensor that is missing, unexpected or not finite, or has a wrong shape.
     """
     state = _State(tensors)
     segments = any(name.startswith("fp") for name in tensors)
@@ -63,14 +63,17 @@ def _part_segmenter(state: "_State") -> PointNet2PartSegmenter:
 
 
 def _encoder(
-    state: "_State", scales: tuple[tuple[Level, ...], tuple[Level, ...]], known: dict[int, str]
+    state: "_State", scales: tuple[tuple[Level, ...], tuple[Level, ...]], kinds: dict[int, str]
 ) -> tuple[tuple[SetAbstraction, ...], PooledMLP, list[int]]:
-    """The set abstractions, the PointNet of all, and the numbers of features: of the points, then of each level."""
+    """The set abstractions, the PointNet over all points, and numbers of features of the points and of each level.
+
+    - `kinds`: allowed numbers of inputs, each with its meaning.
+    """
     multi = "sa1.conv_blocks.0.0.weight" in state.tensors
     first = "sa1.conv_blocks.0.0.weight" if multi else "sa1.mlp_convs.0.weight"
     inputs = state.take(first, None, None).shape[1]
-    choices = " or ".join(f"{number} ({what})" for number, what in known.items())
-    require(inputs in known, f"the tensor {first} takes {inputs} inputs; expected {choices}")
+    choices = " or ".join(f"{number} ({meaning})" for number, meaning in kinds.items())
+    require(inputs in kinds, f"the tensor {first} takes {inputs} inputs; expected {choices}")
     levels, widths = [], [inputs - 3]
     for number, level in enumerate(scales[multi], start=1):
         blocks = [f"conv_blocks.{index}" for index in range(len(level.radii))] if multi else ["mlp_convs"]
@@ -81,26 +84,29 @@ def _encoder(
 
 
 class _State:
-    """Tensors by name, each with its shape checked; what has not been taken in the end has no place."""
+    """Tensors by name, with checks of their shapes. `left` has the names of the tensors that have not been used."""
 
     def __init__(self, tensors: Tensors):
         self.tensors = {name: array for name, array in tensors.items() if not name.endswith("num_batches_tracked")}
         self.left = set(self.tensors)
 
     def take(self, name: str, *shape: int | None) -> np.ndarray:
-        """The tensor as float64, whose shape must be this; None stands for any length, and 1s may follow."""
+        """The tensor as float64. Its shape must be `shape`, where None is any length, possibly followed by 1s."""
         require(name in self.tensors, f"the tensor {name} is missing")
-        found = self.tensors[name].shape
-        fits = len(found) >= len(shape) and all(a in (None, b) for a, b in zip(shape, found, strict=False))
+        actual = self.tensors[name].shape
+        fits = len(actual) >= len(shape) and all(a in (None, b) for a, b in zip(shape, actual, strict=False))
         require(
-            fits and all(length == 1 for length in found[len(shape) :]),
-            f"the tensor {name} has shape {found}; expected ({', '.join(str(a or 'any') for a in shape)})",
+            fits and all(length == 1 for length in actual[len(shape) :]),
+            f"the tensor {name} has shape {actual}; expected ({', '.join(str(a or 'any') for a in shape)})",
         )
         self.left.discard(name)
-        return np.asarray(self.tensors[name], dtype=np.float64).reshape(found[: len(shape)])
+        return np.asarray(self.tensors[name], dtype=np.float64).reshape(actual[: len(shape)])
 
     def linear(self, name: str, inputs: int | None, norm: str | None = None, roll: bool = False) -> Linear:
-        """A layer, the batch normalisation after it included; `roll` puts the coordinates, its last inputs, first."""
+        """A layer, with the batch normalisation `norm` after it folded in.
+
+        - `roll`: move the coordinates from the last inputs to the first.
+        """
         weight = self.take(f"{name}.weight", None, inputs).T
         outputs = weight.shape[1]
         bias = self.take(f"{name}.bias", outputs)
@@ -118,7 +124,7 @@ class _State:
         return Linear(*map(jnp.asarray, arrays))
 
     def layers(self, name: str, inputs: int | None, roll: bool = False) -> tuple[Linear, ...]:
-        """The layers <name>.0, <name>.1, ..., each followed by its batch normalisation."""
+        """The layers <name>.0, <name>.1, ..., each with its batch normalisation folded in."""
         norm = name.replace("mlp_convs", "mlp_bns").replace("conv_blocks", "bn_blocks")
         layers: list[Linear] = []
         while not layers or f"{name}.{len(layers)}.weight" in self.tensors:
@@ -128,7 +134,7 @@ class _State:
         return tuple(layers)
 
     def pooled(self, name: str, inputs: int, roll: bool = False) -> PooledMLP:
-        """The same layers, as a PointNet."""
+        """The layers of `layers` as a PointNet."""
         layers = self.layers(name, inputs, roll)
         require(len(layers) > 1, f"{name} has one layer only; two or more are needed")
         return PooledMLP(layers)

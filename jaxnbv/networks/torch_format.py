@@ -1,8 +1,8 @@
-"""The tensors of a PyTorch file, read without PyTorch and without running anything that the file asks for.
+"""Reads the tensors of a PyTorch file, without PyTorch and without running code from the file.
 
-A `.pth` file is a pickle, that is, a program, beside the raw bytes of its arrays. Of the names that it asks for, those
-of tensors and dictionaries mean something here; in place of any other it gets a thing that does nothing, and nothing is
-imported. Two layouts are read: the zip archive written since PyTorch 1.6 (`data.pkl`, `data/0`, `data/1`, ...), and the
+A `.pth` file is a pickle, which is a program, together with the raw bytes of its arrays. Only the pickle's names of
+tensors and dictionaries have a meaning here. Any other name resolves to an object that does nothing, and nothing is
+imported. Two layouts are supported: the zip archive since PyTorch 1.6 (`data.pkl`, `data/0`, `data/1`, ...), and the
 older stream of pickles followed by the arrays.
 """
 
@@ -24,7 +24,7 @@ import numpy as np
 from jaxnbv.checks import InputError, require
 from jaxnbv.networks.pickle_bounds import skip_pickle
 
-# Names, not types: what a pickle is given it may change, unless it is text.
+# Names and not types, since a pickle could modify the objects that it gets, but not text.
 _TYPES = {
     "DoubleStorage": "float64",
     "FloatStorage": "float32",
@@ -39,17 +39,17 @@ _TYPES = {
 }
 _STREAM_MAGIC = 0x1950A86A20F9469CFC6C
 _STATE_NAMES = ("model_state_dict", "state_dict")
-# A storage by its key, type and number of entries.
+# Loads a storage by its key, type and number of entries.
 _Load = Callable[[str, str, int], np.ndarray]
 
 
 def read_torch_tensors(path: str | Path) -> dict[str, np.ndarray]:
-    """The model's tensors by name, from a file made by `torch.save`.
+    """The model's tensors by name, from a file of `torch.save`.
 
     The file holds a state dictionary, or a training checkpoint with one under `model_state_dict` or `state_dict`. The
     prefix `module.` of models trained on several devices is dropped.
 
-    **Raises:** `ValueError` for a file that is missing, damaged, not PyTorch's, or without a state dictionary.
+    **Raises:** `ValueError` for a file that is missing, damaged, not from PyTorch, or without a state dictionary.
     """
     path = Path(path)
     require(os.path.isfile(path), f"there is no file {path}: give the path of a PyTorch checkpoint")
@@ -80,7 +80,7 @@ def _state_dictionary(content: Any) -> dict[str, np.ndarray]:
 
 
 def _read_archive(file: BufferedIOBase, size: int) -> Any:
-    """The zip archive: one folder that holds data.pkl, the arrays as data/<key>, and the byte order."""
+    """Read a zip archive: one folder with data.pkl, the arrays as data/<key>, and the byte order."""
     with zipfile.ZipFile(file) as archive:
         unpacked = sum(entry.file_size for entry in archive.infolist())
         require(unpacked <= size, f"unpacks to {unpacked} bytes from {size}, which torch.save does not: save it again")
@@ -97,16 +97,17 @@ def _read_archive(file: BufferedIOBase, size: int) -> Any:
 
 
 def _read_stream(file: BufferedIOBase, size: int) -> Any:
-    """The layout before PyTorch 1.6: magic number, protocol, system, content, keys; then each array's count and bytes.
+    """Read the layout before PyTorch 1.6.
 
-    The arrays come last, so the tensors are made as views of arrays that are filled afterwards.
+    It has magic number, protocol, system, content, keys, and then each array's count and bytes. The arrays come last,
+    so the tensors are views of arrays that are filled afterwards.
     """
     storages: dict[str, np.ndarray] = {}
 
     def load(key: str, kind: str, count: int) -> np.ndarray:
         if key not in storages:
-            held = sum(storage.nbytes for storage in storages.values()) + count * np.dtype(kind).itemsize
-            require(held <= size, f"declares arrays of {held} bytes, more than it has: fetch the file again")
+            total = sum(storage.nbytes for storage in storages.values()) + count * np.dtype(kind).itemsize
+            require(total <= size, f"declares arrays of {total} bytes, more than it has: fetch the file again")
             storages[key] = np.zeros(count, kind)
         return storages[key]
 
@@ -126,7 +127,7 @@ def _read_stream(file: BufferedIOBase, size: int) -> Any:
 
 
 def _unpickled(file: BytesIO | mmap.mmap, size: int, load: _Load) -> Any:
-    """What the next pickle of a file describes."""
+    """The object in the next pickle of a file."""
     start = file.tell()
     skip_pickle(file, size)
     end = file.tell()
@@ -135,7 +136,7 @@ def _unpickled(file: BytesIO | mmap.mmap, size: int, load: _Load) -> Any:
 
 
 class _Tensors(pickle.Unpickler):
-    """Python's own reader of pickles, of which a file gets no name but those of tensors and dictionaries."""
+    """Python's own unpickler, restricted to the names of tensors and dictionaries."""
 
     def __init__(self, file: BytesIO, load: _Load):
         super().__init__(file)
@@ -143,7 +144,7 @@ class _Tensors(pickle.Unpickler):
         self._items = len(file.getbuffer())
 
     def find_class(self, module: str, name: str) -> Any:
-        """What stands for a name."""
+        """The replacement for a name in the pickle."""
         if module in ("torch", "torch.cuda") and name in _TYPES:
             return _TYPES[name]
         if (module, name) == ("collections", "OrderedDict"):
@@ -151,26 +152,26 @@ class _Tensors(pickle.Unpickler):
         return _KNOWN.get((module, name), _Nothing)
 
     def persistent_load(self, identifier: Any) -> np.ndarray:
-        """The storage that ('storage', type, key, device, count) names; older files add a view, always None."""
+        """The storage with identifier ('storage', type, key, device, count). Older files append a view, always None."""
         _, kind, key, _, count, *_ = identifier
         return self._storage(key, kind, count)
 
     def _dictionary(self, items: Any = ()) -> "_Dictionary":
-        """A copy of these items; a file that copies more than it has bytes is refused."""
+        """A copy of these items. Refuses a file that copies more items than it has bytes."""
         self._items -= len(items)
         require(self._items >= 0, "copies the same dictionary over and over: it is damaged")
         return _Dictionary(items)
 
 
 class _Dictionary(OrderedDict):
-    """A dictionary that does not take what a model says of itself beside its tensors."""
+    """A dictionary that ignores the state of a model besides its tensors."""
 
     def __setstate__(self, _: Any) -> None:
         pass
 
 
 class _Nothing:
-    """Stands for whatever else a file asks for: it takes what it is given, and does nothing."""
+    """Replacement for all other names in a file. It accepts any arguments and does nothing."""
 
     def __new__(cls, *_: Any) -> "_Nothing":
         return super().__new__(cls)
@@ -183,7 +184,7 @@ class _Nothing:
 
 
 def _tensor(storage: np.ndarray, offset: int, shape: tuple[int, ...], strides: tuple[int, ...], *_: Any) -> np.ndarray:
-    """A view of a storage; NumPy refuses one that leaves it."""
+    """A view of a storage. NumPy refuses a view beyond its end."""
     size = storage.itemsize
     tensor = np.ndarray(shape, storage.dtype, storage, offset * size, tuple(stride * size for stride in strides))
     require(tensor.size <= storage.size, f"stretches {storage.size} numbers to a tensor of shape {shape}: save a copy")

@@ -133,7 +133,7 @@ def test_masked_rows_and_capacity_do_not_matter():
 def test_calls_that_cannot_be_answered_are_refused():
     network, (points, normals) = small_network(), rows(30)
     for category in (-1, 16, np.asarray(50)):
-        with pytest.raises(nbv.InputError, match="the network knows 0 to 15"):
+        with pytest.raises(nbv.InputError, match="the network has 0 to 15"):
             network(points, normals, category)
     with pytest.raises(nbv.InputError, match="n > 0"):
         network(points[:0], normals[:0], 3)
