@@ -92,7 +92,7 @@ SCANNING = [
     (lambda: mesh_of(TRIANGLE, [[0, 1, 1]]), "zero area"),
     (lambda: nbv.sdf.Sphere(-1.0), "must not be negative"),
     (lambda: nbv.sdf.Sphere(np.nan), "finite"),
-    (lambda: nbv.sdf.Cuboid([0.1, 0.2, 0.3], 0.15), "round it by less"),
+    (lambda: nbv.sdf.Cuboid([0.1, 0.2, 0.3], 0.15), "reduce the rounding"),
     (lambda: nbv.sdf.Sphere(1.0).rotate([0, 0, 0], 1.0), "not zero"),
     (lambda: nbv.sdf.Sphere(1.0).rotate([0, 1e-30, 0], 1.0), "not zero"),
     (lambda: nbv.sdf.Sphere(1.0).scale(-2.0), "scaled by -2.0"),

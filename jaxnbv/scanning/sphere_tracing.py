@@ -1,4 +1,4 @@
-"""SDFSurface: the boundary of a solid given by its signed distance function, met by sphere tracing."""
+"""SDFSurface: the boundary of a solid with a signed distance function, traced by sphere tracing."""
 
 import math
 from typing import ClassVar
@@ -15,10 +15,10 @@ from jaxnbv.scanning.sdf import SignedDistance
 # Far above the rounding of float32 distances in the scene (4e-7), far below any part worth seeing.
 _SHORTEST_STRIDE = 1e-3
 _MAX_STRIDES = 512
-# Rays that are still under way go on by themselves once they are at most this fraction of all.
+# Once at most this fraction of the rays is unfinished, these continue in a smaller batch.
 _FEW = 1 / 8
 _CHORDS = 2
-# How far before a hit, along the ray, slopes are taken, in units of a number's rounding: 1e-5 in float32, above the
+# Slopes are evaluated this far before a hit along the ray, in units of rounding. It is 1e-5 in float32, above the
 # rounding of a hit and below any detail.
 _FRONT = 84
 # Least sine of the angle between a ray and the surface for which the exact derivative of the hit is given.
@@ -26,18 +26,18 @@ _GRAZING = 0.05
 
 
 class SDFSurface(Surface):
-    """The boundary of a solid, met by sphere tracing (Hart 1996).
+    """The boundary of a solid, traced by sphere tracing (Hart 1996).
 
     - `sdf`: the solid.
-    - `bounding_radius`: what lies outside this ball about the origin is not seen. The default holds the whole scene,
+    - `bounding_radius`: radius of a ball about the origin; rays hit nothing outside. The default holds the whole scene,
       [-pi/2, pi/2]^3.
 
-    A ray strides by |sdf|, but at least by 0.001, until the sign changes; the root is then found within the last
-    stride. A part thinner than that along a ray may be missed, and a ray that runs along a flat face at an angle of
-    less than a degree may use up its 512 strides and miss.
+    A ray strides by |sdf|, but at least by 0.001, until the sign changes. The root is then located within the last
+    stride. A part thinner than 0.001 along a ray may be missed. A ray along a flat face, at an angle of less than a
+    degree, may use up its 512 strides and miss.
 
-    Hits are differentiable in the rays and in the solid's parameters by `implicit_depth`, with slopes held at 0.05 for
-    grazing rays.
+    Hits are differentiable in the rays and in the solid's parameters by `implicit_depth`, with slopes of at least 0.05
+    for grazing rays.
 
     **Raises:** `ValueError` if the bounding radius is not positive.
     """
@@ -66,12 +66,12 @@ class SDFSurface(Surface):
         along = _Along(self.sdf, origins, directions)
         fixed = jax.lax.stop_gradient(along)
         depth, mask = _first_root(fixed.sdf, fixed.origins, fixed.directions, self.bounding_radius)
-        # Slopes are those just in front of the surface: on it a solid's formula may stand at the zero between two of
-        # its cases, and rounding may take the slope of neither.
+        # Slopes are evaluated just in front of the surface. On it a solid's formula may be at the border of two cases,
+        # where rounding may give the slope of neither.
         before = _Along(self.sdf, origins - _FRONT * jnp.finfo(origins.dtype).eps * directions, directions)
         depth = implicit_depth(before, fixed.newton(depth), mask, jnp.full_like(depth, _GRAZING))
         points, front = along.points(depth), before.points(depth)
-        # Forward mode: the slopes fuse into one pass over the points, which the scatters of reverse mode break up.
+        # Forward mode fuses into one pass over the points. The scatters of reverse mode would prevent that.
         axes = jnp.broadcast_to(jnp.eye(3, dtype=points.dtype)[:, None], (3, *points.shape))
         gradient = jax.vmap(lambda axis: jax.jvp(self.sdf, (front,), (axis,))[1], out_axes=-1)(axes)
         gradient = jnp.where(jnp.any(gradient != 0, axis=-1, keepdims=True), gradient, -directions)
@@ -94,7 +94,7 @@ class _Along(eqx.Module):
         return self.sdf(self.points(depth))
 
     def newton(self, depth: Float[Array, " n"]) -> Float[Array, " n"]:
-        """One Newton step towards the root along each ray, which makes it exact to rounding unless the ray grazes."""
+        """Depths after one Newton step towards the root, exact to rounding except for grazing rays."""
         value, slope = jax.jvp(self, (depth,), (jnp.ones_like(depth),))
         return depth - value / (jnp.where(slope < 0, -1.0, 1.0) * jnp.maximum(jnp.abs(slope), _GRAZING))
 
@@ -102,7 +102,7 @@ class _Along(eqx.Module):
 def _first_root(
     sdf: SignedDistance, origins: Float[Array, "n 3"], directions: Float[Array, "n 3"], radius: float
 ) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
-    """How far along each ray the distance first changes its sign within the ball, and whether it does."""
+    """Depth along each ray at which the signed distance first changes sign within the ball, and whether it does."""
     middle = -jnp.sum(origins * directions, axis=-1)
     squared = middle**2 - jnp.sum(origins**2, axis=-1) + radius**2
     half_chord = jnp.sqrt(jnp.maximum(squared, 0.0))
@@ -112,7 +112,7 @@ def _first_root(
     alive = (squared > 0) & (leave > 0)
     march = _March(origins, directions, jnp.where(start < 0, -1.0, 1.0), leave, enter, start, enter, start, alive)
 
-    # Nearly all rays finish within a few strides: the rest go on by themselves.
+    # Nearly all rays finish within a few strides. The rest continue in a smaller batch.
     few = math.ceil(len(origins) * _FEW)
     march, count = _advance(sdf, march, 0, few)
     (rest,) = jnp.nonzero(march.alive, size=few, fill_value=len(origins))
@@ -125,7 +125,14 @@ def _first_root(
 
 
 class _March(eqx.Module):
-    """Rays under way: `depth` is where each is, `before` where it was a stride ago, with the distances f there."""
+    """State of the rays.
+
+    - `side`: sign of the distance at the start.
+    - `leave`: depth at which the ray leaves the ball.
+    - `depth`, `f`: current depth, and the signed distance there.
+    - `before`, `f_before`: the same a stride earlier.
+    - `alive`: whether the ray is unfinished.
+    """
 
     origins: Float[Array, "n 3"]
     directions: Float[Array, "n 3"]
@@ -139,7 +146,7 @@ class _March(eqx.Module):
 
 
 def _advance(sdf: SignedDistance, march: _March, count, enough: int):
-    """Stride on until at most `enough` rays are alive or `_MAX_STRIDES` are used up; also the number of strides."""
+    """The rays once at most `enough` are alive or `_MAX_STRIDES` are used up, and the number of strides so far."""
     along = _Along(sdf, march.origins, march.directions)
 
     def body(carry):
@@ -155,7 +162,7 @@ def _advance(sdf: SignedDistance, march: _March, count, enough: int):
 
 
 def _refine(sdf: SignedDistance, march: _March) -> Float[Array, " n"]:
-    """The root within the last stride, by regula falsi; the bracket is short, so a few chords reach rounding error."""
+    """The root within the last stride, by regula falsi. A few chords reach rounding error, as the bracket is short."""
 
     along = _Along(sdf, march.origins, march.directions)
 

@@ -1,8 +1,8 @@
-"""First zeros along rays of a trilinear interpolant: marching to the cell that holds one, then the root of a cubic.
+"""First zeros of a trilinear interpolant along rays: a march to the cell that holds one, then the root of a cubic.
 
 Coordinates are the grid's: nodes at the integers 0, ..., g - 1 along every axis, cells between them. Vectors are lists
-of their components (n,). A zero is where f first differs in sign from its sign at the start of the ray, with zero
-counted as negative.
+of their components (n,). A zero is where f first differs in sign from its sign at the start of the ray. The value zero
+counts as negative.
 """
 
 import functools
@@ -17,26 +17,26 @@ from jaxnbv.geometry.volume import ray_interval
 from jaxnbv.scanning.cubic import CORNERS, cubic, first_bracket, first_root
 from jaxnbv.scanning.scanner import implicit_depth
 
-# A march goes on with a fifth of its rays once no more are under way; batches smaller than an image stay together. Each
-# size is compiled: with a quarter a march takes as long to run and a third longer to compile.
+# Once at most a fifth of its rays is unfinished, a march continues with only these. Batches smaller than an image are
+# not reduced. Each size is compiled: reducing to a quarter runs as fast but takes a third longer to compile.
 _SHRINK = 5
 _SMALLEST = 2500
 
 # A ray grazes where the slope of f along it is below this fraction of the spread of f over the cell's corners.
 _GRAZING = 0.03
 
-# The x, y and z components of n vectors, apart: XLA fuses these better than one array of them.
+# The x, y and z components of n vectors as three arrays, which XLA fuses better than one.
 Triple = list[Float[Array, " n"]]
 
 
 class March(NamedTuple):
-    """Rays u + t du, and how far each has come.
+    """State of a march along rays u + t du.
 
-    - `t`: where the ray stands.
-    - `end`: where it leaves the box or, once it has found a zero, the cell of the zero. So t < end after the march
-      says that there is a zero between the two.
+    - `t`: the ray's current place.
+    - `end`: t at which the ray leaves the box or, once it is at a zero, the cell of the zero. So t < end after the
+      march means that there is a zero between the two.
     - `sign`: sign of f at the start, zero while unknown.
-    - `alive`: whether the ray is under way.
+    - `alive`: whether the ray is unfinished.
     """
 
     u: Triple
@@ -56,19 +56,19 @@ class Field(eqx.Module):
 
     @property
     def ahead(self) -> float:
-        """Positions are moved ahead by this much (cells, along every axis) before they are turned into a cell.
+        """Offset, in cells along every axis, by which positions move ahead before their cell is computed.
 
-        It exceeds the rounding of coordinates, so a ray on a border is always in the cell that it enters: it cannot
-        stall, and steps over no more than a sliver of this width. The sign at the start tells of a zero in a sliver.
+        It exceeds the rounding of coordinates, so a ray on a border is always in the cell that it enters. It cannot
+        stall, and skips at most a sliver of this width. A zero in a sliver shows as a difference from the start's sign.
         """
         return 16 * float(jnp.finfo(self.values.dtype).eps) * self.g
 
 
 def free_distance(values: Float[Array, "g g g"]) -> Int8[Array, "m m m"]:
-    """How far each of the m^3 = (g - 1)^3 cells is from a change of sign: 0 where its own corners differ in sign.
+    """Distance in cells from each of the m^3 = (g - 1)^3 cells to a change of sign, with the sign of f.
 
-    Elsewhere the magnitude is a lower bound on the Chebyshev distance (in cells) to the nearest cell with a change of
-    sign, one of 1, 2, 3, 5, 9 and 17, and the sign is that of f in the cell. Zero counts as negative.
+    It is 0 for a cell whose own corners differ in sign. Otherwise the magnitude is a lower bound on the Chebyshev
+    distance to the nearest cell with a change of sign, one of 1, 2, 3, 5, 9 and 17. Zero counts as negative.
     """
     maximum = functools.partial(
         jax.lax.reduce_window, init_value=jnp.int8(-1), computation=jax.lax.max, window_strides=(1, 1, 1)
@@ -79,7 +79,7 @@ def free_distance(values: Float[Array, "g g g"]) -> Int8[Array, "m m m"]:
     near = high - low
     distance = 1 - near
     for step in (1, 1, 2, 4, 8):
-        # `near` has grown by step - 1 cells or more, so that its maximum over {-step, 0, step} leaves no hole.
+        # `near` has already grown by at least step - 1 cells, so its maximum over {-step, 0, step} leaves no hole.
         for axis in range(3):
             window, dilation, padding = [1, 1, 1], [1, 1, 1], [(0, 0)] * 3
             window[axis], dilation[axis], padding[axis] = 3, step, (step, step)
@@ -89,7 +89,7 @@ def free_distance(values: Float[Array, "g g g"]) -> Int8[Array, "m m m"]:
 
 
 class _InCell(eqx.Module):
-    """The trilinear function of a cell along rays u + t du, the cell held fixed."""
+    """The trilinear function of a fixed cell along rays u + t du."""
 
     field: Field
     u: Triple
@@ -107,10 +107,10 @@ class _InCell(eqx.Module):
 
 
 def first_zero(field: Field, u: Triple, du: Triple) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
-    """t of the first zero along each ray, from its origin or where it enters the box; and whether there is one.
+    """t of the first zero along each ray from its origin or its entry into the box, and whether it exists.
 
-    t is differentiable in values and rays, with slopes held away from zero where the ray grazes (`implicit_depth`); it
-    is zero, derivatives included, without a zero.
+    t is differentiable in values and rays. Slopes are kept away from zero for grazing rays (`implicit_depth`). If there
+    is no zero, t and its derivatives are zero.
     """
     t, mask, cell = _found_zero(*jax.lax.stop_gradient((field, u, du)))
     along = _InCell(field, u, du, cell)
@@ -118,7 +118,7 @@ def first_zero(field: Field, u: Triple, du: Triple) -> tuple[Float[Array, " n"],
 
 
 def _first_zero(field: Field, u: Triple, du: Triple):
-    """t of the first zeros, whether there is one, and its cell."""
+    """t of the first zero of each ray, whether there is one, and its cell."""
     rays, start = enter(u, du, field)
     rays = march(rays, field)
     mask = rays.t < rays.end
@@ -135,22 +135,25 @@ _found_zero = jax.custom_batching.custom_vmap(_first_zero)
 
 @_found_zero.def_vmap
 def _found_zero_batched(size: int, batched, field: Field, u: list[Array], du: list[Array]):
-    """Batches of rays through one field are one batch of rays, which marches faster than a batch of marches."""
+    """Joins batches of rays through one field into one batch, which is faster than a batch of marches."""
     u, du = jax.tree.map(
         lambda x, has: x if has else jnp.broadcast_to(x, (size, *x.shape)), (u, du), tuple(batched[1:])
     )
     if any(jax.tree.leaves(batched[0])):
         axes = jax.tree.map(lambda has: 0 if has else None, batched[0])
-        found = jax.vmap(_first_zero, in_axes=(axes, 0, 0))(field, u, du)
+        zeros = jax.vmap(_first_zero, in_axes=(axes, 0, 0))(field, u, du)
     else:
         flat = jax.tree.map(lambda x: x.reshape(-1), (u, du))
-        found = jax.tree.map(lambda x: x.reshape(size, -1), _found_zero(field, *flat))
-    return found, jax.tree.map(lambda _: True, found)
+        zeros = jax.tree.map(lambda x: x.reshape(size, -1), _found_zero(field, *flat))
+    return zeros, jax.tree.map(lambda _: True, zeros)
 
 
 def smooth_gradient(field: Field, x: Triple) -> Triple:
-    """Gradient, per cell, of the function at x within the grid: central differences at the nodes (one-sided on the
-    border), interpolated linearly, so that it is continuous where the interpolant's own gradient jumps."""
+    """Continuous gradient of the function, per cell, at points x within the grid.
+
+    Central differences at the nodes (one-sided on the border) are interpolated linearly, since the interpolant's own
+    gradient jumps between cells.
+    """
     last = field.g - 1
     cell = [jnp.clip(jnp.floor(jax.lax.stop_gradient(p)).astype(jnp.int32), 0, last - 1) for p in x]
     local = [p - c for p, c in zip(x, cell, strict=True)]
@@ -173,8 +176,8 @@ def smooth_gradient(field: Field, x: Triple) -> Triple:
 
 
 def enter(u: Triple, du: Triple, field: Field) -> tuple[March, Float[Array, " n"]]:
-    """Rays set on the box, from where they enter it, and the t of that place, from which the march counts."""
-    # The box is smaller by a sliver so that no position, rounded and moved ahead, lies out of the grid.
+    """Rays at their entry into the box, and t of the entry, from which the march counts."""
+    # The box is smaller by a sliver, so that no rounded position that moved ahead lies outside the grid.
     low, high = 2 * field.ahead, field.g - 1 - 2 * field.ahead
     du = [jnp.where(jnp.abs(d) < 1e-9, 1e-9, d) for d in du]
     start, end = ray_interval(u, du, 3 * [low], 3 * [high])
@@ -185,7 +188,7 @@ def enter(u: Triple, du: Triple, field: Field) -> tuple[March, Float[Array, " n"
 
 
 def march(rays: March, field: Field) -> March:
-    """Every ray at its first zero or out of the box (see `March.end`); none is left under way."""
+    """The rays at their first zeros or outside the box (see `March.end`). None is unfinished."""
     count = rays.t.size
     remainder = count // _SHRINK if count > _SMALLEST else 0
     rays = jax.lax.while_loop(
@@ -203,7 +206,7 @@ def march(rays: March, field: Field) -> March:
 
 
 def _stride(rays: March, field: Field) -> March:
-    """Rays moved through cells without a change of sign, until most are at a cell with one or out of the box."""
+    """The rays after moving through cells without a change of sign, until most are at a change or outside the box."""
 
     def step(state):
         rays, _ = state
@@ -221,22 +224,23 @@ def _stride(rays: March, field: Field) -> March:
 
 
 def _search_cell(rays: March, field: Field) -> March:
-    """Rays that stand at a cell with a change of sign: stopped where it holds a zero of theirs, else moved past it."""
+    """The rays after a search of their cells. A ray in a cell with a change of sign stops if the cell holds its zero,
+    and leaves the cell otherwise."""
     local, cell = cell_at(rays, field)
     distance = _take(field.distance, _flat(cell, field.g - 1))
     here = rays.alive & (distance * rays.sign <= 0)
     leave = jnp.minimum(_leave(rays, cell, 0), rays.end)
     coefficients = cubic(corner_values(cell, field), local, [d * (leave - rays.t) for d in rays.du])
     sign = jnp.where(rays.sign == 0, jnp.where(coefficients[0] > 0, 1, -1).astype(jnp.int8), rays.sign)
-    _, found = first_bracket([c * sign for c in coefficients])
-    found = found & here
-    end = jnp.where(found, leave, rays.end)
-    t = jnp.where(here & ~found, leave, rays.t)
-    return rays._replace(t=t, end=end, sign=jnp.where(here, sign, rays.sign), alive=rays.alive & ~found & (t < end))
+    _, has_zero = first_bracket([c * sign for c in coefficients])
+    has_zero = has_zero & here
+    end = jnp.where(has_zero, leave, rays.end)
+    t = jnp.where(here & ~has_zero, leave, rays.t)
+    return rays._replace(t=t, end=end, sign=jnp.where(here, sign, rays.sign), alive=rays.alive & ~has_zero & (t < end))
 
 
 def cell_at(rays: March, field: Field) -> tuple[Triple, list[Int[Array, " n"]]]:
-    """The cell that rays are in or about to enter, and where they stand in its coordinates, within [0, 1]."""
+    """Position of each ray within its cell, in [0, 1], and the cell, which it is in or about to enter."""
     position = [x + rays.t * d for x, d in zip(rays.u, rays.du, strict=True)]
     cell = [
         jnp.floor(x + jnp.where(d > 0, field.ahead, -field.ahead)).astype(jnp.int32)
@@ -246,7 +250,7 @@ def cell_at(rays: March, field: Field) -> tuple[Triple, list[Int[Array, " n"]]]:
 
 
 def _leave(rays: March, cell: list[Int[Array, " n"]], cells) -> Float[Array, " n"]:
-    """t at which rays leave the cube of cells within a Chebyshev distance `cells` of the cell."""
+    """t at which rays leave the cube of all cells within Chebyshev distance `cells` of this cell."""
     sides = [c + jnp.where(d > 0, cells + 1, -cells) for c, d in zip(cell, rays.du, strict=True)]
     return _smallest([(side - x) / d for side, x, d in zip(sides, rays.u, rays.du, strict=True)])
 

@@ -1,4 +1,4 @@
-"""The first triangle that each ray meets, on the host: by Embree, or by libigl where Embree has no wheel."""
+"""First triangles that rays hit, on the host: by Embree, or by libigl on platforms without an Embree wheel."""
 
 import importlib
 import weakref
@@ -10,9 +10,9 @@ from jaxtyping import Float, Int
 
 from jaxnbv.errors import optional
 
-# libigl counts a ray as parallel to a triangle where twice the area times the cosine is below 1e-6, and loses rays that
-# run exactly through an edge. So it gets a unit that is small beside any triangle, and rays that are shifted by 1e-9 in
-# a direction that edges are unlikely to have.
+# libigl treats a ray as parallel to a triangle if twice the area times the cosine is below 1e-6. It also loses rays
+# that run exactly through an edge. So lengths are scaled up, and rays are shifted by 1e-9 in a direction that edges are
+# unlikely to have.
 _SCALE = 2.0**20
 _SHIFT = 1e-10 * np.array([3.1, 7.7, 5.5])
 
@@ -20,19 +20,20 @@ FirstFaces: TypeAlias = Callable[
     [Float[np.ndarray, "rays 3"], Float[np.ndarray, "rays 3"]],
     tuple[Int[np.ndarray, " rays"], Float[np.ndarray, " rays"]],
 ]
-"""From origins and unit directions to the row of the face that each ray meets first, -1 for none, and the distance."""
+"""A function of origins and unit directions that returns the row of the face that each ray hits first (-1 for none) and
+the distance to it."""
 
 
 def first_faces(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> FirstFaces:
-    """A tree of these triangles, in a scene's coordinates.
+    """The ray tracer of these triangles (scene coordinates), with its tree built.
 
-    **Raises:** `ValueError` where neither Embree nor libigl is installed.
+    **Raises:** `ValueError` if neither Embree nor libigl is installed.
     """
     return (_by_embree if tracer() == "embreex" else _by_libigl)(vertices, faces)
 
 
 def tracer() -> str:
-    """The package that traces here, `embreex` or `libigl`."""
+    """The name of the package that traces rays here: `embreex` or `libigl`."""
     try:
         importlib.import_module("embreex.rtcore_scene")
     except ImportError:
@@ -56,13 +57,13 @@ def _by_embree(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 
 def _by_libigl(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> FirstFaces:
     corners, rows = _SCALE * np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int64)
-    held = [optional("igl").AABB()]
-    held[0].init(corners, rows)
+    trees = [optional("igl").AABB()]
+    trees[0].init(corners, rows)
 
     def first(origins, directions):
-        found, distances, _ = held[0].intersect_ray_first(corners, rows, _SCALE * (origins + _SHIFT), directions)
-        return found, distances / _SCALE
+        indices, distances, _ = trees[0].intersect_ray_first(corners, rows, _SCALE * (origins + _SHIFT), directions)
+        return indices, distances / _SCALE
 
-    # A tree that outlives Python is reported as a leak, on standard error.
-    weakref.finalize(first, held.clear)
+    # A tree that outlives Python would be reported as a leak on standard error.
+    weakref.finalize(first, trees.clear)
     return first

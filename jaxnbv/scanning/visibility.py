@@ -1,4 +1,4 @@
-"""Points that are spread evenly over a sampled surface, and which of them a camera sees from a pose."""
+"""Evenly spread points on a sampled surface, and whether a camera sees each from a pose."""
 
 import math
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from jaxnbv.scanning.grid import GridSurface
 from jaxnbv.scanning.metrics import GRAZING
 from jaxnbv.scanning.scanner import Surface
 
-# Poses at once.
+# Number of poses per batch.
 _POSES = 32
 
 
@@ -23,7 +23,7 @@ class SurfacePoints(NamedTuple):
     """Points of a surface, in scene units.
 
     - `points`, `normals`: the normals are unit and point outward.
-    - `areas`: how much of the surface each point stands for, in squared scene units; zero of a surface without points.
+    - `areas`: area that each point stands for, in squared scene units; zero if the surface is empty.
     """
 
     points: Float[Array, "n 3"]
@@ -33,19 +33,19 @@ class SurfacePoints(NamedTuple):
 
 @eqx.filter_jit
 def spread_points(surface: GridSurface, count: int) -> SurfacePoints:
-    """Points where edges of the grid meet a surface: one of every so many edges, in the order of the grid.
+    """Points where edges of the grid cross a surface, evenly spread over these edges.
 
-    A plane with the unit normal n meets |n_x| + |n_y| + |n_z| edges for each square of the grid's spacing, so that each
-    of these edges stands for the inverse of this many squares (Cauchy and Crofton's formula).
+    A plane with the unit normal n crosses |n_x| + |n_y| + |n_z| edges per squared grid spacing. So each edge stands for
+    an area of the inverse, in squared spacings (Cauchy-Crofton formula).
 
-    - `count`: of the points; a surface that meets fewer edges has some of them several times.
+    - `count`: number of points. Points repeat if the surface crosses fewer edges.
     """
     values, grid = surface.values, surface.grid
     inside = values <= 0
     # The last node along an axis has no neighbour ahead.
     crossed = [jnp.pad(jnp.diff(inside, axis=axis), [(0, int(own == axis)) for own in range(3)]) for axis in range(3)]
     reached = jnp.cumsum(jnp.stack(crossed).reshape(-1))
-    # Every so many-th would fall into step with the rows of the grid.
+    # One random edge in each of `count` equal intervals. A fixed stride could fall into step with the grid's rows.
     apart = jax.random.uniform(jax.random.key(0), (count,))
     ranks = (jnp.arange(count) + apart) / count * reached[-1]
     edge = jnp.searchsorted(reached, ranks, side="right").clip(0, reached.size - 1)
@@ -73,18 +73,19 @@ def sees(
     tolerance: float,
     barrier: Float[Array, "poses rays"] | None = None,
 ) -> Bool[Array, "poses n"]:
-    """Which points of a surface a camera sees from each of some poses: they lie within its image and its range, face it
-    at no grazing angle, and nothing is before them.
+    """Whether a camera sees each point of a surface from each pose of a batch.
 
-    - `tolerance`: how far before a point its ray may meet the surface, in scene units.
+    A point is seen if it is within the image and the range, is not at a grazing angle, and nothing is in front of it.
+
+    - `tolerance`: largest distance in front of a point at which its ray may hit the surface, in scene units.
     - `barrier`: see `scan`.
     """
 
-    def from_pose(given: tuple[Pose, Float[Array, " rays"] | None]) -> Bool[Array, " n"]:
-        pose, barrier = given
+    def from_pose(inputs: tuple[Pose, Float[Array, " rays"] | None]) -> Bool[Array, " n"]:
+        pose, barrier = inputs
         offset = points.points - pose.position
-        away = jnp.linalg.norm(offset, axis=-1)
-        directions = offset / jnp.where(away > 0, away, 1.0)[:, None]
+        distance = jnp.linalg.norm(offset, axis=-1)
+        directions = offset / jnp.where(distance > 0, distance, 1.0)[:, None]
         local = jnp.matmul(offset, pose.rotation, precision="highest")
         depth = local[:, 2]
         inside = (depth > 0) & (depth >= camera.nearest)
@@ -95,11 +96,11 @@ def sees(
         cosine = -jnp.sum(directions * points.normals, axis=-1)
         inside &= cosine >= max(GRAZING, math.cos(camera.max_incidence))
         hits = surface.trace(jnp.broadcast_to(pose.position, offset.shape), directions)
-        inside &= hits.mask & (jnp.linalg.norm(hits.points - pose.position, axis=-1) >= away - tolerance)
+        inside &= hits.mask & (jnp.linalg.norm(hits.points - pose.position, axis=-1) >= distance - tolerance)
         if barrier is None:
             return inside
         pixel = jnp.where(inside, row * camera.width + column, 0).astype(jnp.int32)
-        return inside & (away < barrier[pixel])
+        return inside & (distance < barrier[pixel])
 
-    # All rays through one sample march together, and stay in a CPU's cache.
+    # Batches keep the rays through one sample in a CPU's cache.
     return jax.lax.map(from_pose, (poses, barrier), batch_size=_POSES)

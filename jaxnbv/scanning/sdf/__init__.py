@@ -1,4 +1,4 @@
-"""Analytic signed distance functions and constructive solid geometry of them."""
+"""Signed distance functions of solids and constructive solid geometry."""
 
 from jaxnbv.scanning.sdf.base import Difference as Difference
 from jaxnbv.scanning.sdf.base import Intersection as Intersection

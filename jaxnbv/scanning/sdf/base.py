@@ -1,9 +1,9 @@
-"""Signed distance functions, moved and combined (constructive solid geometry).
+"""The base class of signed distance functions, rigid motions, scaling and set operations (constructive solid geometry).
 
 A signed distance function is negative inside the solid. All functions here have slopes of at most one, so their
-magnitude never exceeds the distance to the surface and a ray may stride by it (Hart 1996). Each class says whether it
-is *exact* or a *bound*, for exact parts. Parameters are arrays: build a batch of scenes with `jax.vmap` and scan them
-in one jitted function.
+magnitude never exceeds the distance to the surface, and a ray may stride by it (Hart 1996). Each class states whether
+it is *exact* or a *bound* if its parts are exact. Parameters are arrays: build a batch of scenes with `jax.vmap` and
+scan them in one jitted function.
 """
 
 import functools
@@ -21,7 +21,7 @@ from jaxnbv.checks import AnyArray, InputError, as_floats, check_type, is_traced
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.rotations import rotation_about, safe_norm
 
-# Numbers and lists are converted on the way in, which mypy cannot see.
+# A converter accepts numbers and lists, which mypy cannot see.
 if TYPE_CHECKING:
     Scalar: TypeAlias = Any
     Vector: TypeAlias = Any
@@ -39,7 +39,7 @@ def parameter(**kwargs):
 
 
 def nonnegative(**kwargs):
-    """A parameter that must not be negative."""
+    """A field for a parameter that must not be negative."""
     return parameter(metadata={"length": True}, **kwargs)
 
 
@@ -47,7 +47,7 @@ def split(x):
     return x[..., 0], x[..., 1], x[..., 2]
 
 
-# Selections rather than jnp.minimum and jnp.maximum, whose derivatives share out ties at many times the cost.
+# Not jnp.minimum and jnp.maximum, whose derivatives split ties evenly and cost many times as much.
 def least(a, b):
     return jnp.where(a <= b, a, b)
 
@@ -58,10 +58,10 @@ def greatest(a, b):
 
 @jax.custom_jvp
 def least_of_last(values):
-    """The least along the last axis, with the derivative of the first that is least.
+    """The minimum along the last axis, with the derivative of its first occurrence.
 
-    That of `jnp.min` compares the values with their least: compiled apart, they can differ in the last bit, and the
-    derivative is then 0 / 0.
+    The derivative of `jnp.min` compares the values with their minimum. If both are compiled separately they can differ
+    in the last bit, and the derivative is then 0 / 0.
     """
     return jnp.min(values, axis=-1)
 
@@ -74,16 +74,16 @@ def _least_of_last_jvp(values, tangents):
 
 
 def corner_distance(*q):
-    """Signed distance to the corner, edge or face where all q <= 0, given the signed distances q to its faces."""
+    """Signed distance to the solid where all q <= 0, from the signed distances q to orthogonal planes."""
     outside = safe_norm(*(greatest(c, 0.0) for c in q))
     return outside + least(functools.reduce(greatest, q), 0.0)
 
 
 class SignedDistance(eqx.Module):
-    """A solid by its signed distance function, in scene units: negative inside.
+    """A solid, defined by its signed distance function in scene units: negative inside.
 
-    A subclass gives `__call__`, which treats every point on its own, has slopes of at most one and changes sign at the
-    surface. Solids combine as sets: `a | b`, `a & b`, `a - b`.
+    A subclass defines `__call__`, which treats each point independently, has slopes of at most one, and changes sign at
+    the surface. Solids combine as sets: `a | b`, `a & b`, `a - b`.
 
     **Raises:** `ValueError` if a parameter is not finite, has the wrong shape, or is a negative length.
     """
@@ -113,7 +113,7 @@ class SignedDistance(eqx.Module):
                 check_type(value, SignedDistance, name)
             if not eqx.is_array(value):
                 continue
-            # A letter stands for any length.
+            # A letter in the annotation allows any length.
             shape = tuple(int(n) if n.isdigit() else n for n in cast(Any, field.type).dim_str.split())
             require(
                 len(value.shape) == len(shape)
@@ -121,11 +121,11 @@ class SignedDistance(eqx.Module):
                 f"{name} has shape {value.shape}, not {shape}: for a batch of solids build it inside jax.vmap",
             )
             if not is_traced(value):
-                known = np.asarray(value)
-                # To print an array takes far longer than to look at it.
-                if not np.isfinite(known).all():
+                numbers = np.asarray(value)
+                # Not `require`, since formatting an array takes far longer than checking it.
+                if not np.isfinite(numbers).all():
                     raise InputError(f"{name} is {value}: give finite numbers")
-                if "length" in field.metadata and (known < 0).any():
+                if "length" in field.metadata and (numbers < 0).any():
                     raise InputError(f"{name} is {value}: a length must not be negative")
 
     def translate(self, offset) -> "Translated":
@@ -133,7 +133,7 @@ class SignedDistance(eqx.Module):
         return Translated(self, offset)
 
     def rotate(self, axis, angle) -> "Rotated":
-        """The solid turned about the direction `axis` (3,) through the origin, by `angle` radians, right-handed.
+        """The solid turned about the axis (3,) through the origin by `angle` radians, right-handed.
 
         **Raises:** `ValueError` if the axis is zero.
         """
@@ -141,7 +141,7 @@ class SignedDistance(eqx.Module):
         shapes = axis.shape, angle.shape
         require(shapes == ((3,), ()), f"axis and angle have shapes {shapes[0]} and {shapes[1]}: give (3,) and ()")
         if not is_traced(axis):
-            # As a float of JAX, which takes what is below the least normal number for zero.
+            # In JAX's float type, which flushes numbers below the least normal one to zero.
             longer = bool(np.sum(np.square(np.asarray(axis))) >= jnp.finfo(axis.dtype).tiny)
             require(longer, f"the axis of rotation is {axis}: give a direction that is not zero")
         return Rotated(self, rotation_about(axis, angle))
@@ -173,7 +173,7 @@ class Union(SignedDistance):
 class SmoothUnion(SignedDistance):
     """The union with a fillet where the two surfaces come within `width` of each other. A bound.
 
-    min(a, b) - h^2 / (4 width), h = max(width - |a - b|, 0): slopes are averages of those of a and b.
+    min(a, b) - h^2 / (4 width), h = max(width - |a - b|, 0). Its slopes are averages of those of a and b.
     """
 
     first: SignedDistance
@@ -229,7 +229,7 @@ class Rotated(SignedDistance):
         Pose(self.rotation, np.zeros(3))
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
-        # R^T x written as a sum, which XLA fuses with its neighbours where it would not a matrix product.
+        # R^T x as a sum, which XLA fuses with other operations; a matrix product would not fuse.
         a, b, c = (x[..., i, None] * self.rotation[i] for i in range(3))
         return self.solid(a + b + c)
 

@@ -1,4 +1,4 @@
-"""The union of primitives that carry labels: one type for all such solids, so that one compiled program scans any."""
+"""Unions of labelled primitives. All have one type, so that one compiled program scans any of them."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -7,26 +7,26 @@ from jaxnbv.checks import AnyArray
 from jaxnbv.geometry.rotations import safe_norm
 from jaxnbv.scanning.sdf.base import SignedDistance, corner_distance, least_of_last, nonnegative, parameter
 
-# The label of a slot without a primitive.
+# Label of a slot without a primitive.
 UNUSED = -1
 
 
 class LabelledSolid(SignedDistance):
-    """The union of labelled primitives; a bound.
+    """The union of labelled primitives. A bound.
 
     A point x has the coordinates u = rotation^T (x - centre) in a primitive's own frame. With h = half_size and
     t = rounding, its distance is that of the box [-h, h] rounded by t,
 
-        d(u) = |max(q, 0)| + min(max(q1, q2, q3), 0) - t,    q = |u| - (h - t),
+        d(u) = |max(q, 0)| + min(max(q1, q2, q3), 0) - t,    q = |u| - (h - t).
 
-    or, where `revolved`, the same in two dimensions of (r - radius - slant * u2, u2), r the distance from the axis u2,
-    divided by the largest singular value (|slant| + sqrt(slant^2 + 4)) / 2 of this shear.
+    A revolved primitive has the same distance in two dimensions, of (r - radius - slant * u2, u2) with r the distance
+    from the axis u2. It is divided by the largest singular value (|slant| + sqrt(slant^2 + 4)) / 2 of this shear.
 
-    - `centre`, `rotation`, `half_size`, `rounding`: as above, in scene units; a revolved one's half width is the first
-      half size and its half height the second, and also the third.
-    - `revolved`: which primitives are revolved; `radius` is then that of the ring, 0 for a solid, and `slant` its
-      growth with height.
-    - `labels`: the label of each primitive; -1 marks a slot that is not used.
+    - `labels`: label of each primitive; -1 for a slot that is not used.
+    - `revolved`: whether each primitive is revolved.
+    - `centre`, `rotation`, `half_size`, `rounding`: as above, in scene units. For a revolved primitive, the half width
+      is the first half size, and the half height is the second and also the third.
+    - `radius`, `slant`: for a revolved primitive, the radius of the ring (0 for a solid) and its growth with height.
     """
 
     labels: Int[Array, " slots"]
@@ -44,7 +44,7 @@ class LabelledSolid(SignedDistance):
     def distances(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n primitives"]:
         """Signed distance to each primitive; infinite for slots that are not used."""
         a, b, c = (x[..., i, None] - self.centre[:, i] for i in range(3))
-        # R^T x written as sums, which XLA fuses with what follows where it would not a matrix product.
+        # R^T x as sums, which XLA fuses with other operations; a matrix product would not fuse.
         u, v, w = (
             a * self.rotation[:, 0, i] + b * self.rotation[:, 1, i] + c * self.rotation[:, 2, i] for i in range(3)
         )
@@ -58,5 +58,5 @@ class LabelledSolid(SignedDistance):
         return jnp.where(self.labels > UNUSED, distance / steepest, jnp.inf)
 
     def part_labels(self, x: Float[AnyArray, "*n 3"]) -> Int[Array, "*n"]:
-        """The label of the primitive whose surface is nearest: exact for points of the solid's surface."""
+        """The label of the primitive with the nearest surface; exact for points on the solid's surface."""
         return self.labels[jnp.argmin(jnp.abs(self.distances(x)), axis=-1)]

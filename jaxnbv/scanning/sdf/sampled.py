@@ -1,4 +1,4 @@
-"""Meshes as solids that can be traced within JAX: their signed distances, sampled on grids."""
+"""Meshes as solids that JAX can trace, by signed distances sampled on grids."""
 
 from typing import Any
 
@@ -12,16 +12,18 @@ from jaxnbv.errors import optional
 from jaxnbv.geometry.rotations import safe_norm
 from jaxnbv.scanning.sdf.base import Scalar, SignedDistance, Vector, nonnegative, parameter, split
 
-# Of the longest side, on all sides.
+# Width of the space around the mesh, as a share of its longest side.
 _PADDING = 0.1
 
 
 class Sampled(SignedDistance):
-    """A solid by its signed distances at the nodes of a grid, trilinear between them. Right to about a cell within the
-    grid, a bound beyond it.
+    """A solid with signed distances at the nodes of a grid, trilinear between them.
 
-    - `values`: at the nodes; `low`: the first of them; `spacing`: between them.
-    - `padding`: by how much the grid is larger than the solid on all sides.
+    Accurate to about a cell within the grid, a bound beyond it.
+
+    - `values`: signed distance at each node.
+    - `low`, `spacing`: the first node, and the distance between neighbouring nodes.
+    - `padding`: width of the space between the solid and the sides of the grid.
     """
 
     values: Float[Array, "a b c"] = parameter()
@@ -33,9 +35,9 @@ class Sampled(SignedDistance):
         high = self.low + self.spacing * (jnp.array(self.values.shape) - 1)
         nearest = jnp.clip(x, self.low, high)
         places = jnp.moveaxis((nearest - self.low) / self.spacing, -1, 0)
-        found = jax.scipy.ndimage.map_coordinates(self.values, list(places), order=1, mode="nearest")
+        inside = jax.scipy.ndimage.map_coordinates(self.values, list(places), order=1, mode="nearest")
         beyond = safe_norm(*split(x - nearest))
-        return jnp.where(beyond > 0, beyond + self.padding, found)
+        return jnp.where(beyond > 0, beyond + self.padding, inside)
 
 
 @checked
@@ -46,12 +48,13 @@ def solid_of_mesh(
     sheet: float = 0.0,
     cubic: bool = False,
 ) -> Sampled:
-    """A mesh as a solid, in the coordinates of its vertices: an obstacle, say. Its inside is told by winding numbers,
-    so that it may have holes.
+    """A mesh as a solid in the coordinates of its vertices, for example for an obstacle.
 
-    - `resolution`: nodes along its longest side.
-    - `sheet`: how thick faces are that have the outside on both sides; without thickness they vanish.
-    - `cubic`: as many nodes along all sides, so that solids of several meshes can be stacked.
+    Inside and outside follow from winding numbers, so the mesh may have holes.
+
+    - `resolution`: number of nodes along the longest side.
+    - `sheet`: thickness of faces with the outside on both sides. With 0 they vanish.
+    - `cubic`: use this many nodes along all sides, so that the solids of several meshes can be stacked.
 
     **Raises:** `ValueError` for triangles as `TriangleMesh.from_arrays` does, or a resolution below four.
     """
@@ -94,12 +97,15 @@ def _signed_distance(
 def _is_inside(
     points: Float[np.ndarray, "n 3"], vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Bool[np.ndarray, " n"]:
-    # Of a solid whose faces are wound the other way the number is negative.
+    # The number is negative for a solid whose faces are wound inside out.
     return np.abs(winding_number(points, vertices, faces)) > 0.5
 
 
 def checked_triangles(vertices: Any, faces: Any) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
-    """**Raises:** `ValueError` for what is no mesh of triangles."""
+    """Vertices and faces as arrays, checked to be a mesh of triangles.
+
+    **Raises:** `ValueError` if they are not.
+    """
     vertices = as_numbers(vertices, "the mesh's vertices", np.float64)
     faces = as_numbers(faces, "the mesh's faces", None)
     require(
@@ -127,13 +133,15 @@ def checked_triangles(vertices: Any, faces: Any) -> tuple[Float[np.ndarray, "v 3
 def distance_to_triangles(
     points: Float[np.ndarray, "n 3"], vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Float[np.ndarray, " n"]:
-    """From each point to the nearest triangle."""
+    """Unsigned distance from each point to the nearest triangle."""
     return np.sqrt(optional("igl").point_mesh_squared_distance(points, vertices, faces)[0])
 
 
 def winding_number(
     points: Float[np.ndarray, "n 3"], vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Float[np.ndarray, " n"]:
-    """How often the triangles wind around each point (Barill et al. 2018): 1 inside a closed mesh, -1 inside one that
-    is wound inside out, between them and 0 by a small hole."""
+    """Winding number of the triangles around each point (Barill et al. 2018).
+
+    It is 1 inside a closed mesh, -1 if the mesh is wound inside out, and between that and 0 near a hole.
+    """
     return np.asarray(optional("igl").fast_winding_number(vertices, faces, points))

@@ -1,4 +1,4 @@
-"""Solids by their signed distance functions."""
+"""Elementary solids with their signed distance functions."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -27,7 +27,9 @@ class Sphere(SignedDistance):
 
 
 class Cuboid(SignedDistance):
-    """The box [-half_size, half_size] with edges rounded by `rounding`, which leaves its outer size as it is. Exact.
+    """The box [-half_size, half_size] with rounded edges. Exact.
+
+    - `rounding`: radius of the edges; it does not change the outer size.
 
     **Raises:** `ValueError` also if the rounding is greater than half of a side.
     """
@@ -39,7 +41,7 @@ class Cuboid(SignedDistance):
         if not is_traced(self):
             require(
                 bool((self.rounding <= self.half_size).all()),
-                f"a box of half sizes {self.half_size} cannot be rounded by {self.rounding}: round it by less",
+                f"a box of half sizes {self.half_size} cannot be rounded by {self.rounding}: reduce the rounding",
             )
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
@@ -58,14 +60,17 @@ class Cylinder(SignedDistance):
 
 
 class Cone(SignedDistance):
-    """The solid cone about the y axis, capped flat: radii at y = -half_height and y = half_height. Exact."""
+    """The solid cone about the y axis with flat caps at y = -half_height and half_height. Exact.
+
+    - `bottom_radius`, `top_radius`: radii of the lower and the upper cap.
+    """
 
     bottom_radius: Scalar = nonnegative()
     top_radius: Scalar = nonnegative()
     half_height: Scalar = nonnegative()
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
-        # The profile in the half plane (r, y): two caps, a slanted edge from the bottom's corner to the top's.
+        # The profile in the half plane (r, y): two caps, and a slanted edge from the bottom corner to the top corner.
         x, y, z = split(x)
         r = safe_norm(x, z)
         widening, rise = self.top_radius - self.bottom_radius, 2.0 * self.half_height
@@ -109,7 +114,9 @@ class Capsule(SignedDistance):
 
 
 class HalfSpace(SignedDistance):
-    """All that lies below a plane through `point`, whose `normal` points out of it: a table, a wall. Exact.
+    """The half space behind the plane through `point`, such as a table or wall. Exact.
+
+    - `normal`: direction out of the solid, of any length.
 
     **Raises:** `ValueError` also if the normal is zero.
     """
