@@ -36,7 +36,9 @@ class ImaginedView(eqx.Module):
 
 
 class Acquisition(eqx.Module):
-    """Base class: the worth of one imagined scan, given the observations. A search maximises its mean over the samples.
+    """Base class: the worth of one imagined scan, given the observations.
+
+    A search maximises its mean over the samples.
 
     - `needs_posterior`: whether `context` reads the posterior. A planner then puts the posterior into the step.
     - `cloud_only`: whether `context` reads D alone, so that a planner can try it before there are observations.
@@ -104,7 +106,7 @@ class Acquisition(eqx.Module):
         return None
 
     def answer_values(self, cloud: PointCloud) -> Float[Array, " n"] | None:
-        """The values of `answer` by JAX operations, or None if there are none or only host code can compute them."""
+        """The values of `answer` by JAX operations. None without an answer, or if it needs host code."""
         return None
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> Answer | None:
@@ -116,7 +118,7 @@ class Acquisition(eqx.Module):
         return self.answer(cloud)
 
     def check(self, cloud: PointCloud) -> None:
-        """Raise `ValueError` if a part of the acquisition, a network say, returns an impossible result on this cloud.
+        """Raise `ValueError` if a network or function of the acquisition has an impossible result.
 
         Called on the first D, and on D together with a scan if the score of that scan is not finite.
         """
@@ -189,7 +191,9 @@ class ExpectedUtilityImprovement(Acquisition):
 
 
 def as_acquisition(value: Any) -> Acquisition:
-    """The value itself if it is an acquisition, else the expected improvement of this utility or plain function.
+    """The value itself if it is an acquisition, else the expected improvement of this utility.
+
+    A plain function of a cloud will do as a utility.
 
     **Raises:** `ValueError` for anything else.
     """
@@ -199,7 +203,7 @@ def as_acquisition(value: Any) -> Acquisition:
 
 
 class AcquisitionList(Acquisition):
-    """Several acquisitions evaluated on the same samples and the same scans, so each pose is scanned only once.
+    """Several acquisitions on the same samples and the same scans, so each pose is scanned only once.
 
     Its value is the vector of the members' values in order, and a member with a vector value takes as many places.
     Use it with `expected_value` and `Problem.scores`, not in a planner.
@@ -320,7 +324,7 @@ def expected_value(
     poses: Pose,
     barrier: Float[Array, "poses rays"] | None = None,
 ) -> Float[Array, "poses *scores"]:
-    """The acquisition at each pose of a batch: the mean score of the imagined scans over the sampled surfaces.
+    """The acquisition at each pose of a batch: mean score of the imagined scans over the samples.
 
     Supports `jit`, `grad` and `vmap`, in the poses and in `seen`. `AcquisitionList` adds an axis for its members.
 
@@ -343,7 +347,9 @@ def expected_value(
 def scores(
     acquisition: Acquisition, context: Any, scans: PointCloud, camera: Camera, poses: Pose, samples: int = 1
 ) -> Float[Array, "poses *scores"]:
-    """Scores of a batch of scans, one scan from each pose. `batch_size // samples` of them are computed at a time.
+    """Scores of a batch of scans, one scan from each pose.
+
+    `batch_size // samples` of them are computed at a time.
 
     - `samples`: number of samples whose scans are scored together.
     """

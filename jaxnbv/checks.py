@@ -89,9 +89,9 @@ def check_fields(module: Any) -> None:
 
 @contextmanager
 def own_settings() -> Iterator[None]:
-    """Context manager or decorator: allow rank promotion, type promotion and transfers, whatever `jax.config` says.
+    """Context manager or decorator: allow rank promotion, type promotion and transfers in JAX.
 
-    Strict settings of a user are meant for the user's own code. `jax_debug_nans` stays as it is.
+    Strict settings of a user in `jax.config` are meant for the user's own code. `jax_debug_nans` stays as it is.
     """
     with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"), jax.transfer_guard("allow"):
         yield
@@ -116,7 +116,7 @@ def checked(function: _F) -> _F:
 
 
 def check_type(value: Any, hint: Any, name: str) -> None:
-    """**Raises:** `ValueError` unless the value agrees with a plain type hint. Other hints are not checked."""
+    """**Raises:** `ValueError` if the value contradicts a plain type hint. Ignores other hints."""
     if hint is int:
         whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
         require(whole, f"{name} is {shown(value)}; it must be a whole number")
@@ -139,7 +139,7 @@ def check_type(value: Any, hint: Any, name: str) -> None:
 
 
 def check_index(index: Any, batch: tuple[int, ...], name: str) -> None:
-    """**Raises:** `ValueError` for a number that indexes no batch or is out of range, where JAX would clamp it."""
+    """**Raises:** `ValueError` for a number that indexes no batch or is out of range (JAX clamps it)."""
     if isinstance(index, int | np.integer):
         check_batch(batch, name)
         require(-batch[0] <= index < batch[0], f"{name} has {batch[0]} along its first axis: there is no index {index}")
@@ -157,9 +157,9 @@ def check_key(key: Any) -> None:
 
 
 def native(value: Any) -> Any:
-    """A NumPy array converted to native byte order and at most double precision. Anything else is returned as it is.
+    """A NumPy array converted to native byte order and at most double precision.
 
-    Under `jit`, JAX reads arrays of the other byte order without swapping bytes.
+    Returns anything else as it is. Under `jit`, JAX reads arrays of the other byte order without swapping bytes.
     """
     if isinstance(value, np.ndarray) and (value.dtype.char == "g" or not value.dtype.isnative):
         return value.astype(np.float64 if value.dtype.char == "g" else value.dtype.newbyteorder("="))
@@ -212,7 +212,7 @@ def as_numbers(value: Any, name: str, dtype: Any = float) -> np.ndarray:
 
 @contextmanager
 def functions_of_users() -> Iterator[None]:
-    """Context manager for calls of the user's functions: explains JAX's tracing errors and gives the remedy.
+    """Context manager for calls of the user's functions: explains JAX's tracing errors.
 
     **Raises:** `ValueError` for a function that calls NumPy, picks rows by a mask, or branches in Python on a value.
     """

@@ -9,7 +9,7 @@ from tqdm import tqdm
 def progress_bar(
     items: Iterable[Any] | None = None, wanted: bool = True, leave: bool = False, **settings: Any
 ) -> "tqdm[Any]":
-    """A progress bar over `items`, or over a `total` among the settings. Hidden if the output is not a terminal.
+    """A progress bar over `items`, or over a `total` among the settings. Shown on terminals only.
 
     - `wanted`: False hides the bar.
     - `leave`: whether the bar stays on the screen once it is full.

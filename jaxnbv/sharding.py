@@ -19,7 +19,7 @@ from jax.sharding import AxisType, PartitionSpec, get_abstract_mesh
 
 
 def shared_map(function: Callable[..., Any], rows: Any, *common: Any, at_once: int = 1) -> Any:
-    """`function(row, *common)` for each row of a tree, like `jax.lax.map`, with a share of the rows on each device.
+    """`jax.lax.map` of `function(row, *common)` over the rows of a tree, shared among devices.
 
     - `at_once`: number of rows that a device computes together.
     """
@@ -31,15 +31,15 @@ def shared_map(function: Callable[..., Any], rows: Any, *common: Any, at_once: i
 
 
 def batched_map(function: Callable[..., Any], rows: Any, at_once: int) -> Any:
-    """`jax.lax.map` over batches of `at_once` rows. Not batched for 1, since XLA is 50 % slower on batches of one."""
+    """`jax.lax.map` over batches of `at_once` rows. Without batches for 1, since XLA would be 50 % slower."""
     return jax.lax.map(function, rows, batch_size=at_once if at_once > 1 else None)
 
 
 def shared(function: Callable[..., Any], rows: Any, *common: Any) -> Any:
-    """`function(rows, *common)` with a share of the leading rows on each device, and the result on all devices.
+    """`function(rows, *common)` with a share of the leading rows on each device.
 
-    The function must treat the rows independently. With more devices than rows, each device computes all rows.
-    All arrays must be arguments, since arrays in a closure do not reach the devices.
+    All devices get the whole result. The function must treat the rows independently. With more devices than rows, each
+    device computes all rows. All arrays must be arguments, since arrays in a closure do not reach the devices.
     """
     axes, devices = _axes()
     count = len(jax.tree.leaves(rows)[0])

@@ -55,12 +55,14 @@ class Answer(eqx.Module):
 
 
 def default_batch_size() -> int:
-    """Number of clouds to pass to a function at once: 1 on a CPU, where larger batches leave its cache, else 128."""
+    """Number of clouds to pass to a function at once: 128, or 1 on a CPU with its smaller cache."""
     return 1 if on_cpu() else 128
 
 
 class Utility(eqx.Module):
-    """Base class of utilities u(D), the worth of a cloud as one number. Subclasses must define `__call__` only.
+    """Base class of utilities u(D), the worth of a cloud as one number.
+
+    Subclasses must define `__call__` only.
 
     - `name`: in words.
     - `improvement`: name, unit and meaning of the expected improvement by a view.
@@ -98,7 +100,7 @@ class Utility(eqx.Module):
         return None
 
     def check(self, cloud: PointCloud) -> None:
-        """Raise `ValueError` if a part of the utility, a network say, returns an impossible result on this cloud."""
+        """Raise `ValueError` if the result of the utility's network or function is impossible."""
         return
 
 

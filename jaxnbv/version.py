@@ -8,9 +8,10 @@ __version__ = importlib.metadata.version("jaxnbv")
 
 
 def check_jax(installed: str) -> None:
-    """Refuse a version of jaxlib that the package's requirements exclude, since it computes wrong values on CPUs.
+    """Refuse a version of jaxlib that the package's requirements exclude.
 
-    `pip` does not install such versions with jaxnbv, but may do so afterwards.
+    Such versions compute wrong values on CPUs. `pip` does not install such versions with jaxnbv, but may do so
+    afterwards.
 
     **Raises:** `ImportError` with the accepted versions.
     """

@@ -71,7 +71,7 @@ _add_commands()
 
 
 def answer() -> None:
-    """Run the command line of this process. Errors that the user can fix print one line, without a traceback.
+    """Run the command line of this process. An `InputError` prints one line, without a traceback.
 
     **Raises:** `SystemExit` with the exit code.
     """

@@ -11,7 +11,7 @@ _NAME = "jaxnbv-background"
 
 
 def in_background(function: Callable[..., Any], *arguments: Any, **settings: Any) -> "Future[Any]":
-    """Start a call in its own thread and return its future. The thread drops the arguments when the call ends."""
+    """Start a call in its own thread and return its future. The arguments are freed when it ends."""
     future: Future[Any] = Future()
 
     def call() -> None:

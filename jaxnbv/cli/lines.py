@@ -12,7 +12,7 @@ from jaxnbv.viz.answers import label_of, number, words_of
 
 
 class Lines:
-    """Prints two lines for each view, within 100 columns: its position and why it was chosen, and the answer."""
+    """Prints two lines for each view, within 100 columns: position and choice, then the answer."""
 
     def __init__(self, planner: Planner):
         self.planner, self.count = planner, 0

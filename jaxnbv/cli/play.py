@@ -66,7 +66,7 @@ _RACE_VIEWS = 10
 
 
 def rule(texts: Sequence[str]) -> StopRule | None:
-    """The rule that stops once any of some rules such as "sure=0.95" does. None for no rules or for "never".
+    """The rule that stops once any of some rules such as "sure=0.95" does, or None for "never".
 
     **Raises:** `ValueError` for an unknown name, or a value that is not a number or out of range.
     """

@@ -12,7 +12,7 @@ def report(
     ],
     out: Annotated[Path | None, typer.Option(help="Output page, an HTML file.", show_default="DIR/report.html")] = None,
 ) -> None:
-    """Gather studies on one page: tables, figures, pictures, settings, versions and times. It runs nothing."""
+    """Gather studies on one page: tables, figures, pictures, settings, versions, times. Runs nothing."""
     from jaxnbv.studies.engine.page import write_page
 
     typer.echo(f"{write_page(folder, out or folder / 'report.html')}")

@@ -1,4 +1,4 @@
-"""Output for any encoding. Redirected output often has the system's encoding, which may lack some characters."""
+"""Output for any encoding, since the system's encoding of redirected output may lack characters."""
 
 import codecs
 import io
@@ -41,7 +41,7 @@ codecs.register_error("readable", _readable)
 
 
 def write_readable() -> None:
-    """Let the standard streams replace characters that their encoding lacks ("m2" for "m²") instead of failing."""
+    """Make the standard streams replace characters that their encoding lacks, such as "m2" for "m²"."""
     for stream in (sys.stdout, sys.stderr):
         # Streams of tests and notebooks have another type, and take all characters.
         if isinstance(stream, io.TextIOWrapper):

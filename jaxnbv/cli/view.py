@@ -21,7 +21,7 @@ class ViewOptions:
 
 @command(ViewOptions)
 def view(options: ViewOptions) -> None:
-    """Look at a run or a session in the browser: points, cameras, surface, imagined surfaces and the next view."""
+    """Look at a run or a session in the browser: points, cameras, surfaces and the next view."""
     from jaxnbv.checks import check_device
 
     check_device()

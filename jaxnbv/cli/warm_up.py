@@ -29,7 +29,7 @@ class WarmUpOptions:
 
 @command(WarmUpOptions)
 def warm_up(options: WarmUpOptions) -> None:
-    """Compile the programs of a session with this camera and keep them, so that its first view comes at once.
+    """Compile and keep the programs of a session with this camera, so that its first view comes at once.
 
     A session of your program uses them after nbv.keep_compiled(). For another planner, call session.rehearse() there.
     """

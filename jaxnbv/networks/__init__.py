@@ -1,4 +1,4 @@
-"""Networks: PointNet++ and published checkpoints, small rotation-invariant classifiers, and a segmenter of parts."""
+"""Networks: PointNet++, small rotation-invariant classifiers, a part segmenter, and checkpoints."""
 
 from jaxnbv.networks.categories import CATEGORIES as CATEGORIES
 from jaxnbv.networks.categories import Category as Category

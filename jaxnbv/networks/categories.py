@@ -12,7 +12,7 @@ from jaxnbv.checks import require
 
 
 class Category(NamedTuple):
-    """A category of objects: its name, its folder in the data set, names of its parts, and label of the first part."""
+    """A category: its name, its folder in the data set, names of its parts, label of the first part."""
 
     name: str
     synset: str

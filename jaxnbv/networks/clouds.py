@@ -54,7 +54,7 @@ class CloudClassifier(Classifier):
 
 
 class CloudSegmenter(Segmenter):
-    """A segmenter from a network: maps a `PointCloud` to probabilities of the parts of a category, row by row.
+    """A segmenter from a network: maps a `PointCloud` to probabilities of a category's parts by row.
 
     Category and scale are arrays, so objects that differ in them share one compilation.
 
@@ -104,7 +104,7 @@ class CloudSegmenter(Segmenter):
         return dict(zip(category.labels, category.parts, strict=True))
 
     def __call__(self, cloud: PointCloud) -> Float[Array, "num_points parts"]:
-        """p(part) at the network's input points. Zero for parts of other categories and in rows without a point.
+        """p(part) at the network's input points. Zero for parts of other categories and in masked rows.
 
         These are the network's probabilities, conditioned on the parts of the category.
         """

@@ -17,11 +17,11 @@ _CENTERS, _CHOSEN = 384, 320
 
 
 class PairLevel(eqx.Module):
-    """One level of grouping: a perceptron of pair features and neighbours' features, then the maximum over neighbours.
+    """One level of grouping: a perceptron of pair and neighbour features, then the maximum.
 
-    The features of a pair of oriented points are (|d|^2, n_i . d, n_j . d, n_i . n_j) with d = (x_j - x_i) / radius:
-    the point-pair features of Drost et al. (2010) without square root and arc cosines, so that derivatives exist
-    everywhere.
+    The maximum is over the neighbours in a group. The features of a pair of oriented points are
+    (|d|^2, n_i . d, n_j . d, n_i . n_j) with d = (x_j - x_i) / radius: the point-pair features of Drost et al. (2010)
+    without square root and arc cosines, so that derivatives exist everywhere.
 
     - `radius`: radius of a group, in the units of the points.
     - `groups`: intended number of centres, which the caller chooses.
@@ -74,10 +74,11 @@ def _affine(layer: Any, rows: Float[Array, "*rows inputs"]) -> Float[Array, "*ro
 
 
 class Focus(eqx.Module):
-    """Network that tells which points are on the cue of the class. Invariant under rotations and translations.
+    """Network that tells which points are on the cue of the class.
 
-    It computes features of each point's edges, groups them around farthest point samples, interpolates these back to
-    the points, and applies a perceptron to both. It has about 12,000 parameters.
+    It is invariant under rotations and translations. It computes features of each point's edges, groups them around
+    farthest point samples, interpolates these back to the points, and applies a perceptron to both. It has about 12,000
+    parameters.
     """
 
     edge: PairLevel

@@ -1,4 +1,6 @@
-"""The layers of PointNet++ (Qi et al. 2017). Set abstraction maps points with features to fewer points,
+"""The layers of PointNet++ (Qi et al. 2017).
+
+Set abstraction maps points with features to fewer points,
 
     g_i = max over j in the ball of c_i of MLP(x_j - c_i, f_j),   c_i by farthest point sampling,
 
@@ -55,7 +57,7 @@ class PooledMLP(eqx.Module):
     layers: tuple[Linear, ...]
 
     def lift(self, points: Float[Array, "n 3"], features: Float[Array, "n inputs"] | None) -> Float[Array, "n outputs"]:
-        """[x, f] W of the first layer without bias. It is linear, so once for each point is enough, for all groups."""
+        """[x, f] W of the first layer without bias. It is linear, so it is computed once for all groups."""
         inputs = points if features is None else jnp.concatenate([points, features], axis=-1)
         return product(inputs, self.layers[0].weight)
 

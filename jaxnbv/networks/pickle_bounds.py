@@ -1,4 +1,4 @@
-"""Checks of a pickle before it is read: it must not ask for more memory than its file can fill, or nest too deep."""
+"""Checks of a pickle before it is read: bounds on its memory and on its nesting."""
 
 import mmap
 import pickletools

@@ -1,6 +1,7 @@
-"""PointNet++ classifier and part segmenter of a cloud (Qi et al. 2017) in inference mode, and a small part segmenter.
+"""PointNet++ classifier and part segmenter (Qi et al. 2017), and a small part segmenter.
 
-The small one has similar layers, and is fast enough for hundreds of imagined scans in each step.
+PointNet++ is in inference mode. The small segmenter has similar layers, and is fast enough for hundreds of imagined
+scans in each step.
 """
 
 import itertools
@@ -17,7 +18,7 @@ from jaxnbv.networks.layers import FeaturePropagation, Linear, PooledMLP, SetAbs
 
 
 class Level(NamedTuple):
-    """Sizes of a set abstraction: number of centres, radii of the balls, and number of rows in each ball's group."""
+    """Sizes of a set abstraction: number of centres, radii of balls, number of rows in each group."""
 
     centers: int
     radii: tuple[float, ...]
@@ -164,7 +165,7 @@ class PointNet2PartSegmenter(eqx.Module):
 
 
 class CompactPartSegmenter(eqx.Module):
-    """Small part segmenter: two set abstractions, a maximum over all points, and three feature propagations.
+    """Small part segmenter: two set abstractions, a maximum over all points, three propagations.
 
     It has about 100,000 parameters. It expects oriented points of upright objects that face one way, as in ShapeNet,
     since absolute coordinates are features too. Reverse-mode differentiable in points and normals, with the sampling

@@ -1,4 +1,4 @@
-"""Networks from tensors of the widely used PyTorch implementation of PointNet++, which have these names:
+"""Networks from the tensors of the widely used PyTorch PointNet++. The names of these are:
 
     sa1, sa2     mlp_convs.<layer>, mlp_bns.<layer>              one radius
                  conv_blocks.<radius>.<layer>, bn_blocks. ...    several radii
@@ -27,7 +27,7 @@ _EPSILON = 1e-5
 
 
 def published_network(tensors: Tensors) -> PointNet2Classifier | PointNet2PartSegmenter:
-    """The network with these tensors: a part segmenter if they include feature propagations, else a classifier.
+    """The network with these tensors: a part segmenter if there are propagations, else a classifier.
 
     **Raises:** `ValueError` with the name of a tensor that is missing, unexpected or not finite, or has a wrong shape.
     """

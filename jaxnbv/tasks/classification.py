@@ -78,7 +78,10 @@ def entropy(log_p: Float[Array, "*batch classes"]) -> Float[Array, "*batch"]:
 def cross_entropy(
     log_p: Float[Array, "*batch classes"], log_q: Float[Array, "*batch classes"]
 ) -> Float[Array, "*batch"]:
-    """-sum_c p_c log q_c in nats, from log-probabilities. Finite: log q_c is at least that of the smallest float."""
+    """-sum_c p_c log q_c in nats, from log-probabilities.
+
+    Finite, since log q_c counts as no less than the logarithm of the smallest float.
+    """
     least = jnp.log(jnp.finfo(log_p.dtype).tiny)
     return -jnp.sum(jnp.exp(log_p) * jnp.maximum(log_q, least), axis=-1)
 
@@ -104,7 +107,7 @@ class ClassAcquisition(Acquisition):
 
     @abstractmethod
     def compare(self, log_p: Float[Array, " classes"], log_q: Float[Array, " classes"]) -> Float[Array, "*values"]:
-        """Value in nats of a scan that changes the classifier's result from `log_p`, at t, to `log_q`, at t + 1."""
+        """Value in nats of a scan that takes the classifier's result from log p^(t) to `log_q`, log p^(t+1)."""
 
     def score(self, context: Context, view: ImaginedView) -> Float[Array, "*values"]:
         """`compare` on D and D u scan. Zero for an empty scan."""
@@ -135,8 +138,7 @@ class ClassAcquisition(Acquisition):
         return ClassAnswer(names, np.eye(len(names))[int(label)]) if 0 <= int(label) < len(names) else None
 
     def check(self, cloud: PointCloud) -> None:
-        """**Raises:** `ValueError` unless the classifier's result on D is a vector of log-probabilities, one for each
-        class that it names."""
+        """**Raises:** `ValueError` unless the classifier returns a log-probability for each of its classes."""
         log_p = context_of(self, cloud)[1]
         require(len(log_p) >= 2, f"the classifier's answer has shape {jnp.shape(log_p)}: {_LOG_P}")
         total = float(jnp.sum(jnp.exp(log_p)))
@@ -172,7 +174,9 @@ class CrossEntropy(ClassAcquisition):
 
 
 class EntropyReduction(ClassAcquisition):
-    """Reduction of entropy, max(0, H(p^(t)) - H(p^(t+1))): the improvement of the paper's u_E(D) = sum_c p_c log p_c.
+    """Reduction of the entropy of the class probabilities, max(0, H(p^(t)) - H(p^(t+1))).
+
+    It is the improvement of the paper's u_E(D) = sum_c p_c log p_c.
 
     - `classifier`, `num_points`: see `CrossEntropy`.
     """
@@ -188,7 +192,7 @@ class EntropyReduction(ClassAcquisition):
 
 
 class MixedEntropy(ClassAcquisition):
-    """Cross-entropy while the class is uncertain, entropy reduction once it is nearly certain (the authors' code).
+    """Cross-entropy while the class is uncertain, then reduction of entropy (the authors' code).
 
     `CrossEntropy` if the entropy of p^(t) is above `threshold` (nats), else `EntropyReduction`.
 

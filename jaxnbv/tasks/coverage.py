@@ -72,7 +72,7 @@ class Unseen(eqx.Module):
 
 
 class NewSurface(Acquisition):
-    """Expected new area: surface that an imagined scan shows and no view has measured yet, in squared scene units.
+    """Area in an imagined scan that no view has measured yet, in squared scene units.
 
         alpha(D, scan) = sum_x a(x) clip(d(x) / s - 1, 0, 1)
 

@@ -30,7 +30,7 @@ def _array(source) -> AnyArray:
 
 
 class HeatProblem(eqx.Module):
-    """A body of uniform temperature that is heated near a point: the paper's du/dt = Delta u + f, u(0) = u0.
+    """A body of uniform temperature, heated near a point: the paper's du/dt = Delta u + f, u(0) = u0.
 
     - `source`: point in scene coordinates. f is `power` within `radius` of it and zero elsewhere, smoothed at the rim
       according to the area of each point (`heating`). A body without a point there is not heated.
@@ -68,11 +68,12 @@ class HeatProblem(eqx.Module):
         return self.initial + self.duration * max(0.0, self.power)
 
     def heating(self, points: Float[np.ndarray, "n 3"], areas: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """f at points: `power` times the approximate share of a point's disc that lies within `radius` of the source.
+        """f at points: `power` times the share of a point's disc within `radius` of the source.
 
-        The share is 1/2 + (radius - d) / (2 rho), clipped to [0, 1], for the distance d and the disc's radius rho. In
-        the authors' code a point is within or not, which is the same for dense points. For 1,024 points on an object,
-        the lowest temperatures of two samplings then differed by a third, and differ by a tenth with shares.
+        The share is approximated by 1/2 + (radius - d) / (2 rho), clipped to [0, 1], for the distance d and the disc's
+        radius rho. In the authors' code a point is within or not, which is the same for dense points. For 1,024 points
+        on an object, the lowest temperatures of two samplings then differed by a third, and differ by a tenth with
+        shares.
         """
         distance = np.linalg.norm(points - np.asarray(self.source, np.float64), axis=1)
         return self.power * np.clip(0.5 + 0.5 * (self.radius - distance) / np.sqrt(areas / np.pi), 0.0, 1.0)
@@ -180,9 +181,10 @@ def cloud_temperature(points: Float[np.ndarray, "n 3"], heat: HeatProblem) -> Te
 def mesh_temperature(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], heat: HeatProblem
 ) -> Temperature:
-    """Temperature at the vertices of a mesh in scene coordinates. It is linear between vertices: see `refine`.
+    """Temperature at the vertices of a mesh in scene coordinates.
 
-    Coincident vertices count as one, so that heat crosses the seams of a triangle soup.
+    It is linear between vertices: see `refine`. Coincident vertices count as one, so that heat crosses the seams of a
+    triangle soup.
 
     **Raises:** `ValueError` for vertices that are not finite.
     """

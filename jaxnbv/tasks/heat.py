@@ -126,7 +126,7 @@ def body_temperature(
 
 
 class Coldest(Answer):
-    """The coldest point, in scene coordinates, and its temperature in degrees, the only value of the answer.
+    """The coldest point, in scene coordinates. Its temperature in degrees is the answer's only value.
 
     - `frame`: frame of the world for the point's coordinates in words.
     """
@@ -144,7 +144,7 @@ class Coldest(Answer):
 
 @checked
 def coldest_point(body: PointCloud | TriangleMesh, heat: HeatProblem, reached_only: bool = False) -> Coldest:
-    """The coldest point of a cloud (the estimate) or of a mesh (the truth). The first one if several are equal.
+    """The coldest point of a cloud (the estimate) or of a mesh (the truth), the first of equals.
 
     - `reached_only`: see `ColdestPoint`. If False, and some points are not connected to the source, the result is one
       of these.

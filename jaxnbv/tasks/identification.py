@@ -1,4 +1,4 @@
-"""Identification: find out which known part an object is and how it lies, by the expected information of views."""
+"""Identification: an acquisition to find out which known part an object is and how it lies."""
 
 from collections.abc import Sequence
 from typing import Any, ClassVar, TypeAlias
@@ -48,7 +48,7 @@ class ImaginedParts(eqx.Module):
 
 
 class Identify(Acquisition):
-    """Expected information about which part the object is, and to a lesser degree about how it lies, in nats:
+    """Expected information in nats about which part the object is and, with less weight, how it lies:
 
         alpha(theta) = I(c) + 0.1 I(h | c),   I(c) = H(c) - sum_h w_h H(c | z_h),
         w_h' | z_h  proportional to  w_h' exp(-L(z_h, z_h'))
@@ -94,7 +94,7 @@ class Identify(Acquisition):
         return jax.nn.one_hot(jnp.asarray(numbers)[shapes], int(numbers.max()) + 1)
 
     def score(self, context: Any, view: ImaginedView) -> Float[Array, ""]:
-        """**Raises:** `ValueError` always. The value of a view depends on the scans of all hypotheses together."""
+        """**Raises:** `ValueError` always. The value of a view needs the scans of all hypotheses."""
         raise InputError("Identify cannot score a single scan: use its sample_scores")
 
     def sample_scores(

@@ -72,10 +72,10 @@ else:
 
 
 class SoftPartCount(Utility):
-    """Soft number of parts found, u_S(D) = sum_c tanh(sum_i p_ic / N_target), for `ExpectedUtilityImprovement`.
+    """Soft number of parts found, u_S(D) = sum_c tanh(sum_i p_ic / N_target).
 
-    The paper's u_S. A part saturates once far more than N_target of its points are seen, so a view gains by showing
-    parts that have not been found yet.
+    The paper's u_S, a utility for `ExpectedUtilityImprovement`. A part saturates once far more than N_target of its
+    points are seen, so a view gains by showing parts that have not been found yet.
 
     - `segmenter`: a `Segmenter`, or a function from a cloud to part probabilities of each point.
     - `target`: N_target, in points that the segmenter gets. The default is the authors'.
@@ -93,7 +93,7 @@ class SoftPartCount(Utility):
         return jnp.sum(jnp.tanh(jnp.sum(_probabilities(self.segmenter, cloud), axis=0) / self.target))
 
     def check(self, cloud: PointCloud) -> None:
-        """**Raises:** `ValueError` unless the segmenter returns probabilities of the parts, one row for each point."""
+        """**Raises:** `ValueError` unless the segmenter returns probabilities, one row for each point."""
         with functions_of_users():
             p = _probabilities(self.segmenter, cloud)
         total = jnp.sum(p, axis=1)
@@ -118,7 +118,7 @@ class SoftPartCount(Utility):
         return Quantity("expected gain in parts", "parts", meaning)
 
     def answer(self, cloud: PointCloud) -> "PartAnswer":
-        """Number of points predicted for each part. It shows the parts that the segmenter names, or else has found."""
+        """Number of points predicted for each part. Shows the segmenter's named parts, or else those found."""
         counts = np.asarray(self.answer_values(cloud), np.float64)
         part_names = self.segmenter.part_names
         names = tuple((part_names or {}).get(index, f"part {index}") for index in range(len(counts)))
@@ -130,8 +130,10 @@ class SoftPartCount(Utility):
         return _counts(self.segmenter, cloud).astype(cloud.points.dtype)
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> "PartAnswer":
-        """Number of surface points of each part by the scene's labels, or the answer on all of the surface without
-        labels. A part is present if it has at least one point."""
+        """Number of surface points of each part by the scene's labels.
+
+        Without labels it is the answer on all of the surface. A part is present if it has at least one point.
+        """
         answer = dataclasses.replace(self.answer(cloud), target=1.0)
         labels = scene.part_labels(cloud.points)
         if labels is None:
@@ -163,6 +165,6 @@ def _counts(segmenter: Segmenter, cloud: PointCloud) -> Int[Array, " parts"]:
 
 
 def part_counts(p: Float[Array, "points parts"]) -> Int[Array, " parts"]:
-    """N_c = sum_i 1[argmax_c' p_ic' = c], the number of points predicted for each part. Rows of zeros do not count."""
+    """N_c = sum_i 1[argmax_c' p_ic' = c], points predicted for each part. Zero rows do not count."""
     predicted = jax.nn.one_hot(jnp.argmax(p, axis=1), p.shape[1], dtype=jnp.int32)
     return jnp.sum(jnp.where(jnp.any(p > 0, axis=1)[:, None], predicted, 0), axis=0)

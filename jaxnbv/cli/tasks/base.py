@@ -1,4 +1,4 @@
-"""Base class of tasks of the command line. Neither this module nor a task that is not chosen imports JAX."""
+"""Base class of tasks of the command line. A task imports JAX only once it is chosen."""
 
 import math
 from abc import ABC, abstractmethod
@@ -39,7 +39,9 @@ class Subject(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Task(ABC):
-    """A task of `jaxnbv run` and `jaxnbv demo`. Its fields are options of `run`, and required without a default.
+    """A task of `jaxnbv run` and `jaxnbv demo`. Its fields are options of `run`.
+
+    Options without a default are required.
 
     - `name`: name in `--task`.
     - `about`: the question, a clause for the help.
@@ -81,7 +83,7 @@ class Task(ABC):
 
 
 def usual_first(radius: float | None = None) -> "Pose":
-    """Default pose of a first view, from (0.8, 0.9, 2.2) or at distance `radius` in this direction (scene units)."""
+    """Default pose of a first view, from (0.8, 0.9, 2.2), or in this direction at distance `radius`."""
     from jaxnbv.geometry.pose import look_at
 
     usual = (0.8, 0.9, 2.2)
