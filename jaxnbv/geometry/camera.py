@@ -30,8 +30,8 @@ _SURELY = 0.96
 
 
 def _limit(depth: Any) -> Any:
-    """A limit of the range as an array, so that a program compiled for one scale of a scene runs for any. No limit
-    stays 0.0 or None, so that programs can branch on it."""
+    """A limit of the range as an array, so that a program compiled for one scale of a scene runs for any. A missing
+    limit stays 0.0 or None, so that programs can branch on it."""
     is_number = isinstance(depth, int | float) and not isinstance(depth, bool) and depth != 0
     return np.float64(depth) if is_number else depth
 

@@ -50,7 +50,7 @@ class Frame(eqx.Module):
     @classmethod
     @checked
     def fit(cls, points: Float[AnyArray, "n 3"], longest_side: float = 2.5, up: str = "y") -> "Frame":
-        """The frame in which the points' bounding box is centred and has this longest side.
+        """The frame that centres the points' bounding box and scales its longest side to `longest_side`.
 
         **Raises:** `ValueError` if there are no points, if all coincide, or if one is not finite.
         """

@@ -25,7 +25,7 @@ class PoseList(eqx.Module):
 
     @classmethod
     def empty(cls, room: int) -> "PoseList":
-        """A list without poses, with room for `room` of them."""
+        """An empty list with capacity `room`."""
         dtype = jnp.result_type(float)
         rows = Pose(np.tile(np.eye(3, dtype=dtype), (room, 1, 1)), np.zeros((room, 3), dtype))
         return cls(rows, jnp.asarray(0, jnp.int32))
@@ -56,7 +56,7 @@ class PoseList(eqx.Module):
 
     @property
     def is_filled(self) -> Bool[Array, " room"]:
-        """Which rows hold a pose of the list."""
+        """Whether each row holds a pose of the list."""
         return jnp.arange(self.room) < self.count
 
 

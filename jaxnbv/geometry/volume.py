@@ -56,7 +56,7 @@ class Box(eqx.Module):
         return f"from {low} to {high}"
 
     def widened(self, by: float) -> "Box":
-        """The box with all faces but the lower one moved outward by a length (y is up).
+        """The box with all faces but the lower one (y is up) moved outward by this length.
 
         The lower face stays, since the support of the object is below.
         """

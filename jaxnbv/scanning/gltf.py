@@ -86,7 +86,7 @@ def _unread(header: dict[str, Any]) -> Iterator[str]:
             yield "a mesh below a camera (clear its parent)"
         if "EXT_mesh_gpu_instancing" in node.get("extensions", {}):
             yield "EXT_mesh_gpu_instancing"
-    weights = [thing.get("weights", []) for name in ("nodes", "meshes") for thing in header.get(name, [])]
+    weights = [entry.get("weights", []) for name in ("nodes", "meshes") for entry in header.get(name, [])]
     if any(weight for row in weights for weight in row):
         yield "shape keys (apply them)"
     no_draco = importlib.util.find_spec("DracoPy") is None

@@ -202,9 +202,7 @@ def held_pieces(
 
 @checked
 def mesh_from_sdf(sdf: SignedDistance, grid: Grid) -> TriangleMesh:
-    """The surface of a solid as a mesh in scene coordinates (its frame is the identity).
-
-    By marching cubes.
+    """The surface of a solid as a mesh in scene coordinates (identity frame), by marching cubes.
 
     **Raises:** `ValueError` if no surface lies within the grid.
     """

@@ -135,8 +135,8 @@ def _read(path: Path) -> list[tuple[str, trimesh.Trimesh]]:
     return _placed(trimesh.load_scene(BytesIO(content), kind, resolver, process=False))
 
 
-def _placed(thing: trimesh.Geometry) -> list[tuple[str, trimesh.Trimesh]]:
+def _placed(geometry: trimesh.Geometry) -> list[tuple[str, trimesh.Trimesh]]:
     """Name of the node and placed mesh, for each mesh of a scene or for a single mesh."""
-    parts = thing.dump() if isinstance(thing, trimesh.Scene) else [thing]
+    parts = geometry.dump() if isinstance(geometry, trimesh.Scene) else [geometry]
     meshes = [part for part in parts if isinstance(part, trimesh.Trimesh)]
     return [(str(mesh.metadata.get("node", index)), mesh) for index, mesh in enumerate(meshes)]

@@ -55,7 +55,7 @@ class Obstacles(eqx.Module):
             require(value >= 0, f"the {name} is {value}; it must not be negative")
 
     def in_scene(self, frame: Frame) -> "Obstacles":
-        """The same obstacles in the scene, if these are in world coordinates."""
+        """A copy in scene coordinates of obstacles in world coordinates."""
 
         def moved(solid: SignedDistance) -> SignedDistance:
             return Rotated(solid.translate(-np.asarray(frame.center)), frame.rotation).scale(frame.scale)

@@ -24,7 +24,7 @@ _FAR_OFF = 100.0
 
 
 class Hits(eqx.Module):
-    """Where rays first meet a surface.
+    """First hits of rays on a surface.
 
     - `points`: the hits, in scene coordinates; zero where the ray misses.
     - `normals`: unit normals on the side of the ray's origin; zero where the ray misses.
@@ -128,7 +128,7 @@ class DepthNoise(eqx.Module):
     `PointCloud.from_depth` then computes points and normals, as for any depth image. The camera's range and
     `max_incidence` decide which hits return at all.
 
-    - `deviation`, `step`: in 1 / metre; a step of 0 does not round.
+    - `deviation`, `step`: standard deviation and step of 1/z, in 1 / metre; a step of 0 does not round.
     - `scale`: scene units per metre; `frame.scale` if the world is in metres.
 
     **Raises:** `ValueError` for a negative deviation or step, or a scale that is not positive.

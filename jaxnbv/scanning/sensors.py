@@ -24,7 +24,7 @@ SENSOR_RADIUS = USUAL_SETTING.radius
 def fitted(setting: Setting, bounding_radius: float) -> Setting:
     """The setting at a distance from which its square image shows the whole object from all sides.
 
-    With a twentieth to spare:
+    There is 5 % to spare:
 
         sin(fov / 2) = 1.05 bounding_radius / radius
 
