@@ -1,4 +1,4 @@
-"""Meshes by class in a local folder, as data sets lay them out."""
+"""Meshes by class in a local folder, in the layouts of common data sets."""
 
 import itertools
 import os
@@ -13,7 +13,7 @@ from jaxnbv.networks.categories import CATEGORIES
 from jaxnbv.scanning import TriangleMesh, load_mesh
 
 _T = TypeVar("_T")
-# Patterns of the meshes in the folder of a class, with their axis that is upward; {name} is the folder's own.
+# Patterns of the meshes in the folder of a class, and their upward axis. {name} is the name of the folder.
 _LAYOUTS = {
     "test/{name}_[0-9]*.off": "z",  # ModelNet
     "*/Scan/Scan.obj": "y",  # OmniObject3D
@@ -22,16 +22,17 @@ _LAYOUTS = {
     "test/**/*": "y",
     "**/*": "y",
 }
-# Categories of ShapeNet lie in folders of WordNet's numbers.
+# Folders of ShapeNet's categories are named by WordNet's numbers.
 _SYNSETS = {category.name: category.synset for category in CATEGORIES}
 
 
 class MeshFile(NamedTuple):
-    """Where a mesh lies, and what is known of it without reading it.
+    """The file of a mesh, and facts about it that do not need reading it.
 
-    - `label`: the place of its class; `name`: the object's.
-    - `path`: of the file.
-    - `up`: the file's axis that is upward, see `Frame`.
+    - `label`: index of its class.
+    - `name`: name of the object.
+    - `path`: path of the file.
+    - `up`: upward axis in the file, see `Frame`.
     """
 
     label: int
@@ -48,30 +49,30 @@ class MeshFile(NamedTuple):
 
 
 def taking_turns(groups: Iterable[Sequence[_T]]) -> list[_T]:
-    """The first of each group, then the second of each that has one, and so on."""
+    """The first item of each group, then the second of each group that has one, and so on."""
     turns = itertools.chain.from_iterable(itertools.zip_longest(*groups))
-    return [one for one in turns if one is not None]
+    return [item for item in turns if item is not None]
 
 
 @checked
 def class_meshes(folder: str | Path, classes: Sequence[str]) -> tuple[MeshFile, ...]:
-    """The meshes in a folder `class/.../name` for those of the classes that have one, labelled by their place in
-    `classes`; these take turns. Other folders are passed over.
+    """The meshes of some classes in the layout `folder/class/.../name`, the classes taking turns.
 
-    Names of classes may be written with underscores. How a class is laid out is seen from its files: as in ModelNet,
-    OmniObject3D or ShapeNet (whose folders are numbers, which can be given as names too), or in any other way. Where
-    there is a split `test` the meshes are its.
+    Labels are indices in `classes`. Classes without a folder and folders of other classes are skipped. Folders may be
+    named with underscores. The layout of a class follows from its files: that of ModelNet, of OmniObject3D, of ShapeNet
+    (whose folders are numbers, which also work as names of classes), or any other. If there is a split `test`, only its
+    meshes are used.
 
-    **Raises:** `ValueError` if there is no such folder, none of a class, or one without a mesh; and unless classes are
-    names.
+    **Raises:** `ValueError` if there is no such folder, if no class has a folder, if the folder of a class has no mesh,
+    or if `classes` is not a list of names.
     """
     named = isinstance(classes, list | tuple) and all(isinstance(name, str) for name in classes)
     require(named, f"the classes are {shown(classes)}: give a list of names")
     folder = _existing(folder)
     folder = folder / "raw_scans" if (folder / "raw_scans").is_dir() else folder
-    there = {_plain(path.name): path for path in sorted(folder.iterdir()) if path.is_dir()}
-    found = [(label, there.get(_plain(name), there.get(_SYNSETS.get(name, "")))) for label, name in enumerate(classes)]
-    groups = [_of_class(path, label) for label, path in found if path is not None]
+    paths = {_plain(path.name): path for path in sorted(folder.iterdir()) if path.is_dir()}
+    rows = [(label, paths.get(_plain(name), paths.get(_SYNSETS.get(name, "")))) for label, name in enumerate(classes)]
+    groups = [_of_class(path, label) for label, path in rows if path is not None]
     require(len(groups) > 0, f"the folder {folder} has none of the folders {', '.join(classes)}: give one that has")
     return tuple(taking_turns(groups))
 
@@ -81,7 +82,7 @@ def _plain(name: str) -> str:
 
 
 def mesh_files(folder: str | Path) -> tuple[MeshFile, ...]:
-    """The meshes in a folder, at any depth and sorted, all of the label 0.
+    """The meshes in a folder at any depth, sorted, all with label 0.
 
     **Raises:** `ValueError` if there is no such folder, or no mesh in it.
     """
@@ -96,10 +97,10 @@ def _existing(folder: str | Path) -> Path:
 def _of_class(folder: Path, label: int) -> list[MeshFile]:
     formats = trimesh.available_formats()
     for pattern, up in _LAYOUTS.items():
-        found = sorted(folder.glob(pattern.format(name=folder.name)))
-        files = [file for file in found if file.suffix[1:].lower() in formats and file.is_file()]
+        matches = sorted(folder.glob(pattern.format(name=folder.name)))
+        files = [file for file in matches if file.suffix[1:].lower() in formats and file.is_file()]
         if files:
-            # Where each object has a folder, this names it.
+            # If each object has a folder, this has the object's name.
             names = [file.relative_to(folder).parts[0] if pattern.startswith("*/") else file.stem for file in files]
             return [MeshFile(label, name, str(file), up) for name, file in zip(names, files, strict=True)]
     raise InputError(f"the folder {folder} holds no mesh: its files must end in {', '.join(sorted(formats))}")

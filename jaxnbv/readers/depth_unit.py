@@ -1,4 +1,4 @@
-"""How long a unit of recorded depth images is, by which of the usual ones frames of the same place agree."""
+"""Finds the unit of recorded depth images: the usual unit with which frames of the same place agree."""
 
 import math
 from collections.abc import Callable
@@ -9,24 +9,25 @@ from jaxtyping import Float, UInt16
 from jaxnbv.geometry.camera import Camera
 
 UNITS_A_METRE = (1000.0, 5000.0, 10000.0, 4000.0, 6553.5, 1.0)
-"""Units of depth images that are in use, as many a metre; 1 where the world has the units of the images."""
+"""Common units of depth images, by their number in a metre. 1 means that the world has the unit of the images."""
 
-# Pairs of frames, the largest angle between their views, pixels of each, and the relative difference of equal depths.
+# Number of pairs of frames, cosine of the largest angle between their views, number of pixels of each, and relative
+# difference up to which depths count as equal.
 _PAIRS, _SAME_WAY, _PIXELS, _ALIKE = 12, math.cos(math.radians(45.0)), 2000, 0.02
-# The share of the points that agree, and how much larger it is than with any other unit.
+# Least share of points that agree, and least ratio of their number to that with any other unit.
 _ENOUGH, _CLEAR = 0.03, 2.0
 
 
 def depth_unit(
     image: Callable[[int], UInt16[np.ndarray, "h w"]], matrices: Float[np.ndarray, "n 4 4"], camera: Camera
 ) -> float | None:
-    """The length of a unit of the images, in the world's units; None where the frames cannot tell.
+    """The length of a unit of the images in world units, or None if the frames do not show it.
 
-    Points of a frame are looked up in another one that looks the same way from elsewhere: they lie at the depth that is
-    stored there if the unit is right.
+    It projects points of a frame into another frame with a similar direction and another position. With the right unit,
+    their depths agree with the image there.
 
-    - `image`: the depth image of a frame, 0 where nothing was measured.
-    - `matrices`: of the frames, camera to world, OpenCV's axes.
+    - `image`: returns the depth image of a frame, 0 where nothing was measured.
+    - `matrices`: poses of the frames, camera to world, OpenCV's axes.
     """
     scales = 1.0 / np.array(UNITS_A_METRE)
     alike, total = np.zeros(len(scales)), 0

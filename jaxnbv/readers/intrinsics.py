@@ -1,4 +1,4 @@
-"""The intrinsics of a recording's depth camera, as people store or give them."""
+"""Reads the intrinsics of a recording's depth camera, in the usual forms and files."""
 
 import json
 from pathlib import Path
@@ -9,13 +9,13 @@ from jaxtyping import Float
 from jaxnbv.checks import AnyArray, InputError, as_numbers, require, shown
 from jaxnbv.readers.text_files import read_rows, read_table, read_text
 
-# Read in this order, so that those of a depth camera come before those of the colour camera beside it.
+# In this order, so that intrinsics of a depth camera come before those of a colour camera.
 _FILES = ("*depth*intrinsic*", "*intrinsic*depth*", "*camera*intrinsic*", "*intrinsic*", "calibration.txt", "info.txt")
 _BUNDLE_FUSION = "m_calibrationDepthIntrinsic"
 
 
 def intrinsic_matrix(values: Float[AnyArray, "..."] | list | tuple, name: str) -> Float[np.ndarray, "3 3"]:
-    """The 3 x 3 matrix, in pixels, of a matrix of 3 x 3 or 4 x 4 or of fx, fy, cx, cy.
+    """The 3 x 3 matrix, in pixels, from a matrix of 3 x 3 or 4 x 4 or from fx, fy, cx, cy.
 
     **Raises:** `ValueError` for another shape.
     """
@@ -28,10 +28,10 @@ def intrinsic_matrix(values: Float[AnyArray, "..."] | list | tuple, name: str) -
 
 
 def stored_intrinsics(folder: Path) -> Float[np.ndarray, "3 3"] | None:
-    """The matrix of a file of intrinsics, .txt or .json, in a folder or else in its parent; None where there is none.
+    """The matrix from a file of intrinsics (.txt, .json) in a folder or else in its parent, or None.
 
-    A text file holds a matrix of 3 x 3 or 4 x 4, or fx, fy, cx, cy, or is BundleFusion's `info.txt`; a JSON file what
-    Open3D writes, the four numbers by name, or the matrix alone.
+    A text file holds a matrix of 3 x 3 or 4 x 4, or fx, fy, cx, cy, or is BundleFusion's `info.txt`. A JSON file holds
+    Open3D's format, the four numbers by name, or the matrix alone.
 
     **Raises:** `ValueError` if the file holds something else.
     """

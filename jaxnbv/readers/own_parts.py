@@ -1,4 +1,4 @@
-"""What a recording's camera sees of its own mount, such as a gripper: it moves with the camera, and is in no scene."""
+"""Finds parts of a camera's own mount, such as a gripper, in a recording. They move with the camera."""
 
 from collections.abc import Callable
 
@@ -10,13 +10,13 @@ from scipy.sparse.csgraph import connected_components
 
 from jaxnbv.geometry.camera import Camera
 
-# Frames that are compared, and blocks along the longer side of an image.
+# Number of frames to compare, least number that show a part, and number of blocks along the longer side of an image.
 _FRAMES, _FEWEST, _BLOCKS = 16, 4, 80
-# Depths that differ by less, as a share of them, are equal; of a part's own blocks, and of two frames' surfaces.
+# Relative difference up to which depths count as equal: of a block in several frames, and of surfaces of two frames.
 _EQUAL, _ALIKE = 0.02, 0.05
-# What is near a block of a part in the image, and no farther than by this factor, is of the same part.
+# Neighbours in the image of a block of a part belong to the same part if they are at most this factor farther.
 _OF_PART = 1.1
-# How many times as often a part was looked through as found again where it was.
+# A part must be looked through more than this many times as often as it is seen again at its place in the world.
 _CLEAR = 4
 
 
@@ -26,18 +26,19 @@ def own_parts(
     camera: Camera,
     scale: float,
 ) -> Float[np.ndarray, "h w"]:
-    """Depths, in units of the images, up to which a pixel shows a part of the camera's mount; zero where it shows none.
+    """Depth up to which each pixel shows a part of the camera's mount, in units of the images, or zero.
 
-    A part is what most frames show at the same place of the image and at the same depth, though the camera has moved:
-    where one frame shows it in the world, others see something deeper. A vase in the middle of an orbit has equal
-    depths too, but the other frames see it at the same place of the world.
+    Most frames show such a part at the same place of the image and at the same depth. At its place in the world, other
+    frames see something deeper, since the camera has moved. A vase in the middle of an orbit has equal depths too, but
+    other frames see it at the same place in the world.
 
-    - `image`: the depth image of a frame, 0 where nothing was measured. `scale`: the length of a unit.
-    - `matrices`: of the frames, camera to world, OpenCV's axes.
+    - `image`: returns the depth image of a frame, 0 where nothing was measured.
+    - `matrices`: poses of the frames, camera to world, OpenCV's axes.
+    - `scale`: length of a unit of the images in world units.
     """
-    asked = np.unique(np.linspace(0, len(matrices) - 1, _FRAMES).astype(int))
+    indices = np.unique(np.linspace(0, len(matrices) - 1, _FRAMES).astype(int))
     side = -(-max(camera.height, camera.width) // _BLOCKS)
-    images = {int(frame): image(int(frame)) for frame in asked}
+    images = {int(frame): image(int(frame)) for frame in indices}
     frames = [frame for frame, depth in images.items() if depth.shape == (camera.height, camera.width)]
     depths = np.stack([_nearest_of_blocks(images[frame], side) for frame in frames])
     measured = depths > 0
@@ -54,7 +55,7 @@ def own_parts(
 
 
 def _nearest_of_blocks(image: UInt16[np.ndarray, "h w"], side: int) -> Float[np.ndarray, "k l"]:
-    """The least depth in each block of `side` pixels; zero where there is none."""
+    """The least depth in each block of `side` x `side` pixels, or zero if nothing was measured."""
     image = np.pad(image, [(0, -size % side) for size in image.shape]).astype(float)
     blocks = np.where(image > 0, image, np.inf).reshape(image.shape[0] // side, side, image.shape[1] // side, side)
     least = blocks.min(axis=(1, 3))
@@ -68,9 +69,9 @@ def _is_looked_through(
     camera: Camera,
     side: int,
 ) -> Bool[np.ndarray, "k l"]:
-    """Which connected pieces of a part, whose depth is positive, other frames look through where one frame shows them.
+    """Mask of the connected pieces of a part that frames look through at the place where another frame shows them.
 
-    - `depths`: of the blocks of all frames; all depths in the world's unit.
+    - `part`, `depths`: depths of the blocks of the part (positive) and of all frames, in world units.
     """
     row, column = np.nonzero(part)
     own, count = _pieces(part)
@@ -79,16 +80,16 @@ def _is_looked_through(
     rays = np.stack([(side * (column + 0.5) - cx - skew * down) / fx, down, np.ones(len(row))], axis=-1)
     points = part[row, column, None] * rays
     deeper, alike = np.zeros(count), np.zeros(count)
-    # Between these the depths about a block lie: it is seen at a slant, and the point is anywhere in it.
+    # Bounds of the depths around a block, since the surface may be slanted and the point is anywhere in the block.
     window = (1, 3, 3)
     least = minimum_filter(np.where(depths > 0, depths, np.inf), window)
     most = maximum_filter(depths, window)
     for first, matrix in enumerate(matrices):
-        shown = np.abs(depths[first, row, column] - part[row, column]) < _EQUAL * part[row, column]
+        is_shown = np.abs(depths[first, row, column] - part[row, column]) < _EQUAL * part[row, column]
         for second, other in enumerate(matrices):
             move = np.linalg.inv(other) @ matrix
             moved = points @ move[:3, :3].T + move[:3, 3]
-            kept = shown & (moved[:, 2] > 0) & (first != second)
+            kept = is_shown & (moved[:, 2] > 0) & (first != second)
             across, along = (moved[:, :2] / np.where(kept, moved[:, 2], 1.0)[:, None]).T
             at = np.floor(np.stack([fy * along + cy, fx * across + skew * along + cx]) / side)
             kept &= np.all((at >= 0) & (at < np.array(part.shape)[:, None]), axis=0)
@@ -98,14 +99,16 @@ def _is_looked_through(
             is_before = most[block] < (1.0 - _ALIKE) * moved[:, 2]
             np.add.at(deeper, own[kept & is_deeper], 1)
             np.add.at(alike, own[kept & ~is_deeper & ~is_before], 1)
-    found = np.zeros(part.shape, bool)
-    found[row, column] = (deeper > _CLEAR * alike)[own]
-    return found
+    mask = np.zeros(part.shape, bool)
+    mask[row, column] = (deeper > _CLEAR * alike)[own]
+    return mask
 
 
 def _pieces(part: Float[np.ndarray, "k l"]) -> tuple[Int[np.ndarray, " blocks"], int]:
-    """The piece that each block of positive depth belongs to, and how many there are: neighbours in the image at about
-    the same depth are of one piece."""
+    """The piece of each block of positive depth, and the number of pieces.
+
+    Neighbours in the image at about the same depth belong to one piece.
+    """
     padded = np.pad(part, 1)
     number = np.zeros(padded.shape, int)
     number[padded > 0] = np.arange(np.count_nonzero(part))

@@ -22,9 +22,9 @@ from jaxnbv.readers.intrinsics import intrinsic_matrix, stored_intrinsics
 from jaxnbv.readers.own_parts import own_parts
 from jaxnbv.readers.text_files import read_rows, read_table, read_text
 
-# In seconds: an image and a pose of a TUM sequence that lie farther apart are not of one moment.
+# Largest difference in seconds between the times of an image and of its pose in a TUM sequence.
 _APART = 0.02
-# 7-Scenes marks what was not measured by the largest number there is.
+# 7-Scenes stores the largest number where nothing was measured.
 _NOT_MEASURED = np.iinfo(np.uint16).max
 _ASK_INTRINSICS = (
     "give intrinsics=(fx, fy, cx, cy) in pixels (on the command line --intrinsics FX FY CX CY), or put a "
@@ -39,7 +39,7 @@ _ASK_UNIT = (
 
 
 class _Layout(NamedTuple):
-    """Files and their matrices, camera to world; intrinsics and the length of a unit where the layout says them."""
+    """Files and their matrices (camera to world), and intrinsics and length of a unit if the layout has them."""
 
     files: list[Path]
     matrices: Float[np.ndarray, "n 4 4"]
@@ -48,29 +48,30 @@ class _Layout(NamedTuple):
 
 
 class RecordedFrames:
-    """The frames of a recorded sequence: depth images, each read when it is asked for, and where they were taken.
+    """The frames of a recorded sequence: depth images, each read on request, and their poses.
 
-    - `folder`: as one of these data sets is unpacked,
+    - `folder`: the unpacked folder of one of these formats,
         - 7-Scenes: `frame-000000.depth.png` (16 bit) and `frame-000000.pose.txt` (4 x 4, camera to world);
         - TUM RGB-D: `depth.txt` (time, file) and `groundtruth.txt` (time, position, quaternion). An image without a
           pose within 20 ms is left out;
         - `frames.json`: `{"intrinsics": 3 x 3, "depth_scale": 0.001, "frames": [{"depth": FILE, "pose": 4 x 4}, ...]}`,
-          files relative to it, camera to world in OpenCV's axes; the first two may be left out.
-    - `up`: where given, the direction that is upward in the world, which is then turned so that this becomes z, and x
-      stays in its plane.
+          files relative to the folder, camera to world in OpenCV's axes. The first two may be left out.
+    - `up`: upward direction in the world. If given, the world is rotated so that it becomes z, and x stays in its
+      plane.
     - `intrinsics`: of the depth camera, in pixels: 3 x 3, or fx, fy, cx, cy. By default those of `frames.json`, or of a
-      file in the folder or its parent: `camera-intrinsics.txt` (3 x 3) or another of the kind that 3DMatch, ScanNet,
-      ETH3D, BundleFusion and Open3D write. No layout has intrinsics of its own.
-    - `depth_scale`: the length of a unit of the images in the poses' units, 1/5000 say. By default that of
-      `frames.json`, or the usual one (1/1000, 1/5000, 1/10000...) with which frames of the same place agree.
+      file in the folder or its parent: `camera-intrinsics.txt` (3 x 3) or a similar file of 3DMatch, ScanNet, ETH3D,
+      BundleFusion or Open3D. The other formats have no intrinsics of their own.
+    - `depth_scale`: length of a unit of the images in the poses' units, 1/5000 say. By default that of `frames.json`,
+      or the usual one (1/1000, 1/5000, 1/10000...) with which frames of the same place agree.
 
-    `camera` is the sensor and `matrices` (n, 4, 4) its poses, OpenCV axes, in world units; `depth_scale` times an image
-    is in these. Add frame i to a session by `session.add(frames.depth(i), frames.matrices[i], frames.depth_scale)`.
-    A frame whose pose was lost (not finite, zeros, or no rotation) is left out with a `UserWarning`, and so is what the
-    camera sees of its own mount: a gripper is at the same place of all images.
+    `camera` is the sensor, and `matrices` (n, 4, 4) are its poses in world units, with OpenCV's axes. `depth_scale`
+    times an image is in world units. To add frame i to a session, call
+    `session.add(frames.depth(i), frames.matrices[i], frames.depth_scale)`. Frames with a lost pose (not finite, zeros,
+    or no rotation) are left out with a `UserWarning`. So are parts of the camera's own mount, such as a gripper, which
+    is at the same place in all images.
 
-    **Raises:** `ValueError` if the folder holds none of these, or what is missing or damaged in it; if the intrinsics
-    are not there, or the frames cannot tell the unit; if most poses are none.
+    **Raises:** `ValueError` if the folder has none of these formats, or is incomplete or damaged, if there are no
+    intrinsics, if the frames do not show the unit, or if most poses are lost.
     """
 
     def __init__(
@@ -118,12 +119,12 @@ class RecordedFrames:
         return len(self.files)
 
     def depth(self, index: int) -> UInt16[np.ndarray, "height width"]:
-        """A depth image, in its own units; 0 where nothing of the scene was measured.
+        """A depth image in its own units, 0 where nothing of the scene was measured.
 
-        **Raises:** `ValueError` for no frame, or an image that cannot be read or is no image of depths.
+        **Raises:** `ValueError` for an index out of range, or an image that cannot be read or is not a depth image.
         """
         pixels = self._stored(index)
-        # One of another size is refused where it is used.
+        # The session refuses an image of another size.
         is_own = pixels <= self._own_parts if pixels.shape == self._own_parts.shape else False
         return np.where(is_own, 0, pixels).astype(np.uint16)
 
@@ -133,14 +134,14 @@ class RecordedFrames:
         if parts.any():
             warnings.warn(
                 f"{np.mean(parts > 0):.0%} of the image show the same in the frames of {self.folder} wherever the "
-                f"camera is, up to {self.depth_scale * parts.max():.3g} from it: parts of the camera's mount, which "
-                "are left out",
+                f"camera is, up to {self.depth_scale * parts.max():.3g} from it: these are parts of the camera's mount "
+                "and are left out",
                 stacklevel=4,
             )
         return parts
 
     def _stored(self, index: int) -> UInt16[np.ndarray, "height width"]:
-        """A depth image as it is in its file, 0 where nothing was measured."""
+        """The depth image in a file, 0 where nothing was measured."""
         require(0 <= index < len(self), f"there is no frame {index}: {self.folder} has {len(self)}, counted from 0")
         file = self.files[index]
         try:
@@ -186,7 +187,7 @@ def _plain(folder: Path) -> _Layout:
     )
 
 
-# By a file that tells it.
+# Each format by a pattern of its files.
 _READERS: dict[str, Callable[[Path], _Layout]] = {
     "frames.json": _plain,
     "groundtruth.txt": _tum,
@@ -195,7 +196,7 @@ _READERS: dict[str, Callable[[Path], _Layout]] = {
 
 
 def _with_pose(files: list[Path], has_pose: Bool[np.ndarray, " n"], folder: Path) -> list[Path]:
-    """The files whose frames have a pose, with a `UserWarning` if others have none.
+    """The files with a pose, with a `UserWarning` if others have none.
 
     **Raises:** `ValueError` if most have none.
     """
@@ -211,13 +212,13 @@ def _with_pose(files: list[Path], has_pose: Bool[np.ndarray, " n"], folder: Path
 
 
 def _upward(up: tuple[float, float, float]) -> Float[np.ndarray, "4 4"]:
-    """The turn of the world that makes a direction z and keeps x in its plane."""
-    found = as_numbers(up, "up", np.float64)
-    length = float(np.linalg.norm(found)) if found.shape == (3,) else 0.0
+    """Rotation of the world that maps a direction to z and keeps x in its plane."""
+    direction = as_numbers(up, "up", np.float64)
+    length = float(np.linalg.norm(direction)) if direction.shape == (3,) else 0.0
     require(0 < length < math.inf, f"up is {shown(up)}; give a direction, such as (0, -1, 0)")
-    # Of a world whose x is upward, y takes its place.
-    beside = np.eye(3)[int(abs(found[0]) > 0.9 * length)]
-    rotation, _ = Rotation.align_vectors(np.eye(3)[[2, 0]], [found / length, beside], weights=[np.inf, 1.0])
+    # If x is upward, y stays in its plane instead.
+    beside = np.eye(3)[int(abs(direction[0]) > 0.9 * length)]
+    rotation, _ = Rotation.align_vectors(np.eye(3)[[2, 0]], [direction / length, beside], weights=[np.inf, 1.0])
     turn = np.eye(4)
     turn[:3, :3] = rotation.as_matrix()
     return turn

@@ -1,4 +1,4 @@
-"""Which object each pixel of a recording shows, from images beside its frames."""
+"""Label images of a recording: the object that each pixel shows."""
 
 from pathlib import Path
 
@@ -13,15 +13,16 @@ _BETWEEN = "._-"
 
 
 class Segmentation:
-    """Which object each pixel shows. A folder has, for each frame that shows an object, one of
+    """The object that each pixel shows, from a folder of label images or masks.
 
-    - an image of the frame's name with a number for each pixel, zero for none: `000012.png` for `000012.png`;
-    - an image for each object, named by the frame and the object, that is not zero where the object is seen:
-      `000012.cup.png` or `000012_cup.png`.
+    For each frame that shows an object, the folder has one of
 
-    `names`: the object of each number.
+    - a label image with the frame's name and an object number in each pixel, zero for none: `000012.png` for
+      `000012.png`;
+    - a mask for each object, named by frame and object, not zero where the object is seen: `000012.cup.png` or
+      `000012_cup.png`.
 
-    **Raises:** `ValueError` if there is no such folder, or it has no image of any frame.
+    **Raises:** `ValueError` if there is no such folder, or it has no image for any frame.
     """
 
     def __init__(self, folder: str | Path, frames: tuple[Path, ...]):
@@ -30,7 +31,7 @@ class Segmentation:
         stems = [_stem(frame) for frame in frames]
         files = {_stem(file): file for file in sorted(folder.iterdir()) if file.name != _stem(file)}
         self._files = [_of_frame(stem, files) for stem in stems]
-        objects = sorted({name for held in self._files for name in held if name})
+        objects = sorted({name for images in self._files for name in images if name})
         self._numbers = {name: number for number, name in enumerate(objects, start=1)}
         if not any(self._files):
             raise InputError(
@@ -40,11 +41,11 @@ class Segmentation:
 
     @property
     def names(self) -> dict[int, str]:
-        """Where numbers are drawn, these are their own names."""
+        """Names of the objects by their numbers in masks. Numbers in label images have no name here."""
         return {number: name for name, number in self._numbers.items()}
 
     def labels(self, index: int) -> Int[np.ndarray, "height width"] | None:
-        """The number of the object that each pixel of a frame shows, zero for none; None where there is no image.
+        """The object's number in each pixel of a frame, zero for none. None if the frame has no image.
 
         **Raises:** `ValueError` for an image that cannot be read, or has several channels.
         """
@@ -66,7 +67,7 @@ def _stem(file: Path) -> str:
 
 
 def _of_frame(stem: str, files: dict[str, Path]) -> dict[str, Path]:
-    """The images of a frame by object; "" for one with numbers."""
+    """The images of a frame by object name, which is "" for a label image."""
     if stem in files:
         return {"": files[stem]}
     return {

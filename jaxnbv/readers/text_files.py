@@ -1,4 +1,4 @@
-"""Text files as other programs leave them: with a byte order mark, in UTF-16, with blank lines."""
+"""Reads text files of other programs, which may have a byte order mark, UTF-16 or blank lines."""
 
 import json
 import re
@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from jaxnbv.checks import InputError
 
-# How Microsoft's C runtime prints infinities and NaN.
+# Infinities and NaN as Microsoft's C runtime prints them.
 _NOT_FINITE = re.compile(r"[+-]?1\.#[A-Z]+\d*")
 
 
@@ -23,7 +23,7 @@ def read_text(path: Path) -> str:
 
 
 def read_rows(path: Path) -> list[list[str]]:
-    """The words of each line of a file, without blank lines and those that begin with #.
+    """The words of each line of a file, without blank lines and lines that begin with #.
 
     **Raises:** `OSError` if it cannot be read.
     """

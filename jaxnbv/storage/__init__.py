@@ -1,4 +1,4 @@
-"""Results on disk: folders of plain JSON, NumPy and PLY files, written one by one and never half a file."""
+"""Results on disk: folders of plain JSON, NumPy and PLY files, each written completely or not at all."""
 
 from jaxnbv.storage.description import describe as describe
 from jaxnbv.storage.rebuilding import rebuild as rebuild

@@ -1,4 +1,4 @@
-"""A JSON description of any configuration; `jaxnbv.storage.rebuilding` is the inverse."""
+"""JSON descriptions of configurations. `jaxnbv.storage.rebuilding` is the inverse."""
 
 import dataclasses
 import enum
@@ -20,7 +20,7 @@ from jaxnbv.errors import InputError
 from jaxnbv.storage.code import closure, is_installed, is_plain, is_written, lookup, name_of, reads_of, source_of
 
 _LARGEST_LISTED = 16
-# Classes whose objects are the functions that they wrap, with the derivatives that JAX is given of them.
+# Classes of objects that wrap functions, some with custom derivatives for JAX.
 _WRAPPERS = {"PjitFunction", "custom_jvp", "custom_vjp", "_JitWrapper", "BoundMethod", "_lru_cache_wrapper"} | {
     kind.__name__ for kind in (functools.cached_property, classmethod, property, staticmethod)
 }
@@ -28,24 +28,24 @@ _FUNCTIONS = ("__func__", "fget", "func", "fun", "jvp", "fwd", "bwd", "__wrapped
 
 
 def describe(thing: Any, arrays: dict[str, np.ndarray] | None = None, way: str = "") -> Any:
-    """A JSON description by which two configurations can be told apart, and from which `rebuild` makes them again.
+    """A JSON description that differs between different configurations. `rebuild` is the inverse.
 
-    Modules, dataclasses and named tuples become their classes and fields, small arrays their values, large ones a hash
-    of their bytes. A function becomes its source, defaults and closure and every global that its code reads; so do the
-    methods of a user's class. What an installed package defines is described by its name. An object with a `version`, a
-    text or a number, is described by its class and version.
+    Modules, dataclasses and named tuples become their classes and fields. Small arrays become their values, and large
+    ones a hash of their bytes. A function becomes its source, defaults, closure and all globals that its code reads,
+    and so does each method of a user's class. Definitions of installed packages become their names. An object with a
+    `version`, a text or a number, becomes its class and version.
 
-    - `arrays`: is filled with the contents of the large arrays, by their hashes.
-    - `way`: what the errors call `thing`.
+    - `arrays`: a dictionary to fill with the contents of the large arrays, by their hashes.
+    - `way`: path to `thing`, for errors.
 
-    **Raises:** `ValueError` that names the way to an object that cannot be told from others of its class, or to a
-    function whose source cannot be read, unless it has a `version`.
+    **Raises:** `ValueError` with the path to an object whose state cannot be described, or to a function whose source
+    cannot be read, unless it has a `version`.
     """
     return _Describer({} if arrays is None else arrays).describe(thing, way)
 
 
 def is_record(kind: type) -> bool:
-    """Whether a class is a dataclass, which a module is too, or a named tuple."""
+    """Whether a class is a dataclass (as are modules) or a named tuple."""
     return dataclasses.is_dataclass(kind) or (issubclass(kind, tuple) and hasattr(kind, "_fields"))
 
 
@@ -55,7 +55,7 @@ def fields_of(kind: type) -> Sequence[str]:
 
 
 class _Describer:
-    """One description under way. What it has visited is described once, so that it ends on what refers to itself."""
+    """State of one description. Objects that refer to themselves end in a reference to the first visit."""
 
     def __init__(self, arrays: dict[str, np.ndarray]):
         self.arrays = arrays
@@ -84,7 +84,7 @@ class _Describer:
         try:
             return self._object(thing, kind, way)
         finally:
-            # Code alone is described once: two equal containers are alike, whether or not they are one.
+            # Only code is described once. Containers with equal contents are described alike, the same object or not.
             if not isinstance(thing, FunctionType | type):
                 del self.visited[id(thing)]
 
@@ -95,7 +95,7 @@ class _Describer:
         if is_record(kind) and not wraps:
             code = {} if is_installed(kind.__module__) else {"class": self.describe(kind, f"{way}.class")}
             values = {name: getattr(thing, name) for name in fields_of(kind)}
-            # The version stands for what is called.
+            # The version stands for functions.
             kept = {name: value for name, value in values.items() if not (versioned and callable(value))}
             return {"type": name_of(kind), **code, **self._named(kept, way)}
         if versioned:
@@ -148,7 +148,7 @@ class _Describer:
         array = np.ascontiguousarray(thing).reshape(np.shape(thing))
         if array.dtype.hasobject:
             raise InputError(f"{way or 'this'} is an array of Python objects: give numbers")
-        # Of a Python number, by which no type is promoted.
+        # "weak" is a JAX scalar from a Python number, which does not promote types.
         kind = f"{'weak' if array.ndim == 0 and getattr(thing, 'weak_type', False) else origin} {array.dtype}"
         if 0 < array.size <= _LARGEST_LISTED and array.dtype.kind in "biuf" and np.isfinite(array).all():
             return {"type": kind, "values": array.tolist()}
@@ -160,7 +160,7 @@ class _Describer:
         return {name: self.describe(value, f"{way}.{name}".lstrip(".")) for name, value in values.items()}
 
     def _function(self, function: FunctionType, way: str) -> dict[str, Any]:
-        """Everything on which the result of a function depends, but for what installed packages define."""
+        """Everything that the result of a function depends on, except definitions of installed packages."""
         own = not is_installed(function.__globals__.get("__name__"))
         parts = {"defaults": (function.__defaults__, function.__kwdefaults__), "closure": closure(function)}
         if own:
@@ -170,7 +170,7 @@ class _Describer:
         return source | self._beside(parts, way)
 
     def _beside(self, parts: dict[str, Any], way: str) -> dict[str, Any]:
-        """Descriptions of what is looked up and not rebuilt, so that its arrays need not be kept."""
+        """Descriptions of parts that are looked up by name, not rebuilt, so that their arrays need not be stored."""
         arrays, self.arrays = self.arrays, {}
         try:
             return self._named(parts, way)

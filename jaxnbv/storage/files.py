@@ -1,4 +1,4 @@
-"""Files that are whole or not there, and folders that can be made; what the disk refuses is named."""
+"""Writes files completely or not at all, and creates folders. Errors of the disk name the path."""
 
 import os
 import secrets
@@ -8,16 +8,18 @@ from typing import Any
 
 from jaxnbv.errors import InputError
 
-# What a process that was killed leaves: the pattern of the names of parts.
+# Pattern of the names of partial files, which a killed process leaves.
 PARTS = "." + 16 * "[0-9a-f]" + ".partial"
 
 
 def write_whole(path: Path, write: Callable[[Any], Any]) -> None:
-    """Write beside the file and rename, so that a reader finds the old file or the whole new one, never a part.
+    """Write a file completely or not at all: a reader finds the old file or the whole new one.
+
+    It writes a partial file in the same folder and renames it.
 
     **Raises:** `ValueError` if the disk is full, the folder is missing or may not be written, or the name is too long.
     """
-    # A name of its own: two processes that write one file do not meet in its parts.
+    # A random name, so that two processes that write the same file use different partial files.
     partial = path.with_name(f".{secrets.token_hex(8)}.partial")
     try:
         try:
@@ -47,9 +49,9 @@ def write_text(path: Path, text: str) -> None:
 
 
 def make_folder(path: str | Path) -> Path:
-    """The folder, made with its parents where it is missing.
+    """Create a folder and its parents if it is missing, and return it.
 
-    **Raises:** `ValueError` if there is a file in its place, or it may not be made.
+    **Raises:** `ValueError` if there is a file in its place, or it cannot be created.
     """
     try:
         Path(path).mkdir(parents=True, exist_ok=True)

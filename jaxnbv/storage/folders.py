@@ -1,4 +1,4 @@
-"""A folder whose results belong to one configuration and are written by one process at a time."""
+"""Folders of results of one configuration, written by one process at a time."""
 
 import importlib.metadata
 import json
@@ -19,33 +19,33 @@ from jaxnbv.scanning.triangle_rays import tracer
 from jaxnbv.storage.files import PARTS, make_folder, write_text, write_whole
 
 _LOCK = ".lock"
-# What belongs to the record, beside it.
+# The large arrays of the record.
 ARRAYS = "arrays.npz"
-# In bytes, unpacked: sixteen million rays, far more than a camera has.
+# Bytes after unpacking: sixteen million rays, far more than a camera has.
 LARGEST = 2**29
 _LONGEST_SHOWN = 60
 
 
 def software() -> dict[str, str]:
-    """Versions of what the numbers depend on."""
+    """Versions of the packages that the numbers depend on."""
     names = ("jaxnbv", "jax", "jaxlib", "equinox", "optax", "optimistix", "numpy", "trimesh", tracer())
     return {name: importlib.metadata.version(name) for name in names}
 
 
 def num_threads() -> int:
-    """Threads among which XLA splits a sum on a CPU: NPROC, or else the cores that this process may use."""
+    """Number of threads for a sum of XLA on a CPU: NPROC, or else the cores that this process may use."""
     if threads := os.environ.get("NPROC"):
         return int(threads)
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def versions() -> dict[str, Any]:
-    """What the last bits of this process's numbers depend on: software, kind of device, and number of threads."""
+    """Software, device and threads of this process, on which the last bits of its numbers depend."""
     return software() | {"device": jax.devices()[0].device_kind, "cores": num_threads()}
 
 
 def differences(found: Any, asked: Any, name: str = "") -> list[str]:
-    """Where two descriptions differ, in words."""
+    """The differences between two descriptions, in words: `found` in the folder, `asked` now."""
     if isinstance(found, dict) and isinstance(asked, dict):
         keys = list(dict.fromkeys([*found, *asked]))
         nested = (differences(found.get(key), asked.get(key), f"{name}.{key}".lstrip(".")) for key in keys)
@@ -54,13 +54,13 @@ def differences(found: Any, asked: Any, name: str = "") -> list[str]:
 
 
 def _short(value: Any) -> str:
-    """The beginning of what may be the source of a function."""
+    """The beginning of a value's text, which may be the source of a function."""
     text = str(value)
     return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}..."
 
 
 def check_format(found: Any, known: int, file: Path) -> None:
-    """**Raises:** `ValueError` for a file of a format that is not known here."""
+    """**Raises:** `ValueError` for a file of a format other than `known`."""
     require(
         found == known,
         f"{file} is of format {str(found)[:20]}; this version of jaxnbv reads format {known}: install a newer one, or "
@@ -69,11 +69,11 @@ def check_format(found: Any, known: int, file: Path) -> None:
 
 
 def read_json(file: Path, problem: str, remedy: str) -> dict[str, Any]:
-    """What a JSON file holds.
+    """The object in a JSON file.
 
-    **Raises:** `ValueError` that tells `problem` and `remedy`, unless that is an object.
+    **Raises:** `ValueError` with `problem` and `remedy`, if the file cannot be read or holds something else.
     """
-    # What is no file, such as a pipe, may never end.
+    # Reading something that is not a file, such as a pipe, may never end.
     require(os.path.isfile(file) or not os.path.lexists(file), f"{file} {problem} (it is no file): {remedy}")
     try:
         content = json.loads(file.read_bytes())
@@ -85,9 +85,9 @@ def read_json(file: Path, problem: str, remedy: str) -> dict[str, Any]:
 
 
 def write_arrays(file: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write arrays to a .npz file, all or nothing.
+    """Write arrays to a .npz file, completely or not at all.
 
-    **Raises:** `ValueError` as `write_whole` does, or if they are larger than `read_arrays` reads.
+    **Raises:** `ValueError` if `write_whole` does, or if the arrays are larger than `read_arrays` accepts.
     """
     size = sum(array.nbytes for array in arrays.values())
     require(size <= LARGEST, f"cannot write {file}: its arrays have {size} bytes, more than {LARGEST}")
@@ -97,22 +97,22 @@ def write_arrays(file: Path, arrays: Mapping[str, np.ndarray]) -> None:
 def read_arrays(file: Path, remedy: str, check: Callable[[dict[str, np.ndarray]], None]) -> dict[str, np.ndarray]:
     """The arrays of a .npz file.
 
-    - `check`: raises any error if they are not what was written.
+    - `check`: raises any error if the arrays are not those that were written.
 
-    **Raises:** `ValueError` that tells `remedy` if the file is damaged.
+    **Raises:** `ValueError` with `remedy` if the file is damaged.
     """
     try:
         if not file.is_file():
             raise ValueError("there is no file")
         with np.load(file, allow_pickle=False) as saved:
-            held = sum(member.file_size for member in saved.zip.infolist())
-            # Headers are small, but count.
-            if held > LARGEST + 2**20:
-                raise ValueError(f"it unpacks to {held} bytes")
+            size = sum(member.file_size for member in saved.zip.infolist())
+            # A margin for the headers.
+            if size > LARGEST + 2**20:
+                raise ValueError(f"it unpacks to {size} bytes")
             arrays = {key: saved[key] for key in saved.files}
         check(arrays)
         return arrays
-    # Whatever NumPy and zipfile raise on bits that were turned: some twenty kinds of error.
+    # On flipped bits NumPy and zipfile raise some twenty kinds of errors.
     except Exception as error:
         raise InputError(f"{file} is damaged ({error}): {remedy}") from error
 
@@ -120,7 +120,7 @@ def read_arrays(file: Path, remedy: str, check: Callable[[dict[str, np.ndarray]]
 def read_record(folder: Path, kind: str, remedy: str) -> dict[str, Any]:
     """The record of a folder, with its `config`.
 
-    **Raises:** `ValueError` that tells `remedy` if there is none, or it has no configuration.
+    **Raises:** `ValueError` with `remedy` if there is no record, or it has no configuration.
     """
     file, problem = folder / f"{kind}.json", f"is no {kind} record"
     record = read_json(file, problem, remedy)
@@ -130,9 +130,9 @@ def read_record(folder: Path, kind: str, remedy: str) -> dict[str, Any]:
 
 @contextmanager
 def writing_in(path: Path) -> Iterator[None]:
-    """While this process writes in a folder; what a process that was killed has left of a file is removed first.
+    """Context manager: lock a folder for writing, and remove partial files of killed processes.
 
-    **Raises:** `ValueError` if another process writes there, or it cannot be written.
+    **Raises:** `ValueError` if another process writes there, or the folder cannot be written.
     """
     lock = filelock.FileLock(path / _LOCK, timeout=0)
     try:
@@ -141,27 +141,27 @@ def writing_in(path: Path) -> Iterator[None]:
         raise InputError(
             f"{path} is being written by another process: wait until it ends, or choose another folder"
         ) from error
-    # Of filelock, down to the least version that we allow (3.16): there are no locks on this file system.
+    # filelock (3.16 and later) raises these if the file system has no locks.
     except (OSError, NotImplementedError) as error:
         raise InputError(f"cannot write in {path} ({error}): make room or choose another place") from error
     try:
-        for left in path.glob(PARTS):
-            left.unlink()
+        for partial in path.glob(PARTS):
+            partial.unlink()
         yield
     finally:
         lock.release()
 
 
 class ResultFolder:
-    """A folder, and the configuration that its results have: a record, written with the first of them.
+    """A folder of results with one configuration. Its record is written with the first result.
 
-    - `config`: what JSON can say, see `jaxnbv.storage.describe`.
-    - `arrays`: contents of its large arrays by their hashes, kept in arrays.npz.
+    - `config`: the configuration as JSON, see `jaxnbv.storage.describe`.
+    - `arrays`: contents of its large arrays by their hashes, stored in arrays.npz.
 
-    A subclass says of what `kind` its results are, after which the record is named, the `pattern` of their names, and
-    the number of their `format`.
+    Subclasses define the `kind` of results, which names the record, the `pattern` of the files' names, and the number
+    of the `format`.
 
-    **Raises:** `ValueError` if the folder cannot be made, or holds results of another configuration or other files.
+    **Raises:** `ValueError` if the folder cannot be created, or holds results of another configuration or other files.
     """
 
     kind: str
@@ -179,17 +179,17 @@ class ResultFolder:
 
     @contextmanager
     def writing(self) -> Iterator[None]:
-        """While this process writes results.
+        """Context manager: lock the folder for writing results.
 
-        **Raises:** `ValueError` if another process does, or the folder cannot be written.
+        **Raises:** `ValueError` if another process writes there, or the folder cannot be written.
         """
         with writing_in(self.path):
-            # Another process may have written since this one looked.
+            # Another process may have written since the last check.
             self._check()
             yield
 
     def set_versions(self, there: dict[str, Any]) -> None:
-        """Set the `versions` of the process that computes the results to come. Warns if the folder has others."""
+        """Set the `versions` of the process that computes new results. Warns if the folder has others."""
         self.versions = there
         if not self.bound:
             return
@@ -202,10 +202,10 @@ class ResultFolder:
             )
 
     def bind(self) -> None:
-        """Write the record and its arrays, if they are not there, before the first result is."""
+        """Write the record and its arrays before the first result, if they are not there."""
         if not self.bound:
             record = {"format": self.format, "config": self.config, "versions": self.versions}
-            # The record first: arrays alone would be of nobody.
+            # The record comes first, since arrays without a record would belong to no configuration.
             write_text(self.path / f"{self.kind}.json", json.dumps(record, indent=2))
             if self.arrays:
                 write_arrays(self.path / ARRAYS, self.arrays)
@@ -223,7 +223,7 @@ class ResultFolder:
             return
         written = read_record(self.path, self.kind, "choose another output folder")
         check_format(written.get("format"), self.format, file)
-        # A record without results is of a run that did not come far; it binds nobody.
+        # A record without results is of a run that ended before its first result, and may be overwritten.
         if not any(self.path.glob(self.pattern)):
             return
         changed = differences(written["config"], self.config)

@@ -1,4 +1,4 @@
-"""Configurations made again from their descriptions, without running what is not of jaxnbv or imported already."""
+"""Rebuilds configurations from their descriptions. Imports no module outside jaxnbv."""
 
 import dataclasses
 import enum
@@ -18,7 +18,7 @@ from jaxnbv.checks import InputError, require
 from jaxnbv.storage.description import describe, fields_of, is_installed, is_record, lookup, name_of
 from jaxnbv.storage.folders import ARRAYS, check_format, differences, read_arrays, read_record
 
-# Modules of installed packages whose functions compute and nothing else. Those of others might do anything when called.
+# Modules of installed packages whose functions only compute. Functions of other packages might do anything.
 _HARMLESS = ("jaxnbv", "jax.nn", "jax._src.nn", "jax.lax", "equinox.nn", "optimistix", "math")
 _TEXTS: dict[str, Callable[[Any], Any]] = {
     "float": float,
@@ -30,22 +30,22 @@ _TEXTS: dict[str, Callable[[Any], Any]] = {
 
 
 def rebuild(description: Any, arrays: Mapping[str, np.ndarray], way: str) -> Any:
-    """The configuration that `describe` described.
+    """The configuration with this description by `describe`.
 
-    Classes and functions are looked up in jaxnbv and in modules that are imported already; none of them is called, not
+    Classes and functions are looked up in jaxnbv and in modules that are already imported. None of them is called, not
     even a constructor.
 
-    - `arrays`: contents of the large arrays by their hashes, as `describe` gives them.
-    - `way`: what the errors call it; its first name is the argument by which it can be given instead.
+    - `arrays`: contents of the large arrays by their hashes, from `describe`.
+    - `way`: path to the configuration, for errors. Its first name is the argument that can replace it.
 
-    **Raises:** `ValueError` that names the way to what cannot be made again, or is another now.
+    **Raises:** `ValueError` with the path to a part that cannot be rebuilt, or has changed.
     """
     remedy = f"import its module first, or give it again: load(..., {way.partition('.')[0] or 'planner'}=...)"
     try:
         thing = _Rebuilder(arrays, remedy).rebuild(description, way)
     except InputError:
         raise
-    # A description that was changed by hand may be anything.
+    # A description that was edited by hand may raise anything.
     except Exception as error:
         raise InputError(f"{way} cannot be made again from its description ({error}): {remedy}") from error
     changed = differences(description, describe(thing, way=way), way)
@@ -54,14 +54,14 @@ def rebuild(description: Any, arrays: Mapping[str, np.ndarray], way: str) -> Any
 
 
 def read_config(path: str | Path, kind: str, format: int, given: Mapping[str, Any]) -> dict[str, Any]:
-    """The configuration of an existing folder, made again from its record.
+    """The configuration of an existing folder, rebuilt from its record.
 
-    - `kind`: of the folder, "episode" say; `format`: the number of the format of its record.
-    - `given`: parts by their names that are not made again. Opening the folder for them checks that they are those of
-      the record.
+    - `kind`: kind of the folder, such as "episode".
+    - `format`: number of the format of its record.
+    - `given`: parts by name that replace those of the record. Opening the folder with them checks that they agree.
 
-    **Raises:** `ValueError` if the folder holds no record, or one that is damaged, or has a part that cannot be made
-    again and is not given.
+    **Raises:** `ValueError` if the folder holds no record, or a damaged one, or has a part that cannot be rebuilt and
+    is not given.
     """
     folder, remedy = Path(path), "give the folder of a run"
     record = read_record(folder, kind, remedy)
@@ -82,75 +82,75 @@ class _Rebuilder:
     def __init__(self, arrays: Mapping[str, np.ndarray], remedy: str):
         self.arrays, self.remedy = arrays, remedy
 
-    def rebuild(self, told: Any, way: str) -> Any:
-        if isinstance(told, list):
-            return tuple(self.rebuild(value, f"{way}[{index}]") for index, value in enumerate(told))
-        if not isinstance(told, dict):
-            return told
-        if "type" not in told:
-            return {name: self.rebuild(value, f"{way}.{name}") for name, value in told.items()}
-        kind = told["type"]
+    def rebuild(self, node: Any, way: str) -> Any:
+        if isinstance(node, list):
+            return tuple(self.rebuild(value, f"{way}[{index}]") for index, value in enumerate(node))
+        if not isinstance(node, dict):
+            return node
+        if "type" not in node:
+            return {name: self.rebuild(value, f"{way}.{name}") for name, value in node.items()}
+        kind = node["type"]
         if ":" in kind:
-            return self._record(kind, told, way)
+            return self._record(kind, node, way)
         if kind in _TEXTS:
-            return _TEXTS[kind](told["value"])
+            return _TEXTS[kind](node["value"])
         if kind in ("list", "set", "frozenset", "dict"):
             return {"list": list, "set": set, "frozenset": frozenset, "dict": dict}[kind](
-                self.rebuild(told["items"], way)
+                self.rebuild(node["items"], way)
             )
         if kind in ("function", "class", "again", "wrapped"):
-            thing = self._code(told["name"], way)
-            alike = kind != "wrapped" or name_of(type(thing)) == told["by"]
-            require(alike, f"{way} is a {told.get('by')} of {told['name']} that has no name of its own: {self.remedy}")
+            thing = self._code(node["name"], way)
+            alike = kind != "wrapped" or name_of(type(thing)) == node["by"]
+            require(alike, f"{way} is a {node.get('by')} of {node['name']} that has no name of its own: {self.remedy}")
             return thing
         if kind == "partial":
             function, arguments, keywords = (
-                self.rebuild(told[part], way) for part in ("function", "arguments", "keywords")
+                self.rebuild(node[part], way) for part in ("function", "arguments", "keywords")
             )
             return functools.partial(function, *arguments, **keywords)
         if kind == "method":
-            function, bound = self.rebuild(told["function"], way), self.rebuild(told["self"], way)
+            function, bound = self.rebuild(node["function"], way), self.rebuild(node["self"], way)
             own = any(member is function for base in type(bound).__mro__ for member in vars(base).values())
             require(own, f"{way} is a method that {type(bound).__name__} does not have: {self.remedy}")
             return getattr(bound, function.__name__)
-        require(" " in kind, f"{way} is a {told.get('name', kind)}, of which its {kind} alone is kept: {self.remedy}")
+        require(" " in kind, f"{way} is a {node.get('name', kind)}, of which its {kind} alone is kept: {self.remedy}")
         origin, dtype = kind.split(" ")
         if origin == "key":
-            return jax.random.wrap_key_data(jnp.array(told["data"], jnp.uint32), impl=dtype)
-        return self._array(origin, np.dtype(dtype), told, way)
+            return jax.random.wrap_key_data(jnp.array(node["data"], jnp.uint32), impl=dtype)
+        return self._array(origin, np.dtype(dtype), node, way)
 
-    def _array(self, origin: str, dtype: np.dtype, told: dict[str, Any], way: str) -> Any:
-        if "values" in told:
-            array = np.array(told["values"], dtype)
+    def _array(self, origin: str, dtype: np.dtype, node: dict[str, Any], way: str) -> Any:
+        if "values" in node:
+            array = np.array(node["values"], dtype)
         else:
-            digest = told["sha256"]
+            digest = node["sha256"]
             require(digest in self.arrays, f"{way} is an array that the folder does not hold: {self.remedy}")
-            array = np.frombuffer(self.arrays[digest].tobytes(), dtype).reshape(told["shape"]).copy()
+            array = np.frombuffer(self.arrays[digest].tobytes(), dtype).reshape(node["shape"]).copy()
         if origin == "weak":
             return jnp.asarray(array.item())
         return jnp.asarray(array) if origin == "jax" else array[()] if origin == "scalar" else array
 
-    def _record(self, name: str, told: dict[str, Any], way: str) -> Any:
+    def _record(self, name: str, node: dict[str, Any], way: str) -> Any:
         kind = self._lookup(name, way)
         if isinstance(kind, enum.EnumType):
-            return kind[told["member"]]
+            return kind[node["member"]]
         require(isinstance(kind, type) and is_record(kind), f"{way} is a {name}, which is no dataclass: {self.remedy}")
-        absent = [field for field in fields_of(kind) if field not in told]
+        absent = [field for field in fields_of(kind) if field not in node]
         require(not absent, f"{way} is a {name} that was stored without its {', '.join(absent)}: {self.remedy}")
-        values = {field: self.rebuild(told[field], f"{way}.{field}") for field in fields_of(kind)}
+        values = {field: self.rebuild(node[field], f"{way}.{field}") for field in fields_of(kind)}
         if not dataclasses.is_dataclass(kind):
             return tuple.__new__(kind, values.values())
         thing: Any = object.__new__(kind)  # type: ignore[arg-type]
         for field, value in values.items():
             object.__setattr__(thing, field, value)
-        # Equinox's wrappers have the names of the functions that they wrap.
+        # Equinox's wrappers take the names of the functions that they wrap.
         if is_installed(kind.__module__) and (wrapped := getattr(thing, "__wrapped__", None)) is not None:
             for attribute in functools.WRAPPER_ASSIGNMENTS:
                 object.__setattr__(thing, attribute, getattr(wrapped, attribute))
         return thing
 
     def _code(self, name: str, way: str) -> Any:
-        """A function, or the class of a record."""
+        """A function, or the class of a record or of a NumPy scalar, by its name."""
         thing = self._lookup(name, way)
         module = name.partition(":")[0]
         harmless = (
@@ -158,7 +158,7 @@ class _Rebuilder:
             if isinstance(thing, type)
             else not is_installed(module)
             or any(module == own or module.startswith(f"{own}.") for own in _HARMLESS)
-            # The functions of jax.numpy that are ufuncs of NumPy, and these.
+            # Ufuncs of NumPy, and the functions of jax.numpy with the same names.
             or (module in ("numpy", "jax.numpy") and isinstance(getattr(np, name.partition(":")[2], None), np.ufunc))
         )
         require(harmless, f"{way} is {name}, which no configuration that is read from a file may call: {self.remedy}")

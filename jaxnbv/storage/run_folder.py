@@ -1,17 +1,16 @@
-"""An episode or a session on disk, written step by step.
+"""The folder of an episode or a session, written step by step.
 
-episode.json      the configuration (planner, scene, noise, first pose, seed) and the versions that made it
-arrays.npz        the configuration's large arrays (weights of networks, meshes) by the SHA-256 of their bytes; none if
-                  it has none
-view_00.npz       pose and scan of the first view; view_01.npz and so on also hold what the search proposed: candidates,
+episode.json      the configuration (planner, scene, noise, first pose, seed) and the versions of the software
+arrays.npz        large arrays of the configuration (weights of networks, meshes) by the SHA-256 of their bytes, if any
+view_00.npz       pose and scan of the first view; view_01.npz and so on also hold the search's proposal: candidates,
                   their values, and the trajectories of a gradient search
-end_00.npz        why a rule ended the episode, and after how many views
-cloud.ply         the points that were kept, in world units, once the episode is complete
+end_00.npz        the reason why a rule ended the episode, and the number of views
+cloud.ply         the points of the cloud, in world units, once the episode is complete
 
-session.json      the configuration (planner, sensor, box, what is up) and the versions that made it
-image_00.npz      the first depth image as the sensor gave it, its pose and scale; image_01.npz and so on
-proposal_01.npz   where the planner wanted the image of that number to be taken, and the depth expected there
-refused_00.npz    a pose that was proposed and cannot be reached, and why; refused_01.npz and so on
+session.json      the configuration (planner, sensor, box, upward axis) and the versions of the software
+image_00.npz      the first depth image of the sensor, its pose and scale; image_01.npz and so on
+proposal_01.npz   the planner's proposed pose for the image with this number, and the depth expected there
+refused_00.npz    a proposed pose that cannot be reached, and the reason; refused_01.npz and so on
 """
 
 import hashlib
@@ -34,7 +33,7 @@ from jaxnbv.storage.files import write_whole
 from jaxnbv.storage.folders import ResultFolder, read_arrays, versions, write_arrays
 from jaxnbv.storage.rebuilding import read_config
 
-# What is stored as several arrays.
+# Parts that are stored as several arrays.
 _MODULES = {
     "pose": Pose,
     "scan": PointCloud,
@@ -46,15 +45,17 @@ _MODULES = {
 
 
 class RunFolder(ResultFolder):
-    """The folder of an "episode" or a "session", open for one configuration: numbered files of arrays, which are
-    checked when they are read.
+    """The folder of an episode or a session with one configuration: numbered files of arrays.
 
-    - `config`: parts of the configuration by their names, as they are: `RunFolder` describes them.
+    Files are checked when they are read.
+
+    - `kind`: "episode" or "session".
+    - `config`: parts of the configuration by name. `RunFolder` makes their descriptions.
 
     **Raises:** `ValueError` if the folder holds results of another configuration, or other files.
     """
 
-    # Not arrays.npz, which belongs to the record.
+    # The pattern leaves out arrays.npz, which belongs to the record.
     pattern, format = "*_*.npz", 4
 
     def __init__(self, path: str | Path, kind: str, config: dict[str, Any]):
@@ -70,31 +71,31 @@ class RunFolder(ResultFolder):
         return read_config(path, kind, cls.format, given)
 
     def count(self, name: str) -> int:
-        """How many files of a name there are, of "view" say: view_00.npz, view_01.npz and so on.
+        """Number of files of a name, such as "view" for view_00.npz, view_01.npz and so on.
 
         **Raises:** `ValueError` if one before the last is missing.
         """
-        # By their names: a link to a file that is gone is an image that cannot be read.
-        found = {file for file in os.listdir(self.path) if re.fullmatch(rf"{name}_\d{{2,}}\.npz", file)}
-        for index in range(len(found)):
+        # By name, so that a broken link counts as an image that cannot be read.
+        names = {file for file in os.listdir(self.path) if re.fullmatch(rf"{name}_\d{{2,}}\.npz", file)}
+        for index in range(len(names)):
             file = self.file(name, index).name
             require(
-                file in found,
-                f"{self.path} holds {len(found)} of {name}_*.npz, but not {file}: restore it, or move those after it "
+                file in names,
+                f"{self.path} holds {len(names)} of {name}_*.npz, but not {file}: restore it, or move those after it "
                 "to another folder",
             )
-        return len(found)
+        return len(names)
 
     def file(self, name: str, index: int) -> Path:
-        """Where the file of a name and index lies."""
+        """The path of the file with a name and an index."""
         return self.path / f"{name}_{index:02d}.npz"
 
     def write(self, name: str, index: int, **parts: Any) -> None:
-        """Write a file, all or nothing; the first of them binds the folder to its configuration.
+        """Write a file, completely or not at all. The first file binds the folder to its configuration.
 
-        - `parts`: modules, arrays or None, by their names.
+        - `parts`: modules, arrays or None, by name.
 
-        **Raises:** `ValueError` as `write_whole` does.
+        **Raises:** `ValueError` if `write_whole` does.
         """
         self.bind()
         leaves = jax.tree_util.tree_leaves_with_path(parts)
@@ -104,9 +105,9 @@ class RunFolder(ResultFolder):
         write_arrays(self.file(name, index), sealed)
 
     def read(self, name: str, index: int) -> dict[str, Any]:
-        """The parts that were written; without those that were None.
+        """The parts in a file, except those that were None.
 
-        **Raises:** `ValueError` if the file is damaged, or not that of the index.
+        **Raises:** `ValueError` if the file is damaged, or has another index inside.
         """
 
         def check(arrays: dict[str, np.ndarray]) -> None:
@@ -121,9 +122,9 @@ class RunFolder(ResultFolder):
         return _parts(arrays)
 
     def write_cloud(self, cloud: PointCloud) -> None:
-        """Write points and normals as a binary PLY file, in the coordinates that they have."""
+        """Write points and normals as a binary PLY file, without a change of coordinates."""
         points, normals = cloud.to_numpy()
-        # A mesh without faces: clouds of trimesh have no normals.
+        # A mesh without faces, since trimesh's point clouds have no normals.
         bare = trimesh.Trimesh(points, vertex_normals=normals, process=False)
         content = trimesh.exchange.ply.export_ply(bare, vertex_normal=True)
         write_whole(self.path / "cloud.ply", lambda file: file.write(content))
@@ -137,7 +138,7 @@ def _checksum(arrays: dict[str, np.ndarray]) -> str:
 
 
 def _parts(arrays: dict[str, Any]) -> dict[str, Any]:
-    """Modules in place of their arrays, which are named by the ways to them."""
+    """Modules and arrays by name. Names of a module's arrays are paths such as "scan.points"."""
     parts: dict[str, Any] = {}
     for name, array in arrays.items():
         part, _, rest = name.partition(".")
@@ -145,4 +146,4 @@ def _parts(arrays: dict[str, Any]) -> dict[str, Any]:
             parts.setdefault(part, {})[rest] = jnp.asarray(array)
         else:
             parts[part] = array
-    return {part: _MODULES[part](**_parts(held)) if isinstance(held, dict) else held for part, held in parts.items()}
+    return {name: _MODULES[name](**_parts(part)) if isinstance(part, dict) else part for name, part in parts.items()}
