@@ -1,4 +1,4 @@
-"""The laboratory: scenes, the engine of studies, and one folder or file a study. The library imports none of it."""
+"""Studies that compare methods, their procedural scenes and their engine. The library imports none of it."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""The studies that ship, as their commands must know them; see `Entry`."""
+"""Entries of the studies that ship, see `Entry`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -21,7 +21,7 @@ CLASSES = {
     "first": Annotated[
         FirstView | None,
         typer.Option(
-            help="Which first views: any, or of classes only those after which the classifier is wrong.",
+            help="First views to start from: any, or only those after which the classifier is wrong.",
             show_default="any",
         ),
     ],
@@ -30,25 +30,27 @@ FRAMING = {
     "framing": Annotated[
         Framing | None,
         typer.Option(
-            help="How large a pyramid stands: a view shows a patch of it, or nearly all.", show_default="both"
+            help="How large a pyramid appears: a view shows a patch of it, or nearly all.", show_default="both"
         ),
     ]
 }
 RECORDING = {
-    "folder": Annotated[Path | None, typer.Argument(help="A recording, for recorded.", show_default=False)],
+    "folder": Annotated[
+        Path | None, typer.Argument(help="The folder of a recording, for the study recorded.", show_default=False)
+    ],
     "box": Annotated[
         tuple[float, float, float, float, float, float] | None,
         typer.Option(
             metavar="LOW HIGH",
-            help="What is to be seen of a recording: two corners of a box, six numbers in its units.",
-            show_default="about nearly all that was seen, with room",
+            help="Region of interest of a recording: two corners of a box, six numbers in its units.",
+            show_default="a box around nearly all recorded points",
         ),
     ],
     "up": Annotated[
         tuple[float, float, float] | None,
         typer.Option(
             metavar="X Y Z",
-            help="The direction of a recording that is upward, which becomes z of the box.",
+            help="Upward direction of a recording. It becomes the z axis of the box.",
             show_default="as recorded",
         ),
     ],
@@ -57,34 +59,34 @@ RECORDING = {
         typer.Option(
             metavar="FX FY CX CY",
             help="Intrinsics of a recording's depth camera, in pixels.",
-            show_default="those in its folder or the parent",
+            show_default="the file in its folder or the parent folder",
         ),
     ],
     "depth_scale": Annotated[
         float | None,
         typer.Option(
-            help="The length of a unit of a recording's images in the units of its poses, 0.0002 for TUM RGB-D.",
-            show_default="the usual one with which frames agree",
+            help="Length of one unit of the depth images, in the units of the poses: 0.0002 for TUM RGB-D.",
+            show_default="the common scale for which the frames agree",
         ),
     ],
 }
 KNOWN_PARTS = {
     "parts": Annotated[
         Path | None,
-        typer.Option(help="A folder of the parts' meshes, at true size.", show_default="sets of parts that look alike"),
+        typer.Option(help="A folder of meshes of the parts, at true size.", show_default="parts that look alike"),
     ],
     "setup": Annotated[
         Setup | None,
         typer.Option(
-            help="How a part is scanned: all of it in view, a patch of it, on a table, or beside a box.",
-            show_default="each",
+            help="Setup of a part's scan: all of it in view, a patch of it, on a table, or beside a box.",
+            show_default="all four",
         ),
     ],
 }
 
 PYRAMID = Entry(
     "jaxnbv.studies.classification.objects:PyramidStudy",
-    "Which methods find the pattern on a pyramid's base, and how soon is its class known?",
+    "How many views does each method need to find the pattern on a pyramid's base, which tells its class?",
     scenes=100,
     views=5,
     model="known",
@@ -92,8 +94,8 @@ PYRAMID = Entry(
 )
 TRUCK = Entry(
     "jaxnbv.studies.classification.objects:TruckStudy",
-    "How soon is the class of a truck's cargo known, which most views do not show? The paper's Truck-ModelNet10, "
-    "on procedural trucks and cargo, or on meshes: a folder `trucks`, and folders of the classes' names.",
+    "How many views does each method need to tell the class of a truck's cargo, which most views do not show? The "
+    "paper's Truck-ModelNet10, on procedural trucks and cargo, or on meshes: a folder `trucks` and one per class.",
     scenes=100,
     views=5,
     model="known",
@@ -101,8 +103,8 @@ TRUCK = Entry(
 )
 HOUSEHOLD = Entry(
     "jaxnbv.studies.classification.objects:HouseholdStudy",
-    "Do all methods tell classes alike that differ in global shape? The paper's ModelNet10, on procedural objects, "
-    "or on meshes in folders of the classes' names.",
+    "Do all methods do equally well on classes that differ in global shape? The paper's ModelNet10, on procedural "
+    "objects, or on meshes in one folder per class.",
     scenes=100,
     views=5,
     model="known",
@@ -110,8 +112,8 @@ HOUSEHOLD = Entry(
 )
 OMNIOBJECT3D = Entry(
     "jaxnbv.studies.classification.objects:OmniObject3DStudy",
-    "How soon are fruits told that differ in what is small? The paper's OmniObject3D, on meshes of yours in "
-    "folders of the classes' names, with a classifier of yours.",
+    "How many views does each method need to tell fruits that differ in small details? The paper's OmniObject3D, "
+    "on your meshes in one folder per class, with your classifier.",
     scenes=100,
     views=5,
     options=MESHES | CLASSES,
@@ -119,7 +121,7 @@ OMNIOBJECT3D = Entry(
 PARTS = Entry(
     "jaxnbv.studies.parts.study:PartStudy",
     "How many views until all parts of an object are found? The paper's Table 1, on procedural objects, or on "
-    "meshes whose nodes are their parts, in folders of the classes' names.",
+    "meshes whose nodes are their parts, in one folder per class.",
     scenes=80,
     views=6,
     model="known",
@@ -127,8 +129,8 @@ PARTS = Entry(
 )
 HEAT = Entry(
     "jaxnbv.studies.heat:HeatStudy",
-    "How near does the coldest point of the scanned cloud come to the object's? On procedural objects whose "
-    "coldest point hides, or on your meshes, heated at one place.",
+    "How near is the coldest point of the scanned cloud to that of the object? On procedural objects whose coldest "
+    "point few views show, or on your meshes, heated at one place.",
     scenes=24,
     views=6,
     model="known",
@@ -136,7 +138,7 @@ HEAT = Entry(
 )
 RECONSTRUCTION = Entry(
     "jaxnbv.studies.reconstruction:ReconstructionStudy",
-    "How near is the surface that a method's views give to the true one? The table of the paper's supplement.",
+    "How near is the surface reconstructed from each method's views to the true one? The supplement's table.",
     scenes=32,
     views=5,
     options=MESHES,
@@ -151,7 +153,7 @@ RECORDED = Entry(
 )
 IDENTIFICATION = Entry(
     "jaxnbv.studies.identification:IdentificationStudy",
-    "Which of some known parts is it, and how does it lie? On your own parts, or on sets of parts that look alike.",
+    "Which of the known parts is the object, and in which pose? On your own parts, or on parts that look alike.",
     scenes=40,
     views=4,
     model="known",

@@ -1,4 +1,4 @@
-"""The study of heat: how near does the coldest point of the scanned cloud come to the object's?"""
+"""Study of heat: how near is the coldest point of the scanned cloud to that of the object?"""
 
 import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -33,15 +33,15 @@ from jaxnbv.tasks import ColdestPoint, Coverage, body_temperature
 from jaxnbv.tasks.diffusion import HeatProblem
 from jaxnbv.viz.render import Still
 
-# Those that seek cold; the other methods know nothing of heat.
+# Methods that look for the coldest point. The others ignore heat.
 HEAT_METHODS = ("heat", "heat-reached", "heat-halving")
 _BASELINES = ("coverage", *RULES)
-# The points among which a cloud's coldest is sought.
+# Sets of points in which the coldest point of a cloud is searched for.
 ESTIMATES = {"all": "of all points", "reached": "of the warmed points"}
-# Points colder than this share of the range of temperatures count as coldest: objects have symmetries, and the inner
-# floor of a mug is as cold all over.
+# Points within this share of the temperature range from the lowest count as coldest: objects have symmetries, and the
+# inner floor of a mug is equally cold all over.
 _NEARLY = 0.01
-# Without its palest colours, which would not stand out against the grey of what was not scanned.
+# Inferno without its palest colours, which would not stand out against the grey of unscanned surface.
 _HEAT = LinearSegmentedColormap.from_list("heat", mpl.colormaps["inferno"](np.linspace(0.0, 0.9, 256)))
 _MARKS: dict[str, dict[str, Any]] = {
     "heat source": {"marker": "X", "color": "#d55e00", "ms": 6.0, "mec": "white"},
@@ -51,10 +51,10 @@ _MARKS: dict[str, dict[str, Any]] = {
 
 
 class Truth(NamedTuple):
-    """The temperature of the object itself.
+    """The temperature of the true object.
 
     - `mesh`: its surface.
-    - `points`, `temperatures`: of that surface, a fortieth of a scene unit apart, in degrees.
+    - `points`: points on the surface, a fortieth of a scene unit apart; `temperatures`: in degrees.
     """
 
     mesh: TriangleMesh
@@ -68,15 +68,15 @@ class Truth(NamedTuple):
 
     @property
     def region(self) -> Float[np.ndarray, "m 3"]:
-        """All points whose temperature is the least to within a hundredth of the range."""
+        """All points whose temperature is within 1 % of the range from the lowest."""
         low, high = self.temperatures.min(), self.temperatures.max()
         return self.points[self.temperatures <= low + _NEARLY * (high - low)]
 
 
 def _saturated(record: Record, method: str) -> dict[int, float]:
-    """Whether every view had the value zero, for the methods that seek cold."""
-    taken = record["methods"][method]["steps"] if method in HEAT_METHODS else []
-    return {view: float(step["value"] == 0.0) for view, step in enumerate(taken, start=2)}
+    """Whether all values of a step were zero (1.0) or not (0.0), by view, for `HEAT_METHODS`."""
+    steps = record["methods"][method]["steps"] if method in HEAT_METHODS else []
+    return {view: float(step["value"] == 0.0) for view, step in enumerate(steps, start=2)}
 
 
 def _measures(estimate: str) -> tuple[Measure, ...]:
@@ -96,21 +96,21 @@ def _measures(estimate: str) -> tuple[Measure, ...]:
 
 
 class HeatStudy(Study):
-    """How near the coldest point of the cloud comes to the object's coldest points. Settings as of `Study`, and
+    """Measures how near the coldest point of the cloud is to the object's coldest points.
 
-    - `num_points`: points of D to which imagined scans are added, where the temperature is simulated.
+    Meshes are heated at a random point. Procedural objects come from `heat_scene`. Settings as in `Study`, and
+
+    - `num_points`: points kept of D for simulating the temperature of D with an imagined scan.
     - `imagined_rays`: rays along a side of an imagined scan; true scans have 50 x 50.
-    - `true_grid`: of the mesh of a procedural object; the default is fine enough for the thinnest rods, of radius 0.04.
-
-    A mesh is heated at a random point; procedural objects are those of `heat_scene`.
+    - `true_grid`: grid on which a procedural object is meshed; the default resolves the thinnest rods, of radius 0.04.
     """
 
     title: ClassVar[str] = "The coldest point"
     explanation: ClassVar[str] = (
-        "The estimate is the coldest of all points of the cloud, as in the paper, or of those that the source warms.\n"
-        "The object's coldest points are those within 1 % of its range of temperatures of the lowest. Saturated are\n"
-        "steps at which every view had the value zero: the first candidate is taken then. The lowest temperature is\n"
-        "already that before heating, at a piece of the cloud that is not connected to the source."
+        "The estimate is the coldest of all points of the cloud, as in the paper, or of the points that the source\n"
+        "warms. The object's coldest points are within 1 % of its temperature range from the lowest. A step is\n"
+        "saturated if every view has the value zero, and the first candidate is chosen. This happens when a piece of\n"
+        "the cloud is not connected to the source, since it keeps the temperature before heating, which is the lowest."
     )
     methods: ClassVar[tuple[str, ...]] = (*HEAT_METHODS, *_BASELINES)
     pictured: ClassVar[tuple[str, ...]] = ("heat", "heat-reached", *RULES)
@@ -122,7 +122,7 @@ class HeatStudy(Study):
         SECONDS,
     )
     claims: ClassVar[tuple[Claim, ...]] = (
-        Claim("The utility comes nearer to the coldest point within few views.", "distance, all", 4, _BASELINES),
+        Claim("The heat utility gets nearer to the coldest point within few views.", "distance, all", 4, _BASELINES),
     )
     seed: ClassVar[int] = 8
     bank: ClassVar[str] = "heat"
@@ -142,11 +142,11 @@ class HeatStudy(Study):
         return Camera(height=self.imagined_rays, width=self.imagined_rays)
 
     def scene(self, index: int) -> Scene:
-        """An object; its task is the point where it is heated."""
+        """An object. The task of the scene is the point where the object is heated."""
         file = self.file(index)
         if file is None:
-            made = heat_scene(index)
-            return Scene(index, made.name, made.surface, made.source)
+            heated = heat_scene(index)
+            return Scene(index, heated.name, heated.surface, heated.source)
         mesh = file.read()
         (source,) = mesh.sample_points(self.key(index, "scene"), 1)
         return Scene(index, file.name, mesh, jnp.asarray(source, jnp.result_type(float)))
@@ -161,7 +161,7 @@ class HeatStudy(Study):
         return super().search(method.removeprefix("heat-"), scene)
 
     def shows_enough(self, scene: Scene, seen: PointCloud) -> bool:
-        """The heat source must be seen."""
+        """Whether the scan shows the heat source."""
         points, _ = seen.to_numpy()
         return bool((np.linalg.norm(points - np.asarray(scene.task), axis=1) <= HeatProblem.radius).any())
 
@@ -170,7 +170,7 @@ class HeatStudy(Study):
         mesh = mesh_from_sdf(surface.sdf, self.true_grid) if isinstance(surface, SDFSurface) else surface
         if not isinstance(mesh, TriangleMesh):
             raise InputError(
-                f"the temperature of a {type(mesh).__name__} is not known: give a mesh or a signed distance"
+                f"the temperature of a {type(mesh).__name__} cannot be computed: give a mesh or a signed distance"
             )
         points, temperature = body_temperature(mesh, heat_problem(scene))
         return Truth(mesh, points, temperature.values)
@@ -180,9 +180,11 @@ class HeatStudy(Study):
         return {"name": scene.name, "truth": {"point": truth.coldest.tolist(), "temperature": low, "hottest": high}}
 
     def follow(self, scene: Scene, truth: Truth, planner: Planner, episode: Iterator[Step]) -> Record:
-        """After each view the share of the points that the source warms and two estimates of the coldest point, one
-        among all points and one among those (among all, where there are none): where it is, its temperature, and its
-        distance to the nearest of the object's coldest points."""
+        """Record after each view the share of warmed points and two estimates of the coldest point.
+
+        One estimate is among all points, the other among the warmed points, or among all if there are none. Each has a
+        position, a temperature, and a distance to the nearest of the object's coldest points.
+        """
         tree, heat, shares = cKDTree(truth.region), heat_problem(scene), []
         lists = ("points", "temperatures", "distances")
         estimates: dict[str, dict[str, list]] = {name: {key: [] for key in lists} for name in ESTIMATES}
@@ -197,8 +199,10 @@ class HeatStudy(Study):
         return {"reached": shares, "estimates": estimates}
 
     def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
-        """The points of the cloud that can be seen, coloured by temperature, over the grey of the object; its coldest
-        point, and the estimate."""
+        """Tiles of the cloud's visible points, coloured by temperature, over the object in grey.
+
+        Marks show the object's coldest point and the estimate.
+        """
         scene, held = self.scene(record["scene"]), record["methods"]
         truth, heat = self.truth(scene), heat_problem(scene)
         still = still_of(truth.mesh, across(record), pixels)
@@ -218,17 +222,17 @@ class HeatStudy(Study):
             _mark(axes, still, np.array(estimate["points"][view]), "coldest point of the cloud")
             say(axes, f"{estimate['distances'][view]:.2f}")
 
-        caption = "Scanned points, coloured by the temperature that they give. Beneath: how far the estimate is off."
+        caption = "Scanned points, coloured by the temperature simulated on them. Beneath: error of the estimate."
         return Tiles(caption, tile, draw_truth, marks=_MARKS, scale=(colours, "temperature (degrees)"))
 
 
 def heat_problem(scene: Scene) -> HeatProblem:
-    """The authors' problem, heated where the scene says."""
+    """The paper's heat problem with the scene's source."""
     return HeatProblem(np.asarray(scene.task))
 
 
 def _mark(axes: Axes, still: Still, point: Float[np.ndarray, "3"], name: str) -> None:
-    """Hollow if the object hides it."""
+    """Draw a mark at a point, hollow if the object hides the point."""
     pixels, in_front = still.project(point[None])
     look = _MARKS[name] if in_front[0] else _MARKS[name] | {"mfc": "white", "mec": _MARKS[name]["color"]}
     axes.plot(pixels[0, 0], pixels[0, 1], zorder=6, **look)

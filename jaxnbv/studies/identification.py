@@ -1,4 +1,4 @@
-"""The study of identification: which of some known parts is it, how does it lie, and by which views is that told?"""
+"""Study of identification: which of the known parts is the object, and in which pose does it lie?"""
 
 import dataclasses
 import math
@@ -41,21 +41,21 @@ from jaxnbv.viz.style import DEVIATION
 
 IDENTIFY, BY_NAME = "identify", "identify-name"
 _SIZE = 2.5
-# The sensor's noise: 0.6 % of the size for each coordinate of a point, six degrees for a normal.
+# Sensor noise: 0.6 % of the size per coordinate of a point, six degrees for a normal.
 _NOISE = SensorNoise(0.006 * _SIZE, 0.1)
 # Cameras about a table stand at least this far above it.
 _ELEVATION = math.radians(10.0)
-# A first view shows the part by so many of its pixels, at least.
+# At least this share of a first view's pixels shows the part.
 _ENOUGH = 0.01
-# Rays by which views are imagined, rows and columns.
+# Rows and columns of rays of an imagined scan.
 _RAYS = (28, 28)
-# Points of the true surface that are measured, and of the placed one that they are compared with.
+# Numbers of points on the true surface and on the placed one, between which distances are measured.
 _POINTS, _DENSE = 500, 20_000
-# Share of the size by which a pose that counts as right is off at most.
+# A pose is right if its error is below this share of the size.
 _RIGHT = 0.01
-# Names whose weights are as near to the largest, as shares of it, are level.
+# Names whose weights reach this share of the largest weight count as tied.
 _LEVEL = 0.99
-# Distances to the true part that pictures tell apart, in scene units.
+# Colour scale of distances to the true part, in scene units.
 _ERRORS = LogNorm(0.01, 0.5)
 _Truth = tuple[PlacedPart, Float[np.ndarray, "n 3"], float]
 
@@ -69,21 +69,21 @@ def _below(share: float) -> Any:
 
 
 class IdentificationStudy(Study):
-    """Which of some known parts an object is, and how it lies. Settings as of `Study`, and
+    """Measures how well views tell which known part an object is, and its pose. Settings as in `Study`, and
 
-    - `setup`: how the part is scanned.
-    - `meshes`: files of the parts, at true size. Without any, parts are sets of eight that look alike.
+    - `setup`: where the part lies and how much of it a view shows.
+    - `meshes`: files of the parts, at true size. Without any, the parts come in sets of eight that look alike.
 
-    All methods hold the same bank and weigh the same hypotheses, so that they differ in their views alone.
+    All methods hold the same bank and weigh the same hypotheses, so they differ only in their views.
     """
 
     title: ClassVar[str] = "Which part it is, and how it lies"
     explanation: ClassVar[str] = (
-        "Name right: the likeliest name is the true one; 'none of these' counts as wrong, one of n that are level as\n"
-        "1/n. Pose right: so is the name, and the true part's surface lies within 1 % of its size of the placed part,\n"
-        "on average. ADD-S: the mean distance from the true part's points to the nearest ones of the placed part, in\n"
-        "shares of the diameter.\n"
-        "There is no oracle: to score each candidate by its true scan takes a search of the bank for each."
+        "Name right: the likeliest name is the true one. 'None of these' counts as wrong, a tie of n names as 1/n.\n"
+        "Pose right: the name is right, and the true part's surface is on average within 1 % of its size of the\n"
+        "placed part. ADD-S: the mean distance from the true part's points to the nearest points of the placed part,\n"
+        "as a share of the diameter.\n"
+        "There is no oracle, because scoring each candidate by its true scan takes a search of the bank for each."
     )
     methods: ClassVar[tuple[str, ...]] = (IDENTIFY, BY_NAME, "farthest", "random")
     further: ClassVar[tuple[str, ...]] = ("new-surface", "uncertainty")
@@ -99,7 +99,7 @@ class IdentificationStudy(Study):
     )
     claims: ClassVar[tuple[Claim, ...]] = (
         Claim(
-            "Views by what they tell about the hypotheses name the part sooner than views that know no hypotheses.",
+            "Views chosen to tell the hypotheses apart name the part sooner than views chosen without hypotheses.",
             "right",
             2,
             ("farthest", "random"),
@@ -129,9 +129,9 @@ class IdentificationStudy(Study):
         setup: Setup | None = None,
         **options: Any,
     ) -> dict[str, Study]:
-        """One for each setup, if none is given.
+        """A study of one setup, or one study per setup if none is given.
 
-        - `parts`: a folder of meshes at true size; by default parts that look alike.
+        - `parts`: a folder of meshes at true size; default: parts that look alike.
 
         **Raises:** `ValueError` for a model that knows no parts, or a folder without meshes.
         """
@@ -145,7 +145,7 @@ class IdentificationStudy(Study):
 
     @property
     def num_scenes(self) -> int | None:
-        """As many as are asked for: a part returns in another pose."""
+        """None: there are as many scenes as needed, since parts come again in other poses."""
         return None
 
     @property
@@ -158,7 +158,7 @@ class IdentificationStudy(Study):
         return self.camera.resized(*_RAYS)
 
     def scene(self, index: int) -> Scene:
-        """A part that lies somehow; its task is the `PlacedPart`."""
+        """A part in a random pose. The task of the scene is its `PlacedPart`."""
         require(index >= 0, f"there is no scene {index}: they are counted from 0")
         if self.meshes:
             parts = parts_in(self.meshes)
@@ -169,7 +169,7 @@ class IdentificationStudy(Study):
         return Scene(index, parts.bank.names[part], placed.mesh, placed)
 
     def sensor(self, scene: Scene) -> Sensor:
-        """A camera whose points are noisy, and their ranges too; what stands around the part hides it."""
+        """A depth camera with noisy points, normals and ranges. Obstacles hide the part; their points are removed."""
         obstacles = scene.task.obstacles
 
         def observe(pose: Pose, key: PRNGKeyArray) -> PointCloud:
@@ -182,7 +182,7 @@ class IdentificationStudy(Study):
         return int(seen.count) >= _ENOUGH * self.camera.num_rays
 
     def sampler_of(self, scene: Scene) -> SurfaceSampler:
-        """With the bank at the scale of the scene; its parts rest on the table, where there is one."""
+        """A sampler that holds the bank at the scene's scale. Its parts rest on the table if there is one."""
         return self.sampler.with_bank(scene.task.bank, scene.task.poses)
 
     def planner_of(self, acquisition: Acquisition, search: Search, scene: Scene) -> Planner:
@@ -195,7 +195,7 @@ class IdentificationStudy(Study):
         return Identify(pose=method != BY_NAME)
 
     def truth(self, scene: Scene) -> _Truth:
-        """The placed part, points of its surface, and its diameter."""
+        """The placed part, points on its surface, and its diameter."""
         mesh = scene.task.mesh
         corners = mesh.to_trimesh().convex_hull.vertices
         return scene.task, mesh.sample_points(self.key(scene.index, "measure"), _POINTS), float(pdist(corners).max())
@@ -206,12 +206,11 @@ class IdentificationStudy(Study):
 
     @classmethod
     def group(cls, record: Record) -> str:
-        """By the set of parts that look alike."""
+        """The set of parts that look alike."""
         return record["set"]
 
     def follow(self, scene: Scene, truth: _Truth, planner: Planner, episode: Iterator[Step]) -> Record:
-        """After each view: the likeliest name, how far it is right, how likely the true one is, and how far off the
-        likeliest placement is."""
+        """Record after each view the likeliest name, the probability of the true one, and the error of the pose."""
         views = [self._told(truth, step.observations.hypotheses) for step in episode]
         return {name: [view[name] for view in views] for name in views[0]}
 
@@ -220,9 +219,9 @@ class IdentificationStudy(Study):
         (task, points, diameter), bank = truth, hypotheses.bank
         weights = np.append(np.asarray(hypotheses.shape_weights), hypotheses.weights[-1])
         named, (part, placement) = int(np.argmax(weights)), hypotheses.likeliest
-        # Parts that nothing seen so far tells apart are level, whatever their order in the bank.
-        level = weights >= _LEVEL * weights.max()
-        right = float(level[task.part] / level.sum())
+        # Parts that the scans so far do not distinguish are tied, whatever their order in the bank.
+        is_tied = weights >= _LEVEL * weights.max()
+        right = float(is_tied[task.part] / is_tied.sum())
         rotation, shift = np.asarray(placement.rotation, np.float64), np.asarray(placement.shift, np.float64)
         off = _distances(placement, bank.shape(jnp.asarray(part)).solid, jnp.asarray(points, jnp.float32))
         fit = float(np.mean(np.abs(np.asarray(off)))) / _SIZE
@@ -238,7 +237,7 @@ class IdentificationStudy(Study):
         }
 
     def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
-        """The likeliest part where it is placed after each view, coloured by the distance to the true one."""
+        """Tiles of the likeliest part as placed after each view, coloured by the distance to the true part."""
         task, held, eye = self.scene(record["scene"]).task, record["methods"], across(record)
         true = task.mesh
         tree = cKDTree(true.sample_points(jax.random.key(0), 10 * _DENSE))
@@ -251,7 +250,7 @@ class IdentificationStudy(Study):
             say(axes, f"{run['named'][view]}, {run['p_true'][view]:.2f}", right=run["right"][view] == 1)
 
         scale = ScalarMappable(_ERRORS, DEVIATION), "distance to the true part\n(scene units)"
-        caption = "The likeliest part as it is placed, its name, and how likely the true name is."
+        caption = "The likeliest part as placed, its name, and the probability of the true name."
         return Tiles(caption, tile, lambda axes: axes.imshow(still_of(true, eye, pixels).image), scale=scale)
 
 

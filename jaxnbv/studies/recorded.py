@@ -1,4 +1,4 @@
-"""The study of a recorded sequence: what its frames show of a box, when they are chosen one by one."""
+"""Study of a recorded sequence: how much of a box the frames show that a method chooses one by one."""
 
 import functools
 from collections.abc import Iterator, Mapping, Sequence
@@ -38,23 +38,23 @@ from jaxnbv.utility import Quantity
 from jaxnbv.viz.style import GREY, INK, LINE, NEW
 
 NEW_AREA, COVERAGE, EVEN, ORACLE = "new surface", "coverage", "evenly spaced", "oracle"
-# A voxel that fewer frames have seen may be noise.
+# A voxel that fewer frames show may be noise.
 _SEEN_BY = 3
 _VOXELS_ALONG_BOX = 80
-# Of the box's voxels that any frame shows; a first view of fewer says nothing.
+# A first view shows at least this share of the box's voxels.
 _ENOUGH = 0.05
-# Rays by which views are imagined, rows and columns.
+# Rows and columns of rays of an imagined scan.
 _RAYS = (24, 32)
-# The stride by which the box is looked for, and its room about nearly all that was seen: of its longest side.
+# Pixel stride for the default box, and its margin as a share of the longest side.
 _COARSE, _ROOM = 16, 0.05
 
 
 class Recording(NamedTuple):
-    """A sequence as a study sees it.
+    """The frames of a sequence, and the voxels of the box that at least three of them show.
 
-    - `poses`: of the frames; `scans`: what each showed of the box; both in scene units.
-    - `shown`: which of the voxels that three frames or more have seen each frame shows, by all of its pixels; `voxels`:
-      their centres, and `places`: of the camera, both in the recording's units.
+    - `poses`: the camera poses; `scans`: what each frame shows of the box; both in scene units.
+    - `shown`: whether each frame shows each voxel, by all pixels of the frame.
+    - `voxels`: the centres of the voxels; `places`: the positions of the camera; both in the recording's units.
     """
 
     poses: Pose
@@ -65,49 +65,49 @@ class Recording(NamedTuple):
 
 
 class _Unknown(Surface):
-    """The true surface of a recording, which nobody knows."""
+    """Stands in for the true surface of a recording, which is unknown."""
 
     in_jit: ClassVar[bool] = False
 
     def trace(self, origins, directions) -> Hits:
         """**Raises:** `ValueError` always."""
-        raise InputError("the true surface of a recording is not known: ask the study's sensor")
+        raise InputError("the true surface of a recording is unknown: take scans from the study's sensor")
 
 
 class InTurn(Baseline):
-    """Candidates in an order that is known before.
+    """Visits the candidates in a fixed order.
 
-    - `turns`: the candidate of each view, the first one included.
+    - `turns`: index of the candidate of each view, the first view included.
     """
 
     turns: Int[Array, " views"] = eqx.field(kw_only=True)
 
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
-        """Values are 1 for the candidate whose turn it is; the key is not used."""
+        """1 for the candidate whose turn it is, 0 for the others. The key is not used."""
         chosen = jnp.arange(candidates.position.shape[0]) == self.turns[problem.observations.num_views]
         return chosen.astype(candidates.position.dtype)
 
 
 class MostNewVoxels(Baseline):
-    """The greedy oracle: the frame that truly shows the most voxels that no frame so far has shown.
+    """Greedy oracle: chooses the frame that shows the most voxels not shown by the frames so far.
 
-    - `shown`: which voxels each candidate shows.
+    - `shown`: whether each candidate shows each voxel.
     """
 
     shown: Bool[Array, "candidates voxels"] = eqx.field(kw_only=True)
 
     def quantity(self, acquisition: Acquisition) -> Quantity:
-        return Quantity("new voxels", "", "voxels that a frame shows and no frame before it.", smooth=False)
+        return Quantity("new voxels", "", "voxels that a frame shows and no earlier frame does.", smooth=False)
 
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
-        """Values are numbers of voxels; the key is not used."""
-        known = jnp.any(self.shown & problem.observations.poses.holds(candidates)[:, None], axis=0)
-        gain = jnp.sum(self.shown & ~known, axis=1)
+        """The number of new voxels of each candidate. The key is not used."""
+        is_shown = jnp.any(self.shown & problem.observations.poses.holds(candidates)[:, None], axis=0)
+        gain = jnp.sum(self.shown & ~is_shown, axis=1)
         return gain.astype(candidates.position.dtype)
 
 
 def _gains(record: Record, method: str) -> dict[int, float | None]:
-    """What views after the first added, as a share of what the oracle's have added by then."""
+    """Share of voxels that a method added by each later view, relative to the oracle's at the same view."""
     if ORACLE not in record["methods"]:
         return {}
     own, best = (record["methods"][name]["covered"] for name in (method, ORACLE))
@@ -116,22 +116,22 @@ def _gains(record: Record, method: str) -> dict[int, float | None]:
 
 
 class RecordedStudy(Study):
-    """Which frames of a recording show the most of a box? Settings as of `Study`, but that candidates are the recorded
-    poses, and a scene is a first view: one of the frames that show a twentieth of the box, at random.
+    """Finds which frames of a recording show the most of a box.
 
-    - `folder`: of `RecordedFrames`; `up`, `intrinsics` (fx, fy, cx, cy) and `depth_scale`: as it takes them.
-    - `box`: low and high corner of what is to be seen, in the recording's units.
+    Each scene starts from another first view, a random one of the frames that show a twentieth of the box. The
+    candidates are the recorded poses, and a chosen frame gives its recorded scan. Settings as in `Study`, and
+
+    - `folder`, `up`, `intrinsics` (fx, fy, cx, cy), `depth_scale`: arguments of `RecordedFrames`.
+    - `box`: the region of interest, in the recording's units.
     - `voxel`: side of the voxels that are counted, in the recording's units.
 
-    Nothing is held out: what a chosen frame shows is what was recorded.
-
-    **Raises:** `ValueError` as `RecordedFrames` does, or if the box holds no voxel that three frames have seen.
+    **Raises:** `ValueError` as `RecordedFrames` does, or if the box holds no voxel that three frames show.
     """
 
     title: ClassVar[str] = "Voxels of a recorded place that were seen"
     explanation: ClassVar[str] = (
-        "Share of the voxels in the box, of those that three frames or more have seen, that the chosen frames show.\n"
-        "The oracle knows what each frame shows; evenly spaced frames divide the recording in time."
+        "Share of the voxels in the box that the chosen frames show. A voxel counts if three frames or more show it.\n"
+        "The oracle knows what each frame shows. Evenly spaced frames divide the recording in time."
     )
     methods: ClassVar[tuple[str, ...]] = (NEW_AREA, COVERAGE, *RULES, EVEN, ORACLE)
     reference: ClassVar[str] = NEW_AREA
@@ -141,7 +141,7 @@ class RecordedStudy(Study):
     )
     claims: ClassVar[tuple[Claim, ...]] = (
         Claim(
-            "Frames chosen by expected new area show more than those of rules that look at no surface.",
+            "Frames chosen by expected new area show more than frames chosen by rules that ignore the surface.",
             "covered",
             4,
             ("farthest", "random", EVEN),
@@ -159,12 +159,13 @@ class RecordedStudy(Study):
 
     @classmethod
     def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
+        """The study of one recording.
+
+        - `folder`, `up`, `intrinsics`, `depth_scale`: as in the study.
+        - `box`: its two corners, six numbers; default: `bounds_of` the recording. A voxel's side is an eightieth of the
+          box's longest side.
         """
-        - `folder`, `up`, `intrinsics`, `depth_scale`: those of the study.
-        - `box`: its corners, six numbers, by default about all but a hundredth of what was seen, to either side of each
-          axis, with room of a twentieth of its longest side. The voxels are an eightieth of its longest side.
-        """
-        require(model in MODELS, f"nothing is known of what was recorded: give a model of {', '.join(MODELS)}")
+        require(model in MODELS, f"a recording has no known shapes: give one of the models {', '.join(MODELS)}")
         folder = str(Path(options["folder"]).resolve())
         sensor: dict[str, Any] = {name: options.get(name) for name in ("up", "intrinsics", "depth_scale")}
         frames = RecordedFrames(folder, **sensor)
@@ -187,7 +188,7 @@ class RecordedStudy(Study):
 
     @property
     def recording(self) -> Recording:
-        """The sequence, read once a process."""
+        """The sequence, read once per process."""
         carving, frame = self.sampler.carving, frame_of_box(self.box)
         kept = self.box if carving is None else carving.with_room(self.box, self.grid, frame)
         sensor = self.up, self.intrinsics, self.depth_scale
@@ -204,7 +205,7 @@ class RecordedStudy(Study):
         return lambda pose, key: self.recording.scans[self.frame_of(pose)]
 
     def first_view(self, scene: Scene) -> int:
-        """Another one in each scene, as long as there are others that show enough."""
+        """Index of a frame that shows enough, a different one in each scene while there are any left."""
         enough = np.flatnonzero(self.recording.shown.mean(axis=1) >= _ENOUGH)
         require(len(enough) > 0, f"no frame of {self.folder} shows a twentieth of {self.box}: give a smaller box")
         order = jax.random.permutation(jax.random.key(self.seed), len(enough))
@@ -219,7 +220,7 @@ class RecordedStudy(Study):
 
     def search(self, method: str, scene: Scene) -> Search:
         if method == EVEN:
-            # They divide the recording evenly, from the first view on and round its end.
+            # Evenly spaced over the recording from the first view on, wrapping around at its end.
             apart = np.round(np.arange(self.views) * self.num_candidates / self.views).astype(int)
             turns = (self.first_view(scene) + apart) % self.num_candidates
             return InTurn(self.candidates, turns=jnp.asarray(turns))
@@ -237,14 +238,16 @@ class RecordedStudy(Study):
         planner: Planner,
         episode: Iterator[Step],
     ) -> Record:
-        """The frames that were chosen, and the share of the voxels that they have shown after each."""
+        """Record the chosen frames, and the share of the voxels shown after each of them."""
         frames = [self.frame_of(step.view.pose) for step in episode]
         seen = np.logical_or.accumulate(truth[frames], axis=0)
         return {"frames": frames, "covered": seen.mean(axis=1).tolist()}
 
     def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
-        """The voxels of the box across its shortest side, those that the frames so far have shown in colour; the way of
-        the recorded camera, and where the chosen frames were taken, in their order."""
+        """Tiles that show the voxels of the box along its shortest side, in colour once a chosen frame shows them.
+
+        A line is the path of the recorded camera, and numbers are the chosen frames in their order.
+        """
         recording, held = self.recording, record["methods"]
         kept = np.sort(np.argsort(self.box.high - self.box.low)[1:])
         voxels, places = recording.voxels[:, kept], recording.places[:, kept]
@@ -252,8 +255,8 @@ class RecordedStudy(Study):
         def tile(axes: Axes, method: str, view: int) -> None:
             frames = held[method]["frames"][: view + 1]
             seen = recording.shown[frames].any(axis=0)
-            for which, colour in ((~seen, LINE), (seen, NEW)):
-                axes.scatter(voxels[which, 0], voxels[which, 1], s=2.0, c=colour, linewidths=0)
+            for mask, colour in ((~seen, LINE), (seen, NEW)):
+                axes.scatter(voxels[mask, 0], voxels[mask, 1], s=2.0, c=colour, linewidths=0)
             axes.plot(places[:, 0], places[:, 1], color=GREY, lw=0.6)
             axes.scatter(places[frames, 0], places[frames, 1], s=14.0, c=INK, zorder=3)
             for number, place in enumerate(places[frames], start=1):
@@ -261,17 +264,17 @@ class RecordedStudy(Study):
             axes.set_aspect("equal")
             say(axes, f"{held[method]['covered'][view]:.0%}")
 
-        return Tiles("Coloured: voxels that the frames show. Numbers: where they were taken, in their order.", tile)
+        return Tiles("Coloured: voxels that the frames show. Numbers: their camera positions, in order.", tile)
 
     def frame_of(self, pose: Pose) -> int:
-        """The frame that was taken from a pose."""
+        """Index of the frame whose pose is nearest."""
         poses = self.recording.poses
         off = jnp.abs(poses.position - pose.position).sum(-1) + jnp.abs(poses.rotation - pose.rotation).sum((-1, -2))
         return int(jnp.argmin(off))
 
 
 def _points(frames: RecordedFrames, index: int, stride: int) -> Float[np.ndarray, "n 3"]:
-    """Points of a frame in the world, one of so many pixels along each axis."""
+    """Points of a frame in world coordinates, from every `stride`-th pixel along each axis."""
     camera, matrix = frames.camera.strided(stride), frames.matrices[index]
     rows = slice(stride // 2, None, stride)
     depth = frames.depth_scale * frames.depth(index)[rows, rows].reshape(-1)
@@ -280,42 +283,46 @@ def _points(frames: RecordedFrames, index: int, stride: int) -> Float[np.ndarray
 
 
 def bounds_of(frames: RecordedFrames) -> list[float]:
-    """Two corners of a box about all but a hundredth of what was seen along each axis, to either side, with room."""
-    found = np.concatenate([_points(frames, index, _COARSE) for index in range(len(frames))])
-    require(len(found) > 0, f"no frame of {frames.folder} has measured anything")
-    low, high = np.percentile(found, [1, 99], axis=0)
+    """Two corners of a box around the 1st to the 99th percentile of all points along each axis, with a margin."""
+    points = np.concatenate([_points(frames, index, _COARSE) for index in range(len(frames))])
+    require(len(points) > 0, f"no frame of {frames.folder} has a valid depth")
+    low, high = np.percentile(points, [1, 99], axis=0)
     room = _ROOM * float((high - low).max())
     return [*(low - room).tolist(), *(high + room).tolist()]
 
 
 def frame_of_box(box: Box) -> Frame:
-    """From the recording to the scene."""
+    """The frame that maps the recording's coordinates to the scene's."""
     return Frame.fit(np.array([box.low, box.high]), up="z")
 
 
 @functools.cache
 def _recording(source: tuple[Any, ...], box: Box, voxel: float, kept: Box) -> Recording:
-    """`source`: the arguments of `RecordedFrames`. `kept`: the box to which scans are cropped."""
+    """Read a recording.
+
+    - `source`: the arguments of `RecordedFrames`.
+    - `kept`: the box to which scans are cropped.
+    """
     frames, frame = RecordedFrames(*source), frame_of_box(box)
     poses, stride = Pose.from_matrix(frames.matrices), stride_of(frames.camera)
     count = frames.camera.strided(stride).num_rays
     nowhere, none = jnp.zeros((count, 3)), jnp.zeros(count, bool)
     scans, seen = [], []
     for index in progress_bar(range(len(frames)), desc="reading frames"):
-        # By all pixels: rays that are left out for the planner's sake would leave voxels out that the frame shows.
+        # Not strided as the scans are: fewer pixels would miss voxels that the frame shows.
         points = _points(frames, index, 1)
         points = points[np.all((points >= box.low) & (points <= box.high), axis=1)]
-        # One that shows nothing of the box says nothing of it.
+        # A frame without points in the box gives an empty scan, which carves nothing either.
         scan = PointCloud(nowhere, nowhere, none, none, jnp.zeros(count))
         if len(points) > 0:
             image = frames.depth(index), frames.camera, poses[index], frames.depth_scale, stride
             scan = PointCloud.from_depth(*image, kept)
         scans.append(frame.to_scene(scan))
         seen.append(np.unique(np.floor(points / voxel).astype(int), axis=0))
-    found, which, counts = np.unique(np.concatenate(seen), axis=0, return_inverse=True, return_counts=True)
+    cells, which, counts = np.unique(np.concatenate(seen), axis=0, return_inverse=True, return_counts=True)
     shown = np.zeros((len(frames), len(counts)), bool)
     shown[np.repeat(np.arange(len(frames)), [len(rows) for rows in seen]), which] = True
     often = counts >= _SEEN_BY
-    require(bool(often.any()), f"no voxel of {box} is seen by {_SEEN_BY} frames of {frames.folder}: give another box")
-    voxels, places = voxel * (found[often] + 0.5), frames.matrices[:, :3, 3]
+    require(bool(often.any()), f"no voxel of {box} shows in {_SEEN_BY} frames of {frames.folder}: give another box")
+    voxels, places = voxel * (cells[often] + 0.5), frames.matrices[:, :3, 3]
     return Recording(frame.to_scene(poses), tuple(scans), shown[:, often], voxels, places)

@@ -1,6 +1,6 @@
-"""The studies of `jaxnbv study`: entry points of the group `jaxnbv.studies` in any installed package.
+"""Registry of the studies of `jaxnbv study`: entry points of the group `jaxnbv.studies` in any installed package.
 
-Each names an `Entry` in a module that imports nothing heavy: the command's help needs it before JAX is imported.
+Each entry point names an `Entry` in a module that does not import JAX, so that the command's help shows quickly.
 """
 
 import functools
@@ -17,15 +17,14 @@ GROUP = "jaxnbv.studies"
 
 
 class Entry(NamedTuple):
-    """One study, as its command must know it.
+    """Describes one study to the command line.
 
-    - `study`: its class, "module:class", imported once it is run.
-    - `question`: for the help.
-    - `scenes`, `views`: numbers by default.
-    - `model`: by which surfaces are imagined by default; "known" for a study that has a `bank`, or is
-      about known parts.
-    - `options`: annotations for typer of its own options, by the names of its settings; None is their default. One that
-      is a `typer.Argument` must be given.
+    - `study`: its class as "module:class", imported when the study runs.
+    - `question`: the question that it answers, shown in the help.
+    - `scenes`, `views`: default numbers of scenes and views.
+    - `model`: default model of surfaces; "known" for a study that has a `bank` or is about known parts.
+    - `options`: typer annotations of the study's own options, by the names of its settings. Their default is None. A
+      `typer.Argument` is required.
     """
 
     study: str
@@ -36,27 +35,27 @@ class Entry(NamedTuple):
     options: Mapping[str, Any] = MappingProxyType({})
 
     def load(self) -> Any:
-        """The class of the study."""
+        """Import and return the class of the study."""
         return pkgutil.resolve_name(self.study)
 
     @property
     def arguments(self) -> tuple[str, ...]:
-        """Those of the options that must be given."""
+        """Names of the required options."""
         return tuple(name for name, hint in self.options.items() if isinstance(get_args(hint)[-1], ArgumentInfo))
 
     def flag(self, option: str) -> str:
-        """How an option is given on the command line."""
+        """An option as it is written on the command line."""
         return option.upper() if option in self.arguments else f"--{option.replace('_', '-')}"
 
 
 @functools.cache
 def studies() -> dict[str, Entry]:
-    """The studies of all installed packages, by name. A `UserWarning` names one that cannot be loaded."""
+    """The studies of all installed packages, by name. A `UserWarning` names each that cannot be loaded."""
     entries: dict[str, Entry] = {}
     for point in entry_points(group=GROUP):
         try:
             entry = point.load()
-        # Whatever a module of somebody else does as it is imported.
+        # A module of another package may raise anything on import.
         except (Exception, SystemExit) as error:
             warnings.warn(f"the study {point.name} is left out: {point.value} fails ({error!r})", stacklevel=2)
             continue

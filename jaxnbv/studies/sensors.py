@@ -1,4 +1,4 @@
-"""The authors' sensors for single tasks, where they are not the usual one."""
+"""Cameras and candidates of the paper's part and heat experiments, which differ from the default."""
 
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.scanning.sensors import Setting
