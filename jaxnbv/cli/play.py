@@ -145,7 +145,7 @@ def play(options: EpisodeOptions, subject: Subject, setting: Setting, sizes: Siz
     """
     began = time.perf_counter()
     if options.quick:
-        typer.echo("--quick: small settings; leave it out for the usual ones.")
+        typer.echo("--quick: small settings. Leave it out for the usual ones.")
         sizes = QUICK
     if subject.note:
         typer.echo(subject.note)

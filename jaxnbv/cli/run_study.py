@@ -47,7 +47,7 @@ def run_study(options: StudyOptions, **of_studies: Any) -> None:
     of_model = "" if model == entry.model else f"-{model}"
     folder = options.out or Path("runs") / f"study-{options.name}{of_model}{'-quick' if options.quick else ''}"
     if options.quick:
-        typer.echo("--quick: small settings and few scenes. This is not the full study: leave it out for that.")
+        typer.echo("--quick: small settings and few scenes. This is not the full study. Leave it out for that.")
         scenes = scenes[: kind.quick_scenes]
     failures: dict[str, str] = {}
     count = 0

@@ -162,13 +162,13 @@ def _positions_of_true(flags: Bool[Array, "m n"], count: int) -> Int[Array, "m c
     wanted = jnp.arange(count, dtype=jnp.int32)
     word = jnp.sum(through[:, None, :] <= wanted[:, None], axis=-1, dtype=jnp.int32)
     before = jnp.where(word > 0, jnp.take_along_axis(through, jnp.maximum(word - 1, 0), axis=1), 0)
-    left = jnp.take_along_axis(words, jnp.minimum(word, words.shape[1] - 1), axis=1)
+    bits = jnp.take_along_axis(words, jnp.minimum(word, words.shape[1] - 1), axis=1)
     rank, column = wanted - before, _WORD * word
     for half in (16, 8, 4, 2, 1):
-        lower = _bit_count(left & jnp.uint32((1 << half) - 1))
+        lower = _bit_count(bits & jnp.uint32((1 << half) - 1))
         above = lower <= rank
         rank = jnp.where(above, rank - lower, rank)
-        left = jnp.where(above, left >> half, left)
+        bits = jnp.where(above, bits >> half, bits)
         column = jnp.where(above, column + half, column)
     return column
 

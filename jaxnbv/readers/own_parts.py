@@ -89,16 +89,16 @@ def _is_looked_through(
         for second, other in enumerate(matrices):
             move = np.linalg.inv(other) @ matrix
             moved = points @ move[:3, :3].T + move[:3, 3]
-            kept = is_shown & (moved[:, 2] > 0) & (first != second)
-            across, along = (moved[:, :2] / np.where(kept, moved[:, 2], 1.0)[:, None]).T
+            is_valid = is_shown & (moved[:, 2] > 0) & (first != second)
+            across, along = (moved[:, :2] / np.where(is_valid, moved[:, 2], 1.0)[:, None]).T
             at = np.floor(np.stack([fy * along + cy, fx * across + skew * along + cx]) / side)
-            kept &= np.all((at >= 0) & (at < np.array(part.shape)[:, None]), axis=0)
-            block = second, *np.where(kept, at, 0).astype(int)
-            kept &= depths[block] > 0
+            is_valid &= np.all((at >= 0) & (at < np.array(part.shape)[:, None]), axis=0)
+            block = second, *np.where(is_valid, at, 0).astype(int)
+            is_valid &= depths[block] > 0
             is_deeper = least[block] > (1.0 + _ALIKE) * moved[:, 2]
             is_before = most[block] < (1.0 - _ALIKE) * moved[:, 2]
-            np.add.at(deeper, own[kept & is_deeper], 1)
-            np.add.at(alike, own[kept & ~is_deeper & ~is_before], 1)
+            np.add.at(deeper, own[is_valid & is_deeper], 1)
+            np.add.at(alike, own[is_valid & ~is_deeper & ~is_before], 1)
     mask = np.zeros(part.shape, bool)
     mask[row, column] = (deeper > _CLEAR * alike)[own]
     return mask

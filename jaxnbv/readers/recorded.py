@@ -163,15 +163,15 @@ def _tum(folder: Path) -> _Layout:
     images = np.array([row[:2] for row in read_rows(folder / "depth.txt")])
     times, track = images[:, 0].astype(float), read_table(folder / "groundtruth.txt")
     nearest = np.abs(times[:, None] - track[None, :, 0]).argmin(axis=1)
-    kept = np.flatnonzero(np.abs(times - track[nearest, 0]) <= _APART)
-    require(len(kept) > 0, f"no image has a pose within {_APART} s")
-    poses = track[nearest[kept], 1:8]
+    rows = np.flatnonzero(np.abs(times - track[nearest, 0]) <= _APART)
+    require(len(rows) > 0, f"no image has a pose within {_APART} s")
+    poses = track[nearest[rows], 1:8]
     length = np.linalg.norm(poses[:, 3:], axis=1)
     is_rotation = np.isfinite(length) & (length > 0)
-    matrices = np.full((len(kept), 4, 4), np.nan)
+    matrices = np.full((len(rows), 4, 4), np.nan)
     matrices[:, :3, 3], matrices[:, 3] = poses[:, :3], (0.0, 0.0, 0.0, 1.0)
     matrices[is_rotation, :3, :3] = Rotation.from_quat(poses[is_rotation, 3:]).as_matrix()
-    return _Layout([folder / images[index, 1] for index in kept], matrices)
+    return _Layout([folder / images[index, 1] for index in rows], matrices)
 
 
 def _plain(folder: Path) -> _Layout:
@@ -200,7 +200,7 @@ def _with_pose(files: list[Path], has_pose: Bool[np.ndarray, " n"], folder: Path
 
     **Raises:** `ValueError` if most have none.
     """
-    lost = [file.name for file, kept in zip(files, has_pose, strict=True) if not kept]
+    lost = [file.name for file, is_posed in zip(files, has_pose, strict=True) if not is_posed]
     problem = f"{len(lost)} of the {len(files)} poses in {folder} are no rigid motion, the first that of {lost[:1]}"
     require(
         2 * len(lost) <= len(files),
@@ -208,7 +208,7 @@ def _with_pose(files: list[Path], has_pose: Bool[np.ndarray, " n"], folder: Path
     )
     if lost:
         warnings.warn(f"{problem}: these frames are left out", stacklevel=3)
-    return [file for file, kept in zip(files, has_pose, strict=True) if kept]
+    return [file for file, is_posed in zip(files, has_pose, strict=True) if is_posed]
 
 
 def _upward(up: tuple[float, float, float]) -> Float[np.ndarray, "4 4"]:

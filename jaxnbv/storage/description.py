@@ -96,8 +96,8 @@ class _Describer:
             code = {} if is_installed(kind.__module__) else {"class": self.describe(kind, f"{way}.class")}
             values = {name: getattr(thing, name) for name in fields_of(kind)}
             # The version stands for functions.
-            kept = {name: value for name, value in values.items() if not (versioned and callable(value))}
-            return {"type": name_of(kind), **code, **self._named(kept, way)}
+            state = {name: value for name, value in values.items() if not (versioned and callable(value))}
+            return {"type": name_of(kind), **code, **self._named(state, way)}
         if versioned:
             return {"type": "versioned", "name": name_of(thing) or name_of(kind), "version": version}
         if kind is dict:
@@ -136,9 +136,9 @@ class _Describer:
         if is_installed(kind.__module__) and is_plain(thing):
             return {"type": name_of(kind), **self._beside({"state": getattr(thing, "__dict__", {})}, way)}
         raise InputError(
-            f"{way or 'this'} is a {kind.__name__}, which nothing here can tell from another {kind.__name__}: give it "
-            "an attribute version, a text or a number that you change whenever it changes; of a network that is not of "
-            'JAX say HostClassifier(..., version="2026-11")'
+            f"{way or 'this'} is a {kind.__name__}, which cannot be told apart from another {kind.__name__}: give it "
+            "an attribute version, a text or a number that you change whenever it changes, or wrap a network from "
+            'outside JAX as HostClassifier(..., version="2026-11")'
         )
 
     def _array(self, thing: Any, way: str) -> Any:

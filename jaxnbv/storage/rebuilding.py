@@ -113,7 +113,7 @@ class _Rebuilder:
             own = any(member is function for base in type(bound).__mro__ for member in vars(base).values())
             require(own, f"{way} is a method that {type(bound).__name__} does not have: {self.remedy}")
             return getattr(bound, function.__name__)
-        require(" " in kind, f"{way} is a {node.get('name', kind)}, of which its {kind} alone is kept: {self.remedy}")
+        require(" " in kind, f"{way} is a {node.get('name', kind)}, of which only its {kind} is stored: {self.remedy}")
         origin, dtype = kind.split(" ")
         if origin == "key":
             return jax.random.wrap_key_data(jnp.array(node["data"], jnp.uint32), impl=dtype)

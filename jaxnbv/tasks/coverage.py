@@ -158,7 +158,7 @@ def _areas_shown(
     views: PoseList,
     barrier: Float[Array, "poses rays"] | None,
 ) -> Float[Array, "2"]:
-    """Areas of one sample: seen and visible from the poses, and visible from the poses."""
+    """Two areas of one sample: visible from the poses and already seen, and visible from the poses."""
     points = spread_points(surface, _POINTS)
     tolerance = surface.grid.spacing
     is_visible = jnp.any(sees(surface, camera, poses, points, tolerance, barrier), axis=0)
