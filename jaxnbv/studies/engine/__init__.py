@@ -1,1 +1,1 @@
-"""What a study is, how its scenes are run, and how its results are shown."""
+"""Base class of studies, the runs of their scenes, and tables, charts and pages of the results."""

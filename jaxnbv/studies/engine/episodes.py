@@ -1,4 +1,4 @@
-"""One method's episode in a simulated scene: its first view, its record, and the same views seen again."""
+"""Episodes of a method in a simulated scene: the first view, the record, and replays of the views."""
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence
@@ -19,21 +19,22 @@ from jaxnbv.studies.engine.measures import Record
 
 
 def sensor_before(surface: Surface, camera: Camera) -> Sensor:
-    """A depth camera with the usual noise before a surface."""
+    """A simulated depth camera with default noise that scans a surface."""
     return lambda pose, key: observe_scene(surface, camera, pose, SensorNoise(), key)
 
 
 def first_showing(
     enough: Callable[[PointCloud], bool], poses: Pose, sensor: Sensor, key: PRNGKeyArray, episode_key: PRNGKeyArray
 ) -> int | None:
-    """Index of a random pose whose scan is enough; None if there is none.
+    """Index of a random pose whose scan satisfies `enough`; None if there is none.
 
     - `poses`: the candidates (n, ...).
-    - `key`: of their order; `episode_key`: of the episode, for the noise of its first view.
+    - `key`: random key of the order in which poses are tried.
+    - `episode_key`: key of the episode, which decides the noise of its first view.
     """
     *_, noise_key = view_keys(episode_key, 0)
     order = jax.random.permutation(key, poses.position.shape[0]).tolist()
-    return next((one for one in order if enough(sensor(poses[one], noise_key))), None)
+    return next((index for index in order if enough(sensor(poses[index], noise_key))), None)
 
 
 def episode_record(
@@ -45,8 +46,10 @@ def episode_record(
     views: int,
     follow: Callable[[Iterator[Step]], Record],
 ) -> Record:
-    """The poses of an episode's views, for each step the value of its view and the seconds of its search, and what
-    `follow` records of the steps; the episode ends after `views`, or where `follow` stops."""
+    """Run an episode and return the poses of its views, the value and seconds of each step, and the record of `follow`.
+
+    The episode ends after `views`, or where `follow` stops.
+    """
     poses: list[dict[str, list]] = []
     searches: list[dict[str, float]] = []
 
@@ -58,7 +61,7 @@ def episode_record(
                 searches.append({"value": float(proposal.value), "seconds": step.seconds})
             yield step
 
-    # `follow` draws the steps, by which the lists are filled.
+    # `follow` runs the steps, which fill the lists.
     followed = follow(noted())
     return {"views": poses, "steps": searches, **followed}
 
@@ -66,9 +69,9 @@ def episode_record(
 def seen_again(
     planner: Planner, sensor: Sensor, poses: Sequence[Pose], key: PRNGKeyArray, camera: Camera
 ) -> list[tuple[PointCloud, Observations]]:
-    """Each scan of an episode and the observations after it, made again from its poses.
+    """Compute again, from the poses of an episode, each scan and the observations after it.
 
-    - `planner`: any of the study's; observations depend on its capacity and what it carves alone.
+    - `planner`: any planner of the study. Observations depend only on its capacity and its carving.
     """
     views = [(pose, sensor(pose, view_keys(key, index)[2])) for index, pose in enumerate(poses)]
     return [(scan, after) for (_, scan), after in zip(views, planner.replay(views, camera), strict=True)]

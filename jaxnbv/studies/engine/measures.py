@@ -1,4 +1,4 @@
-"""What a study measures: numbers of a record, by method and by view (or whatever else they are told by)."""
+"""Measures and claims of a study: numbers computed from a record, by method and by view or another key."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -6,21 +6,22 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-# What is stored of one scene with every method.
+# The stored result of one scene with all methods.
 Record = dict[str, Any]
-# The model of studies that know shapes, and the end of the name of a method that is run once more without them.
+# The model with known shapes, and the suffix of a method that runs a second time without them.
 KNOWN, WITHOUT_BANK = "known", "-screened"
 
 
 class Measure(NamedTuple):
-    """One quantity of a study: a table, and a panel of its chart.
+    """One quantity of a study, shown as a table and as a panel of the chart.
 
-    - `name`: in files; `title`: in words.
-    - `of`: its values in a record with a method, by view from the first on, or by whatever a mapping's keys are; None
-      or NaN where it is not defined.
-    - `by`: what the keys are.
-    - `unit`: of the values; those in "%" are shares, in [0, 1].
-    - `less`: whether less is better.
+    - `name`: name in files; `title`: name in tables and charts.
+    - `of`: function from a record and a method to values: a sequence by view, from the first, or a mapping. None or NaN
+      if a value is undefined.
+    - `by`: what the keys of a mapping are.
+    - `unit`: unit of the values; "%" for shares in [0, 1].
+    - `digits`: decimal places in tables.
+    - `less`: whether lower values are better.
     """
 
     name: str
@@ -33,12 +34,12 @@ class Measure(NamedTuple):
 
 
 class Claim(NamedTuple):
-    """What the paper says of a study: that its reference does better than other methods, or no worse.
+    """A claim of the paper: the study's reference does better than other methods, or no worse.
 
-    - `text`: in words.
-    - `measure`, `at`: the number that tells, by its name and the view, or other key, that it is of.
+    - `text`: the claim in words.
+    - `measure`, `at`: name of the measure that decides, and its view or other key.
     - `than`: the other methods.
-    - `ahead`: whether it is to be better; otherwise it is not to be worse.
+    - `ahead`: True if the reference must be better, False if it must not be worse.
     """
 
     text: str
@@ -49,7 +50,7 @@ class Claim(NamedTuple):
 
 
 def _seconds(record: Record, method: str) -> dict[str, float]:
-    """The median over a scene's steps but the first, which may have compiled."""
+    """Median over a scene's steps, without the first, which may include compilation."""
     seconds = [step["seconds"] for step in record["methods"][method].get("steps", [])][1:]
     return {"median": float(np.median(seconds))} if seconds else {}
 

@@ -1,4 +1,4 @@
-"""Results of a study on disk: one JSON record a scene, so that a study that was interrupted goes on with the next."""
+"""Results of a study on disk: one JSON record per scene, so that an interrupted study continues where it stopped."""
 
 import hashlib
 import json
@@ -26,10 +26,10 @@ _NONE: Mapping[str, np.ndarray] = MappingProxyType({})
 
 
 class RecordFolder(ResultFolder):
-    """A folder of records that belong to one configuration, kept beside them in study.json.
+    """A folder of records that belong to one configuration, which is stored in study.json.
 
     - `executor`: an executor of `concurrent.futures` that runs the missing scenes, such as `Processes(8)` or a
-      `Cluster`. By default this process runs them, and it alone writes records.
+      `Cluster`; default: this process runs them. Only this process writes records.
     - `arrays`: the large arrays of the configuration, see `describe`.
 
     **Raises:** `ValueError` if the folder cannot be made or holds records of another configuration.
@@ -48,10 +48,10 @@ class RecordFolder(ResultFolder):
         super().__init__(path, config, arrays)
 
     def collect(self, scenes: Sequence[int], run: Trial, progress: bool = True) -> list[Record]:
-        """The records of these scenes, in order: those on disk as they are, the others from `run`, each written once it
-        is done.
+        """Return the records of these scenes, in order. Run the scenes that have no record, and write theirs.
 
-        Where `run` fails there is no record; `failures` tells of it, and the next call tries again.
+        Each record is written once its scene is done. A scene whose `run` fails has no record: `failures` gives its
+        error, and the next call tries again.
 
         **Raises:** `ValueError` for a record that is damaged, and if another process writes in the folder.
         """
@@ -73,10 +73,10 @@ class RecordFolder(ResultFolder):
         return [records[index] for index in sorted(records)]
 
     def join(self, folders: Iterable[str | Path]) -> None:
-        """Copy the records of folders into this one.
+        """Copy the records of other folders into this one.
 
-        **Raises:** `ValueError` if a folder holds no records, or records of another configuration; for a record that is
-        damaged; and if a scene is in two folders with results that differ in more than the seconds they took.
+        **Raises:** `ValueError` if a folder holds no records, records of another configuration, or a damaged record, or
+        if a scene is in two folders with results that differ in more than their times.
         """
         with self.writing():
             for folder in map(Path, folders):
@@ -93,14 +93,14 @@ class RecordFolder(ResultFolder):
         )
         self.set_versions(record.get("versions", {}))
         for index, file in _files(folder):
-            there, own = _read(file, index), self._file(index)
+            other, own = _read(file, index), self._file(index)
             if not own.exists():
-                self._write(index, there)
-            elif changes := differences(_without_seconds(there), _without_seconds(_read(own, index))):
+                self._write(index, other)
+            elif changes := differences(_without_seconds(other), _without_seconds(_read(own, index))):
                 raise InputError(f"{file} and {own} differ in {'; '.join(changes[:3])}: delete the one that is wrong")
 
     def failures(self, scenes: Sequence[int]) -> dict[int, str]:
-        """The errors of scenes that failed, a line each; beside the records, scene_*.failed has their tracebacks."""
+        """The errors of failed scenes, one line each. The files scene_*.failed in the folder hold their tracebacks."""
         files = {index: self._file(index).with_suffix(_FAILED) for index in scenes}
         return {index: file.read_text().partition("\n")[0] for index, file in files.items() if os.path.isfile(file)}
 
@@ -111,8 +111,8 @@ class RecordFolder(ResultFolder):
         write_text(self._file(index).with_suffix(_FAILED), f"{failure.error}\n\n{failure.traceback}")
 
     def _write(self, index: int, record: Record) -> Record:
-        """Write a record, and return it as it will be read."""
-        # JSON turns keys that are numbers into text, and the checksum sorts them.
+        """Write a record, and return it as reading it would."""
+        # JSON turns number keys into text, which changes the sorting of keys in the checksum.
         record = json.loads(json.dumps(record))
         self.bind()
         sealed = {"format": _FORMAT, "index": index, "sha256": _checksum(index, record), "record": record}
@@ -122,9 +122,9 @@ class RecordFolder(ResultFolder):
 
 
 def read_records(folder: str | Path) -> list[Record]:
-    """The records that a folder holds, in order.
+    """Read all records of a folder, in the order of their scenes.
 
-    **Raises:** `ValueError` for a record that is damaged, or a file of a name that no record has.
+    **Raises:** `ValueError` for a damaged record, or a file scene_*.json whose name has no scene number.
     """
     return [_read(file, index) for index, file in _files(Path(folder))]
 
@@ -133,15 +133,15 @@ def _files(folder: Path) -> list[tuple[int, Path]]:
     files = []
     for file in sorted(folder.glob(RecordFolder.pattern)):
         number = file.stem.removeprefix("scene_")
-        require(number.isdecimal(), f"{file} is no record, which has the number of its scene: move it elsewhere")
+        require(number.isdecimal(), f"{file} is not a record, since its name has no scene number: move it elsewhere")
         files.append((int(number), file))
     return files
 
 
 def _without_seconds(content: Any) -> Any:
-    """All but what was timed, at any depth."""
+    """A copy without the entries "seconds", at any depth."""
     if isinstance(content, list):
-        return [_without_seconds(one) for one in content]
+        return [_without_seconds(item) for item in content]
     if isinstance(content, dict):
         return {key: _without_seconds(value) for key, value in content.items() if key != "seconds"}
     return content
@@ -152,12 +152,12 @@ def _checksum(index: int, record: dict[str, Any]) -> str:
 
 
 def _read(file: Path, index: int) -> dict[str, Any]:
-    """A record."""
+    """Read and check a record."""
     remedy = "delete it, and it is made again"
     content = read_json(file, "is damaged", remedy)
     check_format(content.get("format"), _FORMAT, file)
     require(content.get("index") == index, f"{file} is damaged (it is scene {content.get('index')!s:.20}): {remedy}")
     record = content.get("record")
     if not isinstance(record, dict) or content.get("sha256") != _checksum(index, record):
-        raise InputError(f"{file} is damaged (its checksum is not that of its record): {remedy}")
+        raise InputError(f"{file} is damaged (its checksum does not match its record): {remedy}")
     return record

@@ -1,4 +1,4 @@
-"""What the records of a study say, in one table; as text, as a chart, and beside the paper's claims."""
+"""Statistics over the records of a study: a table of results, tables of text, and verdicts on the paper's claims."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -18,11 +18,11 @@ _WHERE = ("ahead of", "level with", "behind")
 
 
 def results(records: Sequence[Record], study: type[Study]) -> pd.DataFrame:
-    """A row for each group of scenes, measure, place ("at") and method: the mean over the scenes, its standard error
-    and interval (`low`, `high`); and the `lead` of the study's reference, its value less the method's on the same
-    scenes, with its interval.
+    """Statistics of all measures: a row for each group of scenes, measure, key of the measure (`at`) and method.
 
-    Only scenes count in which all methods have a value; methods that never have one have no row.
+    A row holds the mean over the scenes, its standard error and its interval (`low`, `high`). It also holds the `lead`
+    of the study's reference: the mean difference of its value and the method's on the same scenes, with its interval.
+    Only scenes count in which all methods have a value. A method without any value has no row.
 
     **Raises:** `ValueError` if there are no records.
     """
@@ -31,10 +31,10 @@ def results(records: Sequence[Record], study: type[Study]) -> pd.DataFrame:
     for record in records:
         for measure in study.measures:
             for method in record["methods"]:
-                found = measure.of(record, method)
-                by_place = found if isinstance(found, Mapping) else dict(enumerate(found, start=1))
-                here = record["scene"], study.group(record), measure.name, measure.by, method
-                rows += [(*here, at, value) for at, value in by_place.items()]
+                values = measure.of(record, method)
+                by_key = values if isinstance(values, Mapping) else dict(enumerate(values, start=1))
+                labels = record["scene"], study.group(record), measure.name, measure.by, method
+                rows += [(*labels, at, value) for at, value in by_key.items()]
     every = pd.DataFrame(rows, columns=["scene", "group", "quantity", "by", "method", "at", "value"])
     every["value"] = every["value"].astype(float)
     groups = every[every["group"] != ""].sort_values("group", kind="stable")
@@ -45,7 +45,7 @@ def results(records: Sequence[Record], study: type[Study]) -> pd.DataFrame:
 
 
 def _compared(part: pd.DataFrame, reference: str) -> pd.DataFrame:
-    """The rows of one number."""
+    """The rows of one measure at one key, one per method."""
     values = part.pivot(index="scene", columns="method", values="value")[part["method"].unique()]
     values = values.dropna(axis="columns", how="all").dropna()
     values = values if len(values) else values[[]]
@@ -60,23 +60,25 @@ def _compared(part: pd.DataFrame, reference: str) -> pd.DataFrame:
 
 
 def interval(values: Float[np.ndarray, "scenes columns"]) -> Float[np.ndarray, "2 columns"]:
-    """The ends of the percentile bootstrap interval of each column's mean, as Efron has it: whole scenes are drawn with
-    replacement, the same for all columns. One scene alone has an interval without width."""
+    """The ends of Efron's percentile bootstrap interval of each column's mean.
+
+    Whole scenes are drawn with replacement, the same for all columns. The interval of a single scene has width zero.
+    """
     if len(values) < 2:
         return np.stack([values.sum(axis=0)] * 2)
     settings = {"confidence_level": LEVEL, "method": "percentile", "rng": np.random.default_rng(0)}
-    drawn = bootstrap((values,), np.mean, axis=0, **settings).confidence_interval
-    return np.stack([drawn.low, drawn.high])
+    ends = bootstrap((values,), np.mean, axis=0, **settings).confidence_interval
+    return np.stack([ends.low, ends.high])
 
 
 def groups_of(found: pd.DataFrame) -> dict[str, int]:
-    """The groups of scenes, of which the first is all, and how many scenes each has."""
+    """The number of scenes in each group. The first group, "all", holds all scenes."""
     return found.groupby("group", sort=False)["scenes"].max().to_dict()
 
 
 def tables(found: pd.DataFrame, study: type[Study], group: str = _ALL) -> list[tuple[str, pd.DataFrame]]:
-    """Of each measure its means by method, and the leads of the reference: titles, and cells of text."""
-    made = []
+    """Titles and text cells of two tables per measure: the means of the methods, and the leads of the reference."""
+    texts = []
     for measure in study.measures:
         here = found[(found["group"] == group) & (found["quantity"] == measure.name)]
         unit = f" ({measure.unit})" if measure.unit else ""
@@ -90,12 +92,12 @@ def tables(found: pd.DataFrame, study: type[Study], group: str = _ALL) -> list[t
             if len(rows):
                 table = rows.assign(text=cells).pivot(index="method", columns="at", values="text")
                 ordered = table.reindex(index=rows["method"].unique(), columns=rows["at"].unique()).fillna("-")
-                made.append((title, ordered.rename_axis(index=None, columns=measure.by)))
-    return made
+                texts.append((title, ordered.rename_axis(index=None, columns=measure.by)))
+    return texts
 
 
 def _means(rows: pd.DataFrame, measure: Measure, best: pd.Series) -> list[str]:
-    """Shares with their interval, other means with their standard error; a star marks the best."""
+    """Shares with their interval, other means with their standard error. A star marks the best."""
     texts = []
     for row, star in zip(rows.itertuples(), best, strict=True):
         if measure.unit == "%":
@@ -108,7 +110,7 @@ def _means(rows: pd.DataFrame, measure: Measure, best: pd.Series) -> list[str]:
 
 
 def _leads(rows: pd.DataFrame, measure: Measure) -> list[str]:
-    """With their interval; a star marks those whose interval excludes zero."""
+    """Leads with their interval. A star marks a lead whose interval excludes zero."""
     form, scale = ("+.0f", 100) if measure.unit == "%" else (f"+.{measure.digits}f", 1)
     return [
         f"{scale * lead:{form}} [{scale * low:{form}}, {scale * high:{form}}]" + "*" * (low > 0 or high < 0)
@@ -117,7 +119,7 @@ def _leads(rows: pd.DataFrame, measure: Measure) -> list[str]:
 
 
 def summary(found: pd.DataFrame, study: type[Study]) -> str:
-    """A study as text, of all its scenes."""
+    """The tables of a study over all scenes, as text."""
     title = f"{study.title}: {count_of(groups_of(found)[_ALL], 'scene')}"
     sections = [f"{title}\n{'=' * len(title)}\n\n{study.explanation}\n{explained(study)}\n"]
     sections += [f"{title}\n{cells.to_string()}\n" for title, cells in tables(found, study)]
@@ -125,7 +127,7 @@ def summary(found: pd.DataFrame, study: type[Study]) -> str:
 
 
 def explained(study: type[Study]) -> str:
-    """What stands in the cells of tables."""
+    """An explanation of the cells of tables."""
     return (
         f"Mean over scenes +- its standard error, or in percent; in [ ] the {LEVEL:.0%} bootstrap interval over\n"
         f"scenes; * the best. Differences: {study.reference} minus another method over the same scenes, * where the\n"
@@ -134,7 +136,7 @@ def explained(study: type[Study]) -> str:
 
 
 class Verdict(NamedTuple):
-    """A claim, and against how many of the methods that it names it holds; a sentence tells of each."""
+    """A claim, the number of its methods against which it holds, and a sentence that lists all of them."""
 
     claim: str
     held: int
@@ -143,25 +145,27 @@ class Verdict(NamedTuple):
 
 
 def verdicts(found: pd.DataFrame, study: type[Study]) -> list[Verdict]:
-    """On each claim, by all scenes: how the reference fares beside the methods that it names, those of them that know
-    no shapes too. It is level with a method where the interval includes zero. A claim on methods that were not run is
-    left out."""
-    said = []
+    """Compare the reference with the methods of each claim, over all scenes.
+
+    A claim also covers its methods' runs without known shapes. The reference is level with a method if the interval of
+    its lead includes zero. Claims whose methods were not run are left out.
+    """
+    judged = []
     for claim in study.claims:
-        (measure,) = (one for one in study.measures if one.name == claim.measure)
+        (measure,) = (candidate for candidate in study.measures if candidate.name == claim.measure)
         at = found[(found["group"] == _ALL) & (found["quantity"] == claim.measure) & (found["at"] == claim.at)]
         rows = at[at["method"].str.removesuffix(WITHOUT_BANK).isin(claim.than)].dropna(subset="lead")
-        told: dict[str, list[str]] = {where: [] for where in _WHERE}
+        by_place: dict[str, list[str]] = {place: [] for place in _WHERE}
         for row, text in zip(rows.itertuples(), _leads(rows, measure), strict=True):
             level = row.lead_low <= 0 <= row.lead_high
             better = (row.lead < 0) == measure.less
-            told[_WHERE[1 if level else 0 if better else 2]].append(f"{row.method} ({text.rstrip('*')})")
+            by_place[_WHERE[1 if level else 0 if better else 2]].append(f"{row.method} ({text.rstrip('*')})")
         if len(rows):
-            held = sum(len(told[where]) for where in _WHERE[: 1 if claim.ahead else 2])
-            parts = "; ".join(f"{where} {', '.join(named)}" for where, named in told.items() if named)
+            held = sum(len(by_place[place]) for place in _WHERE[: 1 if claim.ahead else 2])
+            parts = "; ".join(f"{place} {', '.join(methods)}" for place, methods in by_place.items() if methods)
             sentence = f"Holds against {held} of {len(rows)}: {parts}."
-            said.append(Verdict(claim.text, held, len(rows), sentence))
-    return said
+            judged.append(Verdict(claim.text, held, len(rows), sentence))
+    return judged
 
 
 def count_of(count: int, thing: str) -> str:

@@ -1,4 +1,4 @@
-"""How a scene of a study is run with every method, and how a method's views are seen again."""
+"""Runs of a scene with all methods, and replays of the views of a method."""
 
 import functools
 import time
@@ -16,22 +16,23 @@ from jaxnbv.studies.engine.measures import KNOWN, WITHOUT_BANK, Record
 from jaxnbv.studies.engine.records import RecordFolder, read_records
 from jaxnbv.studies.engine.study import Scene, Study
 
-# A method of one's own: the planner of a scene.
+# A method of the user: makes the planner of a scene.
 Factory: TypeAlias = Callable[[Study, Scene], Planner]
 
 
 def run_scene(
     study: Study, index: int, methods: Sequence[str] | None = None, own: Mapping[str, Factory] | None = None
 ) -> Record:
-    """One scene with every method: the record that tables and figures are made of.
+    """Run all methods on one scene and return its record, from which tables and figures are made.
 
-    All methods share the first view, a random one of the candidates that show enough, the sensor's noise and the
-    prior's samples at each view.
+    All methods share the first view, which is a random one of the candidates that show enough. They also share the
+    sensor noise and the prior samples at each view.
 
-    - `methods`: some of the study's, by default all; `own`: further ones, and what makes their planners.
+    - `methods`: names of the study's methods to run, default: all.
+    - `own`: further methods: functions that make their planners, by name.
 
-    **Raises:** `ValueError` for an unknown method, as `Study.scene` does, if no candidate shows enough, or if one of
-    `own` makes no planner of so many views.
+    **Raises:** `ValueError` for an unknown method, as `Study.scene` does, if no candidate shows enough, or if a method
+    of `own` fails or makes no planner with room for the study's views.
     """
     names = study.methods if methods is None else methods_of(type(study), methods, KNOWN)
     start = time.perf_counter()
@@ -50,18 +51,20 @@ def run_scene(
 
 
 def load_study(folder: str | Path) -> tuple[Study, list[Record]]:
-    """The study of a folder with its settings, and its records.
+    """Load a study with its settings, and its records, from a folder.
 
-    **Raises:** `ValueError` if there is none, or if it or a record is damaged.
+    **Raises:** `ValueError` if the folder holds no study, or if the study or a record is damaged.
     """
-    # Which methods were run, and those of a user, are no part of the study.
+    # The names of methods in the file are settings of the run, not of the study.
     config = read_config(folder, "study", RecordFolder.format, {"methods": None, "own": None})
     return config["study"], read_records(folder)
 
 
 def methods_of(study: type[Study], names: Sequence[str] | None, model: str) -> tuple[str, ...]:
-    """The methods of these names, in order; by default all of a study's, and where shapes are known those of
-    `Study.without_bank`.
+    """The names of the methods to run, in the study's order.
+
+    - `names`: the methods to run; default: the study's, and with the model `known` also those of
+      `Study.without_bank`, as "METHOD-screened".
 
     **Raises:** `ValueError` for an unknown method.
     """
@@ -69,10 +72,10 @@ def methods_of(study: type[Study], names: Sequence[str] | None, model: str) -> t
     again = tuple(f"{name}{WITHOUT_BANK}" for name in twice)
     if names is None:
         return (*study.methods, *again)
-    known = (*study.methods, *again, *study.further)
-    unknown = sorted({*names} - {*known})
-    require(not unknown, f"unknown methods: {', '.join(unknown)}; choose from {', '.join(known)}")
-    return tuple(name for name in known if name in names)
+    available = (*study.methods, *again, *study.further)
+    unknown = sorted({*names} - {*available})
+    require(not unknown, f"unknown methods: {', '.join(unknown)}; choose from {', '.join(available)}")
+    return tuple(name for name in available if name in names)
 
 
 def _own_planner(study: Study, scene: Scene, name: str, make: Factory) -> Planner:
@@ -81,17 +84,17 @@ def _own_planner(study: Study, scene: Scene, name: str, make: Factory) -> Planne
     except Exception as error:
         problem = f"{type(error).__name__}: {error}"
         raise InputError(f"the method {name} fails on scene {scene.index} ({problem})") from error
-    check_type(planner, Planner, f"what the method {name} makes")
+    check_type(planner, Planner, f"the planner of the method {name}")
     require(
         planner.max_views >= study.views,
-        f"the method {name} makes a planner of {planner.max_views} views, but the study has {study.views}: give "
+        f"the method {name} makes a planner for {planner.max_views} views, but the study has {study.views}: give "
         f"Planner(max_views={study.views})",
     )
     return planner
 
 
 def replay(study: Study, scene: Scene, run: Record) -> list[tuple[PointCloud, Observations]]:
-    """Each scan of a method, and the observations after it, made again from the poses of its record."""
+    """Compute again, from the poses of a method's record, each scan and the observations after it."""
     planner, sensor, key = (
         study.planner(study.methods[0], scene),
         study.sensor(scene),

@@ -1,4 +1,4 @@
-"""What a study is: its scenes, its methods, what is measured of them, and its settings."""
+"""Base class of studies: scenes, methods, measures and settings."""
 
 import dataclasses
 from abc import abstractmethod
@@ -31,10 +31,10 @@ _PURPOSES = ("first", "episode", "scene", "measure")
 
 
 class Scene(eqx.Module):
-    """One object under study.
+    """One object of a study.
 
-    - `name`: in tables and pictures.
-    - `task`: what else the study knows of it: where it is heated, which parts it has.
+    - `name`: shown in tables and pictures.
+    - `task`: other facts about the object, such as its heat source or its parts; the type depends on the study.
     """
 
     index: int
@@ -44,28 +44,27 @@ class Scene(eqx.Module):
 
 
 class Study(eqx.Module):
-    """What all scenes of a study share, and what it measures. A new study says what is left open here.
+    """Base class: compares methods of choosing views over many scenes. A new study defines the abstract members.
 
     Settings:
 
-    - `views`: in all, the first included.
-    - `num_candidates`: on the sphere of `radius`, at which every search but those by gradient looks.
-    - `sampler`, `num_samples`, `grid_resolution`, `capacity`: of the planner; the sampler has as many samples
-      on a grid of this resolution.
+    - `views`: number of views, the first included.
+    - `num_candidates`: candidates on the sphere of `radius` (scene units). Gradient searches start with half as many.
+    - `sampler`, `capacity`: as in `Planner`; `num_samples` and `grid_resolution` replace those of the sampler.
     - `camera`: the sensor; a planner may imagine fewer rays, see `imagined_camera`.
-    - `num_starts`, `iterations`: of searches by gradient, which look at half the candidates first.
-    - `meshes`: files, one a scene; without any, scenes are procedural.
+    - `num_starts`, `iterations`: settings of searches by gradient.
+    - `meshes`: mesh files, one per scene; without any, scenes are procedural.
 
-    What it is:
+    Class attributes:
 
-    - `title`, `explanation`: for tables.
-    - `methods`: by name, in order; `reference`: the one that the others are compared with; `further`: methods that are
-      run where a command names them; `pictured`: those that pictures show, by default all.
-    - `measures`: what tables and the chart show; `claims`: what the paper says of it.
-    - `quick`: settings for a first look, on `quick_scenes` scenes.
-    - `seed`: of its first views, noise and samples.
-    - `bank`: of the shapes that are known, see `shape_bank`; "" for none.
-    - `without_bank`: those of the methods that are run once more by one who knows none, as "METHOD-screened".
+    - `title`, `explanation`: texts above the tables.
+    - `methods`: names of the methods, in order; `reference`: the method that the others are compared with.
+    - `further`: methods that run only if a command names them; `pictured`: methods in pictures, default: all.
+    - `measures`: quantities in tables and the chart; `claims`: the paper's claims about the study.
+    - `quick`: settings of a quick run; `quick_scenes`: its number of scenes.
+    - `seed`: seed of first views, noise and samples.
+    - `bank`: name of the bank of known shapes, see `shape_bank`; "" for none.
+    - `without_bank`: methods that run a second time without known shapes, as "METHOD-screened".
 
     **Raises:** `ValueError` for fewer than two views, or fewer candidates than views.
     """
@@ -105,16 +104,16 @@ class Study(eqx.Module):
     def __check_init__(self):
         require(
             2 <= self.views <= self.num_candidates,
-            f"the study has {self.views} views of {self.num_candidates} candidates; ask for at least two views, and "
-            "for as many candidates",
+            f"the study has {self.views} views of {self.num_candidates} candidates: give at least two views, and at "
+            "least as many candidates as views",
         )
 
     @classmethod
     def configured(cls, model: str, views: int, quick: bool, **options: Any) -> "dict[str, Study]":
-        """The study that a command asks for, or several by the names of their folders; of one alone the name is "".
+        """The studies of one command, by the names of their folders; "" for a single study.
 
-        - `options`: settings of its own. `meshes` is a folder, see `files_in`; by the model `known` each of its objects
-          is planned by who has seen all others.
+        - `options`: the study's own settings. `meshes` is a folder, see `files_in`. With the model `known`, the bank
+          for each mesh holds all the other meshes.
 
         **Raises:** `ValueError` as `files_in` and `study_sampler` do.
         """
@@ -124,7 +123,7 @@ class Study(eqx.Module):
 
     @classmethod
     def files_in(cls, folder: str | Path) -> tuple[MeshFile, ...]:
-        """The meshes in a folder that can be scenes.
+        """The meshes in a folder that are usable as scenes.
 
         **Raises:** `ValueError` if there is none.
         """
@@ -132,115 +131,115 @@ class Study(eqx.Module):
 
     @property
     def num_scenes(self) -> int | None:
-        """How many scenes there are; None for as many as are asked for."""
+        """Number of scenes; None if it is unlimited."""
         return len(self.meshes) or None
 
     @abstractmethod
     def scene(self, index: int) -> Scene:
-        """A scene.
+        """The scene of an index.
 
-        **Raises:** `ValueError` if there is none of this index, or it cannot be read.
+        **Raises:** `ValueError` if there is no such scene, or it cannot be read.
         """
 
     def file(self, index: int) -> MeshFile | None:
-        """The mesh of a scene; None where scenes are procedural.
+        """The mesh file of a scene; None if scenes are procedural.
 
-        **Raises:** `ValueError` if there is none of this index.
+        **Raises:** `ValueError` if there is no such scene.
         """
         count = len(self.meshes)
         require(
             count == 0 or 0 <= index < count,
-            f"there is no scene {index}: the study has {count} meshes, counted from 0; run as many scenes",
+            f"there is no scene {index}: the study has {count} meshes, counted from 0; run at most {count} scenes",
         )
         return self.meshes[index] if count else None
 
     @abstractmethod
     def acquisition(self, method: str, scene: Scene) -> Acquisition:
-        """What one of `methods` looks for; scenes share compilations."""
+        """The acquisition of a method. It has the same structure in all scenes, so that they share compilations."""
 
     def search(self, method: str, scene: Scene) -> Search:
-        """Of the method's name, or over all candidates by the acquisition."""
+        """The search of a method, see `search_of`."""
         climbs = self.num_starts, self.iterations
         return search_of(method, self.candidates, self.num_candidates, self.radius, *climbs)
 
     def planner(self, method: str, scene: Scene) -> Planner:
-        """The planner of a method, of one that knows no shapes too."""
-        known = method.removesuffix(WITHOUT_BANK)
-        planner = self.planner_of(self.acquisition(known, scene), self.search(known, scene), scene)
-        if known == method:
+        """The planner of a method, which may end in "-screened"."""
+        name = method.removesuffix(WITHOUT_BANK)
+        planner = self.planner_of(self.acquisition(name, scene), self.search(name, scene), scene)
+        if name == method:
             return planner
         return dataclasses.replace(planner, sampler=planner.sampler.without_bank)
 
     def truth(self, scene: Scene) -> Any:
-        """What is measured against, computed once a scene: by default its task."""
+        """The ground truth of a scene, computed once; by default its task."""
         return scene.task
 
     @abstractmethod
     def follow(self, scene: Scene, truth: Any, planner: Planner, episode: Iterator[Step]) -> Record:
-        """What is recorded of a planner's episode, as JSON; it may stop early."""
+        """The record (JSON) of a planner's episode. It may stop drawing steps early."""
 
     def facts(self, scene: Scene, truth: Any, first: int) -> Record:
-        """What is recorded of the scene itself, as JSON."""
+        """The record (JSON) of the scene itself."""
         return {"name": scene.name}
 
     def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles | None:
-        """How a scene's record is drawn, in tiles of so many pixels along a side; None where it is not."""
+        """The picture of a scene's record, in tiles of `pixels` x `pixels`; None if the study draws none."""
         return None
 
     def sensor(self, scene: Scene) -> Sensor:
-        """What the camera sees of a scene."""
+        """The simulated camera that scans a scene."""
         return sensor_before(scene.surface, self.camera)
 
     def shows_enough(self, scene: Scene, seen: PointCloud) -> bool:
-        """Whether a scan can be the first one."""
+        """Whether a scan shows enough of the object to be the first."""
         return bool(seen.mask.any())
 
     @classmethod
     def group(cls, record: Record) -> str:
-        """The scenes among which tables tell of this one too; "" for none."""
+        """Name of the subset of scenes that a record belongs to, tabulated separately; "" for none."""
         return ""
 
     @property
     def candidates(self) -> Candidates:
-        """Where the sensor can stand."""
+        """The candidate poses of the sensor."""
         return SphereCandidates(self.num_candidates, self.radius)
 
     @property
     def grid(self) -> Grid:
-        """Where samples are evaluated."""
+        """The grid on which samples are evaluated."""
         return Grid(self.grid_resolution)
 
     @property
     def imagined_camera(self) -> Camera:
-        """By which planners imagine scans."""
+        """The camera with which planners imagine scans."""
         return self.camera
 
     def sampler_of(self, scene: Scene) -> SurfaceSampler:
-        """What is known of such a scene: of meshes all but its own, where these are known."""
+        """The sampler for a scene. If its bank is made from `meshes`, it leaves out the mesh of the scene."""
         return knowing_others(self.sampler, self.meshes, scene.index) if self.meshes else self.sampler
 
     def planner_of(self, acquisition: Acquisition, search: Search, scene: Scene) -> Planner:
-        """A planner with the study's settings, and what is known of such a scene."""
-        known = self.sampler_of(scene)
-        sampler = dataclasses.replace(known, grid=self.grid, num_samples=self.num_samples)
+        """A planner with the study's settings and the sampler of the scene."""
+        base = self.sampler_of(scene)
+        sampler = dataclasses.replace(base, grid=self.grid, num_samples=self.num_samples)
         planned = acquisition, search, self.imagined_camera, sampler
         return Planner(*planned, capacity=self.capacity, max_views=self.views)
 
     def key(self, index: int, purpose: str) -> PRNGKeyArray:
-        """What is random in a scene depends on the study, the scene and the purpose alone."""
-        of_scene = jax.random.fold_in(jax.random.key(self.seed), index)
-        return jax.random.fold_in(of_scene, _PURPOSES.index(purpose))
+        """The random key of a scene for a purpose. It depends only on these and the study's seed."""
+        scene_key = jax.random.fold_in(jax.random.key(self.seed), index)
+        return jax.random.fold_in(scene_key, _PURPOSES.index(purpose))
 
     def episode_keys(self, method: str, scene: Scene) -> list[PRNGKeyArray]:
-        """The key of a method's episode, which all methods share; several for several episodes, see `joined`."""
+        """The keys of a method's episodes: one, which all methods share, or several to be merged by `joined`."""
         return [self.key(scene.index, "episode")]
 
     def joined(self, runs: Sequence[Record]) -> Record:
-        """The record of a method that is made of those of its episodes."""
+        """One record of a method, merged from those of its episodes."""
         return runs[0]
 
     def first_view(self, scene: Scene) -> int:
-        """A random one of the candidates from which the object shows enough."""
+        """Index of a random candidate from which the object shows enough."""
 
         def enough(seen: PointCloud) -> bool:
             return self.shows_enough(scene, seen)

@@ -109,10 +109,10 @@ def test_a_method_of_ones_own_that_makes_no_planner_is_refused_before_anything_i
         return Planner(Coverage(), RandomView(3), study.camera, study.sampler, max_views=1)
 
     for make, problem in (
-        (lambda study, scene: None, "what the method mine makes is None; give Planner"),
+        (lambda study, scene: None, "the planner of the method mine is None; give Planner"),
         (lambda study, scene: 1 / 0, r"the method mine fails on scene 0 \(ZeroDivisionError"),
         (lambda: None, "the method mine fails on scene 0 .*takes 0 positional arguments"),
-        (few, rf"a planner of 1 views, but the study has {study.views}: give Planner\(max_views={study.views}\)"),
+        (few, rf"a planner for 1 views, but the study has {study.views}: give Planner\(max_views={study.views}\)"),
     ):
         with pytest.raises(InputError, match=problem):
             run_scene(study, 0, ["random"], {"mine": make})
