@@ -329,7 +329,7 @@ REFUSED = {
     "a link to no image": (lambda: reopened("link", dangling), "image_01.npz is damaged"),
     "a pipe as an image": (lambda: reopened("pipe", piped), "image_01.npz is damaged"),
     "an older session that asks": (older_session_asks, "another process has added some"),
-    "a scene without a number": (lambda: records("unnumbered"), "scene_x.json is no record"),
+    "a scene without a number": (lambda: records("unnumbered"), "scene_x.json is not a record"),
     "a PLY that ends early": (lambda: cut("early.ply", 0.6), "its header declares"),
     "decimal commas": (lambda: cut("commas.obj", 1.0, COMMAS), "decimal points in place of commas"),
     "a mesh that is no file": (lambda: nbv.load_mesh(D), "give str or Path or Trimesh or Scene"),

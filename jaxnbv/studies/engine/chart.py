@@ -1,4 +1,4 @@
-"""The chart of a study: its measures by view, a line a method, with intervals over scenes."""
+"""The chart of a study: its measures by view, one line per method, with intervals over scenes."""
 
 import io
 from typing import Any
@@ -15,13 +15,13 @@ from jaxnbv.studies.engine.study import Study
 from jaxnbv.viz.figures import STYLE
 from jaxnbv.viz.style import GREY, INK, LINE
 
-# Its file in the folder of a study.
+# Name of the chart's file in the folder of a study.
 CHART = "chart.png"
-# Methods side by side, so that equal values do not hide one another: of the distance between two columns.
+# Offset between methods, as a share of the distance between two columns, so that equal values stay visible.
 _DODGE = 0.06
 _PANELS_A_ROW = 3
-# Colour, line and marker: colour-blind readers tell the colours apart (Okabe and Ito), the rest tells them in print.
-# What is new stands out in vermilion, its variants beside it; baselines look alike in every study.
+# Colour, line and marker. The palette suits colour-blind readers (Okabe and Ito); lines and markers suit print.
+# The new methods are vermilion. Baselines look the same in every study.
 _OURS, _SECOND, _THIRD = ("#d55e00", "-", "o"), ("#cc79a7", "-", "v"), ("#e69f00", "-", "^")
 LOOKS = {
     "cross-entropy": _OURS,
@@ -47,23 +47,25 @@ LOOKS = {
     "random": (GREY, "--", "X"),
     "oracle": (INK, ":", "*"),
 }
-# Methods of one's own, in turn.
+# Looks of the user's methods, in turn.
 _OTHERS = (("#8c564b", "-", "p"), ("#7f3fbf", "-", "h"), ("#b8860b", "--", "d"))
 
 
 def chart(found: pd.DataFrame, study: type[Study]) -> bytes:
-    """A PNG file of the results of all scenes, a panel a measure. Bars at the views are bootstrap intervals: bands
-    between the views of so many methods would hide one another."""
+    """A PNG file of the results over all scenes, one panel per measure.
+
+    Error bars are bootstrap intervals. Bands would overlap with this many methods.
+    """
     (group, scenes), *_ = groups_of(found).items()
-    here = found[found["group"] == group]
-    shown = [measure for measure in study.measures if (here["quantity"] == measure.name).any()]
+    rows = found[found["group"] == group]
+    shown = [measure for measure in study.measures if (rows["quantity"] == measure.name).any()]
     tall, wide = -(-len(shown) // _PANELS_A_ROW), min(len(shown), _PANELS_A_ROW)
     file = io.BytesIO()
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(8.4, 0.4 + 2.5 * tall), layout="constrained")
         panels = figure.subplots(tall, wide, squeeze=False).ravel()
         for axes, measure in zip(panels, shown, strict=False):
-            _draw(axes, here[here["quantity"] == measure.name], measure, here["method"].unique().tolist())
+            _draw(axes, rows[rows["quantity"] == measure.name], measure, rows["method"].unique().tolist())
             unit = f"share of scenes (%), n = {scenes}" if measure.unit == "%" else measure.unit
             axes.set(title=measure.title, xlabel=measure.by, ylabel=unit)
         for axes in panels[len(shown) :]:
@@ -94,7 +96,7 @@ def _draw(axes: Axes, rows: pd.DataFrame, measure: Measure, methods: list[str]) 
 
 
 def _look(method: str, index: int) -> dict[str, Any]:
-    """A method's line, markers and bars, as arguments of `Axes.errorbar`; those of new ways of choosing are thicker."""
+    """Arguments of `Axes.errorbar` for the line, markers and bars of a method. The main new methods are thicker."""
     colour, line, marker = LOOKS.get(method) or _OTHERS[index % len(_OTHERS)]
     width, size = (2.0, 5.5) if (colour, line, marker) == _OURS else (1.2, 4.4)
     bars = {"ecolor": mpl.colors.to_rgba(colour, 0.35), "elinewidth": 2.4}

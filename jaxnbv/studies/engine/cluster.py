@@ -1,4 +1,4 @@
-"""Workers of a Dask cluster that run the trials of a study."""
+"""Executor that runs the trials of a study on the workers of a Dask cluster."""
 
 import concurrent.futures
 import contextlib
@@ -17,31 +17,31 @@ from jaxnbv.compiled import keep_compiled
 from jaxnbv.errors import optional
 from jaxnbv.storage.folders import differences, num_threads, versions
 
-# Seconds until a scheduler must have answered.
+# Seconds to wait for a scheduler.
 _TIMEOUT = 5
 
 
 class Cluster(Executor):
-    """The workers of a Dask scheduler, each of which runs one call at a time.
+    """An executor on the workers of a Dask scheduler, each of which runs one call at a time.
 
-    - `address`: the scheduler's, such as "tcp://HOST:8786".
+    - `address`: address of the scheduler, such as "tcp://HOST:8786".
 
-    Blocks until there is a worker. If a worker dies, Dask starts its call again on another one. Once it gives the call
-    up, by default after four workers have died with it, the future raises `BrokenExecutor`.
+    Blocks until there is a worker. If a worker dies, Dask starts its call again on another one. If Dask gives up, by
+    default after four workers have died with the call, the future raises `BrokenExecutor`.
 
-    **Raises:** `ValueError` if Dask is not installed or no scheduler answers. Here, and from a future: if a worker runs
-    several calls at a time or has other software or threads than this process, or another device than the first worker,
-    or cannot import what it runs; and if the scheduler is gone.
+    **Raises:** `ValueError` if Dask is not installed or no scheduler answers. Both this constructor and a future raise
+    it if the scheduler is gone, or if a worker runs several calls at a time, has other software or threads than this
+    process or another device than the first worker, or cannot import the function.
     """
 
     def __init__(self, address: str):
         distributed = optional("distributed")
         self.address = address
-        # Tracebacks of a lost connection, which our error names.
+        # Silences Dask's tracebacks of a lost connection, since the error raised here reports it.
         logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
         try:
             self._client = distributed.Client(address, timeout=_TIMEOUT, set_as_default=False)
-        # Whatever answers at the address, if it is no scheduler of Dask's.
+        # Another kind of server at the address may cause any error.
         except Exception as error:
             raise InputError(
                 f"no Dask scheduler answers at {address} ({error}): start one with `dask scheduler`, and give the "
@@ -52,7 +52,7 @@ class Cluster(Executor):
         self._running: set[Future] = set()
         pools = optional("threadpoolctl").threadpool_info()
         threads = [pool["num_threads"] for pool in pools if pool["user_api"] == "blas"]
-        # Dask's workers have one by default. They get as many as this process has, at most NPROC.
+        # Dask gives its workers one thread. They get as many as this process has, at most NPROC.
         self._blas_threads = min([*threads, num_threads()])
         self._versions = versions()
         del self._versions["device"]
@@ -65,21 +65,21 @@ class Cluster(Executor):
             raise
 
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future:
-        """The future of a call. A function is sent once, however often it is called in a row."""
+        """Run a call on a worker, and return its future. A function called many times in a row is sent once."""
         require(self._client.status == "running", self._lost())
         if function is not self._pickled[0]:
-            # Pickled here, for a worker compares versions before it imports what the function needs.
+            # Pickled here, so that a worker can compare versions before it imports the modules of the function.
             content = optional("cloudpickle").dumps(function)
             self._pickled = function, self._client.submit(bytes, content, pure=False)
         task = self._client.submit(
-            # A lambda is pickled as code: a scheduler needs no jaxnbv, and a worker without it can say so.
+            # A lambda is pickled as code: the scheduler needs no jaxnbv, and a worker without it can report that.
             lambda *values: importlib.import_module("jaxnbv.studies.engine.cluster")._call(*values),
             self._pickled[1],
             self._versions,
             self._blas_threads,
             args,
             kwargs,
-            # First come, first served: Dask has no order within a tenth of a second.
+            # First come, first served: Dask ignores the order of calls within a tenth of a second.
             priority=-next(self._count),
             pure=False,
         )
@@ -91,9 +91,9 @@ class Cluster(Executor):
         return answer
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Leave the cluster, which goes on, once no call is left.
+        """Disconnect from the cluster, which keeps running, once all calls are done.
 
-        - `cancel_futures`: leave now; calls that have not ended are forgotten.
+        - `cancel_futures`: disconnect now, and drop the calls that are not done.
         """
         if wait and not cancel_futures:
             concurrent.futures.wait(tuple(self._running))
@@ -103,7 +103,7 @@ class Cluster(Executor):
         self.shutdown(cancel_futures=kind is not None)
 
     def _settle(self, task: Any, answer: Future) -> None:
-        """Pass the end of a task of Dask's on to the future that stands for it."""
+        """Pass the result or error of a Dask task on to its future."""
         if not answer.set_running_or_notify_cancel():
             return
         if task.status == "cancelled":
@@ -119,12 +119,12 @@ class Cluster(Executor):
             answer.set_exception(InputError(f"{problem}: {remedy}"))
         except BaseException as error:
             answer.set_exception(error)
-        # Dask computes a result anew if the worker that holds it dies, until it is released.
+        # Until it is released, Dask computes a result again if the worker that holds it dies.
         task.release()
 
     def _lost(self) -> str:
         return (
-            f"the Dask scheduler at {self.address} is gone: start it, then the same command again; scenes that have a "
+            f"the Dask scheduler at {self.address} is gone: start it, then the same command again. Scenes that have a "
             "record are kept"
         )
 
@@ -138,8 +138,8 @@ def _call(
         worker.state.nthreads == 1,
         f"the worker {worker.address} runs {worker.state.nthreads} calls at a time: start it with --nthreads 1",
     )
-    there = _prepare()
-    changes = differences({name: there[name] for name in client_versions}, client_versions)
+    own = _prepare()
+    changes = differences({name: own[name] for name in client_versions}, client_versions)
     require(
         not changes,
         f"the worker {worker.address} is unlike this process ({'; '.join(changes)}): install the same versions, and "
@@ -147,17 +147,17 @@ def _call(
     )
     try:
         function = pickle.loads(content)
-    # Whatever a module of the user's does as it is imported.
+    # A user's module may raise anything on import.
     except Exception as error:
         raise ImportError(f"{type(error).__name__}: {error}") from error
-    # The last bits of linear algebra depend on its threads too.
+    # The number of threads changes the last bits of linear algebra.
     optional("threadpoolctl").threadpool_limits(blas_threads, user_api="blas")
     return function(*args, **kwargs)
 
 
 @functools.cache
 def _prepare() -> dict[str, Any]:
-    """The versions of this process, determined once. From here on it keeps compiled programs, as the command does."""
+    """Keep compiled programs, as the command does, and return the versions of this process. Runs once."""
     with contextlib.suppress(InputError):
         keep_compiled()
     return versions()

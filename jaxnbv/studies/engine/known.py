@@ -1,4 +1,4 @@
-"""The sampler of a study: by its model, with the shapes that it knows, all of them or a choice."""
+"""The sampler of a study, with or without known shapes, and selections from its bank."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -9,7 +9,7 @@ from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.studies.engine.measures import KNOWN
 from jaxnbv.surfaces import KnownShapes, ShapeBank, Upright, bank_poses, shape_bank
 
-# So that a number fits into a shape's name too.
+# Leaves room for a number in a shape's name.
 _LONGEST = 50
 
 
@@ -21,12 +21,12 @@ def study_sampler(
     quick: bool = False,
     solid: bool = False,
 ) -> SurfaceSampler:
-    """As `SurfaceSampler.preset`, or for the model `known` the screened one that knows shapes: the meshes of a study,
-    upright and of any proportions, or without any those of a bank that ships.
+    """The sampler of a model: a preset of `SurfaceSampler`, or for "known" the screened one with known shapes.
 
-    - `bank`: its name; "" for none.
+    - `bank`: name of a bank that ships; "" for none.
+    - `files`: meshes to use as known shapes instead, upright, with free proportions.
 
-    **Raises:** `ValueError` for another model, or `known` where there are neither meshes nor a bank.
+    **Raises:** `ValueError` for an unknown model, or for "known" with neither meshes nor a bank.
     """
     if model != KNOWN:
         return SurfaceSampler.preset(model, longest_side, quick, solid=solid)
@@ -39,7 +39,7 @@ def study_sampler(
 
 
 def knowing_those(sampler: SurfaceSampler, wanted: Callable[[str], bool]) -> SurfaceSampler:
-    """One that knows shapes, of these alone those whose names are wanted; any other as it is."""
+    """The sampler with only the known shapes whose names are wanted; unchanged if it has none."""
     model = sampler.model
     if not isinstance(model, KnownShapes):
         return sampler
@@ -50,7 +50,7 @@ def knowing_those(sampler: SurfaceSampler, wanted: Callable[[str], bool]) -> Sur
 
 
 def knowing_others(sampler: SurfaceSampler, files: Sequence[MeshFile], index: int) -> SurfaceSampler:
-    """One that knows meshes, but for that of a scene; any other as it is."""
+    """The sampler without the known shape made from the mesh of a scene; unchanged if it has none."""
     return knowing_those(sampler, lambda name: name != _name(files, index))
 
 

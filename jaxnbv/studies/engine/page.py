@@ -1,4 +1,4 @@
-"""All studies of a folder on one page: of each its claims, tables, chart, pictures, settings, versions and times."""
+"""The page of all studies in a folder: claims, tables, chart, pictures, settings, versions and times of each."""
 
 import json
 import os
@@ -21,12 +21,12 @@ _REMEDY = "give a folder that `jaxnbv study` has written"
 
 
 class Chapter(NamedTuple):
-    """One study.
+    """The part of the page about one study.
 
-    - `scenes`: how many; `facts`: what was run, in words; `explanation`: what its measures mean.
-    - `tables`: by the group of scenes, each a title and HTML.
-    - `images`: its chart, drawn anew, and the pictures that lie in its folder: their names, and PNG files.
-    - `settings`: of the study, as JSON.
+    - `scenes`: number of scenes; `facts`: sentences on times and versions; `explanation`: what its measures mean.
+    - `tables`: titles and HTML of the tables, by group of scenes.
+    - `images`: names and PNG files of its chart, drawn anew, and of the pictures in its folder.
+    - `settings`: settings of the study as JSON.
     """
 
     title: str
@@ -40,43 +40,43 @@ class Chapter(NamedTuple):
 
 
 def write_page(folder: str | Path, out: str | Path) -> Path:
-    """Write an HTML page of all studies in a folder, which holds its images and opens offline, and return its path.
+    """Write one HTML page of all studies in a folder, and return its path. It opens offline, with all images.
 
     **Raises:** `ValueError` for a name that does not end in .html, and as `chapters` does.
     """
     out = Path(out)
     require(out.suffix == ".html", f"the page {out} must end in .html")
-    found, date = chapters(folder), f"{datetime.now(UTC):%Y-%m-%d}"
+    content, date = chapters(folder), f"{datetime.now(UTC):%Y-%m-%d}"
     make_folder(out.parent)
-    write_text(out, render(Path(__file__).with_name("page.html"), chapters=found, version=__version__, date=date))
+    write_text(out, render(Path(__file__).with_name("page.html"), chapters=content, version=__version__, date=date))
     return out
 
 
 def chapters(folder: str | Path) -> list[Chapter]:
-    """A chapter for each study in a folder or in folders inside, in the order of the registry.
+    """A chapter for each study in a folder and its subfolders, in the order of the registry.
 
-    **Raises:** `ValueError` if there is none, a study is not known here, or a record is damaged.
+    **Raises:** `ValueError` if there is no study, a study is unknown to this version, or a record is damaged.
     """
     folder = Path(folder)
     require(os.path.isdir(folder), f"there is no folder {folder}: {_REMEDY}")
     kinds = _kinds()
-    found: dict[tuple[int, Path], Chapter] = {}
+    by_place: dict[tuple[int, Path], Chapter] = {}
     for file in sorted(folder.rglob("study.json")):
         if any(file.parent.glob("scene_*.json")):
-            written = read_record(file.parent, "study", _REMEDY)
-            study = written["config"].get("study")
+            record = read_record(file.parent, "study", _REMEDY)
+            study = record["config"].get("study")
             name = study.get("type") if isinstance(study, dict) else study
             name = name.rpartition(":")[2] if isinstance(name, str) else name
             if not isinstance(name, str) or name not in kinds:
-                raise InputError(f"{file} is of a study {name!r}, which this version does not know: {_REMEDY}")
-            chapter = _chapter(file.parent, file.parent.relative_to(folder), written, kinds[name])
-            found[list(kinds).index(name), file] = chapter
-    require(len(found) > 0, f"{folder} holds no study that has a scene: {_REMEDY}")
-    return [found[place] for place in sorted(found)]
+                raise InputError(f"{file} belongs to the study {name!r}, which this version does not know: {_REMEDY}")
+            chapter = _chapter(file.parent, file.parent.relative_to(folder), record, kinds[name])
+            by_place[list(kinds).index(name), file] = chapter
+    require(len(by_place) > 0, f"{folder} holds no study that has a scene: {_REMEDY}")
+    return [by_place[place] for place in sorted(by_place)]
 
 
 def _kinds() -> dict[str, type[Study]]:
-    """The studies by the names of their classes, those of the registry first."""
+    """Classes of studies by name, those of the registry first."""
     named = {kind.__qualname__: kind for kind in (entry.load() for entry in studies().values())}
     todo = [Study]
     while todo:
@@ -86,23 +86,23 @@ def _kinds() -> dict[str, type[Study]]:
     return named
 
 
-def _chapter(path: Path, inside: Path, written: dict[str, Any], kind: type[Study]) -> Chapter:
+def _chapter(path: Path, inside: Path, record: dict[str, Any], kind: type[Study]) -> Chapter:
     records = read_records(path)
-    found = results(records, kind)
+    table = results(records, kind)
     parts = {
         f"{group}: {count_of(scenes, 'scene')}": [
-            (title, cells.to_html(border=0)) for title, cells in tables(found, kind, group)
+            (title, cells.to_html(border=0)) for title, cells in tables(table, kind, group)
         ]
-        for group, scenes in groups_of(found).items()
+        for group, scenes in groups_of(table).items()
     }
-    images = [(CHART, chart(found, kind))]
+    images = [(CHART, chart(table, kind))]
     images += [(file.stem, file.read_bytes()) for file in sorted(path.glob("*.png")) if file.name != CHART]
-    seconds = sum(record["seconds"] for record in records)
-    made_by = ", ".join(f"{name} {version}" for name, version in written.get("versions", {}).items())
+    seconds = sum(scene["seconds"] for scene in records)
+    made_by = ", ".join(f"{name} {version}" for name, version in record.get("versions", {}).items())
     facts = [
-        f"{seconds / len(records):.0f} seconds a scene with all methods, {seconds / 3600:.2f} hours in all.",
+        f"{seconds / len(records):.0f} seconds per scene with all methods, {seconds / 3600:.2f} hours in all.",
         f"Made with {made_by}.",
     ]
     title = kind.title if inside == Path() else f"{kind.title}: {inside}"
-    told = f"{kind.explanation} {explained(kind)}", verdicts(found, kind), parts, images
-    return Chapter(title, len(records), facts, *told, json.dumps(written["config"], indent=1))
+    body = f"{kind.explanation} {explained(kind)}", verdicts(table, kind), parts, images
+    return Chapter(title, len(records), facts, *body, json.dumps(record["config"], indent=1))

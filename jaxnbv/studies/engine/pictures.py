@@ -1,4 +1,4 @@
-"""Pictures of a study: for each scene a grid of tiles, a row a method and a column a view, beside the truth."""
+"""Pictures of a study: a grid of tiles for each scene, one row per method and one column per view."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,15 +15,17 @@ from jaxnbv.studies.engine.tiles import Tiles
 from jaxnbv.viz.figures import STYLE
 from jaxnbv.viz.style import LINE, framed, save_figure
 
-# Inches of a tile, and of what stands beside and above all of them.
+# Inches: size of a tile, and the margins beside and above the grid.
 _TILE, _BESIDE, _ABOVE = (1.75, 1.95), 0.35, 0.75
 
 
 def write_pictures(
     records: Sequence[Record], study: Study, folder: str | Path, scenes: int = 3, pixels: int = 420
 ) -> list[Path]:
-    """Write `scene_<number>.png` for the first scenes, not picked ones, into a folder, if the study draws any; return
-    the paths. Methods are those of the study that are `pictured`, or all that the records hold."""
+    """Write pictures `scene_<number>.png` of the first scenes into a folder, and return their paths.
+
+    Shows the `pictured` methods of the study, or all methods of the records. Writes none if the study draws none.
+    """
     folder, paths = make_folder(folder), []
     for record in sorted(records, key=lambda record: record["scene"])[:scenes]:
         held = record["methods"]

@@ -1,4 +1,4 @@
-"""Processes on this machine that run the trials of a study."""
+"""Executor that runs the trials of a study in processes on this machine."""
 
 import os
 import queue
@@ -12,23 +12,23 @@ import loky
 from loky.process_executor import TerminatedWorkerError
 
 _TRIES = 2
-# Read by XLA, the libraries of linear algebra and our own pools of processes.
+# Numbers of threads, read by XLA, linear algebra libraries and pools of processes.
 _THREADS = ("NPROC", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "LOKY_MAX_CPU_COUNT")
 
 
 class Processes(Executor):
-    """Processes on this machine, which share its cores evenly and end with this one.
+    """An executor of processes on this machine, which share its cores evenly and end with this process.
 
     - `workers`: number of processes.
 
-    A call whose process dies, for want of memory say, is begun once more in a new one. If that dies too, its future
-    raises `BrokenExecutor`. Leaving a `with` block by an error kills the calls that run.
+    If the process of a call dies, for example from lack of memory, the call starts again in a new process. If that dies
+    too, its future raises `BrokenExecutor`. An error that leaves a `with` block kills running calls.
     """
 
     def __init__(self, workers: int):
         self._environment = dict.fromkeys(_THREADS, str(max(loky.cpu_count() // workers, 1)))
         self._threads = ThreadPoolExecutor(workers)
-        # One pool a process: the call that died with a process is the one that ran in its pool.
+        # One pool per process, so that the pool tells which call died with its process.
         self._pools = [self._pool() for _ in range(workers)]
         self._free: queue.SimpleQueue[int] = queue.SimpleQueue()
         for number in range(workers):
@@ -36,13 +36,13 @@ class Processes(Executor):
         self._lock, self._is_closed = threading.Lock(), False
 
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future:
-        """The future of a call. Function and arguments are pickled by cloudpickle."""
+        """Run a call in one of the processes, and return its future. Function and arguments go through cloudpickle."""
         return self._threads.submit(self._call, function, args, kwargs)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End the processes once no call is left.
+        """End the processes once all calls are done.
 
-        - `cancel_futures`: kill the calls that run, and cancel those that have not begun.
+        - `cancel_futures`: kill running calls, and cancel the others.
         """
         if cancel_futures:
             self._kill()
@@ -68,7 +68,7 @@ class Processes(Executor):
 
     def _replace(self, number: int) -> None:
         with self._lock:
-            # Killed by `shutdown`.
+            # `shutdown` has killed the process.
             if self._is_closed:
                 raise BrokenExecutor("the processes were shut down")
             self._pools[number].shutdown(kill_workers=True)
@@ -85,7 +85,7 @@ class Processes(Executor):
 
 
 def _end_with(parent: int) -> None:
-    """End this process when its parent is gone: one that is killed cannot end its processes."""
+    """End this process when its parent is gone, since a killed parent cannot end its processes."""
 
     def watch() -> None:
         while os.getppid() == parent:

@@ -1,4 +1,4 @@
-"""The searches of studies, by the names of their methods."""
+"""Searches of studies by the names of methods."""
 
 from collections.abc import Callable
 
@@ -18,7 +18,7 @@ from jaxnbv.search import (
     UncertaintyView,
 )
 
-# The baselines of all studies that look at no acquisition.
+# The baselines of all studies that ignore the acquisition.
 RULES = ("farthest", "uncertainty", "random")
 _OVER_CANDIDATES: dict[str, Callable[..., Search]] = {
     "farthest": FarthestView,
@@ -38,8 +38,11 @@ _LEARNING_RATE = 0.03
 def search_of(
     method: str, candidates: Candidates, num_candidates: int, radius: float, num_starts: int, iterations: int
 ) -> Search:
-    """Of the name's kind, or over all candidates by the acquisition. One by gradient, about `radius` (scene units),
-    looks at half as many candidates first, and climbs from `num_starts` of them."""
+    """The search that a method is named after, or `DiscreteSearch` over all candidates for any other name.
+
+    A search by gradient, around `radius` (scene units), scores half of `num_candidates` and climbs from the best
+    `num_starts`.
+    """
     if method in _SPACES:
         settings = num_starts, iterations, _LEARNING_RATE, max(num_candidates // 2, num_starts)
         return GradientSearch(None, _SPACES[method](radius), *settings)

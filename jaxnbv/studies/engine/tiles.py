@@ -1,4 +1,4 @@
-"""What a study draws of a scene: tiles, and the tools to fill them."""
+"""Tiles in which a study draws a scene, and tools to fill them."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -17,18 +17,18 @@ from jaxnbv.viz.render import Still
 from jaxnbv.viz.style import GREY
 
 _RIGHT = "#00734f"
-# A still is coloured at vertices: no triangle may be larger than what its colours vary over. Half of what it spans.
+# Longest edge of a still's triangles, since it is coloured at vertices, and half of its extent (scene units).
 _EDGE, _REACH = 0.05, 1.6
 
 
 class Tiles(NamedTuple):
-    """How a study draws a scene.
+    """The picture of a scene.
 
-    - `caption`: beneath all.
-    - `tile`: fills the tile of a method at a column, given its axes.
-    - `truth`: fills the tile of the truth, which stands before the first row; None for none.
-    - `columns`: what the tiles of a method are; "" for its views.
-    - `marks`: a legend, the look of a `Line2D` by name; `scale`: a bar of colours, and what they mean.
+    - `caption`: text below the picture.
+    - `tile`: draws the tile of a method and a column on its axes.
+    - `truth`: draws the tile of the true object, left of the first row; None for no such tile.
+    - `columns`: titles of the columns; empty for one column per view.
+    - `marks`: settings of `Line2D` by name, for the legend; `scale`: a colour bar and its label.
     """
 
     caption: str
@@ -40,14 +40,13 @@ class Tiles(NamedTuple):
 
 
 def say(axes: Axes, text: str, right: bool = False) -> None:
-    """A line beneath a tile, which stands out where it is right."""
+    """Write a line below a tile; in bold green with a tick if `right`."""
     colour, weight = (_RIGHT, "bold") if right else (GREY, "normal")
     axes.set_xlabel(f"{'✓ ' if right else ''}{text}", fontsize=9, color=colour, fontweight=weight)
 
 
 def across(record: Record) -> Float[np.ndarray, "3"]:
-    """Where to look from to see what the first view, which all methods share, does not show: from across the object,
-    and from above."""
+    """A direction opposite the first view, which all methods share, and above, to show what the view does not."""
     run = next(iter(record["methods"].values()))
     position = np.asarray(run["views"][0]["position"])
     away = -position[[0, 2]]
@@ -63,7 +62,7 @@ def still_of(
     value: Callable[[np.ndarray], Float[np.ndarray, " n"]] | None = None,
     norm: LogNorm | None = None,
 ) -> Still:
-    """A picture of a mesh, plain or coloured by a positive value at its points."""
+    """Render a mesh, in one colour or coloured by a positive value at its points."""
     vertices, faces = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, _EDGE, max_iter=12)
     fine = trimesh.Trimesh(vertices, faces)
     values = np.ones(len(fine.vertices)) if value is None else np.maximum(value(fine.vertices), 1e-6)
@@ -77,7 +76,7 @@ def draw_on(
     points: Float[np.ndarray, "n 3"],
     colours: Float[np.ndarray, "n channels"],
 ) -> None:
-    """The points that a still's surface does not hide, over it, the nearest last."""
+    """Draw a still, and over it the points that its surface does not hide, the nearest last."""
     axes.imshow(still.image, interpolation="antialiased", zorder=1)
     pixels, in_front = still.project(points)
     depth = (points - np.asarray(still.pose.position)) @ np.asarray(still.pose.forward)

@@ -1,4 +1,4 @@
-"""How the trials of a study are run: one after the other in this process, or by an executor."""
+"""Runs the trials of a study one after the other in this process, or with an executor."""
 
 import functools
 import traceback
@@ -10,25 +10,25 @@ from jaxnbv.studies.engine.measures import Record
 
 
 class Failure(NamedTuple):
-    """What is kept of a trial that failed: the error in a line, and where it came from."""
+    """The error of a failed trial in one line, and its traceback."""
 
     error: str
     traceback: str
 
 
-# One scene with all methods, by its index.
+# Runs all methods on the scene of an index.
 Trial: TypeAlias = Callable[[int], Record]
 Outcome: TypeAlias = Record | Failure
 Outcomes: TypeAlias = Generator[tuple[int, Outcome], None, None]
 
 
 def outcomes(trial: Trial, indices: Sequence[int], executor: Executor | None = None) -> Outcomes:
-    """Each trial's outcome once, in the order in which they end.
+    """Run trials, and yield the index and outcome of each as it ends.
 
-    - `executor`: of `concurrent.futures`; by default this process runs the trials, one after the other.
+    - `executor`: an executor of `concurrent.futures`; default: this process runs the trials one after the other.
 
-    A `BrokenExecutor` from the executor says that it gave a trial up, because its process died: a `Failure`. Any other
-    error of the executor itself is raised. Trials that have not begun when the generator is closed are cancelled.
+    A `BrokenExecutor` means that the executor gave a trial up because its process died, which counts as a `Failure`.
+    Other errors of the executor are raised. Closing the generator cancels the trials that have not started.
     """
     attempt = functools.partial(_attempt, trial)
     if executor is None:
@@ -53,6 +53,6 @@ def outcomes(trial: Trial, indices: Sequence[int], executor: Executor | None = N
 def _attempt(trial: Trial, index: int) -> Outcome:
     try:
         return trial(index)
-    # A method of the user's may end the process.
+    # A user's method may call sys.exit.
     except (Exception, SystemExit) as error:
         return Failure(f"{type(error).__name__}: {error}", traceback.format_exc())

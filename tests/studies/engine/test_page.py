@@ -40,7 +40,7 @@ def test_a_chapter_tells_means_differences_times_and_versions(tmp_path):
     (verdict,) = chapter.verdicts
     assert (verdict.held, verdict.methods) == (0, 1)
     facts = " ".join(chapter.facts)
-    assert "3 seconds a scene" in facts
+    assert "3 seconds per scene" in facts
     assert re.search(r"jax \d", facts)
 
 
