@@ -1,4 +1,4 @@
-"""The study of reconstruction: how near is the surface that a method's views give to the true one?"""
+"""Study of reconstruction: how near is the surface reconstructed from a method's views to the true one?"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar, cast
@@ -33,32 +33,33 @@ from jaxnbv.viz.style import DEVIATION
 
 POISSON, MEAN = "screened Poisson", "posterior mean"
 RECONSTRUCTIONS = (POISSON, MEAN)
-# Distances to the truth that the pictures tell apart: from the sensor's noise to a fifth of the object.
+# Colour scale of distances to the true surface: from the sensor noise to a fifth of the object.
 _ERRORS = LogNorm(0.01, 0.5)
-# Points of the true surface that they are measured to there.
+# Number of points on the true surface to which pictures measure distances.
 _DENSE = 200_000
 
 
 def _distances(name: str, title: str) -> Measure:
     def of(record: Record, method: str) -> dict[str, float | None]:
-        found = record["methods"][method]["reconstructions"]
-        return {way: None if distances is None else distances[name] for way, distances in found.items()}
+        surfaces = record["methods"][method]["reconstructions"]
+        return {way: None if distances is None else distances[name] for way, distances in surfaces.items()}
 
     return Measure(name, title, of, "reconstruction", "scene units", less=True)
 
 
 class ReconstructionStudy(Study):
-    """How near the surface made of a method's cloud comes to the true one. Settings as of `Study`; procedural
-    objects are those of the test split of `part_scene`.
+    """Measures the distance between the surface reconstructed from a method's cloud and the true surface.
 
-    The posterior's mean is meshed on the grid of the samples, carved as they are.
+    Settings as in `Study`. Procedural objects come from the test split of `part_scene`. The posterior mean is meshed on
+    the grid of the samples and carved like them.
     """
 
     title: ClassVar[str] = "Distances to the true surface after the last view"
     explanation: ClassVar[str] = (
-        "In scene units (longest side 2.5). Chamfer distance CD = accuracy + completeness: the mean distance from the\n"
-        "reconstruction to the truth, and from the truth to the reconstruction. HD: the Hausdorff distance, the\n"
-        "largest of both. A reconstruction that no scene has (pip install pymeshlab for Poisson) is left out."
+        "In scene units (longest side 2.5). Accuracy is the mean distance from the reconstruction to the truth,\n"
+        "completeness the mean distance from the truth to the reconstruction, and the Chamfer distance CD their sum.\n"
+        "HD is the Hausdorff distance, the largest of both kinds. A reconstruction that no scene has is left out\n"
+        "(Poisson needs pip install pymeshlab)."
     )
     bank: ClassVar[str] = "parts"
     without_bank: ClassVar[tuple[str, ...]] = ("coverage", "new-surface", "uncertainty")
@@ -73,7 +74,7 @@ class ReconstructionStudy(Study):
     )
     claims: ClassVar[tuple[Claim, ...]] = (
         Claim(
-            "Surfaces made of coverage's views are as near to the truth as those of baselines made for coverage.",
+            "Surfaces from coverage's views are as near to the truth as surfaces from baselines designed for coverage.",
             "chamfer",
             POISSON,
             ("farthest", "uncertainty"),
@@ -84,18 +85,18 @@ class ReconstructionStudy(Study):
     quick: ClassVar[Mapping[str, Any]] = {**Study.quick, "num_candidates": 40}
 
     def scene(self, index: int) -> Scene:
-        """An object."""
+        """The object of an index: a mesh or a procedural object."""
         file = self.file(index)
         if file is not None:
             return Scene(index, file.name, file.read())
-        made = part_scene(Split.TEST, index)
-        return Scene(index, f"{CATEGORIES[int(made.category)].name} {index}", SDFSurface(made.solid))
+        part = part_scene(Split.TEST, index)
+        return Scene(index, f"{CATEGORIES[int(part.category)].name} {index}", SDFSurface(part.solid))
 
     def acquisition(self, method: str, scene: Scene) -> Acquisition:
         return NewSurface() if method == "new-surface" else Coverage()
 
     def mesher(self, scene: Scene) -> Planner:
-        """Whose posterior all methods' views are meshed by, those of planners of one's own too."""
+        """The planner whose sampler reconstructs the surface for all methods, including those of the user."""
         return self.planner("farthest", scene)
 
     def truth(self, scene: Scene) -> Float[np.ndarray, "n 3"]:
@@ -111,17 +112,19 @@ class ReconstructionStudy(Study):
         planner: Planner,
         episode: Iterator[Step],
     ) -> Record:
-        """The share of the true surface that is covered after each view, and the distances to it of two
-        reconstructions from the last cloud; that by Poisson reconstruction is None without `pymeshlab`."""
+        """Record the covered share of the true surface after each view, and the distances of two reconstructions.
+
+        Both are made from the last cloud. The Poisson reconstruction is None without `pymeshlab`.
+        """
         views = [view for view, *_ in episode]
         mesher = self.mesher(scene)
         *_, observations = mesher.replay(((view.pose, view.scan) for view in views), self.camera)
-        found = {
+        distances = {
             name: self._distances(reconstruct(mesher.sampler, observations, name), truth, scene.index)
             for name in RECONSTRUCTIONS
         }
         covered = coverage(views, truth)
-        return {"coverage": covered, "points": int(observations.cloud.count), "reconstructions": found}
+        return {"coverage": covered, "points": int(observations.cloud.count), "reconstructions": distances}
 
     def _distances(self, mesh: TriangleMesh | None, truth: Float[np.ndarray, "n 3"], index: int) -> Record | None:
         if mesh is None:
@@ -130,31 +133,30 @@ class ReconstructionStudy(Study):
         return {"chamfer": distance.chamfer, **distance._asdict()}
 
     def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
-        """Each reconstruction after the last view, coloured by the distance to the true surface."""
+        """Tiles of each reconstruction after the last view, coloured by the distance to the true surface."""
         scene, held = self.scene(record["scene"]), record["methods"]
         truth = cast(TriangleMesh, true_mesh(scene.surface))
         tree = cKDTree(truth.sample_points(jax.random.key(0), _DENSE))
         eye, sampler = across(record), self.mesher(scene).sampler
-        known = {method: replay(self, scene, held[method])[-1][1] for method in methods}
-        made = {method: held[method]["reconstructions"] for method in methods}
-        names = tuple(name for name in RECONSTRUCTIONS if all(found[name] is not None for found in made.values()))
+        last = {method: replay(self, scene, held[method])[-1][1] for method in methods}
+        results = {method: held[method]["reconstructions"] for method in methods}
+        names = tuple(name for name in RECONSTRUCTIONS if all(run[name] is not None for run in results.values()))
 
         def tile(axes: Axes, method: str, column: int) -> None:
-            mesh = reconstruct(sampler, known[method], names[column])
+            mesh = reconstruct(sampler, last[method], names[column])
             if mesh is None:
                 raise InputError(f"the records hold {names[column]}: to draw it again, {install('poisson')}")
             still = still_of(mesh, eye, pixels, lambda points: tree.query(points)[0], _ERRORS)
             axes.imshow(still.image, interpolation="antialiased")
-            found = made[method][names[column]]
-            say(axes, f"CD {found['chamfer']:.3f}, HD {found['hausdorff']:.3f}")
+            distances = results[method][names[column]]
+            say(axes, f"CD {distances['chamfer']:.3f}, HD {distances['hausdorff']:.3f}")
 
         scale = ScalarMappable(_ERRORS, DEVIATION), "distance to the true surface\n(scene units)"
         return Tiles("", tile, lambda axes: axes.imshow(still_of(truth, eye, pixels).image), names, scale=scale)
 
 
 def reconstruct(sampler: SurfaceSampler, observations: Observations, name: str) -> TriangleMesh | None:
-    """One of `RECONSTRUCTIONS` from what is known; None for Poisson reconstruction where `pymeshlab` cannot be
-    imported."""
+    """One of `RECONSTRUCTIONS` from observations; None for Poisson reconstruction without `pymeshlab`."""
     if name == MEAN:
         return sampler.mean_mesh(observations)
     return screened_poisson(observations.cloud) if has_poisson() else None

@@ -1,1 +1,1 @@
-"""The discovery of semantic parts: the paper's Table 1."""
+"""Studies of the discovery of semantic parts, the paper's Table 1."""

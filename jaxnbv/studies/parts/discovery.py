@@ -1,4 +1,4 @@
-"""What the studies of semantic parts have in common: how many views until all parts of an object are found?"""
+"""Base class of the studies of semantic parts: how many views until all parts of an object are found?"""
 
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
@@ -30,30 +30,29 @@ from jaxnbv.studies.sensors import PART_SETTING
 from jaxnbv.tasks import Coverage, Segmenter, SoftPartCount, part_counts
 from jaxnbv.viz.style import GREY, SERIES
 
-# The paper's N_target of its Table 1, and the authors' value for the utility, in points of the 2,048 that the network
-# is fed.
+# N_target of the paper's Table 1, and the authors' N_target of the utility, both for the 2,048 points of the network.
 TARGETS = (20, 40, 60, 80, 100)
 TARGET, NETWORK_POINTS = 60, 2048
 _BY_PARTS = ("discrete", "gradient-2dof", "gradient-6dof")
 _BASELINES = (*RULES, "coverage")
-# Twice the standard deviation of the sensor's noise.
+# Width w: twice the standard deviation of the sensor noise.
 _WIDTH = 0.02
-# Of a part that is not there: its probability is zero, and so is every derivative.
+# Distance of an absent part, at which its probability and all derivatives are zero.
 _NOWHERE = 100.0
-# Points of the true surface that are drawn.
+# Number of points of the true surface in pictures.
 _DENSE = 8000
 
 
 class NearestPart(Segmenter):
-    """An oracle in place of a network that segments: it separates what planning does from what the network does.
+    """An oracle segmenter that knows the true parts, so that a study measures planning without a network's errors.
 
-    The parts of an object that is known: p_ic in proportion to exp(-d_ic^2 / 2 w^2), w = 0.02 scene units, with the
-    distance d_ic of point i from the true part c.
+        p_ic proportional to exp(-d_ic^2 / 2 w^2),   w = 0.02 scene units,
 
-    Objects that differ share one compilation if they have room for as many parts.
+    with the distance d_ic of point i from the true part c. Objects with room for equally many parts share one
+    compilation.
 
-    - `distances`: of each part, at the nodes of `grid`; between them linear.
-    - `num_points`: what is told apart, by farthest point sampling.
+    - `distances`: distance from each part at the nodes of `grid`, interpolated linearly.
+    - `num_points`: number of points to segment, chosen by farthest point sampling.
     """
 
     distances: Float[Array, "parts g g g"]
@@ -62,19 +61,19 @@ class NearestPart(Segmenter):
 
     @classmethod
     def of(cls, parts: MeshParts, room: int, grid: Grid, num_points: int) -> "NearestPart":
-        """Of a mesh, with room for so many parts."""
+        """The oracle of a mesh, with room for `room` parts."""
         distances = parts.distances(grid)
         absent = ((0, room - len(distances)), (0, 0), (0, 0), (0, 0))
         return cls(jnp.pad(distances, absent, constant_values=_NOWHERE), grid, num_points)
 
     def __call__(self, cloud: PointCloud) -> Float[Array, "num_points parts"]:
-        """p, and zeros in rows without a point."""
+        """Probabilities p; zero in rows without a point."""
         fed = farthest_point_subsample(cloud, self.num_points)
         p = jax.nn.softmax(-0.5 * (self.distances_at(fed.points) / _WIDTH) ** 2, axis=-1)
         return jnp.where(fed.mask[:, None], p, 0.0)
 
     def predict(self, cloud: PointCloud) -> tuple[PointCloud, Int[Array, " num_points"]]:
-        """The points that are told apart, and the nearest part of each; -1 in rows without a point."""
+        """The segmented points, and the nearest part of each; -1 in rows without a point."""
         fed = farthest_point_subsample(cloud, self.num_points)
         return fed, jnp.where(fed.mask, self.nearest(fed.points), -1)
 
@@ -83,31 +82,31 @@ class NearestPart(Segmenter):
         return jnp.argmin(self.distances_at(points), axis=-1).astype(jnp.int32)
 
     def distances_at(self, points: Float[Array, "n 3"]) -> Float[Array, "n parts"]:
-        """Beyond the grid those at its border."""
+        """Distances of points from all parts. Points beyond the grid get the values at its border."""
         at = (points.T + self.grid.half_extent) / self.grid.spacing
-        of_part = jax.vmap(lambda values: map_coordinates(values, list(at), order=1, mode="nearest"), out_axes=-1)
-        return of_part(self.distances)
+        interpolate = jax.vmap(lambda values: map_coordinates(values, list(at), order=1, mode="nearest"), out_axes=-1)
+        return interpolate(self.distances)
 
 
-# What tells parts apart: a network, or one who knows.
+# A segmenter of parts: a network or the oracle.
 PartSegmenter: TypeAlias = CloudSegmenter | NearestPart
 
 
 def discovery_time(counts: Int[np.ndarray, "views parts"], target: int) -> int | None:
-    """T_discovery: the first view, from 1, after which every part has at least `target` points; None if none has."""
-    found: Bool[np.ndarray, " views"] = np.all(np.asarray(counts) >= target, axis=1)
-    return int(np.argmax(found)) + 1 if found.any() else None
+    """T_discovery: the first view, from 1, after which all parts have at least `target` points; None if never."""
+    is_complete: Bool[np.ndarray, " views"] = np.all(np.asarray(counts) >= target, axis=1)
+    return int(np.argmax(is_complete)) + 1 if is_complete.any() else None
 
 
 def _times(record: Record, method: str) -> dict[int, float]:
-    """T_discovery by target; one more than the study's views where the parts were not all found."""
+    """T_discovery by target; one more than the number of views if some part was not found."""
     counts = np.asarray(record["methods"][method]["counts"])
-    found = {target: discovery_time(counts, target) for target in TARGETS}
-    return {target: float(record["study_views"] + 1 if time is None else time) for target, time in found.items()}
+    times = {target: discovery_time(counts, target) for target in TARGETS}
+    return {target: float(record["study_views"] + 1 if time is None else time) for target, time in times.items()}
 
 
 def _found(record: Record, method: str) -> dict[int, float]:
-    """Whether all parts had been found in the end, by target."""
+    """Whether all parts are found after the last view, by target."""
     return {target: float(time <= record["study_views"]) for target, time in _times(record, method).items()}
 
 
@@ -117,17 +116,18 @@ def _found_by_view(record: Record, method: str) -> list[float]:
 
 
 class PartDiscoveryStudy(Study):
-    """How many views until a segmenter gives enough points to every part that the object has. Settings as of `Study`,
-    and
+    """Measures the number of views until a segmenter gives enough points to every part of the object.
+
+    Settings as in `Study`, and
 
     - `imagined_rays`: rays along a side of an imagined scan; true scans have 64 x 64.
-    - `num_points`: points that the segmenter is fed of D and an imagined scan; N_target is taken in proportion.
+    - `num_points`: points of D and an imagined scan that the segmenter gets. N_target is scaled in proportion.
     """
 
     title: ClassVar[str] = "Views until all parts are found"
     explanation: ClassVar[str] = (
-        "T_discovery for each N_target: views until the segmenter gives that many points to every part of the object;\n"
-        "one more than there are views if that did not happen, so that means are lower bounds."
+        "T_discovery for each N_target: views until the segmenter gives that many points to every part of the object.\n"
+        "If some part never gets them, it is one more than the number of views, so that means are lower bounds."
     )
     methods: ClassVar[tuple[str, ...]] = (*_BY_PARTS, *_BASELINES)
     pictured: ClassVar[tuple[str, ...]] = ("discrete", "gradient-2dof", "farthest", "uncertainty")
@@ -138,7 +138,7 @@ class PartDiscoveryStudy(Study):
         Measure("found_by_view", f"All parts found, N_target = {TARGET}", _found_by_view, unit="%"),
     )
     claims: ClassVar[tuple[Claim, ...]] = tuple(
-        Claim(f"The utility finds all parts in fewer views, of {target} points each.", "time", target, _BASELINES)
+        Claim(f"The utility finds {target} points of every part in fewer views.", "time", target, _BASELINES)
         for target in (TARGET, max(TARGETS))
     )
     seed: ClassVar[int] = 6
@@ -153,11 +153,11 @@ class PartDiscoveryStudy(Study):
 
     @abstractmethod
     def segmenter_of(self, scene: Scene, num_points: int | None = None) -> PartSegmenter:
-        """What tells the parts of a scene's object, fed so many points; by default as many as of a cloud alone."""
+        """The segmenter for a scene that gets `num_points` points; default: as many as for a cloud alone."""
 
     @abstractmethod
     def true_parts(self, scene: Scene, points: Float[Array, "n 3"]) -> Int[Array, " n"]:
-        """The true part of points of the surface: its place among those of the segmenter."""
+        """The true part of each point of the surface, as its index among the parts of the segmenter."""
 
     @property
     def imagined_camera(self) -> Camera:
@@ -171,8 +171,10 @@ class PartDiscoveryStudy(Study):
         return ExpectedUtilityImprovement(soft_count, self.num_points)
 
     def follow(self, scene: Scene, truth: list[int], planner: Planner, episode: Iterator[Step]) -> Record:
-        """How many points the segmenter gives to each part after each view; it stops once every part has the largest
-        of `TARGETS`."""
+        """Record the points that the segmenter gives to each part after each view.
+
+        Stops once every part has the largest of `TARGETS`.
+        """
         segmenter = self.segmenter_of(scene)
         counts: list[list[int]] = []
         for view, *_ in episode:
@@ -182,30 +184,32 @@ class PartDiscoveryStudy(Study):
         return {"counts": counts}
 
     def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
-        """The cloud so far over the true shape, coloured by the part that the segmenter says; beneath it how many parts
-        have N_target = 60 points. A method ends once every part has 100."""
+        """Tiles of the cloud over the true shape, coloured by predicted part.
+
+        Below is the number of parts with N_target = 60 points. A method ends once every part has 100.
+        """
         scene, held = self.scene(record["scene"]), record["methods"]
-        asked, segmenter = np.asarray(self.truth(scene)), self.segmenter_of(scene)
-        own, point = [SERIES[part % len(SERIES)] for part in range(len(asked))], jnp.zeros((1, 3))
+        parts, segmenter = np.asarray(self.truth(scene)), self.segmenter_of(scene)
+        palette, point = [SERIES[part % len(SERIES)] for part in range(len(parts))], jnp.zeros((1, 3))
         labels = jax.eval_shape(segmenter, PointCloud(point, point, jnp.zeros(1, bool))).shape[1]
         colours = np.tile(mpl.colors.to_rgb(GREY), (labels, 1))
-        colours[asked] = mpl.colors.to_rgba_array(own)[:, :3]
+        colours[parts] = mpl.colors.to_rgba_array(palette)[:, :3]
         mesh = cast(TriangleMesh, true_mesh(scene.surface))
         points = mesh.sample_points(jax.random.key(0), _DENSE)
-        of = np.asarray(self.true_parts(scene, jnp.asarray(points, jnp.float32)))
+        labels_of_points = np.asarray(self.true_parts(scene, jnp.asarray(points, jnp.float32)))
         still = still_of(mesh, across(record), pixels)
-        known = {method: replay(self, scene, held[method]) for method in methods}
+        replays = {method: replay(self, scene, held[method]) for method in methods}
 
         def tile(axes: Axes, method: str, view: int) -> None:
-            fed, predicted = segmenter.predict(known[method][view][1].cloud)
+            fed, predicted = segmenter.predict(replays[method][view][1].cloud)
             mask = np.asarray(fed.mask)
             draw_on(axes, still, np.asarray(fed.points)[mask], colours[np.asarray(predicted)[mask]])
-            found = sum(count >= TARGET for count in held[method]["counts"][view])
-            say(axes, f"{found} of {len(asked)} parts", found == len(asked))
+            num_found = sum(count >= TARGET for count in held[method]["counts"][view])
+            say(axes, f"{num_found} of {len(parts)} parts", num_found == len(parts))
 
-        marks = {name: {"marker": "o", "color": colour} for name, colour in zip(record["parts"], own, strict=True)}
-        caption = f"Points: the part that the segmenter says. Beneath: parts with {TARGET} points. View 1 is given."
-        return Tiles(caption, tile, lambda axes: draw_on(axes, still, points, colours[of]), marks=marks)
+        marks = {name: {"marker": "o", "color": colour} for name, colour in zip(record["parts"], palette, strict=True)}
+        caption = f"Points: predicted parts. Beneath: parts with {TARGET} points. View 1 is the same for all methods."
+        return Tiles(caption, tile, lambda axes: draw_on(axes, still, points, colours[labels_of_points]), marks=marks)
 
 
 @eqx.filter_jit

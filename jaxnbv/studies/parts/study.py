@@ -1,6 +1,6 @@
-"""The studies of semantic parts: how many views until all parts of an object are found? The paper's Table 1.
+"""Studies of semantic parts: how many views until all parts of an object are found? The paper's Table 1.
 
-Objects are procedural and a network tells their parts, or they are mesh files whose nodes are parts and an oracle does.
+Objects are procedural and segmented by a network, or mesh files whose nodes are parts, segmented by an oracle.
 """
 
 from pathlib import Path
@@ -25,30 +25,31 @@ from jaxnbv.studies.scenes import Split, part_scene
 from jaxnbv.surfaces.known_shapes import kind_of
 from jaxnbv.tasks import part_counts
 
-# Where distances from the parts are known: the object's longest side is 2.5.
+# The grid of distances from the parts. The object's longest side is 2.5.
 _GRID = Grid(64, 1.4)
 
 
 class PartMesh(eqx.Module):
-    """A mesh and what tells its parts apart."""
+    """The parts of a mesh, and the oracle that segments them."""
 
     parts: MeshParts
     oracle: NearestPart
 
 
 class MeshPartStudy(PartDiscoveryStudy):
-    """The parts of real objects, told by `NearestPart`, so that planning is seen without the network's errors. Settings
-    as of `PartDiscoveryStudy`, and
+    """Studies the parts of real objects, segmented by the oracle `NearestPart`, without a network's errors.
 
-    - `meshes`: files whose nodes are parts; `room`: for as many parts as any has.
+    Settings as in `PartDiscoveryStudy`, and
 
-    The planner is asked for all parts. It is measured on those that can be found: of which all candidates together show
-    as many points as the largest N_target asks.
+    - `meshes`: files whose nodes are parts; `room`: largest number of parts of any mesh.
+
+    The utility counts all parts. The measures count only the parts that can be found: all candidates together show at
+    least as many points of them as the largest N_target.
     """
 
     explanation: ClassVar[str] = (
-        f"{PartDiscoveryStudy.explanation}\nAn oracle gives each point to the nearest part; asked is for those of "
-        f"which\nall candidates together show {max(TARGETS)} points of {NETWORK_POINTS}."
+        f"{PartDiscoveryStudy.explanation}\nAn oracle gives each point to the nearest part. A part counts if all "
+        f"candidates\ntogether show {max(TARGETS)} of its points among {NETWORK_POINTS}."
     )
     seed: ClassVar[int] = 12
 
@@ -61,7 +62,7 @@ class MeshPartStudy(PartDiscoveryStudy):
 
     @classmethod
     def files_in(cls, folder: str | Path) -> tuple[MeshFile, ...]:
-        """Those of two nodes or more, by folder and name; folders take turns.
+        """The meshes with two nodes or more, by folder and name. Folders take turns.
 
         **Raises:** `ValueError` if there is no such mesh, or one cannot be read.
         """
@@ -74,7 +75,7 @@ class MeshPartStudy(PartDiscoveryStudy):
         return tuple(taking_turns(by_class.values()))
 
     def scene(self, index: int) -> Scene:
-        """An object; its task is the `PartMesh`."""
+        """A mesh. The task of the scene is its `PartMesh`."""
         file = self.file(index)
         assert file is not None
         parts = load_parts(file.path)
@@ -90,13 +91,13 @@ class MeshPartStudy(PartDiscoveryStudy):
         return scene.task.oracle.nearest(points)
 
     def truth(self, scene: Scene) -> list[int]:
-        """The parts that can be found."""
+        """Indices of the parts that can be found."""
         seen = scan(scene.surface, self.imagined_camera, self.candidates.poses())
         joined = PointCloud(seen.points.reshape(-1, 3), seen.normals.reshape(-1, 3), seen.mask.reshape(-1))
         counts = part_counts(scene.task.oracle(joined))
-        found = [int(part) for part in np.flatnonzero(np.asarray(counts) >= max(TARGETS))]
-        require(len(found) > 0, f"{scene.name} has no part that shows {max(TARGETS)} points: leave it out")
-        return found
+        visible = [int(part) for part in np.flatnonzero(np.asarray(counts) >= max(TARGETS))]
+        require(len(visible) > 0, f"{scene.name} has no part that shows {max(TARGETS)} points: leave it out")
+        return visible
 
     def facts(self, scene: Scene, truth: list[int], first: int) -> Record:
         names = scene.task.parts.names
@@ -105,10 +106,10 @@ class MeshPartStudy(PartDiscoveryStudy):
 
 
 class PartStudy(PartDiscoveryStudy):
-    """The parts of procedural objects by the shipped network. Settings as of `PartDiscoveryStudy`, and
+    """Studies the parts of procedural objects with the shipped network. Settings as in `PartDiscoveryStudy`, and
 
-    - `segmenter`: of clouds in scene coordinates; its category is replaced by that of each scene's object.
-    - `split`: which scenes; tune on those of the validation split.
+    - `segmenter`: segmenter of clouds in scene coordinates. Each scene replaces its category by that of the object.
+    - `split`: split of the scenes. Tune settings on the validation split.
     """
 
     bank: ClassVar[str] = "parts"
@@ -120,30 +121,30 @@ class PartStudy(PartDiscoveryStudy):
     def configured(
         cls, model: str, views: int, quick: bool, meshes: str | Path | None = None, **options: Any
     ) -> dict[str, Study]:
-        """With a folder of meshes, that of their parts."""
+        """The study, or a `MeshPartStudy` if there is a folder of meshes."""
         if meshes is not None:
             return MeshPartStudy.configured(model, views, quick, meshes=meshes, **options)
         return super().configured(model, views, quick, segmenter=part_segmenter(category=0), **options)
 
     def scene(self, index: int) -> Scene:
-        """An object; its task is the `PartScene`."""
-        made = part_scene(self.split, index)
-        return Scene(index, CATEGORIES[int(made.category)].name, SDFSurface(made.solid), made)
+        """A procedural object. The task of the scene is its `PartScene`."""
+        part = part_scene(self.split, index)
+        return Scene(index, CATEGORIES[int(part.category)].name, SDFSurface(part.solid), part)
 
     def segmenter_of(self, scene: Scene, num_points: int | None = None) -> CloudSegmenter:
-        """The network, told the object's category."""
-        given = self.segmenter
-        return CloudSegmenter(given.network, scene.task.category, num_points or given.num_points, given.scale)
+        """The network, for the object's category."""
+        base = self.segmenter
+        return CloudSegmenter(base.network, scene.task.category, num_points or base.num_points, base.scale)
 
     def sampler_of(self, scene: Scene) -> SurfaceSampler:
-        """As the network's, with the shapes of the object's category."""
+        """The sampler, with only the known shapes of the object's category."""
         return knowing_those(self.sampler, lambda name: kind_of(name) == scene.name)
 
     def true_parts(self, scene: Scene, points: Float[Array, "n 3"]) -> Int[Array, " n"]:
         return scene.task.solid.part_labels(points)
 
     def truth(self, scene: Scene) -> list[int]:
-        """The labels of the parts that the object has."""
+        """Labels of the object's parts."""
         return [int(label) for label in np.flatnonzero(np.asarray(scene.task.parts))]
 
     def facts(self, scene: Scene, truth: list[int], first: int) -> Record:
