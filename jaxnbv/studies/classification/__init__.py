@@ -1,1 +1,1 @@
-"""Which class is the object of? The paper's experiments on classification, one a module."""
+"""Studies of the class of an object: the paper's experiments on classification."""

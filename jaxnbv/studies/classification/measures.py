@@ -1,7 +1,7 @@
-"""What studies of classification measure: hits by view, what views have shown, and how good the samples were.
+"""Measures of classification studies: hits and visible cues by view, and the quality of samples and values.
 
-A hit is when a sequence of views first gives the right class, gives it for good, or first shows its cue. Views count
-from 1.
+A view, counted from 1, is a first hit if the right class was predicted up to it, and a stable hit if the right class is
+predicted from it to the end.
 """
 
 from collections.abc import Callable
@@ -14,24 +14,24 @@ from jaxnbv.checks import AnyArray
 from jaxnbv.sampler import StepInputs, SurfaceSampler
 from jaxnbv.studies.engine.measures import SECONDS, Measure, Record
 
-# What the studies call having seen it: rays of one scan that hit the cue of the class.
+# A view shows the cue of the class if at least this number of its rays hits it.
 CUE_PIXELS = 150
-# Methods of one acquisition, whose values can be compared.
+# Methods that share the acquisition cross-entropy, so that their values are comparable.
 _BY_CROSS_ENTROPY = ("cross-entropy", "halving", "gradient-2dof", "gradient-constrained", "hybrid")
 
 
 def first_hits(correct: Bool[np.ndarray, "runs views"]) -> Bool[np.ndarray, "runs views"]:
-    """Whether a prediction was correct by each view: from the paper's T_first on."""
+    """Whether any prediction up to each view was correct, which holds from the paper's T_first on."""
     return np.logical_or.accumulate(correct, axis=1)
 
 
 def stable_hits(correct: Bool[np.ndarray, "runs views"]) -> Bool[np.ndarray, "runs views"]:
-    """Whether predictions are correct from each view to the end: from the paper's T_stable on."""
+    """Whether all predictions from each view on are correct, which holds from the paper's T_stable on."""
     return np.logical_and.accumulate(correct[:, ::-1], axis=1)[:, ::-1]
 
 
 def _hit(by_view: Callable) -> Callable[[Record, str], Float[np.ndarray, " views"]]:
-    """The share of a method's runs that have hit, by view: for all but random search that of one run, 0 or 1."""
+    """The share of a method's runs with a hit, by view. Only random search has several runs."""
 
     def of(record: Record, method: str) -> Float[np.ndarray, " views"]:
         guesses = np.argmax(record["methods"][method]["log_p"], axis=-1)
@@ -41,7 +41,7 @@ def _hit(by_view: Callable) -> Callable[[Record, str], Float[np.ndarray, " views
 
 
 def _seen(record: Record, method: str) -> Float[np.ndarray, " views"] | list:
-    """Whether a view has shown the cue of the class."""
+    """The share of runs in which some view up to each one showed the cue of the class."""
     pixels = record["methods"][method]["pixels"]
     return first_hits(np.array(pixels) >= CUE_PIXELS).mean(axis=0) if pixels else []
 
@@ -52,23 +52,23 @@ def _value(record: Record, method: str) -> dict[int, float]:
 
 
 def roughness(sampler: SurfaceSampler, inputs: StepInputs) -> float:
-    """Cells of the grid that a sample's surface crosses, mean over samples, per cell that the mean's surface crosses,
-    carved as the samples are. Of a posterior without closed forms the mean is that of these samples.
+    """Mean number of grid cells crossed by a sample's surface, divided by that of the posterior mean's surface.
 
-    About 1 for samples as smooth as the mean. It rises when the spacing of the data exceeds the kernel's width; near 5
-    an acquisition says little about the value of a view.
+    The mean is carved like the samples. For a posterior without closed forms it is the mean of the samples. The value
+    is about 1 for samples as smooth as the mean, and rises if the spacing of the data exceeds the kernel's width. Near
+    5, an acquisition says little about the value of a view.
     """
     posterior, surfaces = inputs.posterior, inputs.surfaces
     assert posterior is not None
     assert surfaces is not None
     values, closed = np.asarray(surfaces.values), posterior.has_closed_forms
     mean = np.asarray(sampler.mean(inputs.observations, posterior)) if closed else values.mean(axis=0)
-    samples = [crossed_cells(one) for one in values]
+    samples = [crossed_cells(sample) for sample in values]
     return float(np.mean(samples)) / max(crossed_cells(mean), 1)
 
 
 def crossed_cells(values: Float[np.ndarray, "g g g"]) -> int:
-    """Cells whose eight corners do not share a sign."""
+    """The number of cells whose eight corners do not share a sign."""
     inside = values < 0
     size = inside.shape[0] - 1
     corners = [inside[i : i + size, j : j + size, k : k + size] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
@@ -78,8 +78,10 @@ def crossed_cells(values: Float[np.ndarray, "g g g"]) -> int:
 def rank_correlation(
     values: Float[AnyArray, " c"], true_values: Real[AnyArray, " c"], compared: Bool[np.ndarray, " c"]
 ) -> float | None:
-    """Spearman's, between the expected and the true values of the candidates compared; None where either does not
-    vary."""
+    """Spearman's rank correlation of expected and true values; None if either is constant.
+
+    - `compared`: which candidates to include.
+    """
     a, b = np.asarray(values)[compared], np.asarray(true_values)[compared]
     return None if np.ptp(a) == 0 or np.ptp(b) == 0 else float(spearmanr(a, b).statistic)
 

@@ -1,7 +1,8 @@
-"""The studies of classes by what their objects are: which methods' views tell the class, and how soon?
+"""Classification studies by kind of object: which methods' views tell the class, and how soon?
 
-Of a pyramid its base has a pattern. Of a loaded truck the outside is most of what can be seen, and says nothing of the
-cargo. Of household objects, the paper's sanity check, and of scanned fruits, from its supplement, all tells the class.
+The class of a pyramid shows in a pattern on its base. The class of a truck is that of its cargo, which the outside of
+the truck hides. The whole surface tells the class of household objects, the paper's sanity check, and of scanned
+fruits, from its supplement.
 """
 
 from pathlib import Path
@@ -30,13 +31,13 @@ from jaxnbv.studies.scenes.class_object import ClassMesh, choose_hidden
 from jaxnbv.studies.scenes.splits import scene_key
 from jaxnbv.studies.scenes.truck_meshes import loaded_truck
 
-# Degrees. Of the cameras from which the pattern cannot be seen two fifths lie in each of the first two, a fifth in the
-# last.
+# Lower ends of the groups, in degrees. Of the cameras that cannot see the pattern, each of the first two groups has two
+# fifths and the last one fifth.
 _ANGLES = (0, 110, 140)
 
 
 class PyramidStudy(ClassificationStudy):
-    """The class of a pyramid whose pattern the first view does not show. Settings as of `ClassificationStudy`."""
+    """The class of a pyramid, from a first view that hides its pattern. Settings as in `ClassificationStudy`."""
 
     title: ClassVar[str] = "The class of a pyramid"
     objects: ClassVar[ClassSet] = ClassSet(PATTERNS, pyramid_scene)
@@ -49,12 +50,12 @@ class PyramidStudy(ClassificationStudy):
 
     @classmethod
     def group(cls, record: Record) -> str:
-        """By the first view's angle from the base's normal."""
+        """The range of the first view's angle from the base's normal."""
         least = max(angle for angle in _ANGLES if angle <= record["angle"])
         return f"first view at {least:03d}° or more from the base's normal"
 
     def facts(self, scene: Scene, truth: Truth, first: int) -> Record:
-        """With the first view's angle from the base's normal, in degrees: at 180 it looks from behind the apex."""
+        """Also records the first view's angle from the base's normal: degrees, 180 behind the apex."""
         direction = np.asarray(self.candidates.poses().position[first])
         # The base looks along -z of the pyramid's own frame.
         assert isinstance(truth.thing, Pyramid)
@@ -63,7 +64,7 @@ class PyramidStudy(ClassificationStudy):
         return super().facts(scene, truth, first) | {"angle": float(np.degrees(np.arccos(cosine)))}
 
     def first_view(self, scene: Scene) -> int:
-        """A random one of the candidates that do not show the pattern, but something, as `first` asks."""
+        """Index of a random candidate that hides the pattern but shows enough, see `shows_enough`."""
         scans = scene.task.scans
         enough = [self.shows_enough(scene, scans[index]) for index in range(self.num_candidates)]
         require(any(enough), f"none of {self.num_candidates} candidates shows enough of {scene.name}: ask for more")
@@ -71,9 +72,9 @@ class PyramidStudy(ClassificationStudy):
 
 
 class TruckStudy(ClassificationStudy):
-    """The class of a truck's cargo, from a random first view. Settings as of `ClassificationStudy`, and
+    """The class of a truck's cargo, from a random first view. Settings as in `ClassificationStudy`, and
 
-    - `trucks`: files of trucks that carry what `meshes` names.
+    - `trucks`: mesh files of trucks, which carry the objects of `meshes`.
     """
 
     title: ClassVar[str] = "The class of a truck's cargo"
@@ -95,24 +96,27 @@ class TruckStudy(ClassificationStudy):
 
     @classmethod
     def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
-        """
-        - `meshes`: a folder with a folder `trucks` of meshes, and those of the cargo's classes, see `class_meshes`.
+        """The studies of one command, by the names of their folders.
 
-        **Raises:** `ValueError` as of a `ClassificationStudy`, or if there is no truck.
+        - `meshes`: a folder with a folder `trucks` of meshes and one folder per class of cargo, see `class_meshes`.
+
+        **Raises:** `ValueError` as `ClassificationStudy` does, or if there is no truck.
         """
         if "meshes" in options:
             options["trucks"] = mesh_files(Path(options["meshes"]) / "trucks")
         return super().configured(model, views, quick, **options)
 
     def of_mesh(self, file: MeshFile, index: int) -> ClassMesh:
-        """The cargo on the bed of one of the trucks, which take turns."""
+        """The object of a file on the bed of a truck. The trucks take turns."""
         truck = self.trucks[index % len(self.trucks)].read()
         return loaded_truck(truck, file.read(), file.label, scene_key(self.seed, self.split, index))
 
 
 class HouseholdStudy(ClassificationStudy):
-    """The class of a household object, one of ten that are told by their global shape, for which any views will do;
-    from a random first view. Settings as of `ClassificationStudy`."""
+    """The class of a household object, from a random first view. Settings as in `ClassificationStudy`.
+
+    The ten classes differ in global shape, which any view shows.
+    """
 
     title: ClassVar[str] = "The class of a household object"
     objects: ClassVar[ClassSet] = ClassSet(HOUSEHOLD, household_scene)
@@ -125,8 +129,10 @@ class HouseholdStudy(ClassificationStudy):
 
 
 class OmniObject3DStudy(ClassificationStudy):
-    """The class of a scanned fruit, which is told by what is small on it, from a random first view, on meshes and by a
-    classifier of the user's. Settings as of `ClassificationStudy`."""
+    """The class of a scanned fruit, from a random first view. Settings as in `ClassificationStudy`.
+
+    The classes differ in small details. The meshes and the classifier are the user's.
+    """
 
     title: ClassVar[str] = "The class of a fruit"
     objects: ClassVar[ClassSet] = ClassSet(("apple", "lemon", "mango", "mushroom", "orange"))
@@ -136,13 +142,14 @@ class OmniObject3DStudy(ClassificationStudy):
 
     @classmethod
     def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
-        """
-        **Raises:** `ValueError` as of a `ClassificationStudy`, or if `meshes` or `classifier` is not given.
+        """The studies of one command, by the names of their folders.
+
+        **Raises:** `ValueError` as `ClassificationStudy` does, or if `meshes` or `classifier` is missing.
         """
         needed = {
             "meshes": f"--meshes FOLDER, a folder with a folder of meshes for each of {', '.join(cls.objects.classes)}",
-            "classifier": "--classifier FILE, the checkpoint of a network that tells these apart, such as a PointNet++ "
-            "that was trained in PyTorch",
+            "classifier": "--classifier FILE, the checkpoint of a network trained on these classes, such as a "
+            "PointNet++ from PyTorch",
         }
         missing = [text for name, text in needed.items() if name not in options]
         require(not missing, f"nothing ships for the study omniobject3d: give {', and '.join(missing)}")

@@ -1,4 +1,4 @@
-"""What the studies of classification have in common: which methods' views tell the class, and how soon?"""
+"""Base class of classification studies: which methods' views tell the class, and how soon?"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -37,11 +37,11 @@ from jaxnbv.tasks import Coverage, CrossEntropy, EntropyReduction, MixedEntropy
 from jaxnbv.tasks.classification import AnyClassifier, ClassAcquisition, Classifier, as_classifier
 from jaxnbv.viz.style import NEW, framed
 
-# Of random search, in each scene.
+# Runs of random search in each scene.
 _RUNS = 8
 BASELINES = ("coverage", *RULES)
 _GRADIENT = ("gradient-2dof", "gradient-constrained")
-# All others choose by cross-entropy, in their ways of searching.
+# All other methods maximise cross-entropy with different searches.
 _ACQUISITIONS: dict[str, type[ClassAcquisition] | None] = {
     **dict.fromkeys(BASELINES),
     "entropy": EntropyReduction,
@@ -52,7 +52,7 @@ _PLAIN, _TINTED = np.array([0.68, 0.72, 0.78]), np.array(mpl.colors.to_rgb(NEW))
 
 
 class Truth(eqx.Module):
-    """The class, and what each candidate would truly show: scans with noise, and how many rays hit its cue."""
+    """The class, the object, and for each candidate its true noisy scan and the rays that hit the cue."""
 
     label: int
     scans: PointCloud
@@ -61,41 +61,40 @@ class Truth(eqx.Module):
 
 
 class OracleView(CandidateSearch):
-    """The candidate whose true scan has the highest value: what the acquisition would choose that knows the surface.
+    """Oracle search: chooses the candidate whose true scan has the highest acquisition score.
 
-    - `scans`: what each candidate would truly show.
+    - `scans`: the true scan of each candidate.
     """
 
     scans: PointCloud = eqx.field(kw_only=True)
     uses_samples: ClassVar[bool] = False
 
     def score(self, problem: Problem, candidates: Pose) -> Float[Array, "1 1 candidates"]:
-        """The values of the true scans."""
+        """The acquisition scores of the true scans."""
         context = problem.acquisition.context(inputs_of(problem.observations))
         return scores(problem.acquisition, context, self.scans, problem.camera, candidates)[None, None]
 
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
-        """The argmax over the candidates not visited yet; the key is not used."""
+        """The best candidate that is not visited yet. The key is not used."""
         return best_unvisited(problem, candidates, scores[0, 0])
 
 
 class ClassificationStudy(Study):
-    """The class of an object. Settings as of `Study`, and
+    """Base class: measures how many views a method needs to tell the class of an object. Settings as in `Study`, and
 
-    - `classifier`: of clouds in scene coordinates; it says what is known after each view.
-    - `imagining`: the classifier of D u scan for imagined scans, by default the same; one that is fed fewer points
-      saves time.
-    - `framing`: how large the object stands before the sensor.
-    - `split`: which scenes; tune on those of the validation split.
-    - `num_points`: D is thinned to so many, once a step, before imagined scans are added to it.
-    - `first`: which views may be the first one.
+    - `classifier`: classifier of clouds in scene coordinates, applied after each view.
+    - `imagining`: classifier of D u scan for imagined scans; default: `classifier`. One that gets fewer points saves
+      time.
+    - `framing`: how much of the object fits into a view.
+    - `split`: split of the scenes. Tune settings on the validation split.
+    - `num_points`: D is thinned to this number, once a step, before imagined scans are added.
+    - `first`: which views may be the first.
 
-    What it is:
+    Class attributes:
 
-    - `objects`: the scenes; `cue`: the part of them that differs by class, "" for all of the object.
-    - `network`: the name of the shipped classifier; `fed`: the points that it is fed of what was seen, and of that and
-      an imagined scan.
-    - `framings`: each a study of its own; `solid`: whether the objects are nowhere thin, see `sampler`.
+    - `objects`: the scenes and their classes; `cue`: name of the part that differs by class, "" for the whole object.
+    - `network`: name of the shipped classifier; `fed`: numbers of points for `classifier` and for `imagining`.
+    - `framings`: framings to study, one study each; `solid`: whether the objects have no thin parts, see `sampler`.
     """
 
     methods: ClassVar[tuple[str, ...]] = ("cross-entropy", "entropy", "mixed", "tie-break", *BASELINES, "oracle")
@@ -103,21 +102,21 @@ class ClassificationStudy(Study):
     pictured: ClassVar[tuple[str, ...]] = ("cross-entropy", "farthest", "uncertainty")
     reference: ClassVar[str] = "cross-entropy"
     explanation: ClassVar[str] = (
-        "First hit: a right prediction so far. Stable hit: right from then to the end. Of random search both are\n"
-        f"means over {_RUNS} runs. Cue seen: one of the views shows at least {CUE_PIXELS} pixels of what differs by\n"
-        "class. Rank correlation and roughness are by the view being chosen."
+        "First hit: some prediction so far was right. Stable hit: all predictions from this view on are right. For\n"
+        f"random search, both are means over {_RUNS} runs. Cue seen: some view shows at least {CUE_PIXELS} pixels of\n"
+        "the part that differs by class. Rank correlation and roughness belong to the view that is chosen."
     )
     measures: ClassVar[tuple[Measure, ...]] = MEASURES
     claims: ClassVar[tuple[Claim, ...]] = (
         Claim(
-            "Where local features tell the class, cross-entropy is right sooner than views that know nothing of the "
-            "task, most of all at the second view.",
+            "Where local features tell the class, cross-entropy is right sooner than methods that ignore the task, "
+            "most of all at the second view.",
             "first",
             2,
             BASELINES,
         ),
         Claim(
-            "Search over candidates tells the class as soon as search by gradient, or almost.",
+            "Search over candidates tells the class as soon as search by gradient, or nearly so.",
             "stable",
             2,
             _GRADIENT,
@@ -143,21 +142,21 @@ class ClassificationStudy(Study):
 
     @classmethod
     def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
-        """One for each framing, if none is given.
+        """A study of one framing, or one study per framing if none is given.
 
-        - `classifier`: the file of a network, see `load_checkpoint`, in place of the one that ships.
+        - `classifier`: file of a network, see `load_checkpoint`; default: the one that ships.
 
-        **Raises:** `ValueError` as it does, or if the network does not tell as many classes.
+        **Raises:** `ValueError` as `load_checkpoint` does, or if the network has another number of classes.
         """
         if "meshes" in options:
             options["meshes"] = cls.files_in(options["meshes"])
         file = options.pop("classifier", None)
         studies: dict[str, Study] = {}
-        for one in (options["framing"],) if "framing" in options else cls.framings:
-            classifier, imagining = (cls._classifier(file, one.longest_side, fed) for fed in cls.fed)
-            sampler = study_sampler(model, cls.bank, (), one.longest_side, quick, cls.solid)
-            settings: dict[str, Any] = {"classifier": classifier, "imagining": imagining, "framing": one} | options
-            name = one.value if len(cls.framings) > 1 else ""
+        for framing in (options["framing"],) if "framing" in options else cls.framings:
+            classifier, imagining = (cls._classifier(file, framing.longest_side, fed) for fed in cls.fed)
+            sampler = study_sampler(model, cls.bank, (), framing.longest_side, quick, cls.solid)
+            settings: dict[str, Any] = {"classifier": classifier, "imagining": imagining, "framing": framing} | options
+            name = framing.value if len(cls.framings) > 1 else ""
             studies[name] = cls(views=views, sampler=sampler, **settings | (dict(cls.quick) if quick else {}))
         return studies
 
@@ -172,24 +171,24 @@ class ClassificationStudy(Study):
         network = load_checkpoint(file)
         classifier = CloudClassifier(network, fed, network_scale(network, longest_side))
         rows = jnp.zeros((fed, 3))
-        (known,) = jax.eval_shape(classifier, PointCloud(rows, rows, jnp.ones(fed, bool))).shape
+        (num_classes,) = jax.eval_shape(classifier, PointCloud(rows, rows, jnp.ones(fed, bool))).shape
         names = cls.objects.classes
         require(
-            known == len(names),
-            f"the network in {file} knows {known} classes; the study has {len(names)}: {', '.join(names)}",
+            num_classes == len(names),
+            f"the network in {file} knows {num_classes} classes; the study has {len(names)}: {', '.join(names)}",
         )
         return classifier
 
     @classmethod
     def group(cls, record: Record) -> str:
-        """Whether the first view, which all methods share, shows something of the cue of the class."""
+        """Whether the first view, which all methods share, shows any of the cue; "" without a cue."""
         if not cls.cue:
             return ""
         pixels = next(iter(record["methods"].values()))["pixels"]
         return f"first view {'with' if pixels[0][0] else 'without'} {cls.cue}"
 
     def scene(self, index: int) -> Scene:
-        """An object; its task is the `Truth`.
+        """An object. The task of the scene is its `Truth`.
 
         **Raises:** `ValueError` if there is no mesh of this index, or it cannot be read.
         """
@@ -199,7 +198,7 @@ class ClassificationStudy(Study):
         return Scene(index, name, surface_of(thing), Truth(int(thing.label), _noisy(scans, keys), thing, pixels))
 
     def thing(self, index: int) -> tuple[str, ClassObject | ClassMesh]:
-        """The object of a scene and its name."""
+        """The name of a scene and its object."""
         file = self.file(index)
         if file is None:
             assert self.objects.scene is not None
@@ -207,7 +206,7 @@ class ClassificationStudy(Study):
         return f"{self.objects.classes[file.label]} {file.name}", self.of_mesh(file, index)
 
     def of_mesh(self, file: MeshFile, index: int) -> ClassMesh:
-        """What a file of `meshes` gives."""
+        """The object of a file of `meshes`."""
         return ClassMesh(file.read(), file.label)
 
     def facts(self, scene: Scene, truth: Truth, first: int) -> Record:
@@ -215,11 +214,11 @@ class ClassificationStudy(Study):
 
     @property
     def grid(self) -> Grid:
-        """In proportion to the object."""
+        """The grid of samples, in proportion to the object's size."""
         return Grid(self.grid_resolution, 0.7 * self.framing.longest_side)
 
     def shows_enough(self, scene: Scene, seen: PointCloud) -> bool:
-        """Something, of which the classifier may be wrong only, where `first` says so."""
+        """Whether a scan shows the object and, if `first` requires it, the classifier is wrong about it."""
         shows = super().shows_enough(scene, seen)
         if self.first is FirstView.ANY or not shows:
             return shows
@@ -237,7 +236,7 @@ class ClassificationStudy(Study):
         return super().search(method, scene)
 
     def sensor(self, scene: Scene) -> Sensor:
-        """From a candidate the same scan for all methods and views."""
+        """A sensor whose scan from a candidate is the same for all methods and views."""
         anywhere, poses = super().sensor(scene), self.candidates.poses()
 
         def look(pose, key):
@@ -248,36 +247,40 @@ class ClassificationStudy(Study):
         return look
 
     def episode_keys(self, method: str, scene: Scene) -> list[PRNGKeyArray]:
-        """Several of random search."""
+        """The keys of the episodes: several for random search, one for other methods."""
         keys = super().episode_keys(method, scene)
         return [jax.random.fold_in(keys[0], run) for run in range(_RUNS)] if method == "random" else keys
 
     def joined(self, runs: Sequence[Record]) -> Record:
-        """What the classifier says and what was seen in each run, the rest of the first."""
+        """The record of the first run, with the predictions and cue pixels of all runs."""
         return runs[0] | {name: [row for run in runs for row in run[name]] for name in ("log_p", "pixels")}
 
     def follow(self, scene: Scene, truth: Truth, planner: Planner, episode: Iterator[Step]) -> Record:
-        """Of its run what the classifier says after each view, and how many rays of the view hit the cue of the class;
-        and by the view being chosen how well values agreed with what the candidates would truly show, and how rough
-        the samples were."""
-        found: dict[str, list] = {name: [] for name in ("log_p", "pixels", "rank_correlation", "roughness")}
+        """Record the class probabilities after each view, and the rays of the view that hit the cue.
+
+        For the view that is chosen, also record the rank correlation of the candidates' values and true cue pixels, and
+        the roughness of the samples.
+        """
+        lists: dict[str, list] = {name: [] for name in ("log_p", "pixels", "rank_correlation", "roughness")}
         for view, _, inputs, _ in episode:
-            found["log_p"].append(np.asarray(_classify(self.classifier, view.cloud)).tolist())
+            lists["log_p"].append(np.asarray(_classify(self.classifier, view.cloud)).tolist())
             pose = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], view.pose)
-            found["pixels"].append(int(scan_cue(truth.thing, self.camera, pose)[0][0]))
+            lists["pixels"].append(int(scan_cue(truth.thing, self.camera, pose)[0][0]))
             rank, rough = None, None
             if self.cue and view.proposal is not None and len(view.proposal.values) == self.num_candidates:
                 values = np.asarray(view.proposal.values)
                 rank = rank_correlation(values, truth.pixels, np.isfinite(values))
             if inputs is not None:
                 rough = roughness(planner.sampler, inputs)
-            found["rank_correlation"].append(rank)
-            found["roughness"].append(rough)
-        return found | {"log_p": [found["log_p"]], "pixels": [found["pixels"]] if self.cue else []}
+            lists["rank_correlation"].append(rank)
+            lists["roughness"].append(rough)
+        return lists | {"log_p": [lists["log_p"]], "pixels": [lists["pixels"]] if self.cue else []}
 
     def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
-        """The true surface in the sensor's field of view, its cue tinted; beneath it the predicted class with its
-        probability once this view is known."""
+        """Tiles of the true surface in the sensor's field of view, with its cue tinted.
+
+        Below is the class predicted after this view, and its probability.
+        """
         held, scene, names = record["methods"], self.scene(record["scene"]), self.objects.classes
         poses = {method: poses_of(held[method]) for method in methods}
         camera = Camera(height=pixels, width=pixels)
@@ -291,7 +294,7 @@ class ClassificationStudy(Study):
             say(axes, f"{names[guess]} {np.exp(log_p[guess]):.0%}", guess == record["label"])
 
         framing = f"Framed: at least {CUE_PIXELS} {self.cue} pixels. " if self.cue else ""
-        return Tiles(f"{framing}Beneath: prediction so far, of class {names[record['label']]}. View 1 is given.", tile)
+        return Tiles(f"{framing}Beneath: prediction; true: {names[record['label']]}. All methods share view 1.", tile)
 
 
 @eqx.filter_jit
@@ -301,12 +304,12 @@ def _noisy(scans: PointCloud, keys: Key[Array, " candidates"]) -> PointCloud:
 
 @eqx.filter_jit
 def _classify(classifier: Classifier, cloud: PointCloud) -> Float[Array, " classes"]:
-    """log p, compiled."""
+    """Log probabilities of the classes, compiled."""
     return classifier(cloud)
 
 
 def _image(scene: Scene, camera: Camera, pose: Pose, tinted: bool) -> Float[np.ndarray, "h w 3"]:
-    """Lit from the sensor, tinted where its cue is."""
+    """An image of the scene, lit from the sensor, with its cue tinted."""
     seen = scan(scene.surface, camera, jax.tree.map(jnp.asarray, pose))
     on_cue = np.asarray(scene.task.thing.on_cue(seen.points)) & tinted
     points, normals, hit = (np.asarray(array) for array in (seen.points, seen.normals, seen.mask))

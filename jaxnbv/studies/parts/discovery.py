@@ -208,7 +208,7 @@ class PartDiscoveryStudy(Study):
             say(axes, f"{num_found} of {len(parts)} parts", num_found == len(parts))
 
         marks = {name: {"marker": "o", "color": colour} for name, colour in zip(record["parts"], palette, strict=True)}
-        caption = f"Points: predicted parts. Beneath: parts with {TARGET} points. View 1 is the same for all methods."
+        caption = f"Points: predicted parts. Beneath: parts with {TARGET} points. All methods share view 1."
         return Tiles(caption, tile, lambda axes: draw_on(axes, still, points, colours[labels_of_points]), marks=marks)
 
 
