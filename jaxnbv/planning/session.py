@@ -1,4 +1,4 @@
-"""A live session: depth images of a real sensor in, where to take the next one out, in the user's own world."""
+"""Live sessions: add depth images of a real sensor, get the next camera pose, all in world coordinates."""
 
 import math
 import threading
@@ -53,12 +53,12 @@ _NO_IMAGE = "the session has no image yet: add one first, session.add(depth, mat
 class NextView(eqx.Module):
     """Where to take the next image.
 
-    - `matrix`: camera to world, in the convention of the session: what to send the camera to. With `correct_mount` it
-      is by so much off as the mount is, so that the camera arrives where it should.
-    - `value`: what the search maximises, a length or an area in world units; `standard_error`: of the value, as a mean
-      over the posterior samples; None for a search that draws fewer than two.
-    - `proposal`: all that the search looked at, in scene coordinates.
-    - `refusals`: how many poses of more value cannot be reached, by the reason.
+    - `matrix`: the pose to send the camera to: camera to world, in the session's convention. With `correct_mount` it
+      compensates for the error of the mount, so that the camera arrives where it should.
+    - `value`: the value that the search maximises, with lengths or areas in world units.
+    - `standard_error`: standard error of the value, a mean over posterior samples; None with fewer than two samples.
+    - `proposal`: the search's full result, in scene coordinates.
+    - `refusals`: number of poses that were tried and cannot be reached, by reason.
     """
 
     matrix: Float[np.ndarray, "4 4"]
@@ -69,41 +69,41 @@ class NextView(eqx.Module):
 
 
 class Session:
-    """The loop at a real sensor. Matrices are 4 x 4, camera to world, in world units; so is the box. Rules of stopping,
-    costs and values are in world units too. Rows and columns of an image are left out evenly, so that 20,000 rays are
-    left or fewer; whole images are kept.
+    """The planning loop at a real sensor.
 
-    - `camera`: the sensor, its range in world units.
+    Matrices are 4 x 4, camera to world. Matrices, the box, stop rules, costs and values are in world units. Planning
+    uses evenly spaced rows and columns of each image, at most 20,000 rays; the folder stores whole images.
+
+    - `camera`: the sensor, with its range in world units.
     - `box`: two corners of a box about the object, without the table.
-    - `planner`: in scene coordinates, as for a simulation. The scene is the box, scaled; the planner's camera is
-      replaced by the sensor's with the planner's number of pixels, and the default volume, `Box()`, by the box. By
-      default it looks for `NewSurface`, by a `DiscreteSearch` over eight samples with 24 x 32 rays, and keeps 2,000
-      points.
-    - `up`: the world's axis that is upward, "y" or "z" say. It must be given, since no default is right for all.
-    - `obstacles`: what stands around the object, in world units: `Obstacles((table,), margin=0.005)`, say. By default
-      the plane that the object stands on is looked for in the first image, named in a warning, and taken for a table:
-      left out of the cloud, and no place for a camera. If there is none a warning says so, and whether there would be
-      one by another `up`. Other things outside the box that images show hide the object and keep cameras away,
-      coarsely. `Obstacles()` says that there is nothing.
-    - `poses`: (n, 4, 4), where the sensor can be held; by default the candidates of the planner's search, in scene
-      units about the box's centre, and of a whole sphere the upper half: what is below may be the table. In a room that
-      is scanned from inside they must be given: the default ones stand outside the box.
-    - `folder`: where images and proposals are kept before they are acted on; a session that was killed goes on from it.
-    - `convention`: of the matrices' axes, see `Pose.from_matrix`.
-    - `key`: of the posterior samples.
-    - `until`: when it is done, such as `Sure(0.95) | Budget(seconds=600)`; see `jaxnbv.planning.stopping`.
-    - `correct_mount`: whether poses are corrected by what the images tell of their errors, from the third image on; see
-      `alignment`. By default a warning says once that they are off; with None nothing is looked for.
-    - `reachable`: a function of matrices (n, 4, 4), in the session's convention, which says of each whether the arm
-      can go there: a truth; None if it can, else why not ("joint limit"); or a score from 0 to 1 that the value is
-      multiplied by, 1 / (1 + seconds of motion) say. It is asked about the best poses that the search looked at, a few
-      at a time, and about those that do not hold with the camera turned about its optical axis too.
-    - `ignore`: a function of points (n, 3) in the world, which says of each whether it is of the robot itself: it is
-      no part of the object, and hides what is behind it. Asked once about all that an image measured.
-    - `progress`: whether a bar shows what it is at while it plans.
+    - `planner`: a planner in scene coordinates, as for a simulation. The scene is the scaled box. The sensor's camera
+      replaces the planner's, at the planner's resolution, and the box replaces the default volume `Box()`. The default
+      planner uses `NewSurface`, `DiscreteSearch`, eight samples, 24 x 32 rays and 2,000 points.
+    - `up`: the world's upward axis, for example "z". Required, because no default is right for all.
+    - `obstacles`: solids around the object, in world units, for example `Obstacles((table,), margin=0.005)`. By default
+      the session looks in the first image for the plane that the object stands on, and takes it for a table: its points
+      are removed, and cameras keep clear of it. A warning names the plane, or says that there is none and which other
+      `up` would give one. Other things that images show outside the box become coarse obstacles: they hide the object
+      and keep cameras away. `Obstacles()` says that there are none.
+    - `poses`: (n, 4, 4), the poses where the sensor can be held. The default is the candidates of the planner's search,
+      in scene units about the box's centre. Only the upper half of a whole sphere is used, since the table may be
+      below. To scan a room from inside, give the poses: the default ones are outside the box.
+    - `folder`: folder that stores images and proposals before they are used. A killed session continues from it.
+    - `convention`: axes of the matrices, see `Pose.from_matrix`.
+    - `key`: random key of the posterior samples.
+    - `until`: stop rule, for example `Sure(0.95) | Budget(seconds=600)`; see `jaxnbv.planning.stopping`.
+    - `correct_mount`: True corrects the poses by the errors that the images show, from the third image on; see
+      `alignment`. False warns once if the poses seem off. None skips the check.
+    - `reachable`: function of matrices (n, 4, 4), in the session's convention, that returns for each whether the arm
+      can go there: a bool, or None if it can and otherwise the reason ("joint limit"), or a score from 0 to 1 that
+      multiplies the value, for example 1 / (1 + seconds of motion). It gets the best poses of the search in batches. An
+      unreachable pose is tried again with the camera turned about its optical axis.
+    - `ignore`: function of points (n, 3) in the world that returns for each whether it belongs to the robot. Such
+      points are not part of the object, but hide what is behind them. Called once for each image, with all its points.
+    - `progress`: whether a bar shows the stages of planning.
 
-    **Raises:** `ValueError` for a box without inside, no `up`, poses that the search has no use for, or a folder of
-    another session.
+    **Raises:** `ValueError` for an empty box, a missing `up`, poses that the search cannot use, or a folder of another
+    session.
     """
 
     @checked
@@ -146,7 +146,7 @@ class Session:
         self._rehearsing = threading.RLock()
         self._folder: SessionFolder | None = None
         if folder is not None:
-            # What a session is made of, as it was given: `load` makes it again from these.
+            # `load` makes the session again from these arguments.
             config = {"camera": camera, "box": self.box, "planner": planner, "up": up, "poses": matrices}
             config |= {"convention": convention, "key": self.key, "obstacles": obstacles}
             config |= {"correct_mount": correct_mount}
@@ -163,29 +163,29 @@ class Session:
         reachable: Reachable | None = None,
         ignore: Ignore | None = None,
     ) -> "Session":
-        """The session of a folder, which goes on from its last image.
+        """Load a session from its folder, to continue after its last image.
 
-        - `planner`: in place of the stored one, where that holds a function or a network that cannot be made again from
-          its description; it must have the same description.
-        - `until`, `progress`, `reachable`, `ignore`: as of a new session; they are not stored.
+        - `planner`: replaces the stored planner. Needed if that holds a function or network that cannot be restored
+          from its description. Both must have the same description.
+        - `until`, `progress`, `reachable`, `ignore`: as for a new session; they are not stored.
 
-        **Raises:** `ValueError` if the folder holds no session, or its planner cannot be made again.
+        **Raises:** `ValueError` if the folder holds no session, or its planner cannot be restored.
         """
         config = SessionFolder.config_of(path, **({} if planner is None else {"planner": planner}))
         return cls(**config, folder=path, until=until, progress=progress, reachable=reachable, ignore=ignore)
 
     def __repr__(self) -> str:
         images = f"{len(self.views)} image{'s' * (len(self.views) != 1)}"
-        kept = f", {int(self.observations.cloud.count):,} points" if self.views else ""
-        proposed = ", the next view proposed" if self.next_view else ""
-        return f"Session({self.planner.quantity.name}: {images}{kept}{proposed})"
+        points = f", {int(self.observations.cloud.count):,} points" if self.views else ""
+        next_view = ", the next view proposed" if self.next_view else ""
+        return f"Session({self.planner.quantity.name}: {images}{points}{next_view})"
 
     def rehearse(self) -> Rehearsal:
-        """Compile what the first views run, by images of a ball on a table. It takes half a minute to a minute, or a
-        few seconds where programs are kept, see `keep_compiled`. The session stays as it is.
+        """Compile the programs of the first views, by planning with simulated images of a ball on a table.
 
-        Call it in a thread while the camera goes to its first pose; images that come before it ends wait for it:
-        `threading.Thread(target=session.rehearse).start()`.
+        It takes half a minute to a minute, or a few seconds if compiled programs are cached, see `keep_compiled`. The
+        session does not change. Call it in a thread while the camera goes to its first pose:
+        `threading.Thread(target=session.rehearse).start()`. `add` waits until it has ended.
         """
         with self._rehearsing:
             intake = Intake(self.camera, self.box, self.frame, self.convention, self._given_planner)
@@ -194,12 +194,12 @@ class Session:
 
     @property
     def planner(self) -> Planner:
-        """The planner at this sensor and box, in scene coordinates."""
+        """The planner for this sensor and box, in scene coordinates."""
         return self._loop.planner
 
     @property
     def views(self) -> tuple[View, ...]:
-        """The images so far, as views of an episode: in scene coordinates."""
+        """The images so far, as views of an episode in scene coordinates."""
         return self._loop.views
 
     @property
@@ -214,7 +214,7 @@ class Session:
     @property
     @own_settings()
     def cloud(self) -> PointCloud:
-        """The points in the box that are kept, in world units.
+        """The points of the observations that lie in the box, in world units.
 
         **Raises:** `ValueError` before the first image.
         """
@@ -223,16 +223,16 @@ class Session:
 
     @property
     def identity(self) -> dict[str, float]:
-        """How likely the object is each of the parts that the planner knows, most likely first, and "none of these".
+        """Probability of each known part and of "none of these", the largest first.
 
-        **Raises:** `ValueError` before the first image, or if the planner knows no parts.
+        **Raises:** `ValueError` before the first image, or if the planner has no known parts.
         """
         return hypotheses_of(self.observations).names()
 
     @property
     @own_settings()
     def object_pose(self) -> ObjectPose:
-        """Where the likeliest part lies in the world.
+        """Pose of the likeliest part in the world.
 
         **Raises:** `ValueError` as `identity` does.
         """
@@ -241,8 +241,7 @@ class Session:
     @property
     @own_settings()
     def alignment(self) -> Alignment:
-        """How far the images disagree, by the poses as they were given, and which error of the poses explains it. In
-        world units.
+        """How far the images disagree with their poses as added, and the pose error that explains it, in world units.
 
         **Raises:** `ValueError` for fewer than two images.
         """
@@ -250,7 +249,7 @@ class Session:
 
     @property
     def episode(self) -> Episode:
-        """The session so far, as an episode: in scene coordinates, and with the frame in which it is shown.
+        """The session so far as an episode, in scene coordinates, with the frame that maps them to the world.
 
         **Raises:** `ValueError` before the first image.
         """
@@ -260,10 +259,12 @@ class Session:
 
     @own_settings()
     def done(self) -> str | None:
-        """Why no more images are needed, by the rule that was given; None while they are. Asked once an image, and
-        nothing is stored: the samples and the proposal that a rule asks for are those that `next` gives.
+        """The reason to stop, by the stop rule; None to continue.
 
-        **Raises:** `ValueError` as `next` does, if the rule is about what comes next.
+        The rule is evaluated once for each image. If it needs samples or a proposal, `next` uses the same ones. Nothing
+        is stored.
+
+        **Raises:** `ValueError` as `next` does, if the rule needs the next proposal.
         """
         with self._planning():
             return self._loop.enough()
@@ -276,22 +277,21 @@ class Session:
         depth_scale: float = 1.0,
         mask: AnyArray | None = None,
     ) -> None:
-        """Take in an image, which is stored first. A later image that measured nothing is left out with a
-        `UserWarning`.
+        """Add an image, and store it first. A later image that measured nothing is left out with a `UserWarning`.
 
-        - `depth`: see `PointCloud.from_depth`; `depth_scale` times it is in world units: 0.001 for millimetres where
-          the world is in metres.
-        - `matrix`: where the camera truly was, which need not be what was proposed.
-        - `mask`: which pixels show the object, where other things are in the box too, which may hide it; by default
-          all that lie in the box.
+        - `depth`: depth image, see `PointCloud.from_depth`.
+        - `matrix`: the camera's actual pose, which may differ from the proposed one.
+        - `depth_scale`: factor from depth to world units: 0.001 for millimetres in a world in metres.
+        - `mask`: pixels that show the object. Give it if other things in the box may hide the object; by default all
+          points in the box count.
 
         **Raises:** `ValueError` as `PointCloud.from_depth`, `Pose.from_matrix`, `Planner.init` and `observe` do, if the
-        first image shows nothing of the box, an earlier image is the same bit for bit though its pose is another, or
-        another process has added images to the folder. Nothing is changed then.
+        first image shows nothing of the box, if the image is identical to an earlier one with another pose, or if
+        another process has added images to the folder. The session does not change then.
         """
         image, count = Image.of(depth, matrix, depth_scale, mask), len(self.views)
         if self.ignore is not None:
-            # Asked while the robot stands there, and stored.
+            # Called now, while the robot is still at this pose, and the result is stored.
             image = image.with_robot(self.ignore, self.camera, Pose.from_matrix(image.matrix, self.convention))
         with self._rehearsing, self._alone() as folder:
             looks_for_table = count == 0 and self.planner.obstacles is None
@@ -316,11 +316,14 @@ class Session:
 
     @own_settings()
     def next(self, seconds: float = math.inf) -> NextView:
-        """Where to take the next image. It is stored, and the same until an image is added; what was proposed once is
-        not proposed again, for where the sensor could not be held it need not be tried twice. Warns where the best view
-        is worth no more than three standard errors and what is expected in vain.
+        """Where to take the next image.
 
-        - `seconds`: how long `reachable` may take, for a motion planner say: then the best pose so far is taken.
+        The result is stored, and stays the same until an image is added. A pose is proposed only once, since one that
+        the sensor could not take need not be tried again. Warns if the best value is at most three standard errors plus
+        the value that is expected in vain.
+
+        - `seconds`: time limit for `reachable`, for example with a motion planner. After it, the best reachable pose so
+          far is used.
 
         **Raises:** `ValueError` before the first image, as `Planner.propose` does, if no pose can be reached, or if
         another process has added images to the folder.
@@ -332,8 +335,8 @@ class Session:
                 refusals: Mapping[str, int] = {}
                 if self.reachable is not None or self._refused:
                     values_at = self._values_at if self._sees_more_turned else None
-                    asked = self.reachable, self._matrices, self._refused, values_at, seconds
-                    proposal, refusals = best_reachable(proposal, *asked)
+                    arguments = self.reachable, self._matrices, self._refused, values_at, seconds
+                    proposal, refusals = best_reachable(proposal, *arguments)
                     self._loop.settle(proposal)
                 next_view = self._next_of(proposal, refusals)
                 warn_of_little(next_view.value, next_view.standard_error, self._in_vain(proposal))
@@ -344,8 +347,9 @@ class Session:
 
     @own_settings()
     def expected_depth(self) -> Float[np.ndarray, "h w"] | None:
-        """What the sensor is expected to see at the pose that `next` gives, in world units and at the planner's
-        resolution: the mean depth over the posterior samples, NaN where most of them are missed; None for a search
+        """Expected depth image at the pose of `next`, in world units and at the planner's resolution.
+
+        A pixel is the mean depth over the posterior samples, NaN where the ray misses most samples. None for a search
         without samples.
 
         **Raises:** `ValueError` as `next` does.
@@ -356,10 +360,12 @@ class Session:
         return self.frame.length_to_world(np.asarray(self.planner.expected_depth(surfaces, proposal.pose)))
 
     def refuse(self, reason: str = "refused") -> None:
-        """Say that the camera cannot be held where `next` asks for it: the next call gives the best other pose, at once
-        from the same samples, and this one is not proposed again. It is not counted as a place where the camera was.
+        """Refuse the pose of `next`, because the camera cannot be held there.
 
-        **Raises:** `ValueError` if `next` was not asked since the last image.
+        The pose is not proposed again, and does not count as visited. `next` then returns the best other pose, from the
+        same samples, without delay.
+
+        **Raises:** `ValueError` if `next` was not called since the last image.
         """
         if self._next is None:
             raise InputError("there is no proposal to refuse: ask session.next() first")
@@ -372,7 +378,7 @@ class Session:
 
     @property
     def next_view(self) -> NextView | None:
-        """What `next` gave since the last image; None where it was not asked yet."""
+        """The result of `next` since the last image; None if it was not called yet."""
         return self._next
 
     def _add(self, image: Image, accepted: Callable[[], None] = lambda: None) -> None:
@@ -381,7 +387,7 @@ class Session:
             self._loop, self._next = loop, None
 
     def _correct(self) -> None:
-        """Add the images again where they tell that cameras were elsewhere."""
+        """Correct the poses by the images so far, and add the images again if that moves a camera."""
         if not self._intake.mount_error.update():
             return
         images, views = self._intake.images, self.views
@@ -392,32 +398,32 @@ class Session:
             self._add(image)
 
     def _read(self, folder: SessionFolder) -> None:
-        """The images of the folder and the proposals that they followed; the proposal after the last one."""
+        """Restore the images of the folder, the proposal before each, and the proposal after the last one."""
         self._refused, count = folder.refused(), folder.num_images
         for index in range(count + 1):
-            if index and (stored := folder.proposal(index)) is not None:
-                self._loop.resume(stored)
-                self._next = self._next_of(stored)
+            if index and (proposal := folder.proposal(index)) is not None:
+                self._loop.resume(proposal)
+                self._next = self._next_of(proposal)
             if index < count:
                 self._add(folder.image(index))
                 if self.correct_mount:
                     self._correct()
 
     def _next_of(self, proposal: Proposal, refusals: Mapping[str, int] = MappingProxyType({})) -> NextView:
-        """A proposal in the user's world."""
+        """A proposal in world coordinates."""
         error = None if proposal.standard_error is None else self._loop.in_world(proposal.standard_error)
         error = error if error is not None and math.isfinite(error) else None
         (matrix,), value = self._matrices(proposal.pose[None]), self._loop.in_world(proposal.value)
         return NextView(matrix, value, error, proposal, dict(refusals))
 
     def _matrices(self, poses: Pose) -> Float[np.ndarray, "n 4 4"]:
-        """What to send the camera to for it to stand at poses of the scene."""
+        """World matrices to send the camera to, so that it arrives at poses (n,) of the scene."""
         sent = self._intake.mount_error.sent(self.frame.to_world(poses))
         return np.asarray(sent.to_matrix(self.convention), np.float64)
 
     @property
     def _sees_more_turned(self) -> bool:
-        """Whether the planner's image shows something else if the camera is turned about its optical axis."""
+        """Whether turning the camera about its optical axis changes a pose's value."""
         camera = self.planner.camera
         return self.planner.search.uses_samples and camera.height != camera.width
 
@@ -428,7 +434,7 @@ class Session:
         return 0.0 if proposal.in_vain is None else self._loop.in_world(proposal.in_vain)
 
     def _show(self, stage: str) -> None:
-        """The stage on the bar, which begins with the first one."""
+        """Show the stage on the bar, which is created at the first stage."""
         if self._bar is None:
             self._bar = progress_bar(total=2, wanted=self.progress)
         self._bar.set_description(f"view {len(self.views) + 1}, {stage}")
@@ -436,7 +442,7 @@ class Session:
 
     @contextmanager
     def _planning(self) -> Iterator[None]:
-        """While a bar shows the stages of planning, if there are any."""
+        """Context of planning: closes the progress bar at its end."""
         try:
             yield
         finally:
@@ -446,9 +452,9 @@ class Session:
 
     @contextmanager
     def _alone(self) -> Iterator[SessionFolder | None]:
-        """The folder, if there is one, while nobody else writes there.
+        """Context with exclusive write access to the folder; yields None without a folder.
 
-        **Raises:** `ValueError` if another process does, or has added images.
+        **Raises:** `ValueError` if another process writes there, or has added images.
         """
         if self._folder is None:
             yield None
