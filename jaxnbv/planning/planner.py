@@ -1,4 +1,4 @@
-"""The planner: ask for the next view, tell what it showed. A simulated episode and a real scanner call the same two."""
+"""The planner: propose the next view, and observe its scan. Simulations and real sensors call the same methods."""
 
 import dataclasses
 from collections.abc import Iterable, Iterator
@@ -49,21 +49,21 @@ else:
 class Planner(eqx.Module):
     """Bayesian next-best-view selection (the paper's Algorithm 1) as ask/tell over immutable observations.
 
-    - `acquisition`: what a view is worth. A plain function of a cloud is taken as a utility to improve.
-    - `search`: how the pose that is expected to be worth most is found.
+    - `acquisition`: the expected worth of a view. A plain function of a cloud becomes a utility to improve.
+    - `search`: method that finds the pose of the highest expected value.
     - `camera`: the sensor whose scans are imagined.
-    - `sampler`: the surfaces that are possible given the observations.
-    - `cost`: of going from the last view to the next; None where it does not count.
-    - `obstacles`: what stands around the object, hides it, and keeps cameras out; None for nothing.
-    - `capacity`: points of D that are kept, by farthest point sampling beyond it.
-    - `max_views`: views for which observations have room.
+    - `sampler`: draws the surfaces that fit the observations.
+    - `cost`: cost of going from the last view to the next; None to ignore it.
+    - `obstacles`: solids around the object, which hide it and which cameras keep clear of; None if there are none.
+    - `capacity`: largest number of points in D. Larger clouds are thinned by farthest point sampling.
+    - `max_views`: largest number of views that observations can hold.
 
-    All methods are pure and run under `jit`. A planner compiles at its first two views, and nothing after them.
-    Observations of a cloud from no pose are `planner.init(None, cloud)`.
+    All methods are pure and run under `jit`. A planner compiles at its first two views only. For a cloud without a
+    pose, use `planner.init(None, cloud)`.
 
-    **Raises:** `ValueError` for numbers below one, and if the search cannot work with the acquisition or the camera: a
-    gradient search with an acquisition that JAX cannot differentiate, say; for a utility, classifier or segmenter that
-    JAX cannot trace, or that gives an array of another shape.
+    **Raises:** `ValueError` for numbers below one, if the search cannot work with the acquisition or the camera (for
+    example a gradient search with an acquisition that JAX cannot differentiate), or for a utility, classifier or
+    segmenter that JAX cannot trace or that returns an array of the wrong shape.
     """
 
     acquisition: AnyAcquisition = eqx.field(converter=as_acquisition)
@@ -82,12 +82,12 @@ class Planner(eqx.Module):
             value = getattr(self, name)
             require(value >= 1, f"{name} is {value}; it must be at least 1")
         self.search.check(self.acquisition, self.camera, self.capacity)
-        # Before anything is computed for a function that JAX cannot trace.
         require(
             self.sampler.model.carries_hypotheses or not self.acquisition.needs_hypotheses,
-            f"{type(self.acquisition).__name__} is about known parts, and the sampler knows none: give it a bank at "
+            f"{type(self.acquisition).__name__} needs known parts, but the sampler has none: give it a bank at "
             "true size, sampler.with_bank(ShapeBank.from_meshes(folder, scale='m'), FreeRotation())",
         )
+        # Find functions that JAX cannot trace before anything is computed.
         if self.search.uses_samples and self.acquisition.cloud_only:
             check_traceable(self.acquisition, self.capacity, self.camera)
         require(
@@ -98,11 +98,12 @@ class Planner(eqx.Module):
 
     @classmethod
     def for_parts(cls, bank: ShapeBank, poses: ShapePoses = FreeRotation(), acquisition: Any = Identify()) -> "Planner":  # noqa: B008
-        """A planner that asks which part of a bank the object is and how it lies.
+        """A planner that finds out which part of a bank the object is, and its pose.
 
-        - `bank`: at true size, `ShapeBank.from_meshes(folder, scale="m")`. In a session it is in world units, in a
-          simulation in scene units.
-        - `poses`: how parts can lie, in any rotation by default; `acquisition`: what views are chosen by.
+        - `bank`: parts at true size, `ShapeBank.from_meshes(folder, scale="m")`, in world units in a session and in
+          scene units in a simulation.
+        - `poses`: possible poses of the parts, by default in any rotation.
+        - `acquisition`: the expected worth of a view.
 
         **Raises:** `ValueError` for a bank without parts, or not at true size.
         """
@@ -111,29 +112,31 @@ class Planner(eqx.Module):
 
     @property
     def quantity(self) -> Quantity:
-        """What the values of its proposals are."""
+        """Name, unit and power of length of the values of its proposals."""
         value = self.search.quantity(self.acquisition)
         return value if self.cost is None else self.cost.quantity(value)
 
     @own_settings()
     def init(self, pose: Pose | None, scan: PointCloud, camera: Camera | None = None) -> Observations:
-        """The observations after a first scan, in scene coordinates, taken from `pose` (None for a cloud from no pose).
+        """Start observations with a first scan, in scene coordinates.
 
-        `camera`: the one that took the scan, by default the planner's.
+        The acquisition is evaluated once, so that a classifier or utility with invalid results fails at once.
 
-        The acquisition is asked once about the cloud, so that a classifier or utility which gives something impossible
-        says so at once.
+        - `pose`: pose of the scan; None for a cloud without a pose.
+        - `camera`: the camera that took the scan, by default the planner's.
 
-        **Raises:** `ValueError` if the cloud is empty, if a point is not finite or outside the scene's grid, or more
-        than stray ones outside the carving's volume, a normal not of unit length (to 1 %), or the scan an image of
-        another camera; and as the acquisition's `check` does.
+        **Raises:** `ValueError` if the cloud is empty, a point is not finite or outside the scene's grid, more than a
+        few stray points are outside the carving's volume, a normal is not of unit length (to 1 %), or the scan is an
+        image of another camera. Also raises as the acquisition's `check` does.
         """
         camera = camera or self.camera
         self._check(pose, scan, camera, first=True)
         grid = self.sampler.grid
-        within = None if self.obstacles is None else self.obstacles.within(grid)
-        kept = None if within is None and self.sampler.carving is None else grid
-        observations = Observations.start(limit_capacity(scan, self.capacity), self.max_views, kept, within, camera)
+        solid_nodes = None if self.obstacles is None else self.obstacles.within(grid)
+        used_grid = None if solid_nodes is None and self.sampler.carving is None else grid
+        observations = Observations.start(
+            limit_capacity(scan, self.capacity), self.max_views, used_grid, solid_nodes, camera
+        )
         if self.search.uses_samples and not is_traced(observations):
             if not self.acquisition.cloud_only:
                 check_traceable(self.acquisition, observations, self.camera)
@@ -147,13 +150,12 @@ class Planner(eqx.Module):
     def observe(
         self, observations: Observations, pose: Pose, scan: PointCloud, camera: Camera | None = None
     ) -> Observations:
-        """Tell: the observations after a scan (scene coordinates) from a pose. A scan that hit nothing adds no points.
+        """Add a scan from a pose to the observations (scene coordinates). A scan that hit nothing adds no points.
 
-        `camera`: the one that took the scan, by default the planner's. Scans of one capacity and camera share one
-        compilation.
+        - `camera`: the camera that took the scan, by default the planner's. Scans of one capacity and camera share one
+          compilation.
 
-        **Raises:** `ValueError` for a scan as `init` does, for observations of another grid, or without room for
-        another view.
+        **Raises:** `ValueError` for a scan as `init` does, for observations of another grid, or if they are full.
         """
         camera = camera or self.camera
         check_type(observations, Observations, "observations")
@@ -167,14 +169,16 @@ class Planner(eqx.Module):
                 f"Planner(max_views=...) greater than {room}",
             )
         after = self._with_view(self.sampler.adapt(observations), pose, scan, camera).add_points(scan)
-        # Views that are chosen by known parts are chosen by no samples on the grid.
+        # An acquisition about known parts uses no samples on the grid.
         if self.search.uses_samples and not self.acquisition.needs_hypotheses and not is_traced(after):
             self.sampler.grid.check(after.cloud)
         return self.sampler.model.observed(after)
 
     def replay(self, views: Iterable[tuple[Pose, PointCloud]], camera: Camera | None = None) -> Iterator[Observations]:
-        """The observations after each of some views, poses and scans: `init` with the first, then `observe`, and
-        raises as these do. `camera` took the scans."""
+        """Yield the observations after each view: `init` with the first, then `observe`. Raises as these do.
+
+        - `views`: poses and scans; `camera`: the camera that took the scans.
+        """
         observations = None
         for pose, scan in views:
             after = (pose, scan, camera)
@@ -183,9 +187,9 @@ class Planner(eqx.Module):
 
     @own_settings()
     def propose(self, observations: Observations, key: PRNGKeyArray, pending: PoseList | None = None) -> Proposal:
-        """Ask: the pose to take next, and what the search looked at.
+        """Propose the next pose.
 
-        - `pending`: poses that were proposed before and not taken, which are not proposed again.
+        - `pending`: poses that were proposed before but not taken. They are not proposed again.
 
         **Raises:** `ValueError` if every candidate has been visited, and for observations of another grid.
         """
@@ -195,15 +199,17 @@ class Planner(eqx.Module):
 
     @own_settings()
     def step_inputs(self, observations: Observations, key: PRNGKeyArray) -> StepInputs:
-        """The first half of `propose`: the posterior and its samples; the observations alone for a search that asks for
-        no samples."""
+        """First half of `propose`: the posterior and its samples, or only the observations if the search needs none."""
         check_type(observations, Observations, "observations")
         return self.sampled(observations, key) if self.search.uses_samples else StepInputs(observations)
 
     @own_settings()
     def sampled(self, observations: Observations, key: PRNGKeyArray) -> StepInputs:
-        """The posterior and its samples, less what the sensor cannot measure if the acquisition asks for that alone;
-        the likeliest part in place of the samples for an acquisition about hypotheses."""
+        """Condition the model on the observations, and draw the samples of a step.
+
+        With `measurable_only`, sampled surface that a view should have measured and did not is left out. For an
+        acquisition about hypotheses, the only sample is the likeliest part.
+        """
         if self.acquisition.needs_hypotheses:
             return StepInputs(observations, None, hypotheses_of(observations).surfaces(self.sampler.grid, 1))
         inputs = self.sampler.step_inputs(observations, key)
@@ -214,13 +220,13 @@ class Planner(eqx.Module):
 
     @own_settings()
     def choose(self, inputs: StepInputs, key: PRNGKeyArray, pending: PoseList | None = None) -> Proposal:
-        """The second half of `propose`: the search, given the step's samples (any that a model of your own drew).
+        """Second half of `propose`: search, given the step's inputs. Their samples may come from a model of your own.
 
         **Raises:** `ValueError` if every candidate has been visited, or a score is not finite.
         """
         check_key(key)
         check_type(inputs, StepInputs, "the inputs of a step")
-        # NaN is a value here: the standard error of a single sample. That of an acquisition is reported below.
+        # NaN is valid here: it is the standard error of one sample. NaN from an acquisition is reported below.
         with functions_of_users(), jax.debug_nans(False):
             problem = Problem(inputs, self.camera, self.acquisition, self.obstacles, self.cost, pending).prepared()
             proposal = _propose(self.search, problem, key)
@@ -230,8 +236,7 @@ class Planner(eqx.Module):
     @jax.debug_nans(False)
     @eqx.filter_jit
     def values_at(self, inputs: StepInputs, poses: Pose) -> Float[Array, " poses"]:
-        """The values of a batch of poses, in scene coordinates, by the step's samples and with the cost of going there:
-        what the search maximises.
+        """Values that the search maximises, at poses (n,) in scene coordinates. Include the cost of going there.
 
         **Raises:** `ValueError` for inputs without samples.
         """
@@ -241,25 +246,25 @@ class Planner(eqx.Module):
     @jax.debug_nans(False)
     @eqx.filter_jit
     def expected_depth(self, surfaces: GridSurface, pose: Pose) -> Float[Array, "h w"]:
-        """The depth image that is expected from a pose: `mean_depth` over the samples, by the planner's camera."""
+        """Expected depth image from a pose in scene units: `mean_depth` over the samples, with the planner's camera."""
         scans = scan_samples(surfaces, self.camera, pose[None], barrier_of(self.obstacles, self.camera, pose[None]))
         depth = mean_depth(jax.tree.map(lambda rows: rows[:, 0], scans), pose)
         return depth.reshape(self.camera.height, self.camera.width)
 
     def _with_view(self, observations: Observations, pose: Pose, scan: PointCloud, camera: Camera) -> Observations:
-        # What clutter hid, the scan itself says.
+        # Without clutter: the scan itself shows where clutter blocked a ray.
         obstacles = None if self.obstacles is None else self.obstacles.with_clutter(None)
         return observations.add_view(pose, scan, camera, self.sampler.carving, obstacles)
 
     def _check(self, pose: Pose | None, scan: PointCloud, camera: Camera, first: bool) -> None:
-        """**Raises:** `ValueError` for a scan that `init` refuses, or `observe` if it is not the first."""
+        """**Raises:** `ValueError` for a scan that is not valid for `init` (`first`) or `observe`."""
         for value, hint, name in ((scan, PointCloud, "scan"), (pose, Pose | None, "pose"), (camera, Camera, "camera")):
             check_type(value, hint, f"the {name}")
         check_single(scan, "the scan")
         require(pose is None or pose.position.ndim == 1, "the pose is a batch of poses: give one, poses[0] say")
         if is_traced(scan, pose):
             return
-        # Within jit too, values of what is not traced are known.
+        # Under jit, arrays that are not traced still have values.
         with jax.ensure_compile_time_eval():
             problem = None if pose is None else far_from_scene(pose)
             require(problem is None, f"the pose is not of the scene: {problem}")
@@ -281,21 +286,21 @@ def _propose(search: Search, problem: Problem, key: PRNGKeyArray) -> Proposal:
 
 
 def _checked_proposal(planner: Planner, problem: Problem, proposal: Proposal) -> Proposal:
-    """A proposal as it is.
+    """The proposal, unchanged.
 
-    **Raises:** `ValueError` if its value is not finite, naming what of the user's gave that, or if every candidate has
-    been visited.
+    **Raises:** `ValueError` if its value is not finite, with the name of the cause, or if every candidate has been
+    visited.
     """
     if is_traced(proposal):
         return proposal
     value, search = proposal.value, planner.search
-    known = not bool(jnp.isnan(value))
-    if not known or (search.uses_samples and bool(value == jnp.inf)):
+    is_number = not bool(jnp.isnan(value))
+    if not is_number or (search.uses_samples and bool(value == jnp.inf)):
         _check_parts(planner, problem, proposal)
         kind = f"acquisition {type(problem.acquisition).__name__}" if search.uses_samples else type(search).__name__
         raise InputError(
-            f"the value of {kind} is {'infinite' if known else 'not a number (NaN)'} for a candidate: it must be "
-            "finite for every scan, one that sees nothing included, and for a gradient search so must its derivatives"
+            f"the value of {kind} is {'infinite' if is_number else 'not a number (NaN)'} for a candidate: it must be "
+            "finite for every scan, also for one that sees nothing; a gradient search needs finite derivatives too"
         )
     require(
         bool(value > -jnp.inf),
@@ -306,8 +311,10 @@ def _checked_proposal(planner: Planner, problem: Problem, proposal: Proposal) ->
 
 
 def _check_parts(planner: Planner, problem: Problem, proposal: Proposal) -> None:
-    """**Raises:** `ValueError` that names the cost, or the part of the acquisition, that gives no finite number at the
-    first candidate whose value is none."""
+    """**Raises:** `ValueError` that names the cost or the part of the acquisition that is not finite.
+
+    Checks the first candidate whose value is not finite.
+    """
     values = proposal.values
     wrong = jnp.isnan(values) | (values == jnp.inf)
     pose = proposal.candidates[int(jnp.argmax(wrong))] if bool(wrong.any()) else proposal.pose
