@@ -1,4 +1,4 @@
-"""Studies that compare methods, their procedural scenes and their engine. The library imports none of it."""
+"""Studies that compare methods, with scenes and an engine. The library itself imports none of them."""
 
 import lazy_loader
 

@@ -69,7 +69,9 @@ def _below(share: float) -> Any:
 
 
 class IdentificationStudy(Study):
-    """Measures how well views tell which known part an object is, and its pose. Settings as in `Study`, and
+    """Measures how well views tell which known part an object is, and its pose.
+
+    Settings as in `Study`, and
 
     - `setup`: where the part lies and how much of it a view shows.
     - `meshes`: files of the parts, at true size. Without any, the parts come in sets of eight that look alike.
@@ -169,7 +171,10 @@ class IdentificationStudy(Study):
         return Scene(index, parts.bank.names[part], placed.mesh, placed)
 
     def sensor(self, scene: Scene) -> Sensor:
-        """A depth camera with noisy points, normals and ranges. Obstacles hide the part; their points are removed."""
+        """A depth camera with noisy points, normals and ranges.
+
+        Obstacles hide the part, and points on obstacles are removed.
+        """
         obstacles = scene.task.obstacles
 
         def observe(pose: Pose, key: PRNGKeyArray) -> PointCloud:
@@ -210,7 +215,7 @@ class IdentificationStudy(Study):
         return record["set"]
 
     def follow(self, scene: Scene, truth: _Truth, planner: Planner, episode: Iterator[Step]) -> Record:
-        """Record after each view the likeliest name, the probability of the true one, and the error of the pose."""
+        """Record after each view the likeliest name, the true name's probability, and the error of the pose."""
         views = [self._told(truth, step.observations.hypotheses) for step in episode]
         return {name: [view[name] for view in views] for name in views[0]}
 

@@ -1,4 +1,4 @@
-"""Study of reconstruction: how near is the surface reconstructed from a method's views to the true one?"""
+"""Study of reconstruction: how near is the surface made from a method's views to the true one?"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar, cast
@@ -112,9 +112,9 @@ class ReconstructionStudy(Study):
         planner: Planner,
         episode: Iterator[Step],
     ) -> Record:
-        """Record the covered share of the true surface after each view, and the distances of two reconstructions.
+        """Record the share of the surface covered after each view, and errors of two reconstructions.
 
-        Both are made from the last cloud. The Poisson reconstruction is None without `pymeshlab`.
+        Both reconstructions are made from the last cloud. The Poisson reconstruction is None without `pymeshlab`.
         """
         views = [view for view, *_ in episode]
         mesher = self.mesher(scene)

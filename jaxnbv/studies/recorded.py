@@ -244,7 +244,7 @@ class RecordedStudy(Study):
         return {"frames": frames, "covered": seen.mean(axis=1).tolist()}
 
     def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
-        """Tiles that show the voxels of the box along its shortest side, in colour once a chosen frame shows them.
+        """Tiles of the box's voxels along its shortest side, in colour once a chosen frame shows them.
 
         A line is the path of the recorded camera, and numbers are the chosen frames in their order.
         """
@@ -283,7 +283,7 @@ def _points(frames: RecordedFrames, index: int, stride: int) -> Float[np.ndarray
 
 
 def bounds_of(frames: RecordedFrames) -> list[float]:
-    """Two corners of a box around the 1st to the 99th percentile of all points along each axis, with a margin."""
+    """Two corners of a box from the 1st to the 99th percentile of all points per axis, with a margin."""
     points = np.concatenate([_points(frames, index, _COARSE) for index in range(len(frames))])
     require(len(points) > 0, f"no frame of {frames.folder} has a valid depth")
     low, high = np.percentile(points, [1, 99], axis=0)

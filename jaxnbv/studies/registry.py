@@ -1,6 +1,7 @@
-"""Registry of the studies of `jaxnbv study`: entry points of the group `jaxnbv.studies` in any installed package.
+"""Registry of the studies of `jaxnbv study`.
 
-Each entry point names an `Entry` in a module that does not import JAX, so that the command's help shows quickly.
+Studies are entry points of the group `jaxnbv.studies` in any installed package. Each entry point names an `Entry` in a
+module that does not import JAX, so that the command's help shows quickly.
 """
 
 import functools

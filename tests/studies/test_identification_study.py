@@ -60,7 +60,7 @@ def test_there_is_a_study_for_each_setup_and_none_without_known_parts(folder):
 
 def test_one_part_alone_is_refused(folder):
     study = small_study(folder / "spare")
-    with pytest.raises(InputError, match="there is one part, block: give a folder of two"):
+    with pytest.raises(InputError, match="there is only one part, block: give a folder of at least two parts"):
         study.scene(0)
 
 

@@ -1,4 +1,4 @@
-"""Measures of classification studies: hits and visible cues by view, and the quality of samples and values.
+"""Measures of classification studies: hits, visible cues, and the quality of samples and values.
 
 A view, counted from 1, is a first hit if the right class was predicted up to it, and a stable hit if the right class is
 predicted from it to the end.
@@ -52,11 +52,11 @@ def _value(record: Record, method: str) -> dict[int, float]:
 
 
 def roughness(sampler: SurfaceSampler, inputs: StepInputs) -> float:
-    """Mean number of grid cells crossed by a sample's surface, divided by that of the posterior mean's surface.
+    """Grid cells that a sample's surface crosses on average, relative to the posterior mean's surface.
 
-    The mean is carved like the samples. For a posterior without closed forms it is the mean of the samples. The value
-    is about 1 for samples as smooth as the mean, and rises if the spacing of the data exceeds the kernel's width. Near
-    5, an acquisition says little about the value of a view.
+    The posterior mean is carved like the samples. For a posterior without closed forms it is the mean of the samples.
+    The value is about 1 for samples as smooth as the mean, and rises if the spacing of the data exceeds the kernel's
+    width. Near 5, an acquisition says little about the value of a view.
     """
     posterior, surfaces = inputs.posterior, inputs.surfaces
     assert posterior is not None

@@ -37,7 +37,10 @@ _ANGLES = (0, 110, 140)
 
 
 class PyramidStudy(ClassificationStudy):
-    """The class of a pyramid, from a first view that hides its pattern. Settings as in `ClassificationStudy`."""
+    """The class of a pyramid, from a first view that hides its pattern.
+
+    Settings as in `ClassificationStudy`.
+    """
 
     title: ClassVar[str] = "The class of a pyramid"
     objects: ClassVar[ClassSet] = ClassSet(PATTERNS, pyramid_scene)
@@ -72,7 +75,9 @@ class PyramidStudy(ClassificationStudy):
 
 
 class TruckStudy(ClassificationStudy):
-    """The class of a truck's cargo, from a random first view. Settings as in `ClassificationStudy`, and
+    """The class of a truck's cargo, from a random first view.
+
+    Settings as in `ClassificationStudy`, and
 
     - `trucks`: mesh files of trucks, which carry the objects of `meshes`.
     """

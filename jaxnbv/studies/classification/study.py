@@ -80,7 +80,9 @@ class OracleView(CandidateSearch):
 
 
 class ClassificationStudy(Study):
-    """Base class: measures how many views a method needs to tell the class of an object. Settings as in `Study`, and
+    """Base class: measures how many views a method needs to tell the class of an object.
+
+    Settings as in `Study`, and
 
     - `classifier`: classifier of clouds in scene coordinates, applied after each view.
     - `imagining`: classifier of D u scan for imagined scans; default: `classifier`. One that gets fewer points saves

@@ -65,7 +65,7 @@ class Cluster(Executor):
             raise
 
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future:
-        """Run a call on a worker, and return its future. A function called many times in a row is sent once."""
+        """Run a call on a worker, and return its future. Repeated calls of a function send it once."""
         require(self._client.status == "running", self._lost())
         if function is not self._pickled[0]:
             # Pickled here, so that a worker can compare versions before it imports the modules of the function.

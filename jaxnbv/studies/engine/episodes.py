@@ -46,9 +46,10 @@ def episode_record(
     views: int,
     follow: Callable[[Iterator[Step]], Record],
 ) -> Record:
-    """Run an episode and return the poses of its views, the value and seconds of each step, and the record of `follow`.
+    """Run an episode and return its record.
 
-    The episode ends after `views`, or where `follow` stops.
+    It holds the poses of the views, the value and seconds of each step, and the record of `follow`. The episode ends
+    after `views`, or where `follow` stops.
     """
     poses: list[dict[str, list]] = []
     searches: list[dict[str, float]] = []

@@ -21,7 +21,7 @@ def study_sampler(
     quick: bool = False,
     solid: bool = False,
 ) -> SurfaceSampler:
-    """The sampler of a model: a preset of `SurfaceSampler`, or for "known" the screened one with known shapes.
+    """The sampler of a model: a preset, or for "known" the screened preset with known shapes.
 
     - `bank`: name of a bank that ships; "" for none.
     - `files`: meshes to use as known shapes instead, upright, with free proportions.

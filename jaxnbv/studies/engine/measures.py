@@ -1,4 +1,4 @@
-"""Measures and claims of a study: numbers computed from a record, by method and by view or another key."""
+"""Measures of a study, computed from a record by method and by view or another key, and its claims."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple

@@ -1,4 +1,4 @@
-"""The page of all studies in a folder: claims, tables, chart, pictures, settings, versions and times of each."""
+"""Page of all studies in a folder, with claims, tables, chart, pictures, settings and times of each."""
 
 import json
 import os
@@ -40,7 +40,7 @@ class Chapter(NamedTuple):
 
 
 def write_page(folder: str | Path, out: str | Path) -> Path:
-    """Write one HTML page of all studies in a folder, and return its path. It opens offline, with all images.
+    """Write one HTML page of all studies in a folder, which opens offline, and return its path.
 
     **Raises:** `ValueError` for a name that does not end in .html, and as `chapters` does.
     """

@@ -36,7 +36,10 @@ class Processes(Executor):
         self._lock, self._is_closed = threading.Lock(), False
 
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future:
-        """Run a call in one of the processes, and return its future. Function and arguments go through cloudpickle."""
+        """Run a call in one of the processes, and return its future.
+
+        Cloudpickle pickles the function and its arguments.
+        """
         return self._threads.submit(self._call, function, args, kwargs)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:

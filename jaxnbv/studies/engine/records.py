@@ -1,4 +1,4 @@
-"""Results of a study on disk: one JSON record per scene, so that an interrupted study continues where it stopped."""
+"""Results of a study on disk: one JSON record per scene, so that an interrupted study can continue."""
 
 import hashlib
 import json
@@ -100,7 +100,7 @@ class RecordFolder(ResultFolder):
                 raise InputError(f"{file} and {own} differ in {'; '.join(changes[:3])}: delete the one that is wrong")
 
     def failures(self, scenes: Sequence[int]) -> dict[int, str]:
-        """The errors of failed scenes, one line each. The files scene_*.failed in the folder hold their tracebacks."""
+        """The errors of failed scenes, one line each. The files scene_*.failed hold their tracebacks."""
         files = {index: self._file(index).with_suffix(_FAILED) for index in scenes}
         return {index: file.read_text().partition("\n")[0] for index, file in files.items() if os.path.isfile(file)}
 

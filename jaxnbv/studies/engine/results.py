@@ -1,4 +1,4 @@
-"""Statistics over the records of a study: a table of results, tables of text, and verdicts on the paper's claims."""
+"""Statistics over the records of a study, tables of them, and verdicts on the paper's claims."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -18,7 +18,7 @@ _WHERE = ("ahead of", "level with", "behind")
 
 
 def results(records: Sequence[Record], study: type[Study]) -> pd.DataFrame:
-    """Statistics of all measures: a row for each group of scenes, measure, key of the measure (`at`) and method.
+    """Statistics of all measures: a row per group of scenes, measure, key (`at`) and method.
 
     A row holds the mean over the scenes, its standard error and its interval (`low`, `high`). It also holds the `lead`
     of the study's reference: the mean difference of its value and the method's on the same scenes, with its interval.
@@ -77,7 +77,7 @@ def groups_of(found: pd.DataFrame) -> dict[str, int]:
 
 
 def tables(found: pd.DataFrame, study: type[Study], group: str = _ALL) -> list[tuple[str, pd.DataFrame]]:
-    """Titles and text cells of two tables per measure: the means of the methods, and the leads of the reference."""
+    """Titles and text cells of two tables per measure: means of the methods, leads of the reference."""
     texts = []
     for measure in study.measures:
         here = found[(found["group"] == group) & (found["quantity"] == measure.name)]

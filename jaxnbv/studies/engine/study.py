@@ -44,9 +44,9 @@ class Scene(eqx.Module):
 
 
 class Study(eqx.Module):
-    """Base class: compares methods of choosing views over many scenes. A new study defines the abstract members.
+    """Base class: compares methods of choosing views over many scenes.
 
-    Settings:
+    A new study defines the abstract members. Settings:
 
     - `views`: number of views, the first included.
     - `num_candidates`: candidates on the sphere of `radius` (scene units). Gradient searches start with half as many.
@@ -155,7 +155,7 @@ class Study(eqx.Module):
 
     @abstractmethod
     def acquisition(self, method: str, scene: Scene) -> Acquisition:
-        """The acquisition of a method. It has the same structure in all scenes, so that they share compilations."""
+        """The acquisition of a method, with one structure in all scenes, so that they share compilations."""
 
     def search(self, method: str, scene: Scene) -> Search:
         """The search of a method, see `search_of`."""
@@ -215,7 +215,7 @@ class Study(eqx.Module):
         return self.camera
 
     def sampler_of(self, scene: Scene) -> SurfaceSampler:
-        """The sampler for a scene. If its bank is made from `meshes`, it leaves out the mesh of the scene."""
+        """The sampler for a scene. A bank made from `meshes` leaves out the mesh of the scene."""
         return knowing_others(self.sampler, self.meshes, scene.index) if self.meshes else self.sampler
 
     def planner_of(self, acquisition: Acquisition, search: Search, scene: Scene) -> Planner:

@@ -46,7 +46,7 @@ def say(axes: Axes, text: str, right: bool = False) -> None:
 
 
 def across(record: Record) -> Float[np.ndarray, "3"]:
-    """A direction opposite the first view, which all methods share, and above, to show what the view does not."""
+    """A direction opposite the shared first view and above, to show what this view does not."""
     run = next(iter(record["methods"].values()))
     position = np.asarray(run["views"][0]["position"])
     away = -position[[0, 2]]

@@ -44,7 +44,7 @@ _DENSE = 8000
 
 
 class NearestPart(Segmenter):
-    """An oracle segmenter that knows the true parts, so that a study measures planning without a network's errors.
+    """An oracle segmenter that knows the true parts. It measures planning without a network's errors.
 
         p_ic proportional to exp(-d_ic^2 / 2 w^2),   w = 0.02 scene units,
 
@@ -93,7 +93,7 @@ PartSegmenter: TypeAlias = CloudSegmenter | NearestPart
 
 
 def discovery_time(counts: Int[np.ndarray, "views parts"], target: int) -> int | None:
-    """T_discovery: the first view, from 1, after which all parts have at least `target` points; None if never."""
+    """T_discovery: the first view, from 1, after which all parts have `target` points; None if never."""
     is_complete: Bool[np.ndarray, " views"] = np.all(np.asarray(counts) >= target, axis=1)
     return int(np.argmax(is_complete)) + 1 if is_complete.any() else None
 

@@ -1,4 +1,4 @@
-"""Studies of semantic parts: how many views until all parts of an object are found? The paper's Table 1.
+"""Studies of the views until all semantic parts of an object are found: the paper's Table 1.
 
 Objects are procedural and segmented by a network, or mesh files whose nodes are parts, segmented by an oracle.
 """
@@ -37,7 +37,7 @@ class PartMesh(eqx.Module):
 
 
 class MeshPartStudy(PartDiscoveryStudy):
-    """Studies the parts of real objects, segmented by the oracle `NearestPart`, without a network's errors.
+    """Studies the parts of real objects with the oracle `NearestPart`, without a network's errors.
 
     Settings as in `PartDiscoveryStudy`, and
 
@@ -106,7 +106,9 @@ class MeshPartStudy(PartDiscoveryStudy):
 
 
 class PartStudy(PartDiscoveryStudy):
-    """Studies the parts of procedural objects with the shipped network. Settings as in `PartDiscoveryStudy`, and
+    """Studies the parts of procedural objects with the shipped network.
+
+    Settings as in `PartDiscoveryStudy`, and
 
     - `segmenter`: segmenter of clouds in scene coordinates. Each scene replaces its category by that of the object.
     - `split`: split of the scenes. Tune settings on the validation split.

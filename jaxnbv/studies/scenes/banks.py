@@ -1,4 +1,4 @@
-"""Objects of the training split, of which the banks of procedural shapes that ship are made."""
+"""Recipes for the shipped banks of procedural shapes, made from the training split."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -14,11 +14,11 @@ from jaxnbv.surfaces import ShapeBank
 
 
 class BankRecipe(NamedTuple):
-    """Of what a bank is made.
+    """The contents of a bank.
 
-    - `number`: of objects.
+    - `number`: number of objects.
     - `kinds`: their kinds, which take turns.
-    - `shape`: the object of a number, not turned.
+    - `shape`: function from an index to its object, not turned.
     """
 
     number: int
@@ -26,7 +26,7 @@ class BankRecipe(NamedTuple):
     shape: Callable[[int], SignedDistance]
 
     def make(self) -> ShapeBank:
-        """The bank; each shape is named by its kind and number."""
+        """Make the bank. The name of a shape is its kind and index."""
         names = [f"{self.kinds[index % len(self.kinds)]} {index}" for index in range(self.number)]
         return ShapeBank.of([self.shape(index) for index in range(self.number)], names)
 
@@ -43,4 +43,4 @@ RECIPES = {
     "parts": BankRecipe(520, PART_CATEGORIES, lambda i: part_scene(Split.TRAIN, i).solid),
     "heat": BankRecipe(256, HEAT_OBJECTS, _heated),
 }
-"""The banks of procedural shapes, by name."""
+"""Recipes of the banks by name."""

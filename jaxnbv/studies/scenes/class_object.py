@@ -1,4 +1,4 @@
-"""Objects whose class is asked for."""
+"""Objects of several classes, with the part of their surface that tells the class."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -21,9 +21,9 @@ from jaxnbv.studies.scenes.labelled import LabelledSolid
 
 
 class ClassObject(SignedDistance):
-    """A solid of one of several classes.
+    """Base class: a solid of one of several classes.
 
-    - `label`: which, from 0.
+    - `label`: index of its class.
     """
 
     label: eqx.AbstractVar[Int[Array, ""]]
@@ -33,17 +33,18 @@ class ClassObject(SignedDistance):
         return self.label
 
     def on_cue(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[Array, "*n"]:
-        """Which points of the surface tell the class: here all.
+        """Whether each point of the surface tells the class; here always True.
 
-        Give hits without noise; the tolerance is in scene units.
+        - `x`: hits without noise.
+        - `tolerance`: largest distance from the cue, in scene units.
         """
         return jnp.ones(x.shape[:-1], bool)
 
 
 class SolidObject(ClassObject):
-    """Labelled primitives; a bound. Those of label 0 say nothing of the class, all others tell it.
+    """A solid of labelled primitives; a bound. Primitives of label 0 do not tell the class.
 
-    - `solid`: where it stands in the scene.
+    - `solid`: the primitives, in scene coordinates.
     """
 
     solid: LabelledSolid
@@ -53,15 +54,15 @@ class SolidObject(ClassObject):
         return self.solid(x)
 
     def on_cue(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[Array, "*n"]:
-        """Those of the primitives that tell the class."""
+        """Whether each point lies on a primitive that tells the class."""
         return least_of_last(jnp.where(self.solid.labels > 0, self.solid.distances(x), jnp.inf)) <= tolerance
 
 
 class ClassSet(NamedTuple):
     """Scenes of several classes.
 
-    - `classes`: their names.
-    - `scene`: of a split, an index and a framing; None where meshes alone are such scenes.
+    - `classes`: names of the classes.
+    - `scene`: function from a split, an index and a framing to a scene; None if all scenes are meshes.
     """
 
     classes: tuple[str, ...]
@@ -71,8 +72,8 @@ class ClassSet(NamedTuple):
 class ClassMesh(eqx.Module):
     """A mesh of one of several classes.
 
-    - `label`: which, from 0.
-    - `part`: the triangles that tell the class, of `mesh`; default: all.
+    - `label`: index of its class.
+    - `part`: the triangles of `mesh` that tell the class; default: all.
     """
 
     mesh: TriangleMesh
@@ -80,7 +81,7 @@ class ClassMesh(eqx.Module):
     part: TriangleMesh | None = None
 
     def on_cue(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[np.ndarray, "*n"]:
-        """As of a `ClassObject`; on the host."""
+        """Whether each point of the surface tells the class, see `ClassObject.on_cue`. Runs on the host."""
         if self.part is None:
             return np.ones(x.shape[:-1], bool)
         points = np.asarray(x, np.float64).reshape(-1, 3)
@@ -89,12 +90,12 @@ class ClassMesh(eqx.Module):
 
 
 def surface_of(thing: ClassObject | ClassMesh) -> Surface:
-    """What rays hit."""
+    """The surface of an object, for ray tracing."""
     return thing.mesh if isinstance(thing, ClassMesh) else SDFSurface(thing)
 
 
 def scan_cue(thing: ClassObject | ClassMesh, camera: Camera, poses: Pose) -> tuple[Int[Array, " poses"], PointCloud]:
-    """How many rays of each pose hit the cue of the class, and the scans, without noise."""
+    """The number of rays from each pose that hit the cue of the class, and the scans without noise."""
     return _scan_telling(thing, camera, poses) if isinstance(thing, ClassMesh) else _compiled(thing, camera, poses)
 
 
@@ -111,20 +112,20 @@ _compiled = eqx.filter_jit(_scan_telling)
 def hidden_view(
     thing: ClassObject | ClassMesh, key: PRNGKeyArray, camera: Camera = Camera(), poses: Pose | None = None
 ) -> Pose:
-    """A pose from which the object shows but not the cue of its class, drawn uniformly.
+    """A random pose from which the object is visible but not the cue of its class.
 
-    - `poses`: from which it is drawn, by default the paper's 120.
+    - `poses`: poses to draw from uniformly; default: the paper's 120.
 
-    **Raises:** `ValueError` if there is none.
+    **Raises:** `ValueError` if there is no such pose.
     """
     poses = sphere_candidates(120) if poses is None else poses
     return poses[choose_hidden(*scan_cue(thing, camera, poses), key)]
 
 
 def choose_hidden(cue_pixels: Int[AnyArray, " poses"], scans: PointCloud, key: PRNGKeyArray) -> int:
-    """Index of a pose whose scan hits the object but not the cue of its class, drawn uniformly from them.
+    """Index of a random pose whose scan hits the object but not the cue of its class, drawn uniformly.
 
-    **Raises:** `ValueError` if there is none.
+    **Raises:** `ValueError` if there is no such pose.
     """
     hidden = np.flatnonzero((np.asarray(cue_pixels) == 0) & (np.asarray(scans.count) > 0))
     require(len(hidden) > 0, f"the cue of the class shows from all {len(cue_pixels)} candidates: ask for more of them")

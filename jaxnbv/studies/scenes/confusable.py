@@ -1,4 +1,4 @@
-"""Sets of parts that look alike: the same housing, and one feature that differs, which few views show.
+"""Sets of parts that look alike: the same housing with one different feature, which few views show.
 
 Lengths are scene units. No part reaches beyond 1.35 from the origin along an axis.
 """
@@ -18,11 +18,11 @@ from jaxnbv.scanning.sdf import Cuboid, Cylinder, Difference, Sampled, SignedDis
 from jaxnbv.surfaces import ShapeBank
 
 PARTS_OF_SET = 8
-# Two spacings of the bank's grid are less than the smallest feature, 0.12 across; the meshes are finer.
+# Two spacings of the bank's grid are smaller than the smallest feature, 0.12. The meshes are finer.
 _BANK_GRID, _MESH_GRID = Grid(64, 1.5), Grid(100, 1.4)
-# No part comes nearer to the faces of the bank's grid.
+# Every part keeps this distance from the faces of the bank's grid.
 _PADDING = 0.15
-# The pocket of the housing: its centre across, its floor, and one that holes in it are seen in.
+# The pocket of the housing: x of its centre, its floor, and a higher floor that shows the holes in it.
 _ACROSS, _FLOOR, _SHALLOW = 0.15, 0.05, 0.45
 
 
@@ -35,9 +35,9 @@ def _pin(radius: float, half_height: float, center: Sequence[float]) -> SignedDi
 
 
 def _housing(side: float = 1.0, floor: float = _FLOOR) -> SignedDistance:
-    """A block with a deep pocket, open above, and a notch at one corner by which its sides are told apart.
+    """A block with a deep pocket, open above, and a notch at one corner that breaks its symmetry.
 
-    - `side`: 1, or -1 for its mirror image; `floor`: of the pocket.
+    - `side`: 1, or -1 for its mirror image; `floor`: height of the pocket's floor.
     """
     block = Cuboid(np.array([0.75, 1.25, 0.55]))
     pocket = _box([0.42, 0.7, 0.3], [side * _ACROSS, floor + 0.7, 0.0])
@@ -45,7 +45,7 @@ def _housing(side: float = 1.0, floor: float = _FLOOR) -> SignedDistance:
 
 
 def _bosses() -> list[SignedDistance]:
-    """A boss on the floor of the pocket: its place, radius and height."""
+    """Housings with a boss on the floor of the pocket that differs in place, radius and height."""
     variants = [
         (-0.25, 0.0, 0.12, 0.25),
         (0.25, 0.0, 0.12, 0.25),
@@ -60,7 +60,7 @@ def _bosses() -> list[SignedDistance]:
 
 
 def _bores() -> list[SignedDistance]:
-    """A blind hole in the floor of the pocket: its place and radius."""
+    """Housings with a blind hole in the floor of the pocket that differs in place and radius."""
     places = [(-0.25, 0.0), (0.25, 0.0), (0.0, 0.15), (0.0, -0.15), (0.0, 0.0), (0.0, 0.0), (-0.25, 0.15), (0.25, 0.15)]
     radii = [0.12, 0.12, 0.12, 0.12, 0.12, 0.22, 0.12, 0.12]
     return [
@@ -70,7 +70,7 @@ def _bores() -> list[SignedDistance]:
 
 
 def _ribs() -> list[SignedDistance]:
-    """A rib across the floor of the pocket: its place and direction."""
+    """Housings with a rib on the floor of the pocket that differs in place and direction."""
     along = [(-0.28, 0.0, 90.0), (0.0, 0.0, 90.0), (0.28, 0.0, 90.0)]
     across = [(0.0, -0.2, 0.0), (0.0, 0.0, 0.0), (0.0, 0.2, 0.0)]
     aslant = [(0.0, 0.0, 45.0), (0.0, 0.0, -45.0)]
@@ -83,7 +83,7 @@ def _ribs() -> list[SignedDistance]:
 
 
 def _connectors() -> list[SignedDistance]:
-    """A connector on the floor of the pocket: its sides and place."""
+    """Housings with a connector on the floor of the pocket that differs in size and place."""
     variants = [
         (0.3, 0.1, 0.0, 0.0),
         (0.1, 0.22, 0.0, 0.0),
@@ -100,21 +100,21 @@ def _connectors() -> list[SignedDistance]:
 
 
 def _pins() -> list[SignedDistance]:
-    """Four places for pins on the floor of the pocket, some of which hold one."""
+    """Housings with pins at some of four places on the floor of the pocket."""
     places = [(-0.24, -0.15), (-0.24, 0.15), (0.24, -0.15), (0.24, 0.15)]
-    held = ["1111", "0111", "1011", "1101", "1110", "1001", "0110", "1010"]
+    patterns = ["1111", "0111", "1011", "1101", "1110", "1001", "0110", "1010"]
 
-    def part(which: str) -> SignedDistance:
-        # A pin that is not there lies within the block, so that all parts are made alike.
-        heights = [_FLOOR + (0.2 if one == "1" else -0.6) for one in which]
+    def part(pattern: str) -> SignedDistance:
+        # An absent pin lies inside the block, so that all parts have the same structure.
+        heights = [_FLOOR + (0.2 if digit == "1" else -0.6) for digit in pattern]
         pins = [_pin(0.1, 0.25, [_ACROSS + x, y, z]) for (x, z), y in zip(places, heights, strict=True)]
         return functools.reduce(Union, pins, _housing())
 
-    return [part(which) for which in held]
+    return [part(pattern) for pattern in patterns]
 
 
 def _channels() -> list[SignedDistance]:
-    """A boss in a channel through a block: how far in, and on which of two walls."""
+    """Blocks with a channel and a boss in it that differs in depth and wall."""
     block = Difference(Cuboid(np.array([0.7, 0.6, 1.25])), _box([0.28, 0.28, 1.5], [0.0, 0.1, 0.0]))
     block = Difference(block, _box([0.2, 0.2, 0.2], [0.7, -0.6, 1.25]))
     places = [(wall, z) for wall in (-0.24, 0.24) for z in (-0.6, -0.2, 0.2, 0.6)]
@@ -129,22 +129,22 @@ def _cup(floor: float, size: float = 1.0) -> SignedDistance:
 
 
 def _cups() -> list[SignedDistance]:
-    """A cup: how far up its floor is, which the outside does not show."""
+    """Cups that differ in the height of their floor, which the outside does not show."""
     return [_cup(floor) for floor in np.linspace(-1.1, -0.05, PARTS_OF_SET)]
 
 
 def _sizes() -> list[SignedDistance]:
-    """A cup in sizes that differ by 4 %."""
+    """Cups whose sizes differ by 4 %."""
     return [_cup(-1.1 * size, size) for size in 1.04 ** -np.arange(PARTS_OF_SET)]
 
 
 def _mugs() -> list[SignedDistance]:
-    """A mug whose handle, which hides behind it, differs in place and length."""
+    """Mugs whose handle differs in place and length. The mug hides it from behind."""
     variants = [(y, half) for half in (0.2, 0.4) for y in (-0.6, -0.2, 0.2, 0.6)]
 
     def part(y: float, half: float) -> SignedDistance:
         grip = Difference(_box([0.22, half, 0.1], [0.86, y, 0.0]), _box([0.12, half - 0.1, 0.2], [0.82, y, 0.0]))
-        # The grip ends at the wall: it must not show inside.
+        # Cut the handle at the wall, so that it does not show inside.
         mug = Union(_cup(-1.1), Difference(grip, Cylinder(0.65, 1.5)))
         return Translated(mug, np.array([-0.19, 0.0, 0.0]))
 
@@ -176,26 +176,28 @@ _SETS: dict[str, Callable[[], list[SignedDistance]]] = {
 CONFUSABLE_SETS = tuple(_SETS)
 """Names of the sets."""
 HIDDEN_CUES = ("boss", "bore", "rib", "connector", "pins", "channel", "cup")
-"""The sets whose parts look the same from at least two directions in three."""
+"""The sets whose parts look the same from at least two thirds of all directions."""
 
 
 def confusable_solids(name: str) -> list[SignedDistance]:
-    """The parts of a set as solids, all made of the same operations."""
+    """The parts of a set as solids with the same structure."""
     return _SETS[name]()
 
 
 @functools.cache
 def confusable_meshes(name: str) -> tuple[TriangleMesh, ...]:
-    """The parts of a set as meshes, whose edges are rounded to 0.03."""
+    """The parts of a set as meshes. Meshing rounds edges to 0.03."""
     values = [np.array(_values(solid, _nodes(_MESH_GRID))) for solid in confusable_solids(name)]
     triangles = [level_triangles(rows, _MESH_GRID) for rows in values]
-    return tuple(TriangleMesh(found[0], found[1], Frame()) for found in triangles if found is not None)
+    return tuple(TriangleMesh(mesh[0], mesh[1], Frame()) for mesh in triangles if mesh is not None)
 
 
 @functools.cache
 def confusable_bank(name: str) -> ShapeBank:
-    """The parts of a set as a bank at true size, by their signed distances on a grid: a tree of operations would take
-    minutes to compile within a search."""
+    """The parts of a set as a bank at true size.
+
+    It stores signed distances on a grid, since a tree of operations takes minutes to compile in a search.
+    """
     nodes = _nodes(_BANK_GRID)
     low, spacing = np.full(3, -_BANK_GRID.half_extent), _BANK_GRID.spacing
     solids = [Sampled(_values(solid, nodes), low, spacing, _PADDING) for solid in confusable_solids(name)]

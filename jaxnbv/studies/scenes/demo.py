@@ -1,4 +1,4 @@
-"""The demonstration object: a mug on a saucer, built from primitives, with places that a search must go and find."""
+"""The demonstration object: a mug on a saucer, with surface that only few views show."""
 
 import math
 
@@ -7,11 +7,11 @@ from jaxnbv.scanning.sphere_tracing import SDFSurface
 
 
 def demo_object() -> SDFSurface:
-    """An empty mug on a saucer, with a spoon in it and two lumps of sugar beside it: the scene's y axis is up.
+    """An empty mug on a saucer, with a spoon in it and two lumps of sugar beside it. The y axis is up.
 
-    The longest side, across the saucer, is 2.5. The mug's inside, the spoon's bowl at its bottom, the saucer's
-    underside and what stands behind the mug show from few directions. No part is thinner than 0.06, but for the lip of
-    the spoon's bowl.
+    The longest side, across the saucer, is 2.5. The inside of the mug, the bowl of the spoon, the underside of the
+    saucer and the objects behind the mug show from few directions. No part is thinner than 0.06, except the lip of the
+    spoon's bowl.
     """
     return SDFSurface((_saucer() | _mug() | _spoon() | _sugar()).translate([0.0, -0.87, 0.0]))
 

@@ -1,4 +1,4 @@
-"""Objects to be heated, in which heat takes ways that few views show: legs and rails, panels, a handle, fins."""
+"""Heated objects, in which heat flows through legs, panels, a handle or fins that few views show."""
 
 from functools import partial
 
@@ -16,18 +16,18 @@ from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.studies.scenes import labelled
 from jaxnbv.studies.scenes.labelled import assemble, generator
 
-# Nobody asks for the labels of a heated object.
+# Labels of heated objects are not used.
 bar, box, ring, rod = (partial(make, 0) for make in (labelled.bar, labelled.box, labelled.ring, labelled.rod))
 path = partial(labelled.path, 0)
 FIRST_TRAINING = 100_000
 
 
 class HeatScene(eqx.Module):
-    """An object in one piece and where it is heated.
+    """A connected object and its heat source.
 
-    - `surface`: the object, centred, its longest side 2.5; a procedural one stands upright along y.
-    - `name`: what it is, such as one of `HEAT_OBJECTS`.
-    - `source`: a point of its surface, in scene units; power goes in nearby.
+    - `surface`: the object, centred, with longest side 2.5. Procedural ones stand upright along y.
+    - `name`: the kind of object, such as one of `HEAT_OBJECTS`.
+    - `source`: the point of the surface (scene coordinates) around which power enters.
     """
 
     surface: Surface
@@ -36,8 +36,10 @@ class HeatScene(eqx.Module):
 
 
 def heat_scene(index: int, turned: bool = True) -> HeatScene:
-    """Scene number `index`: the kinds of object take turns, with random proportions, source and turn about y, or not
-    `turned`. Those of `FIRST_TRAINING` and beyond are never reported.
+    """The heated scene of an index. The kinds of objects take turns.
+
+    Proportions and source are random, and so is the turn about y if `turned`. Indices from `FIRST_TRAINING` on are for
+    training only.
 
     **Raises:** `ValueError` if the index is negative.
     """
@@ -53,9 +55,9 @@ def heat_scene(index: int, turned: bool = True) -> HeatScene:
 
 
 def source_view(scene: HeatScene, key: PRNGKeyArray, num_candidates: int = 100, radius: float = 3.0) -> Pose:
-    """A candidate of the sphere from which the heat source shows, drawn uniformly from them.
+    """A random candidate on the sphere from which the heat source is visible, drawn uniformly.
 
-    **Raises:** `ValueError` if there is none.
+    **Raises:** `ValueError` if there is no such candidate.
     """
     poses = sphere_candidates(num_candidates, radius)
     scans = scan(scene.surface, Camera(), poses)
@@ -65,7 +67,7 @@ def source_view(scene: HeatScene, key: PRNGKeyArray, num_candidates: int = 100, 
     return poses[int(jax.random.choice(key, shown))]
 
 
-# Each gives the primitives, the heated one first, and the source in that one's own frame, in units of its half sizes.
+# Each function returns the primitives, the heated one first, and the source in the frame of that one, in half sizes.
 
 
 def _on_top(rng):
@@ -73,7 +75,7 @@ def _on_top(rng):
 
 
 def _desk(rng):
-    """Four legs, a panel behind and a drawer; heated on its top."""
+    """A desk with four legs, a panel behind and a drawer, heated on its top."""
     half_depth, half_width, height = rng.uniform(0.5, 0.65), rng.uniform(0.95, 1.2), rng.uniform(1.0, 1.3)
     thick, leg = rng.uniform(0.05, 0.08), rng.uniform(0.05, 0.08)
     parts = [box((0, height, 0), (half_depth, thick, half_width))]
@@ -87,7 +89,7 @@ def _desk(rng):
 
 
 def _chair(rng):
-    """Four legs with rails between them and an open back; heated on its seat."""
+    """A chair with rails between its four legs and an open back, heated on its seat."""
     half_depth, half_width, height = rng.uniform(0.5, 0.6), rng.uniform(0.5, 0.6), rng.uniform(1.0, 1.2)
     thick, leg, rise = rng.uniform(0.05, 0.08), rng.uniform(0.05, 0.07), rng.uniform(0.8, 1.1)
     parts = [box((0, height, 0), (half_depth, thick, half_width), 0.03)]
@@ -107,7 +109,7 @@ def _chair(rng):
 
 
 def _mug(rng):
-    """Hollow, with a handle; heated from below."""
+    """A hollow mug with a handle, heated from below."""
     radius, half_height, wall = rng.uniform(0.65, 0.8), rng.uniform(0.75, 0.95), rng.uniform(0.045, 0.06)
     parts = [
         rod((0, -half_height, 0), (0, -half_height + 0.12, 0), radius - wall),
@@ -121,7 +123,7 @@ def _mug(rng):
 
 
 def _fins(rng):
-    """A comb of upright fins on a plate; heated from below."""
+    """A comb of upright fins on a plate, heated from below."""
     count, half_depth, half_width = int(rng.integers(6, 10)), rng.uniform(0.6, 0.9), rng.uniform(1.0, 1.2)
     rise, thick = rng.uniform(0.6, 1.0), rng.uniform(0.06, 0.1)
     parts = [box((0, 0, 0), (half_depth, thick, half_width))]
@@ -134,5 +136,5 @@ def _fins(rng):
 
 _BUILDERS = {"desk": _desk, "chair": _chair, "mug": _mug, "fins": _fins}
 
-# The kinds of heated object.
+# The kinds of heated objects.
 HEAT_OBJECTS = tuple(_BUILDERS)

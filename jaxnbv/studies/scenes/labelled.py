@@ -1,7 +1,7 @@
-"""A solid whose surface carries labels, one type for all objects: one compiled program scans any of them.
+"""Builds solids with labelled surfaces from primitives. One compiled program scans any of them.
 
-An object is a list of primitives, which `assemble` joins into a `LabelledSolid`. A primitive is a rounded box or a
-rounded rectangle that is turned about an axis: a ring, a wheel, a rod, a cone, a ball.
+An object is a list of primitives, which `assemble` joins into a `LabelledSolid`. A primitive is a rounded box, or a
+rounded rectangle revolved about an axis: a ring, a wheel, a rod, a cone or a ball.
 """
 
 import dataclasses
@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from jaxnbv.checks import require
 from jaxnbv.scanning.sdf import UNUSED, LabelledSolid
 
-# How many primitives a solid has room for, or a multiple of it.
+# Number of primitives that a solid has room for. Larger solids use a multiple of it.
 CAPACITY = 24
 
 _UNTURNED, _UNMOVED = np.eye(3), np.zeros(3)
@@ -24,7 +24,7 @@ _UNTURNED, _UNMOVED = np.eye(3), np.zeros(3)
 
 @dataclasses.dataclass(frozen=True)
 class Primitive:
-    """One slot of a `LabelledSolid`, of NumPy numbers; the fields are those of the solid."""
+    """One slot of a `LabelledSolid` on the host. It has the same fields as the solid."""
 
     label: int
     centre: np.ndarray
@@ -36,12 +36,12 @@ class Primitive:
     revolved: bool = False
 
     def bounds(self) -> Float[np.ndarray, "2 3"]:
-        """The lowest and highest coordinates, exactly: how far the primitive reaches down and up each axis."""
+        """The exact lowest and highest coordinates of the primitive."""
         inner = self.half_size - self.rounding
         if not self.revolved:
             reach = np.abs(self.rotation) @ inner + self.rounding
             return self.centre + np.stack([-reach, reach])
-        # The direction of an axis, or its opposite, in the profile's plane, and what the shear makes of it.
+        # Both directions of each axis in the plane of the profile, then their image under the shear.
         up = np.stack([-self.rotation[:, 1], self.rotation[:, 1]])
         out = np.sqrt(np.maximum(1.0 - up**2, 0.0))
         up = up + self.slant * out
@@ -50,14 +50,14 @@ class Primitive:
 
 
 def box(label: int, centre, half_size, rounding: float = 0.02, turn: tuple | None = None) -> Primitive:
-    """A box with rounded edges; `turn` = (axis, angle) turns it about its centre, right-handed."""
+    """A box with rounded edges. `turn` = (axis, angle in radians) turns it about its centre, right-handed."""
     half_size = np.asarray(half_size, dtype=float)
     rotation = np.eye(3) if turn is None else rotation_about(*turn)
     return Primitive(label, np.asarray(centre, dtype=float), rotation, half_size, min(rounding, half_size.min()))
 
 
 def bar(label: int, start, end, half_width: float, half_depth: float, rounding: float = 0.02) -> Primitive:
-    """A box from `start` to `end`: its width lies across the y axis, or along z if the bar is upright."""
+    """A box from `start` to `end`. Its width is horizontal, and along z if the bar is upright."""
     start, end = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
     half_size = np.array([half_depth, 0.5 * np.linalg.norm(end - start), half_width])
     rotation = _upright(end - start)
@@ -74,14 +74,14 @@ def ring(
     rounding: float = 0.02,
     slant: float = 0.0,
 ) -> Primitive:
-    """A rounded rectangle turned about the direction `axis` at a mean distance `radius`, which grows by `slant`."""
+    """A rounded rectangle revolved about `axis` at mean distance `radius`, which grows with slope `slant`."""
     half_size = np.array([half_width, half_height, half_height])
     rounding = min(rounding, half_width, half_height)
     return Primitive(label, np.asarray(centre, dtype=float), _upright(axis), half_size, rounding, radius, slant, True)
 
 
 def rod(label: int, start, end, radius: float, end_radius: float | None = None, rounding: float = 0.02) -> Primitive:
-    """A solid of circular section with flat ends, from one radius to another."""
+    """A solid with circular section and flat ends, whose radius changes linearly to `end_radius`."""
     start, end = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
     length = float(np.linalg.norm(end - start))
     end_radius = radius if end_radius is None else end_radius
@@ -116,7 +116,7 @@ def rotation_about(axis, angle: float) -> Float[np.ndarray, "3 3"]:
 
 
 def _upright(axis):
-    """A rotation whose second column is the direction `axis` and whose third lies as level as it can."""
+    """A rotation whose second column is the direction `axis` and whose third column is horizontal."""
     axis = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
     level = np.cross(axis, [0.0, 1.0, 0.0])
     if np.linalg.norm(level) < 1e-6:
@@ -126,14 +126,16 @@ def _upright(axis):
 
 
 def assemble(primitives: list[Primitive], turn: float = 0.0, longest_side: float = 2.5) -> LabelledSolid:
-    """The union of primitives, turned about the y axis by an angle in radians, then moved and scaled: its bounding box
-    is centred in the scene and has the given longest side."""
+    """The union of primitives, turned about the y axis by `turn` (radians), then moved and scaled.
+
+    Its bounding box is centred in the scene and has the given longest side.
+    """
     turned = rotation_about((0.0, 1.0, 0.0), turn)
     return united(fitted([moved(p, rotation=turned) for p in primitives], longest_side))
 
 
 def moved(p: Primitive, scale: float = 1.0, rotation=_UNTURNED, offset=_UNMOVED) -> Primitive:
-    """A primitive whose points x are at `scale` rotation x + offset."""
+    """The image of a primitive under x -> scale rotation x + offset."""
     return dataclasses.replace(
         p,
         centre=scale * rotation @ p.centre + offset,
@@ -145,20 +147,20 @@ def moved(p: Primitive, scale: float = 1.0, rotation=_UNTURNED, offset=_UNMOVED)
 
 
 def bounds(primitives: list[Primitive]) -> Float[np.ndarray, "2 3"]:
-    """The lowest and highest coordinates of several primitives."""
+    """The lowest and highest coordinates of a list of primitives."""
     lows, highs = zip(*(p.bounds() for p in primitives), strict=True)
     return np.stack([np.min(lows, axis=0), np.max(highs, axis=0)])
 
 
 def fitted(primitives: list[Primitive], longest_side: float) -> list[Primitive]:
-    """The primitives moved and scaled: their bounding box is centred and has this longest side."""
+    """The primitives, moved and scaled so that their bounding box is centred and has this longest side."""
     low, high = bounds(primitives)
     scale = longest_side / (high - low).max()
     return [moved(p, scale, offset=-0.5 * scale * (low + high)) for p in primitives]
 
 
 def united(primitives: list[Primitive], capacity: int = CAPACITY) -> LabelledSolid:
-    """The union of primitives, where they are.
+    """The union of primitives, without moving them.
 
     **Raises:** `ValueError` if there are no primitives or more than the capacity.
     """
@@ -171,5 +173,5 @@ def united(primitives: list[Primitive], capacity: int = CAPACITY) -> LabelledSol
 
 
 def generator(key) -> np.random.Generator:
-    """NumPy's generator seeded by a JAX key: objects are built on the host, once."""
+    """A NumPy generator seeded by a JAX key, for objects that are built on the host."""
     return np.random.default_rng(np.asarray(jax.random.key_data(key)))

@@ -1,4 +1,4 @@
-"""Scenes of part-labelled objects: the categories take turns."""
+"""Scenes of objects with labelled parts, in all procedural categories."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ from jaxnbv.studies.scenes.labelled import LabelledSolid, assemble, generator
 from jaxnbv.studies.scenes.parts import belongings, furniture, vehicles
 from jaxnbv.studies.scenes.splits import Split, scene_key
 
-# Each gives the primitives of a random object: x is forward, y up and z to the right.
+# Each function yields the primitives of a random object. x is forward, y up and z to the right.
 _BUILDERS = {
     "airplane": vehicles.airplane,
     "bag": belongings.bag,
@@ -30,16 +30,16 @@ _BUILDERS = {
 # The categories that have procedural objects, in the order of `networks.CATEGORIES`.
 PART_CATEGORIES = tuple(_BUILDERS)
 
-# Objects face one way, as ShapeNet's do, but for a small turn about the y axis.
+# Objects face one way, as in ShapeNet, up to a small turn about the y axis.
 _LARGEST_TURN = np.radians(10.0)
 
 
 class PartScene(eqx.Module):
-    """An object and what it is.
+    """An object with its category and parts.
 
-    - `solid`: the object; its labels are the fifty parts'.
-    - `category`: its index in `networks.CATEGORIES`.
-    - `parts`: which of the fifty parts it has.
+    - `solid`: the object. Its labels are indices of the fifty parts.
+    - `category`: index of its category in `networks.CATEGORIES`.
+    - `parts`: whether it has each of the fifty parts.
     """
 
     solid: LabelledSolid
@@ -48,11 +48,10 @@ class PartScene(eqx.Module):
 
 
 def part_scene(split: Split, index: int) -> PartScene:
-    """Scene number `index` of a split; the categories take turns: a random object of one of `PART_CATEGORIES`, upright
-    along y and facing x up to 10 degrees.
+    """The part scene of an index in a split: a random object. The categories `PART_CATEGORIES` take turns.
 
-    Its bounding box is centred and has the longest side 2.5; no part is thinner than 0.05. Built on the host: it does
-    not run under `jit`.
+    The object stands upright along y and faces x to within 10 degrees. Its bounding box is centred and has longest side
+    2.5. No part is thinner than 0.05. Built on the host: does not run under `jit`.
 
     **Raises:** `ValueError` if the index is negative.
     """

@@ -1,4 +1,4 @@
-"""Known parts as they lie before a sensor: turned at random or resting on a table, a box beside them or not."""
+"""Known parts placed in a scene: turned at random, or resting on a table, perhaps beside a box."""
 
 import dataclasses
 import functools
@@ -20,35 +20,35 @@ from jaxnbv.studies.scenes.framing import Setup
 from jaxnbv.surfaces import FreeRotation, Resting, ShapeBank, ShapePoses
 
 _LONGEST_SIDE = 2.5
-# The box beside a part: how far away, half its thickness, and how far it goes beyond the part, in scene units.
+# The box beside a part: its gap to the part, half its thickness, and its excess over the part, in scene units.
 _GAP, _THIN, _BEYOND = 0.3, 0.15, 0.2
-# The part of each scene follows from these, whatever the study's seed.
+# Seed of the order of parts, the same for all seeds of a study.
 _ORDER = 123
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Parts:
-    """A bank at true size, and the meshes of its parts, in the coordinates of its shapes and at true size."""
+    """A bank at true size, and the meshes of its parts in the coordinates of its shapes."""
 
     bank: ShapeBank
     meshes: tuple[TriangleMesh, ...]
 
     @functools.cached_property
     def resting(self) -> Resting:
-        """How they can lie on a table."""
+        """The stable poses of the parts on a table."""
         return Resting.of(self.bank)
 
     def choose(self, index: int) -> int:
-        """The part of a scene. Scenes of even and of odd numbers share none, and each part comes before any returns."""
+        """The part of a scene. Even and odd scenes share no part, and all parts come once before any repeats."""
         half = np.random.default_rng(_ORDER).permutation(len(self.meshes))[index % 2 :: 2]
         return int(half[index // 2 % len(half)])
 
 
 @functools.cache
 def parts_in(files: tuple[MeshFile, ...]) -> Parts:
-    """The parts of files, less those that cannot be used: a `UserWarning` names each.
+    """Read the parts from files. A `UserWarning` names each file that cannot be used, which is left out.
 
-    **Raises:** `ValueError` for a single part, which there is nothing to tell from.
+    **Raises:** `ValueError` if there is only one part.
     """
     counts: dict[str, int] = {}
     names = []
@@ -56,7 +56,7 @@ def parts_in(files: tuple[MeshFile, ...]) -> Parts:
         counts[file.name] = counts.get(file.name, 0) + 1
         names.append(file.name if counts[file.name] == 1 else f"{file.name} {counts[file.name]}")
     bank = ShapeBank.from_meshes([file.path for file in files], names=names, scale=1.0, up=files[0].up)
-    require(len(bank) > 1, f"there is one part, {bank.names[0]}: give a folder of two at least, to tell them apart")
+    require(len(bank) > 1, f"there is only one part, {bank.names[0]}: give a folder of at least two parts")
     used = {name.encode()[:64].decode(errors="ignore"): file for name, file in zip(names, files, strict=True)}
     return Parts(bank, tuple(_at_true_size(used[name].read()) for name in bank.names))
 
@@ -66,19 +66,20 @@ def _at_true_size(mesh: TriangleMesh) -> TriangleMesh:
 
 
 def confusable_parts(index: int) -> tuple[str, Parts, int]:
-    """The set of a scene of parts that look alike, its parts, and which of them it is: sets take turns."""
-    turn, which = divmod(index, len(CONFUSABLE_SETS))
-    name = CONFUSABLE_SETS[which]
-    order = np.random.default_rng(_ORDER + which).permutation(PARTS_OF_SET)
+    """The name of a scene's set of parts, its parts, and the index of the scene's part. Sets take turns."""
+    turn, set_index = divmod(index, len(CONFUSABLE_SETS))
+    name = CONFUSABLE_SETS[set_index]
+    order = np.random.default_rng(_ORDER + set_index).permutation(PARTS_OF_SET)
     return name, Parts(confusable_bank(name), confusable_meshes(name)), int(order[turn % PARTS_OF_SET])
 
 
 class PlacedPart(eqx.Module):
-    """A part as it lies in a scene, whose box is centred and has a longest side of 2.5.
+    """A part placed in a scene. Its bounding box is centred and has longest side 2.5.
 
-    - `part`: its number in the bank; `parts`: all that it may be, at true size.
-    - `scale`: scene units a unit of the parts. A point u of its shape stands at rotation (scale u) + shift.
-    - `obstacles`: a table, and a box on it; None for none.
+    - `part`: index of the part in the bank; `parts`: all candidate parts, at true size.
+    - `scale`: scene units per unit of the parts.
+    - `rotation`, `shift`: the placement. A point u of the shape lies at rotation (scale u) + shift.
+    - `obstacles`: a table, perhaps with a box on it; None for no obstacles.
     """
 
     part: int = eqx.field(static=True)
@@ -90,27 +91,27 @@ class PlacedPart(eqx.Module):
 
     @property
     def bank(self) -> ShapeBank:
-        """In scene units."""
+        """The bank in scene units."""
         return self.parts.bank.in_scene(Frame(scale=self.scale))
 
     @property
     def poses(self) -> ShapePoses:
-        """How the parts can lie: on a table, where there is one."""
+        """The poses in which the parts can lie: stable on the table if there is one, else any."""
         return FreeRotation() if self.obstacles is None else self.parts.resting
 
     @property
     def mesh(self) -> TriangleMesh:
-        """The part as it lies, in scene coordinates."""
+        """The mesh of the placed part, in scene coordinates."""
         return self.placed(self.part, self.rotation, self.shift)
 
     def placed(self, part: int, rotation: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"]) -> TriangleMesh:
-        """The mesh of any of the parts, placed in the scene."""
+        """The mesh of any of the parts with a given placement, in scene coordinates."""
         mesh = self.parts.meshes[part]
         return TriangleMesh(self.scale * mesh.vertices @ np.asarray(rotation).T + shift, mesh.faces, Frame())
 
 
 def place_part(parts: Parts, part: int, setup: Setup, key: PRNGKeyArray) -> PlacedPart:
-    """A part that lies as a setup says, at random."""
+    """Place a part at random, as a setup requires."""
     random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     vertices = parts.meshes[part].vertices
     rotation = _resting(vertices, random) if setup.is_resting else Rotation.random(rng=random).as_matrix()
@@ -122,17 +123,17 @@ def place_part(parts: Parts, part: int, setup: Setup, key: PRNGKeyArray) -> Plac
 
 
 def _resting(vertices: Float[np.ndarray, "v 3"], random: np.random.Generator) -> Float[np.ndarray, "3 3"]:
-    """The rotation of a stable pose on a table, y upward: those on which a part lands more often come up more often."""
+    """The rotation of a random stable pose on a table, y up, drawn by the probability that the part lands so."""
     hull = trimesh.Trimesh(vertices, process=False).convex_hull
     matrices, shares = trimesh.poses.compute_stable_poses(hull)
-    lying = matrices[random.choice(len(shares), p=shares / shares.sum())][:3, :3]
+    resting = matrices[random.choice(len(shares), p=shares / shares.sum())][:3, :3]
     upright = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
     spin = Rotation.from_rotvec([0.0, random.uniform(0.0, 2.0 * np.pi), 0.0]).as_matrix()
-    return spin @ upright @ lying
+    return spin @ upright @ resting
 
 
 def _obstacles(half: Float[np.ndarray, "3"], has_box: bool, random: np.random.Generator) -> Obstacles:
-    """The table below a part of this half size, and a box on it that hides one half of the part from one side."""
+    """The table below a part of this half size, and perhaps a box on it that hides half of one side of the part."""
     table = HalfSpace(np.array([0.0, -half[1], 0.0]), np.array([0.0, 1.0, 0.0]))
     if not has_box:
         return Obstacles((table,))

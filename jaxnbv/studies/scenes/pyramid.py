@@ -1,4 +1,4 @@
-"""The synthetic pyramid: five classes that differ in a pattern imprinted on the base, and in nothing else."""
+"""The synthetic pyramid: five classes that differ only in a pattern imprinted on the base."""
 
 import functools
 
@@ -14,9 +14,9 @@ from jaxnbv.studies.scenes.splits import Split, scene_key
 
 
 class Pyramid(ClassObject):
-    """A pyramid whose pattern is its class.
+    """A pyramid whose class is its pattern.
 
-    - `solid`: where it stands in the scene.
+    - `solid`: the pyramid in scene coordinates.
     - `label`: the class, an index of `PATTERNS`.
     """
 
@@ -27,9 +27,10 @@ class Pyramid(ClassObject):
         return self.solid(x)
 
     def on_cue(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[Array, "*n"]:
-        """Which points of the surface belong to the pattern, its floor or its walls; the tolerance is in scene units.
+        """Whether each point of the surface lies on the floor or the walls of the pattern.
 
-        Give hits without noise: a floor is a few hundredths below the base.
+        - `x`: hits without noise, since the floor is only a few hundredths below the base.
+        - `tolerance`: largest distance from the pattern, in scene units.
         """
         distance, height = self.solid.imprint(x)
         return (distance <= tolerance) & (height > tolerance)
@@ -38,10 +39,10 @@ class Pyramid(ClassObject):
 def pyramid_scene(
     split: Split, index: int | Int[Array, ""], framing: Framing = Framing.CLOSE_UP, turned: bool = True
 ) -> Pyramid:
-    """Scene number `index` of a split, the same pyramid in both framings; the classes take turns.
+    """The pyramid scene of an index in a split, the same pyramid in both framings. The classes take turns.
 
-    A pyramid with random height and pattern, centred in the scene, and turned in any direction or, not `turned`,
-    upright along z. Runs under `jit` and `vmap`.
+    The pyramid has a random height, and its pattern a random size, place, turn and depth. It is centred in the scene
+    with a random rotation, or upright along z if not `turned`. Runs under `jit` and `vmap`.
 
     **Raises:** `ValueError` if the index is negative.
     """
@@ -49,7 +50,7 @@ def pyramid_scene(
     return _pyramid(key, label, framing.longest_side, turned)
 
 
-# Least distance of a pattern from the base's edge: with the ranges below no pattern breaks through a side.
+# Least distance of a pattern from the base's edge. With the ranges below, no pattern breaks through a side.
 _MARGIN = 0.1
 
 

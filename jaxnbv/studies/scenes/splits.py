@@ -1,4 +1,4 @@
-"""Which scenes there are."""
+"""Splits of procedural scenes, and the random keys of their scenes."""
 
 from enum import StrEnum
 
@@ -9,7 +9,7 @@ from jaxnbv.checks import require
 
 
 class Split(StrEnum):
-    """Which scenes are trained on, tuned on and reported: no two splits share one."""
+    """Disjoint sets of scenes for training, for tuning (validation) and for reported results (test)."""
 
     TRAIN = "train"
     VALIDATION = "validation"
@@ -17,7 +17,7 @@ class Split(StrEnum):
 
 
 def scene_key(seed: int, split: Split, index: int | Int[Array, ""]) -> PRNGKeyArray:
-    """What scene number `index` of a split is made of, for scenes of one kind, told by `seed`.
+    """The random key of the scene of an index in a split. Each kind of scene has its own `seed`.
 
     **Raises:** `ValueError` if the index is negative.
     """

@@ -1,4 +1,4 @@
-"""A truck with an open bed that carries an object of one of ten classes: only the cargo tells the class."""
+"""A truck whose open bed carries an object of one of ten classes. Only the cargo tells the class."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,16 +21,16 @@ from jaxnbv.studies.scenes.labelled import (
 )
 from jaxnbv.studies.scenes.splits import Split, scene_key
 
-# Says nothing of the class; primitives of the cargo have other labels.
+# Label of the truck, which does not tell the class. Primitives of the cargo have other labels.
 _TRUCK = 0
 
 
 def truck_scene(split: Split, index: int, framing: Framing = Framing.CLOSE_UP, turned: bool = True) -> SolidObject:
-    """Scene number `index` of a split; the classes of the cargo take turns.
+    """The truck scene of an index in a split. The classes of the cargo take turns.
 
-    The cargo is turned at random about the vertical, as large as the bed has room for, and the loaded truck in any
-    direction, or, not `turned`, upright along y and along x; its bounding box is centred in the scene. Built on the
-    host: it does not run under `jit`.
+    The cargo is turned about the vertical at random and scaled to fill the bed. The loaded truck has a random rotation,
+    or stands upright along y and faces x if not `turned`. Its bounding box is centred in the scene. Built on the host:
+    does not run under `jit`.
 
     **Raises:** `ValueError` if the index is negative.
     """
@@ -48,8 +48,10 @@ def truck_scene(split: Split, index: int, framing: Framing = Framing.CLOSE_UP, t
 def stowed(
     room: Float[np.ndarray, "2 3"], cargo: Float[np.ndarray, "2 3"], rng: np.random.Generator
 ) -> tuple[float, Float[np.ndarray, "3"]]:
-    """By what a cargo is scaled, and then moved, to stand on the floor of a bed, anywhere that it has room, as large
-    as it can be or a little less. Both boxes are given by their lowest and highest corners."""
+    """The scale and the shift that place a cargo at random on the floor of a bed.
+
+    The scale is 85 to 95 % of the largest that fits. `room` and `cargo` are boxes (lowest and highest corner).
+    """
     side, size = np.diff(room, axis=0)[0], np.diff(cargo, axis=0)[0]
     scale = float((rng.uniform(0.85, 0.95) * side / size).min())
     corner = room[0] + (side - scale * size) * np.array([rng.random(), 0.0, rng.random()])
@@ -57,7 +59,7 @@ def stowed(
 
 
 def random_rotation(rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:
-    """A uniform one, from the QR decomposition of a normal matrix."""
+    """A uniformly random rotation, from the QR decomposition of a Gaussian matrix."""
     rotation, triangle = np.linalg.qr(rng.normal(size=(3, 3)))
     rotation = rotation * np.sign(np.diag(triangle))
     rotation[:, 0] *= np.linalg.det(rotation)
@@ -65,7 +67,7 @@ def random_rotation(rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:
 
 
 def _truck(rng: np.random.Generator) -> tuple[list[Primitive], Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """A truck that looks along x, and the lowest and the highest corner of the room on its bed."""
+    """The primitives of a truck that faces x, and the lowest and highest corner of the room on its bed."""
     wheel, half_width = rng.uniform(0.16, 0.22), rng.uniform(0.52, 0.62)
     bed, cab, rail = rng.uniform(1.05, 1.35), rng.uniform(0.4, 0.6), rng.uniform(0.4, 0.5)
     hood = rng.choice([0.0, rng.uniform(0.3, 0.45)])

@@ -1,4 +1,4 @@
-"""Trucks and cargo from mesh files: where the bed of a truck is, and what stands on it."""
+"""Trucks and cargo from mesh files: finds the bed of a truck and places cargo on it."""
 
 import operator
 from collections.abc import Iterator
@@ -12,19 +12,19 @@ from jaxnbv.studies.scenes.class_object import ClassMesh
 from jaxnbv.studies.scenes.labelled import generator, rotation_about
 from jaxnbv.studies.scenes.truck import random_rotation, stowed
 
-# The truck is looked at from above, along so many lines of rays.
+# Rows and columns of rays that look at the truck from above.
 _LINES = 96
-# Shares of a truck's height: where a bed's floor can be, how even it is, and the room that must be above it.
+# Shares of a truck's height: the lowest and highest floor of a bed, and the range of heights within a floor.
 _LOWEST, _HIGHEST, _EVEN = 0.15, 0.85, 0.02
 
 
 def bed_of(truck: TriangleMesh) -> Float[np.ndarray, "2 3"]:
-    """The lowest and the highest corner of the room above an upright truck's bed, in its scene coordinates.
+    """The lowest and highest corner of the room above an upright truck's bed, in scene coordinates.
 
-    The floor is the largest level rectangle along the axes that shows from above, neither at the truck's top nor at
-    its bottom; the room reaches to the truck's top.
+    The floor is the largest level, axis-aligned rectangle visible from above, between 15 and 85 % of the truck's
+    height. The room reaches to the truck's top.
 
-    **Raises:** `ValueError` if none is as large as a tenth of the truck's outline.
+    **Raises:** `ValueError` if no such rectangle covers a tenth of the truck's outline.
     """
     low, high = truck.vertices.min(axis=0), truck.vertices.max(axis=0)
     across = [np.linspace(low[axis], high[axis], 2 * _LINES + 1)[1::2] for axis in (0, 2)]
@@ -35,11 +35,11 @@ def bed_of(truck: TriangleMesh) -> Float[np.ndarray, "2 3"]:
     tall = high[1] - low[1]
     step = 0.5 * _EVEN * tall
     levels = np.arange(low[1] + _LOWEST * tall, low[1] + _HIGHEST * tall, step)
-    rectangles = (found for level in levels for found in _rectangles(np.abs(heights - level) <= step))
+    rectangles = (each for level in levels for each in _rectangles(np.abs(heights - level) <= step))
     area, rows, columns = max(rectangles, key=operator.itemgetter(0), default=(0, slice(0), slice(0)))
     require(
         area >= 0.1 * _LINES**2,
-        f"the largest level place of the truck covers {area / _LINES**2:.0%} of its outline: give one that stands "
+        f"the largest level area of the truck covers {area / _LINES**2:.0%} of its outline: give a truck that stands "
         "upright and has an open bed",
     )
     half, x, z = 0.5 * (high - low) / _LINES, across[0][rows], across[1][columns]
@@ -48,7 +48,7 @@ def bed_of(truck: TriangleMesh) -> Float[np.ndarray, "2 3"]:
 
 
 def _rectangles(flags: Bool[np.ndarray, "m n"]) -> Iterator[tuple[int, slice, slice]]:
-    """The widest rectangle of true entries between any two rows: its area, rows and columns."""
+    """Area, rows and columns of the widest all-True rectangle for each pair of first and last row."""
     for top in range(len(flags)):
         whole = np.ones(flags.shape[1], bool)
         for bottom in range(top, len(flags)):
@@ -63,9 +63,10 @@ def _rectangles(flags: Bool[np.ndarray, "m n"]) -> Iterator[tuple[int, slice, sl
 
 
 def loaded_truck(truck: TriangleMesh, cargo: TriangleMesh, label: int, key: PRNGKeyArray) -> ClassMesh:
-    """A truck that carries an object of a class, both upright as they are given, as `truck_scene` places them: the
-    cargo is turned at random about the vertical, as large as the bed has room for, and the loaded truck in any
-    direction.
+    """A truck mesh that carries an object of a class, placed as in `truck_scene`.
+
+    Both meshes must be upright. The cargo is turned about the vertical at random and scaled to fill the bed, and the
+    loaded truck has a random rotation.
 
     **Raises:** `ValueError` as `bed_of` does.
     """

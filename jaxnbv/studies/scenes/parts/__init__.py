@@ -1,1 +1,1 @@
-"""Procedural objects of ShapeNet-part's categories, labelled by its parts: random proportions, variants and extras."""
+"""Procedural objects in the categories of ShapeNet-part, with labelled parts and random proportions."""

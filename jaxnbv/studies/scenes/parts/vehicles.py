@@ -14,7 +14,7 @@ SKATE_WHEEL, DECK, TRUCK = CATEGORIES[category_index("skateboard")].labels
 
 
 def airplane(rng: np.random.Generator) -> Iterator[Primitive]:
-    """Swept wings, low or high, with two or four engines below them, or two beside the tail; a low or a high tail."""
+    """An airplane with swept wings, and two or four engines below them or two beside a high tail."""
     radius, sweep = rng.uniform(0.12, 0.17), rng.uniform(0.1, 0.6)
     yield rod(BODY, (-0.55, 0, 0), (0.85, 0, 0), radius, rounding=0.0)
     yield rod(BODY, (0.83, 0, 0), (1.22, -0.02, 0), radius, 0.35 * radius, rounding=0.03)
@@ -45,7 +45,7 @@ def airplane(rng: np.random.Generator) -> Iterator[Primitive]:
 
 
 def rocket(rng: np.random.Generator) -> Iterator[Primitive]:
-    """Upright: a hull with a pointed nose and three or four fins, boosters between them or none."""
+    """An upright rocket with a pointed nose and three or four fins, with or without boosters between them."""
     radius = rng.uniform(0.2, 0.32)
     nose = rng.uniform(0.45, 0.7)
     yield rod(HULL, (0, 0, 0), (0, 1.75, 0), radius, radius * rng.uniform(0.85, 1.0))
@@ -64,7 +64,7 @@ def rocket(rng: np.random.Generator) -> Iterator[Primitive]:
 
 
 def motorbike(rng: np.random.Generator) -> Iterator[Primitive]:
-    """Two wheels, a fork, an engine with exhaust, a tank, a seat, handles, a head light and perhaps a tail light."""
+    """A motorbike with fork, engine, exhaust, tank, seat, handles, head light and perhaps a tail light."""
     radius, base, tyre = rng.uniform(0.38, 0.44), rng.uniform(0.74, 0.82), rng.uniform(0.08, 0.11)
     rear, front = np.array([-base, 0.0, 0.0]), np.array([base, 0.0, 0.0])
     for hub in (rear, front):
