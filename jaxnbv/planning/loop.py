@@ -1,7 +1,7 @@
-"""The loop that every episode is: ask for a pose, take the view, tell what it showed, ask whether that is enough.
+"""The loop of an episode: propose a pose, take the view, add its scan, check the stop rule.
 
-A simulation, a study and a session at a real sensor drive the same `Loop`, which keeps all that depends on the views so
-far: the observations, what was proposed, the keys, the clock and the rule that ends it.
+Simulations, studies and sessions at a real sensor use the same `Loop`. It holds all state that depends on the views so
+far: observations, proposals, random keys, clock and stop rule.
 """
 
 import copy
@@ -33,7 +33,7 @@ from jaxnbv.tasks.identification import identity_answer
 from jaxnbv.utility import Answer
 
 Sensor: TypeAlias = Callable[[Pose, PRNGKeyArray], PointCloud]
-"""What a sensor sees from a pose; the key is of its noise, for which a real sensor has no use."""
+"""Function that returns the scan from a pose. The key decides simulated noise; a real sensor ignores it."""
 
 STAGES = ("sampling surfaces", "searching", "scanning")
 
@@ -41,12 +41,12 @@ STAGES = ("sampling surfaces", "searching", "scanning")
 class View(eqx.Module):
     """One view of an episode, in scene coordinates.
 
-    - `pose`: where the sensor was.
-    - `scan`: what it saw, noise included; one row a pixel.
+    - `pose`: pose of the sensor.
+    - `scan`: the scan, with noise; one row for each pixel.
     - `cloud`: D after this view.
-    - `proposal`: what the search looked at; None for the first view, which was given.
-    - `camera`: the one that took it, in scene units.
-    - `hypotheses`: what the model carries after this view, see `Observations`.
+    - `proposal`: the proposal of the search; None for the first view, which the user chose.
+    - `camera`: the camera that took it, in scene units.
+    - `hypotheses`: hypotheses of the model after this view, see `Observations`.
     """
 
     pose: Pose
@@ -57,8 +57,7 @@ class View(eqx.Module):
     hypotheses: eqx.Module | None = None
 
     def answer(self, acquisition: Acquisition) -> Answer | None:
-        """What the views so far answer to what an acquisition asks; which part the object is, where it has no answer of
-        its own and parts are known."""
+        """The acquisition's answer after this view. If it has none and there are known parts, which part it is."""
         answer = acquisition.answer(self.cloud)
         if answer is None and isinstance(self.hypotheses, PartHypotheses):
             return identity_answer(self.hypotheses, acquisition)
@@ -66,12 +65,12 @@ class View(eqx.Module):
 
 
 class Step(NamedTuple):
-    """How an episode came to a view.
+    """A view of an episode, with the search that led to it.
 
-    - `observations`: after the view.
-    - `inputs`: the samples that the view was chosen by; None where there are none, and for a view that was given or
-      stored.
-    - `seconds`: of the search; zero for a view that was given or stored.
+    - `observations`: observations after the view.
+    - `inputs`: posterior and samples that the view was chosen by. None if the search needs none, and for a first or
+      stored view.
+    - `seconds`: time of the search; zero for a first or stored view.
     """
 
     view: View
@@ -82,10 +81,10 @@ class Step(NamedTuple):
 
 @dataclasses.dataclass
 class _StepState:
-    """What was computed for the next view so far.
+    """Results for the next view so far.
 
-    - `is_proposed`: whether the proposal was handed out, and not computed for the rule alone.
-    - `stop`: why the view is not needed, once the rule `is_asked`.
+    - `is_proposed`: whether a caller received the proposal, so that it was not computed only for the stop rule.
+    - `stop`: reason to stop, once the rule `is_asked`.
     """
 
     inputs: StepInputs | None = None
@@ -97,15 +96,17 @@ class _StepState:
 
 
 class Loop:
-    """An episode as it goes on. What was taken and what is proposed are told apart: travel, and the distance to earlier
-    cameras, count from poses that were taken; a pose that was proposed is not proposed again, whether it was taken.
+    """A running episode.
 
-    - `planner`: plans, in scene coordinates.
-    - `key`: view i depends on it and on i alone.
-    - `until`: the rule that ends the episode; None for no end.
-    - `frame`: of the user's world, in whose units the rule is asked.
-    - `camera`: the sensor's, in scene units, by default the planner's.
-    - `begin`: is called with each of `STAGES` as it begins.
+    Travel and the distance to earlier cameras count from the poses of views, not from proposals. A pose is proposed
+    only once, whether or not the view was taken there.
+
+    - `planner`: the planner, in scene coordinates.
+    - `key`: random key. The keys of view i depend only on it and on i.
+    - `until`: stop rule; None to continue for ever.
+    - `frame`: frame of the user's world, which gives the units of the stop rule.
+    - `camera`: the sensor's camera in scene units, by default the planner's.
+    - `begin`: called with each of `STAGES` when it begins.
 
     **Raises:** `ValueError` if the rule does not apply to the planner's acquisition.
     """
@@ -131,24 +132,24 @@ class Loop:
         self._next = _StepState()
 
     def emptied(self, planner: Planner) -> "Loop":
-        """Without its views, by a planner that may be another: to add them again. The clock goes on."""
+        """A copy without views, to add them again with this planner. The clock keeps running."""
         loop = copy.copy(self)
         loop.planner, loop.views, loop._observations = planner, (), None
         loop._pending, loop._next = PoseList.empty(planner.max_views), _StepState()
         return loop
 
     def with_clutter(self, clutter: SignedDistance | None) -> "Loop":
-        """With other clutter among the planner's obstacles, in scene units; None for none."""
+        """A copy with this clutter in the planner's obstacles, in scene units; None for no clutter."""
         assert self.planner.obstacles is not None
         loop = copy.copy(self)
-        # The planner is checked already, which takes time.
+        # tree_at skips the planner's checks, which take time and have passed already.
         where = lambda planner: planner.obstacles.clutter  # noqa: E731
         loop.planner = eqx.tree_at(where, self.planner, clutter, is_leaf=lambda leaf: leaf is None)
         return loop
 
     @property
     def observations(self) -> Observations:
-        """After the last view.
+        """Observations after the last view.
 
         **Raises:** `ValueError` before the first view.
         """
@@ -158,12 +159,12 @@ class Loop:
 
     @own_settings()
     def add(self, pose: Pose, scan: PointCloud, accepted: Callable[[], None] = lambda: None) -> View:
-        """Add a view that was taken, wherever that was; its proposal is what `propose` gave since the last view, if it
-        was asked.
+        """Add a view. Its proposal is the result of `propose` since the last view, if that was called.
 
-        - `accepted`: is called before the view is added, once nothing can refuse it: to store it.
+        - `pose`: actual pose of the sensor, which may differ from the proposed one.
+        - `accepted`: called after all checks and before the view is added, for example to store it.
 
-        **Raises:** `ValueError` as `Planner.init` and `Planner.observe` do; the loop is unchanged then.
+        **Raises:** `ValueError` as `Planner.init` and `Planner.observe` do; the loop does not change then.
         """
         if self._observations is None:
             observations = self.planner.init(pose, scan, self.camera)
@@ -182,10 +183,9 @@ class Loop:
 
     @own_settings()
     def take(self, sensor: Sensor, first: Pose) -> Step | None:
-        """Take the next view by a sensor, from where the planner asks for it, and add it; None once the views are
-        enough.
+        """Take the next view with a sensor at the proposed pose, and add it; None if the stop rule ends the episode.
 
-        - `first`: the pose of the first view.
+        - `first`: pose of the first view.
 
         **Raises:** `ValueError` as `propose` and `add` do.
         """
@@ -203,11 +203,11 @@ class Loop:
     def steps(
         self, sensor: Sensor, first: Pose, stored: Iterable[tuple[Pose, PointCloud, Proposal | None]] = ()
     ) -> Iterator[Step]:
-        """Views from `first` on, for as long as more are wanted, they are not enough, and the planner has room.
+        """Take views, the first at `first`, until the stop rule ends the episode or `max_views` is reached.
 
-        - `stored`: views that were taken before, in their order: they are added first, and the sensor not asked.
+        - `stored`: earlier views in order. They are added first, without the sensor.
 
-        **Raises:** `ValueError` as `take` does; among others when every candidate has been visited.
+        **Raises:** `ValueError` as `take` does, for example when every candidate has been visited.
         """
         for pose, scan, proposal in stored:
             if proposal is not None:
@@ -215,12 +215,12 @@ class Loop:
             yield Step(self.add(pose, scan), self.observations, None, 0.0)
         while len(self.views) < self.planner.max_views and (step := self.take(sensor, first)) is not None:
             yield step
-            # The posterior of a step may be large, and is not to be held beside that of the next.
+            # A posterior may be large: free it before the next step computes another.
             del step
 
     @own_settings()
     def propose(self) -> Proposal:
-        """The next pose and what the search looked at: the same until a view is added.
+        """The proposal for the next view: the same until a view is added.
 
         **Raises:** `ValueError` before the first view, and as `Planner.propose` does.
         """
@@ -238,25 +238,26 @@ class Loop:
         return self._next.proposal
 
     def settle(self, proposal: Proposal) -> None:
-        """Take a proposal in place of the one that the search gave from the same samples."""
+        """Replace the search's proposal by another one from the same samples."""
         self._next.proposal = proposal
 
     def resume(self, proposal: Proposal) -> None:
-        """Take a stored proposal for that of the next view."""
+        """Use a stored proposal for the next view."""
         self._next = _StepState(proposal=proposal, is_proposed=True)
 
     def inputs(self) -> StepInputs:
-        """What the search of the next view looks at, computed once."""
+        """Inputs of the search for the next view, computed once."""
         if not self.planner.search.uses_samples:
             return StepInputs(self.observations)
         return self._sampled()
 
     @own_settings()
     def enough(self) -> str | None:
-        """Why no more views are needed, by the rule; None while they are. Costs what the rule looks at, once a view:
-        the samples and the proposal that it asks for are those of `propose`.
+        """The reason to stop, by the stop rule; None to continue.
 
-        **Raises:** `ValueError` as `propose` does, where the rule is about the next view.
+        The rule is evaluated once for each view. If it needs samples or a proposal, `propose` uses the same ones.
+
+        **Raises:** `ValueError` as `propose` does, if the rule needs the next proposal.
         """
         if self.until is None or self._first_view_at is None or not self.views:
             return None
@@ -275,11 +276,11 @@ class Loop:
 
     @property
     def stopped(self) -> str | None:
-        """Why no more views are needed, as far as the rule was asked."""
+        """The reason to stop, if `enough` has found one; otherwise None."""
         return self._next.stop
 
     def in_world(self, value: Float[Array, ""]) -> float:
-        """A value of the search, or its error, with lengths in world units."""
+        """A value of the search, or its standard error, with lengths in world units."""
         return float(self.frame.length_to_world(value, self.planner.quantity.length_power))
 
     def _surfaces(self) -> GridSurface:
@@ -296,7 +297,7 @@ class Loop:
 
 
 def view_keys(key: PRNGKeyArray, index: int | Int[Array, ""]) -> tuple[PRNGKeyArray, PRNGKeyArray, PRNGKeyArray]:
-    """Keys of view `index` (from 0) of an episode: of its posterior samples, its search and its sensor's noise."""
+    """Keys for view `index` (from 0) of an episode: for posterior samples, search and sensor noise."""
     step_key, noise_key = jax.random.split(jax.random.fold_in(key, index))
     sample_key, search_key = jax.random.split(step_key)
     return sample_key, search_key, noise_key
