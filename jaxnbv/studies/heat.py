@@ -203,11 +203,11 @@ class HeatStudy(Study):
 
         Marks show the object's coldest point and the estimate.
         """
-        scene, held = self.scene(record["scene"]), record["methods"]
+        scene, runs = self.scene(record["scene"]), record["methods"]
         truth, heat = self.truth(scene), heat_problem(scene)
         still = still_of(truth.mesh, across(record), pixels)
         colours = ScalarMappable(Normalize(0.0, float(truth.temperatures.max())), _HEAT)
-        clouds = {method: [after.cloud for _, after in replay(self, scene, held[method])] for method in methods}
+        clouds = {method: [after.cloud for _, after in replay(self, scene, runs[method])] for method in methods}
 
         def draw_truth(axes: Axes) -> None:
             draw_on(axes, still, truth.points, colours.to_rgba(truth.temperatures))
@@ -217,7 +217,7 @@ class HeatStudy(Study):
         def tile(axes: Axes, method: str, view: int) -> None:
             points, temperature = body_temperature(clouds[method][view], heat)
             draw_on(axes, still, points, colours.to_rgba(temperature.values))
-            estimate = held[method]["estimates"]["all"]
+            estimate = runs[method]["estimates"]["all"]
             _mark(axes, still, truth.coldest, "coldest point of the object")
             _mark(axes, still, np.array(estimate["points"][view]), "coldest point of the cloud")
             say(axes, f"{estimate['distances'][view]:.2f}")

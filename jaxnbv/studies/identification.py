@@ -147,7 +147,7 @@ class IdentificationStudy(Study):
 
     @property
     def num_scenes(self) -> int | None:
-        """None: there are as many scenes as needed, since parts come again in other poses."""
+        """None: the number of scenes is unlimited, since parts come again in other poses."""
         return None
 
     @property
@@ -161,7 +161,7 @@ class IdentificationStudy(Study):
 
     def scene(self, index: int) -> Scene:
         """A part in a random pose. The task of the scene is its `PlacedPart`."""
-        require(index >= 0, f"there is no scene {index}: they are counted from 0")
+        require(index >= 0, f"there is no scene {index}: scenes are counted from 0")
         if self.meshes:
             parts = parts_in(self.meshes)
             part = parts.choose(index)
@@ -178,8 +178,8 @@ class IdentificationStudy(Study):
         obstacles = scene.task.obstacles
 
         def observe(pose: Pose, key: PRNGKeyArray) -> PointCloud:
-            seen = observe_scene(scene.surface, self.camera, pose, _NOISE, key, obstacles)
-            return seen if obstacles is None else obstacles.remove_points(seen)
+            scan = observe_scene(scene.surface, self.camera, pose, _NOISE, key, obstacles)
+            return scan if obstacles is None else obstacles.remove_points(scan)
 
         return observe
 
@@ -243,12 +243,12 @@ class IdentificationStudy(Study):
 
     def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
         """Tiles of the likeliest part as placed after each view, coloured by the distance to the true part."""
-        task, held, eye = self.scene(record["scene"]).task, record["methods"], across(record)
+        task, runs, eye = self.scene(record["scene"]).task, record["methods"], across(record)
         true = task.mesh
         tree = cKDTree(true.sample_points(jax.random.key(0), 10 * _DENSE))
 
         def tile(axes: Axes, method: str, view: int) -> None:
-            run = held[method]
+            run = runs[method]
             at = run["likeliest"][view]
             mesh = task.placed(at["part"], np.asarray(at["rotation"]), np.asarray(at["shift"]))
             axes.imshow(still_of(mesh, eye, pixels, lambda points: tree.query(points)[0], _ERRORS).image)

@@ -134,12 +134,12 @@ class ReconstructionStudy(Study):
 
     def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
         """Tiles of each reconstruction after the last view, coloured by the distance to the true surface."""
-        scene, held = self.scene(record["scene"]), record["methods"]
+        scene, runs = self.scene(record["scene"]), record["methods"]
         truth = cast(TriangleMesh, true_mesh(scene.surface))
         tree = cKDTree(truth.sample_points(jax.random.key(0), _DENSE))
         eye, sampler = across(record), self.mesher(scene).sampler
-        last = {method: replay(self, scene, held[method])[-1][1] for method in methods}
-        results = {method: held[method]["reconstructions"] for method in methods}
+        last = {method: replay(self, scene, runs[method])[-1][1] for method in methods}
+        results = {method: runs[method]["reconstructions"] for method in methods}
         names = tuple(name for name in RECONSTRUCTIONS if all(run[name] is not None for run in results.values()))
 
         def tile(axes: Axes, method: str, column: int) -> None:

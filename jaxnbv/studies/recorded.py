@@ -240,29 +240,29 @@ class RecordedStudy(Study):
     ) -> Record:
         """Record the chosen frames, and the share of the voxels shown after each of them."""
         frames = [self.frame_of(step.view.pose) for step in episode]
-        seen = np.logical_or.accumulate(truth[frames], axis=0)
-        return {"frames": frames, "covered": seen.mean(axis=1).tolist()}
+        is_shown = np.logical_or.accumulate(truth[frames], axis=0)
+        return {"frames": frames, "covered": is_shown.mean(axis=1).tolist()}
 
     def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
         """Tiles of the box's voxels along its shortest side, in colour once a chosen frame shows them.
 
         A line is the path of the recorded camera, and numbers are the chosen frames in their order.
         """
-        recording, held = self.recording, record["methods"]
+        recording, runs = self.recording, record["methods"]
         kept = np.sort(np.argsort(self.box.high - self.box.low)[1:])
         voxels, places = recording.voxels[:, kept], recording.places[:, kept]
 
         def tile(axes: Axes, method: str, view: int) -> None:
-            frames = held[method]["frames"][: view + 1]
-            seen = recording.shown[frames].any(axis=0)
-            for mask, colour in ((~seen, LINE), (seen, NEW)):
+            frames = runs[method]["frames"][: view + 1]
+            is_shown = recording.shown[frames].any(axis=0)
+            for mask, colour in ((~is_shown, LINE), (is_shown, NEW)):
                 axes.scatter(voxels[mask, 0], voxels[mask, 1], s=2.0, c=colour, linewidths=0)
             axes.plot(places[:, 0], places[:, 1], color=GREY, lw=0.6)
             axes.scatter(places[frames, 0], places[frames, 1], s=14.0, c=INK, zorder=3)
             for number, place in enumerate(places[frames], start=1):
                 axes.annotate(str(number), place, textcoords="offset points", xytext=(3, 3), fontsize=8, zorder=4)
             axes.set_aspect("equal")
-            say(axes, f"{held[method]['covered'][view]:.0%}")
+            say(axes, f"{runs[method]['covered'][view]:.0%}")
 
         return Tiles("Coloured: voxels that the frames show. Numbers: their camera positions, in order.", tile)
 
@@ -307,7 +307,7 @@ def _recording(source: tuple[Any, ...], box: Box, voxel: float, kept: Box) -> Re
     poses, stride = Pose.from_matrix(frames.matrices), stride_of(frames.camera)
     count = frames.camera.strided(stride).num_rays
     nowhere, none = jnp.zeros((count, 3)), jnp.zeros(count, bool)
-    scans, seen = [], []
+    scans, cells_of_frames = [], []
     for index in progress_bar(range(len(frames)), desc="reading frames"):
         # Not strided as the scans are: fewer pixels would miss voxels that the frame shows.
         points = _points(frames, index, 1)
@@ -318,10 +318,10 @@ def _recording(source: tuple[Any, ...], box: Box, voxel: float, kept: Box) -> Re
             image = frames.depth(index), frames.camera, poses[index], frames.depth_scale, stride
             scan = PointCloud.from_depth(*image, kept)
         scans.append(frame.to_scene(scan))
-        seen.append(np.unique(np.floor(points / voxel).astype(int), axis=0))
-    cells, which, counts = np.unique(np.concatenate(seen), axis=0, return_inverse=True, return_counts=True)
+        cells_of_frames.append(np.unique(np.floor(points / voxel).astype(int), axis=0))
+    cells, which, counts = np.unique(np.concatenate(cells_of_frames), axis=0, return_inverse=True, return_counts=True)
     shown = np.zeros((len(frames), len(counts)), bool)
-    shown[np.repeat(np.arange(len(frames)), [len(rows) for rows in seen]), which] = True
+    shown[np.repeat(np.arange(len(frames)), [len(rows) for rows in cells_of_frames]), which] = True
     often = counts >= _SEEN_BY
     require(bool(often.any()), f"no voxel of {box} shows in {_SEEN_BY} frames of {frames.folder}: give another box")
     voxels, places = voxel * (cells[often] + 0.5), frames.matrices[:, :3, 3]

@@ -283,15 +283,15 @@ class ClassificationStudy(Study):
 
         Below is the class predicted after this view, and its probability.
         """
-        held, scene, names = record["methods"], self.scene(record["scene"]), self.objects.classes
-        poses = {method: poses_of(held[method]) for method in methods}
+        runs, scene, names = record["methods"], self.scene(record["scene"]), self.objects.classes
+        poses = {method: poses_of(runs[method]) for method in methods}
         camera = Camera(height=pixels, width=pixels)
 
         def tile(axes: Axes, method: str, view: int) -> None:
             axes.imshow(_image(scene, camera, poses[method][view], bool(self.cue)), interpolation="antialiased")
-            if self.cue and held[method]["pixels"][0][view] >= CUE_PIXELS:
+            if self.cue and runs[method]["pixels"][0][view] >= CUE_PIXELS:
                 framed(axes, NEW, 1.6)
-            log_p = held[method]["log_p"][0][view]
+            log_p = runs[method]["log_p"][0][view]
             guess = int(np.argmax(log_p))
             say(axes, f"{names[guess]} {np.exp(log_p[guess]):.0%}", guess == record["label"])
 
@@ -312,9 +312,9 @@ def _classify(classifier: Classifier, cloud: PointCloud) -> Float[Array, " class
 
 def _image(scene: Scene, camera: Camera, pose: Pose, tinted: bool) -> Float[np.ndarray, "h w 3"]:
     """An image of the scene, lit from the sensor, with its cue tinted."""
-    seen = scan(scene.surface, camera, jax.tree.map(jnp.asarray, pose))
-    on_cue = np.asarray(scene.task.thing.on_cue(seen.points)) & tinted
-    points, normals, hit = (np.asarray(array) for array in (seen.points, seen.normals, seen.mask))
+    cloud = scan(scene.surface, camera, jax.tree.map(jnp.asarray, pose))
+    on_cue = np.asarray(scene.task.thing.on_cue(cloud.points)) & tinted
+    points, normals, hit = (np.asarray(array) for array in (cloud.points, cloud.normals, cloud.mask))
     rays = pose.position - points
     facing = np.where(hit, np.sum(rays * normals, axis=-1) / np.linalg.norm(rays, axis=-1), 0.0)
     colours = np.where(on_cue[:, None], _TINTED, _PLAIN) * (0.4 + 0.65 * facing)[:, None]

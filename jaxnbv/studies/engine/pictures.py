@@ -28,8 +28,8 @@ def write_pictures(
     """
     folder, paths = make_folder(folder), []
     for record in sorted(records, key=lambda record: record["scene"])[:scenes]:
-        held = record["methods"]
-        methods = [method for method in study.pictured if method in held] or list(held)
+        by_method = record["methods"]
+        methods = [method for method in study.pictured if method in by_method] or list(by_method)
         tiles = study.tiles(record, methods, pixels)
         if tiles is not None:
             paths.append(folder / f"scene_{record['scene']:04d}.png")

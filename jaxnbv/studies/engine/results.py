@@ -80,13 +80,13 @@ def tables(found: pd.DataFrame, study: type[Study], group: str = _ALL) -> list[t
     """Titles and text cells of two tables per measure: means of the methods, leads of the reference."""
     texts = []
     for measure in study.measures:
-        here = found[(found["group"] == group) & (found["quantity"] == measure.name)]
+        part = found[(found["group"] == group) & (found["quantity"] == measure.name)]
         unit = f" ({measure.unit})" if measure.unit else ""
-        others = here[(here["method"] != study.reference) & ~((measure.by == "view") & (here["at"] == 1))]
+        others = part[(part["method"] != study.reference) & ~((measure.by == "view") & (part["at"] == 1))]
         others = others.dropna(subset="lead")
-        best = here.groupby("at", sort=False)["mean"].transform("min" if measure.less else "max") == here["mean"]
+        best = part.groupby("at", sort=False)["mean"].transform("min" if measure.less else "max") == part["mean"]
         for title, rows, cells in (
-            (f"{measure.title}{unit}, by {measure.by}", here, _means(here, measure, best)),
+            (f"{measure.title}{unit}, by {measure.by}", part, _means(part, measure, best)),
             (f"{measure.title}{unit}: {study.reference} minus another method", others, _leads(others, measure)),
         ):
             if len(rows):
@@ -161,10 +161,10 @@ def verdicts(found: pd.DataFrame, study: type[Study]) -> list[Verdict]:
             better = (row.lead < 0) == measure.less
             by_place[_WHERE[1 if level else 0 if better else 2]].append(f"{row.method} ({text.rstrip('*')})")
         if len(rows):
-            held = sum(len(by_place[place]) for place in _WHERE[: 1 if claim.ahead else 2])
+            num_held = sum(len(by_place[place]) for place in _WHERE[: 1 if claim.ahead else 2])
             parts = "; ".join(f"{place} {', '.join(methods)}" for place, methods in by_place.items() if methods)
-            sentence = f"Holds against {held} of {len(rows)}: {parts}."
-            judged.append(Verdict(claim.text, held, len(rows), sentence))
+            sentence = f"Holds against {num_held} of {len(rows)}: {parts}."
+            judged.append(Verdict(claim.text, num_held, len(rows), sentence))
     return judged
 
 

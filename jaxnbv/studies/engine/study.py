@@ -125,7 +125,7 @@ class Study(eqx.Module):
     def files_in(cls, folder: str | Path) -> tuple[MeshFile, ...]:
         """The meshes in a folder that are usable as scenes.
 
-        **Raises:** `ValueError` if there is none.
+        **Raises:** `ValueError` if there is no mesh.
         """
         return mesh_files(folder)
 
@@ -241,8 +241,8 @@ class Study(eqx.Module):
     def first_view(self, scene: Scene) -> int:
         """Index of a random candidate from which the object shows enough."""
 
-        def enough(seen: PointCloud) -> bool:
-            return self.shows_enough(scene, seen)
+        def enough(scan: PointCloud) -> bool:
+            return self.shows_enough(scene, scan)
 
         keys = self.key(scene.index, "first"), self.key(scene.index, "episode")
         first = first_showing(enough, self.candidates.poses(), self.sensor(scene), *keys)

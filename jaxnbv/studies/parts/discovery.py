@@ -188,7 +188,7 @@ class PartDiscoveryStudy(Study):
 
         Below is the number of parts with N_target = 60 points. A method ends once every part has 100.
         """
-        scene, held = self.scene(record["scene"]), record["methods"]
+        scene, runs = self.scene(record["scene"]), record["methods"]
         parts, segmenter = np.asarray(self.truth(scene)), self.segmenter_of(scene)
         palette, point = [SERIES[part % len(SERIES)] for part in range(len(parts))], jnp.zeros((1, 3))
         labels = jax.eval_shape(segmenter, PointCloud(point, point, jnp.zeros(1, bool))).shape[1]
@@ -198,13 +198,13 @@ class PartDiscoveryStudy(Study):
         points = mesh.sample_points(jax.random.key(0), _DENSE)
         labels_of_points = np.asarray(self.true_parts(scene, jnp.asarray(points, jnp.float32)))
         still = still_of(mesh, across(record), pixels)
-        replays = {method: replay(self, scene, held[method]) for method in methods}
+        replays = {method: replay(self, scene, runs[method]) for method in methods}
 
         def tile(axes: Axes, method: str, view: int) -> None:
             fed, predicted = segmenter.predict(replays[method][view][1].cloud)
             mask = np.asarray(fed.mask)
             draw_on(axes, still, np.asarray(fed.points)[mask], colours[np.asarray(predicted)[mask]])
-            num_found = sum(count >= TARGET for count in held[method]["counts"][view])
+            num_found = sum(count >= TARGET for count in runs[method]["counts"][view])
             say(axes, f"{num_found} of {len(parts)} parts", num_found == len(parts))
 
         marks = {name: {"marker": "o", "color": colour} for name, colour in zip(record["parts"], palette, strict=True)}

@@ -92,8 +92,8 @@ class MeshPartStudy(PartDiscoveryStudy):
 
     def truth(self, scene: Scene) -> list[int]:
         """Indices of the parts that can be found."""
-        seen = scan(scene.surface, self.imagined_camera, self.candidates.poses())
-        joined = PointCloud(seen.points.reshape(-1, 3), seen.normals.reshape(-1, 3), seen.mask.reshape(-1))
+        scans = scan(scene.surface, self.imagined_camera, self.candidates.poses())
+        joined = PointCloud(scans.points.reshape(-1, 3), scans.normals.reshape(-1, 3), scans.mask.reshape(-1))
         counts = part_counts(scene.task.oracle(joined))
         visible = [int(part) for part in np.flatnonzero(np.asarray(counts) >= max(TARGETS))]
         require(len(visible) > 0, f"{scene.name} has no part that shows {max(TARGETS)} points: leave it out")
