@@ -358,9 +358,9 @@ REFUSED = {
     ),
     "a segmenter of rows": (lambda: planner(nbv.SoftPartCount(lambda c: c.mask)), "the segmenter's answer"),
     "a baseline of NaN": (lambda: nan_baseline(), "the value of NaNView is not a number"),
-    "a rule that says True": (lambda: stopping(True), "the rule of stopping Saying says True"),
+    "a rule that says True": (lambda: stopping(True), "the stop rule Saying returned True"),
     "a rule that says nothing": (lambda: stopping(""), "None to go on"),
-    "a rule of a number in two": (lambda: stopping(0.5, nbv.Budget(seconds=1e9)), "Saying says 0.5"),
+    "a rule of a number in two": (lambda: stopping(0.5, nbv.Budget(seconds=1e9)), "Saying returned 0.5"),
     "a utility by a mask": (
         lambda: planner(lambda cloud: jnp.max(cloud.points[cloud.mask][:, 1])),
         "jnp.where(cloud.mask",

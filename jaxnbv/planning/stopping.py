@@ -1,6 +1,6 @@
-"""When an episode is long enough: rules that a loop asks after each view, and about each view that is proposed.
+"""Stop rules: conditions that end an episode, checked after each view and for each proposed view.
 
-    rule         its number is                                            asked about the next view too
+    rule         its limit is                                             checks the proposed view too
     Sure         a probability                                            no
     Found        points of each part                                      no
     Identified   a probability                                            no
@@ -9,7 +9,7 @@
     ValueBelow   a value of the search, lengths in world units            yes
     Budget       seconds; or a cost, of poses in the world                for a cost
 
-Rules are combined by `|`: the first that holds ends the episode. In a simulation the world is the scene.
+Combine rules with `|`: the first that holds ends the episode. In a simulation, world units are scene units.
 """
 
 import dataclasses
@@ -38,13 +38,14 @@ from jaxnbv.tasks.segmentation import PartAnswer, SoftPartCount
 
 @dataclasses.dataclass(frozen=True)
 class StopContext:
-    """An episode between two views, as a rule sees it.
+    """The state of an episode between two views, for stop rules.
 
-    - `planner`, `observations`: as of the next step, in scene coordinates.
-    - `poses`: that were taken, in scene coordinates.
-    - `seconds`: since the first view of this process.
-    - `key`: of the next step's samples; `surfaces` draws them, once for the rule and the search.
-    - `frame`: of the user's world, in whose units a value or a cost is given.
+    - `planner`, `observations`: planner and observations of the next step, in scene coordinates.
+    - `poses`: poses of the views so far, in scene coordinates.
+    - `seconds`: time since the first view of this process.
+    - `key`: random key of the next step's samples.
+    - `surfaces`: function that draws these samples, once for both the rule and the search.
+    - `frame`: frame of the user's world, which gives the units of values and costs.
     """
 
     planner: Planner
@@ -56,16 +57,16 @@ class StopContext:
     frame: Frame
 
     def cost(self, poses: tuple[Pose, ...], of: CostFunction) -> float:
-        """The cost of the way through some poses, by a function of poses in the user's world."""
+        """Cost of the path through poses of the scene, by a function `of` of poses in the user's world."""
         return total_cost(poses, WorldCost(of, self.frame))
 
 
 class StopRule(eqx.Module):
-    """Says when no more views are needed: after a view, or about the next view before it is taken."""
+    """Base class of rules that end an episode: after a view, or before the proposed view is taken."""
 
     @property
     def needs_proposal(self) -> bool:
-        """Whether the rule is asked about the next view too."""
+        """Whether the rule checks the proposed view, so that `before` must be called."""
         return type(self).before is not StopRule.before
 
     def check(self, acquisition: Acquisition) -> None:
@@ -73,23 +74,24 @@ class StopRule(eqx.Module):
         return
 
     def after(self, context: StopContext) -> str | None:
-        """Why the views so far are enough, in words; None to go on."""
+        """The reason to stop after the views so far, in words; None to continue."""
         return None
 
     def before(self, context: StopContext, pose: Pose, value: float) -> str | None:
-        """Why the next view is not to be taken; None to go on.
+        """The reason to stop before the proposed view, in words; None to continue.
 
-        - `pose`: of the proposal, in scene coordinates; `value`: its value in world units.
+        - `pose`: proposed pose, in scene coordinates.
+        - `value`: its value, in world units.
         """
         return None
 
     def __or__(self, other: "StopRule") -> "StopRule":
-        check_type(other, StopRule, "a rule of stopping")
+        check_type(other, StopRule, "a stop rule")
         return AnyOf((self, other))
 
 
 class AnyOf(StopRule):
-    """The first of some rules that holds."""
+    """Stop once any of these rules holds. The reason is that of the first one."""
 
     rules: tuple[StopRule, ...]
 
@@ -110,24 +112,28 @@ class AnyOf(StopRule):
 
 
 def checked_reason(rule: StopRule, reason: str | None) -> str | None:
-    """What a rule says, as it is.
+    """The reason that a rule returned, unchanged.
 
-    **Raises:** `ValueError` unless it is a reason in words, or None.
+    **Raises:** `ValueError` unless it is a non-empty string or None.
     """
-    proper = reason is None or (isinstance(reason, str) and bool(reason))
+    is_proper = reason is None or (isinstance(reason, str) and bool(reason))
     name = type(rule).__name__
-    require(proper, f"the rule of stopping {name} says {shown(reason)}: it must say why, in words, or None to go on")
+    require(
+        is_proper,
+        f"the stop rule {name} returned {shown(reason)}: it must return the reason in words, or None to go on",
+    )
     return reason
 
 
 class Sure(StopRule):
-    """Stop once the class is known: it has this probability given D, and given each of several random halves of D too,
-    since a single answer may be sure by chance.
+    """Stop once the most probable class has this probability given D, and given each of several random halves of D.
+
+    The halves are there because a single answer may be sure by chance.
 
     - `probability`: within (0, 1).
-    - `num_resamplings`: how many halves are drawn.
+    - `num_resamplings`: number of random halves.
 
-    **Raises:** `ValueError` for another probability or a negative number; of an acquisition without a classifier.
+    **Raises:** `ValueError` for a value out of range, or an acquisition without a classifier.
     """
 
     probability: float = eqx.field(static=True, default=0.95)
@@ -147,7 +153,7 @@ class Sure(StopRule):
         return self.reason(context.planner.acquisition, context.observations.cloud, context.key)
 
     def reason(self, acquisition: Acquisition, cloud: PointCloud, key: PRNGKeyArray) -> str | None:
-        """Why the class is known given D, in words; None if it is not. `key`: of the random halves."""
+        """The reason to stop given D, in words; None to continue. `key` decides the random halves."""
         acquisition = _of_classes(acquisition)
         answer = acquisition.answer(cloud)
         best = int(np.argmax(answer.values))
@@ -174,19 +180,18 @@ def _of_classes(acquisition: Acquisition) -> ClassAcquisition:
 
 @jax.jit
 def half_of(cloud: PointCloud, key: PRNGKeyArray) -> PointCloud:
-    """Each of a cloud's points with probability one half."""
+    """A random subset of a cloud that keeps each point with probability one half."""
     return cloud.only(jax.random.bernoulli(key, 0.5, cloud.mask.shape))
 
 
 class Found(StopRule):
     """Stop once all parts are found.
 
-    - `points`: a part is found once so many points are predicted to be of it.
-    - `parts`: names of those to be found; by default all that the segmenter is asked for, of which the object may lack
-      one.
+    - `points`: number of points that must be predicted to belong to each part.
+    - `parts`: names of the parts to find, by default all parts of the segmenter. The object may lack one of these.
 
-    **Raises:** `ValueError` for a number of points below one; of an acquisition without a segmenter, or whose
-    segmenter does not know a part.
+    **Raises:** `ValueError` for a number of points below one, an acquisition without a segmenter, or a part that the
+    segmenter does not know.
     """
 
     points: int = eqx.field(static=True, default=60)
@@ -208,7 +213,7 @@ class Found(StopRule):
         names = tuple((utility.segmenter.part_names or {}).values())
         require(
             bool(self.parts or names),
-            "the segmenter does not name the parts that it is asked for: give Found(parts=...), 'part 0' and so on",
+            "the segmenter has no names for its parts: give the parts to find as Found(parts=('part 0', ...))",
         )
         unknown = [name for name in self.parts or () if names and name not in names]
         require(not unknown, f"the segmenter knows no part {unknown[:1]}: give some of {', '.join(names)}")
@@ -216,20 +221,19 @@ class Found(StopRule):
     def after(self, context: StopContext) -> str | None:
         answer = context.planner.acquisition.answer(context.observations.cloud)
         if not isinstance(answer, PartAnswer):
-            raise InputError("the acquisition's answer tells no parts")
-        found = dict(zip(answer.names, answer.values.tolist(), strict=True))
-        wanted = self.parts or tuple(answer.names[index] for index in answer.asked)
-        if any(found.get(name, 0) < self.points for name in wanted):
+            raise InputError("the acquisition's answer has no parts: Found needs that of the utility SoftPartCount")
+        counts = dict(zip(answer.names, answer.values.tolist(), strict=True))
+        names = self.parts or tuple(answer.names[index] for index in answer.asked)
+        if any(counts.get(name, 0) < self.points for name in names):
             return None
-        return f"all of {len(wanted)} parts are found, by {self.points} points or more"
+        return f"all {len(names)} parts are found, each by {self.points} points or more"
 
 
 class Covered(StopRule):
-    """Stop once this share of what the candidates can show is expected to have been seen: of the area of the sampled
-    surfaces that they would show, what a view that was taken shows and `NewSurface` does not take for new.
+    """Stop once this share of the visible surface is expected to have been seen, see `expected_coverage`.
 
-    - `share`: within (0, 1].
-    - `size`: of `NewSurface`, in world units in a session; by default that of the acquisition, or of `NewSurface()`.
+    - `share`: share of the area, within (0, 1].
+    - `size`: size of `NewSurface`, in world units; by default that of the acquisition, or of `NewSurface()`.
 
     **Raises:** `ValueError` for another share, or a size that is not positive.
     """
@@ -247,14 +251,17 @@ class Covered(StopRule):
         new = newness_of(context.planner.acquisition)
         if self.size is not None:
             new = NewSurface(self.size * context.frame.scale)
-        covered = expected_coverage(context, new)
-        return f"{100 * covered:.1f} % of what can be seen is expected to be covered" if covered >= self.share else None
+        share = expected_coverage(context, new)
+        return f"{100 * share:.1f} % of what can be seen is expected to be covered" if share >= self.share else None
 
 
 def expected_coverage(context: StopContext, new: NewSurface) -> float:
-    """`seen_share` of the posterior's surfaces from all candidates, less what no sensor can measure.
+    """Expected share of the visible surface that the views so far have seen.
 
-    - `new`: what is new.
+    It is `seen_share` of the posterior samples from all candidates. Sampled surface that a view should have measured
+    and did not is left out.
+
+    - `new`: decides which surface is new.
     """
     planner, observations, surfaces = context.planner, context.observations, context.surfaces()
     if observations.looks is not None and not planner.acquisition.measurable_only:
@@ -266,11 +273,11 @@ def expected_coverage(context: StopContext, new: NewSurface) -> float:
 
 
 class Identified(StopRule):
-    """Stop once it is known which part the object is: one of them, or none of these, has this probability.
+    """Stop once one of the known parts, or "none of these", has this probability.
 
     - `probability`: within (0, 1).
 
-    **Raises:** `ValueError` for another probability; for a planner that knows no parts.
+    **Raises:** `ValueError` for another probability, or a planner without known parts.
     """
 
     probability: float = eqx.field(static=True, default=0.95)
@@ -285,12 +292,13 @@ class Identified(StopRule):
 
 
 class Placed(StopRule):
-    """Stop once it is known where the object lies: the surface of the likeliest part to this length, the root mean
-    square over its surface and over the hypotheses.
+    """Stop once the surface of the likeliest part is known to this length, see `surface_error`.
+
+    The error is a root mean square over the surface and over the hypotheses.
 
     - `length`: in world units in a session, scene units in a simulation.
 
-    **Raises:** `ValueError` for a length that is not positive; for a planner that knows no parts.
+    **Raises:** `ValueError` for a length that is not positive, or a planner without known parts.
     """
 
     length: float = eqx.field(static=True)
@@ -307,8 +315,11 @@ class Placed(StopRule):
 
 
 class ValueBelow(StopRule):
-    """Stop once the best view's value is less than this: in the units of what the search maximises, lengths in world
-    units in a session and in scene units in a simulation."""
+    """Stop once the proposed view's value is below this limit.
+
+    - `value`: in the units of the search's values, with lengths in world units in a session and in scene units in a
+      simulation.
+    """
 
     value: float = eqx.field(static=True)
 
@@ -323,12 +334,13 @@ class ValueBelow(StopRule):
 
 
 class Budget(StopRule):
-    """Stop when time is up, or when the next view would cost more than is left.
+    """Stop when time is up, or when the next view would exceed the cost.
 
-    - `seconds`: of this process, since its first view; the view that is under way is finished.
-    - `cost`: of the whole way through all views, by the function `of`: of poses in the world in a session.
+    - `seconds`: time since the first view of this process. The current view is finished.
+    - `cost`: cost of the whole path through all views, by the function `of`.
+    - `of`: cost function of poses, in world coordinates in a session.
 
-    **Raises:** `ValueError` for neither, or one that is not positive.
+    **Raises:** `ValueError` for neither limit, or one that is not positive.
     """
 
     seconds: float | None = eqx.field(static=True, default=None)
@@ -337,9 +349,9 @@ class Budget(StopRule):
 
     def __check_init__(self):
         check_fields(self)
-        given = [limit for limit in (self.seconds, self.cost) if limit is not None]
-        require(len(given) > 0, "the budget is of nothing: give seconds or cost")
-        require(all(limit > 0 for limit in given), f"the budget is {given}; it must be positive")
+        limits = [limit for limit in (self.seconds, self.cost) if limit is not None]
+        require(len(limits) > 0, "the budget has no limit: give seconds or cost")
+        require(all(limit > 0 for limit in limits), f"the budget is {limits}; it must be positive")
 
     @property
     def needs_proposal(self) -> bool:

@@ -259,13 +259,13 @@ def test_a_view_of_too_little_value_is_not_taken():
         (lambda: Found(0), "a part is found by 0 points"),
         (lambda: Covered(1.5), "share is 1.5"),
         (lambda: Covered(size=0.0), "size is 0.0"),
-        (lambda: Budget(), "of nothing: give seconds or cost"),
+        (lambda: Budget(), "has no limit: give seconds or cost"),
         (lambda: Budget(seconds=0.0), "must be positive"),
         (lambda: Sure().check(Coverage()), "Sure is about a class, but Coverage has no classifier"),
         (lambda: Found().check(Coverage()), "Found is about parts, but Coverage has no segmenter"),
         (
             lambda: Found().check(ExpectedUtilityImprovement(segmenter((3, 3)))),
-            "does not name the parts",
+            "has no names for its parts",
         ),
     ],
 )
