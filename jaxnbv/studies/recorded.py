@@ -53,7 +53,7 @@ class Recording(NamedTuple):
     """The frames of a sequence, and the voxels of the box that at least three of them show.
 
     - `poses`: the camera poses; `scans`: what each frame shows of the box; both in scene units.
-    - `shown`: whether each frame shows each voxel, by all pixels of the frame.
+    - `shown`: whether any pixel of each frame shows each voxel.
     - `voxels`: the centres of the voxels; `places`: the positions of the camera; both in the recording's units.
     """
 
@@ -107,7 +107,7 @@ class MostNewVoxels(Baseline):
 
 
 def _gains(record: Record, method: str) -> dict[int, float | None]:
-    """Share of voxels that a method added by each later view, relative to the oracle's at the same view."""
+    """Voxels that a method has added by each later view, as a share of those that the oracle has added."""
     if ORACLE not in record["methods"]:
         return {}
     own, best = (record["methods"][name]["covered"] for name in (method, ORACLE))

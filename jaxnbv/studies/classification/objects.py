@@ -1,8 +1,8 @@
 """Classification studies by kind of object: which methods' views tell the class, and how soon?
 
-The class of a pyramid shows in a pattern on its base. The class of a truck is that of its cargo, which the outside of
-the truck hides. The whole surface tells the class of household objects, the paper's sanity check, and of scanned
-fruits, from its supplement.
+The class of a pyramid shows in a pattern on its base. The class of a truck is that of its cargo, but most of what views
+show is the truck's outside. The whole surface tells the class of household objects, the paper's sanity check, and of
+scanned fruits, from its supplement.
 """
 
 from pathlib import Path
@@ -58,7 +58,7 @@ class PyramidStudy(ClassificationStudy):
         return f"first view at {least:03d}° or more from the base's normal"
 
     def facts(self, scene: Scene, truth: Truth, first: int) -> Record:
-        """Also records the first view's angle from the base's normal: degrees, 180 behind the apex."""
+        """Also record the first view's angle from the base's normal, in degrees (180: behind the apex)."""
         direction = np.asarray(self.candidates.poses().position[first])
         # The base looks along -z of the pyramid's own frame.
         assert isinstance(truth.thing, Pyramid)

@@ -87,7 +87,7 @@ class ClassificationStudy(Study):
     - `classifier`: classifier of clouds in scene coordinates, applied after each view.
     - `imagining`: classifier of D u scan for imagined scans; default: `classifier`. One that gets fewer points saves
       time.
-    - `framing`: how much of the object fits into a view.
+    - `framing`: size of the object, and so how much of it a view shows.
     - `split`: split of the scenes. Tune settings on the validation split.
     - `num_points`: D is thinned to this number, once a step, before imagined scans are added.
     - `first`: which views may be the first.
@@ -258,7 +258,7 @@ class ClassificationStudy(Study):
         return runs[0] | {name: [row for run in runs for row in run[name]] for name in ("log_p", "pixels")}
 
     def follow(self, scene: Scene, truth: Truth, planner: Planner, episode: Iterator[Step]) -> Record:
-        """Record the class probabilities after each view, and the rays of the view that hit the cue.
+        """Record the log probabilities of the classes after each view, and the rays of the view that hit the cue.
 
         For the view that is chosen, also record the rank correlation of the candidates' values and true cue pixels, and
         the roughness of the samples.

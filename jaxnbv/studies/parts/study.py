@@ -43,8 +43,8 @@ class MeshPartStudy(PartDiscoveryStudy):
 
     - `meshes`: files whose nodes are parts; `room`: largest number of parts of any mesh.
 
-    The utility counts all parts. The measures count only the parts that can be found: all candidates together show at
-    least as many points of them as the largest N_target.
+    The utility counts all parts. The measures count only the parts that can be found, of which all candidates together
+    show at least the largest N_target of points.
     """
 
     explanation: ClassVar[str] = (

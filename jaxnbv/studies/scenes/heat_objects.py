@@ -38,8 +38,8 @@ class HeatScene(eqx.Module):
 def heat_scene(index: int, turned: bool = True) -> HeatScene:
     """The heated scene of an index. The kinds of objects take turns.
 
-    Proportions and source are random, and so is the turn about y if `turned`. Indices from `FIRST_TRAINING` on are for
-    training only.
+    Proportions and source are random, and so is the turn about y if `turned`. Reported results never include indices
+    from `FIRST_TRAINING` on.
 
     **Raises:** `ValueError` if the index is negative.
     """
