@@ -258,7 +258,7 @@ class ClassificationStudy(Study):
         return runs[0] | {name: [row for run in runs for row in run[name]] for name in ("log_p", "pixels")}
 
     def follow(self, scene: Scene, truth: Truth, planner: Planner, episode: Iterator[Step]) -> Record:
-        """Record the log probabilities of the classes after each view, and the rays of the view that hit the cue.
+        """Record the classes' log probabilities after each view, and the rays of the view that hit the cue.
 
         For the view that is chosen, also record the rank correlation of the candidates' values and true cue pixels, and
         the roughness of the samples.
