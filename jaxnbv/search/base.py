@@ -1,4 +1,4 @@
-"""How a pose is found: what all searches have in common."""
+"""Base classes of searches, and the choice of the best candidate."""
 
 import dataclasses
 from abc import abstractmethod
@@ -24,36 +24,39 @@ else:
     AnyCandidates = Candidates
 
 Scores: TypeAlias = Float[Array, "asked samples candidates"]
-"""Of the acquisitions that a search asks, of each posterior sample, at each candidate."""
+"""Scores of each acquisition in `CandidateSearch.asks`, for each posterior sample and candidate."""
 
 _TIE = 1e-5
 
 
 class Search(eqx.Module):
-    """How a pose is found. `uses_samples` says whether posterior samples must be drawn for it, `uses_cost` whether
-    the cost of going there can count."""
+    """Base class of searches: methods that find the next pose.
+
+    - `uses_samples`: whether the search needs posterior samples.
+    - `uses_cost`: whether the cost of going to a pose can count.
+    """
 
     uses_samples: eqx.AbstractClassVar[bool]
     uses_cost: ClassVar[bool] = True
 
     def check(self, acquisition: Acquisition, camera: Camera, capacity: int) -> None:
-        """Raise `ValueError` if the search cannot work with an acquisition, a camera and a cloud of so many rows."""
+        """Raise `ValueError` if the search cannot work with an acquisition, a camera and clouds of `capacity` rows."""
         return
 
     def quantity(self, acquisition: Acquisition) -> Quantity:
-        """What the values of its proposals are: by default the acquisition's."""
+        """Quantity of the values of its proposals, by default the acquisition's."""
         return acquisition.quantity
 
     def poses_around(self) -> Pose:
-        """Poses all about the object, for questions about all that can be seen of it: by default the paper's."""
+        """Poses all around the object, used to compute which surface is visible. By default the paper's."""
         return SphereCandidates().poses()
 
     def above(self) -> "Search":
-        """The search over the upper half of its poses, where these are the whole sphere."""
+        """A copy over the upper half of its poses if these are a whole sphere; otherwise the search itself."""
         return self
 
     def among(self, poses: Pose) -> "Search":
-        """The search over given poses (n,).
+        """A copy that chooses among these poses (n,).
 
         **Raises:** `ValueError` if the search does not choose among poses.
         """
@@ -64,22 +67,22 @@ class Search(eqx.Module):
 
     @abstractmethod
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
-        """The pose to take next; a pure function of its arguments, which runs under `jit`."""
+        """Propose the next pose. A pure function that runs under `jit`."""
 
 
 class CandidateSearch(Search):
-    """A search that chooses one of its candidates, in two halves: it scores them, then it picks.
+    """Base class of searches over candidates, in two halves: score the candidates, then pick one.
 
-    A study gives several searches the same scores, those of `asks`, and lets each `pick`.
+    A study computes the scores of `asks` once for several searches, and lets each of them `pick`.
 
-    - `candidates`: `SphereCandidates`, `GivenPoses` or others; a number stands for so many on the paper's sphere, and a
-      batch of poses for these.
+    - `candidates`: `SphereCandidates`, `GivenPoses` or others. A number becomes `SphereCandidates`, a batch of poses
+      `GivenPoses`.
     """
 
     candidates: AnyCandidates = eqx.field(converter=as_candidates, default=SphereCandidates())
 
     def poses_around(self) -> Pose:
-        """Its candidates."""
+        """The poses of its candidates."""
         return self.candidates.poses()
 
     def above(self) -> "CandidateSearch":
@@ -89,21 +92,21 @@ class CandidateSearch(Search):
         return dataclasses.replace(self, candidates=GivenPoses(poses))
 
     def asks(self, acquisition: Acquisition) -> tuple[Acquisition, ...]:
-        """The acquisitions whose scores it picks by; none for a search that does not look at them."""
+        """The acquisitions whose scores `pick` needs; empty for a search that needs none."""
         return (acquisition,)
 
     def score(self, problem: Problem, candidates: Pose) -> Scores:
-        """The first half: the scores of the candidates, sample by sample, by each acquisition that it asks."""
-        asked = self.asks(problem.acquisition)
-        if not asked:
+        """First half: the scores of the candidates for each acquisition in `asks` and each sample."""
+        acquisitions = self.asks(problem.acquisition)
+        if not acquisitions:
             return jnp.zeros((0, 0, self.candidates.count))
-        if len(asked) == 1:
+        if len(acquisitions) == 1:
             return problem.scores(candidates)[None]
-        return problem.about(AcquisitionList(asked)).scores(candidates)
+        return problem.about(AcquisitionList(acquisitions)).scores(candidates)
 
     @abstractmethod
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
-        """The second half: one of the candidates, given their scores."""
+        """Second half: propose one of the candidates, given their scores."""
 
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
         """Score, then pick."""
@@ -112,21 +115,21 @@ class CandidateSearch(Search):
 
 
 class Baseline(CandidateSearch):
-    """A search that values candidates by itself, whatever the acquisition."""
+    """Base class of searches that value candidates without the acquisition."""
 
     uses_samples: ClassVar[bool] = False
     uses_cost: ClassVar[bool] = False
 
     def asks(self, acquisition: Acquisition) -> tuple[Acquisition, ...]:
-        """None."""
+        """No acquisitions."""
         return ()
 
     @abstractmethod
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
-        """Of each candidate; the open one of the highest value is taken."""
+        """Value of each candidate. The search picks the highest among those that are not excluded."""
 
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
-        """The argmax of `values`; there are no scores."""
+        """The argmax of `values`. The scores are empty."""
         return best_unvisited(problem, candidates, self.values(problem, candidates, key))
 
 
@@ -137,49 +140,51 @@ def best_unvisited(
     tie: float = _TIE,
     scores: Float[Array, "samples candidates"] | None = None,
 ) -> Proposal:
-    """The candidate of the highest value among those that are open; the first of them where values tie.
+    """Propose the candidate of the highest value that is not excluded; the first one if values tie.
 
-    `tie`: the relative difference within which they do, by default what sums in another order differ by. `scores`:
-    those whose means the values are, for their standard errors.
+    - `tie`: values tie within this relative difference, by default the rounding error of sums in another order.
+    - `scores`: scores whose means are the values, for standard errors.
     """
     values = jnp.where(problem.is_excluded(candidates), -jnp.inf, values)
     index = first_best(values, tie)
-    found = Proposal(candidates[index], values[index], candidates, values)
+    proposal = Proposal(candidates[index], values[index], candidates, values)
     if scores is None:
-        return found
-    errors, of_differences = standard_error(scores), standard_error(scores - scores[:, index][:, None])
+        return proposal
+    errors, difference_errors = standard_error(scores), standard_error(scores - scores[:, index][:, None])
     return dataclasses.replace(
-        found, standard_error=errors[index], standard_errors=errors, difference_errors=of_differences
+        proposal, standard_error=errors[index], standard_errors=errors, difference_errors=difference_errors
     )
 
 
 def best_or_farthest(problem: Problem, candidates: Pose, scores: Float[Array, "samples candidates"]) -> Proposal:
-    """`best_unvisited`; of an acquisition that `gains_once`, the farthest from the cameras so far among the candidates
-    that are level with it, unless a cost counts, which would speak against it."""
-    found = best_unvisited(problem, candidates, jnp.mean(scores, axis=0), scores=scores)
+    """Propose as `best_unvisited`, but take the farthest of the tied candidates from earlier cameras.
+
+    This applies if the acquisition `gains_once` and no cost counts, since a cost counts against far candidates.
+    """
+    proposal = best_unvisited(problem, candidates, jnp.mean(scores, axis=0), scores=scores)
     if not problem.acquisition.gains_once or problem.cost is not None:
-        return found
-    found = dataclasses.replace(found, in_vain=problem.expected_in_vain())
-    taken = problem.observations.poses
-    # From no pose, all are equally far.
-    return preferred(found, jnp.where(taken.count > 0, taken.distance(candidates), found.values))
+        return proposal
+    proposal = dataclasses.replace(proposal, in_vain=problem.expected_in_vain())
+    visited = problem.observations.poses
+    # Without earlier cameras there is no distance: prefer the highest value.
+    return preferred(proposal, jnp.where(visited.count > 0, visited.distance(candidates), proposal.values))
 
 
-def preferred(found: Proposal, preference: Float[Array, " candidates"]) -> Proposal:
-    """A proposal with the candidate of the highest preference among those that are level with its best and open."""
-    tied, errors = found.tied_with_best(), found.standard_errors
+def preferred(proposal: Proposal, preference: Float[Array, " candidates"]) -> Proposal:
+    """Change a proposal to the candidate of the highest preference among those tied with its best and not excluded."""
+    tied, errors = proposal.tied_with_best(), proposal.standard_errors
     assert tied is not None
     assert errors is not None
-    preference = jnp.where(tied & (found.values > -jnp.inf), preference, -jnp.inf)
+    preference = jnp.where(tied & (proposal.values > -jnp.inf), preference, -jnp.inf)
     index = first_best(preference)
     # NaN in either propagates; the planner reports it.
-    value = jnp.where(jnp.isnan(preference[index]), jnp.nan, found.values[index])
-    value = jnp.where(jnp.isfinite(found.value), value, found.value)
-    return dataclasses.replace(found, pose=found.candidates[index], value=value, standard_error=errors[index])
+    value = jnp.where(jnp.isnan(preference[index]), jnp.nan, proposal.values[index])
+    value = jnp.where(jnp.isfinite(proposal.value), value, proposal.value)
+    return dataclasses.replace(proposal, pose=proposal.candidates[index], value=value, standard_error=errors[index])
 
 
 def first_best(values: Float[Array, " candidates"], tie: float = _TIE) -> Int[Array, ""]:
-    """Index of the highest value, ties as of `best_unvisited`."""
+    """Index of the highest value; the first one within the relative difference `tie`."""
     best = jnp.max(values)
     # Nothing ties with an infinite value, and the planner reports NaN.
     tied = values >= best - jnp.where(jnp.isfinite(best), tie * jnp.abs(best), 0.0)

@@ -1,4 +1,4 @@
-"""What a search answers."""
+"""Results of a search: proposals and the trajectories of gradient searches."""
 
 import equinox as eqx
 import jax
@@ -10,9 +10,9 @@ from jaxnbv.geometry.pose import Pose
 
 
 class Trajectories(eqx.Module):
-    """Where a gradient search stood, step by step, from each of its starts to the end, and the values there.
+    """Poses and values of a gradient search at each step, for each of its starts.
 
-    - `poses`: with the leading axes of `values`; `iterations` + 1 steps.
+    - `poses`: a batch with the axes of `values`; there are `iterations` + 1 steps.
     """
 
     poses: Pose
@@ -20,23 +20,24 @@ class Trajectories(eqx.Module):
 
     @property
     def flat(self) -> tuple[Pose, Float[Array, " looks"]]:
-        """All poses and values: the starts, then where each went with its first step, and so on."""
+        """All poses and values along one axis: all starts, then all first steps, and so on."""
         poses, values = jax.tree.map(lambda rows: jnp.swapaxes(rows, 0, 1), (self.poses, self.values))
         return jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), (poses, values))
 
 
 class Proposal(eqx.Module):
-    """A search's answer: the pose to take next, and what it looked at.
+    """A search's result: the next pose, and the values of all poses that were evaluated.
 
-    - `value`: the chosen pose's value, in the units of what the search maximises; `standard_error`: of it, as a mean
-      over the posterior samples. NaN for a single sample; None for a search that does not score on samples.
-    - `candidates`, `values`: the pool of poses and their values; -inf where one was excluded as visited.
-    - `standard_errors`: of the values, each as a mean over the samples that its candidate was scored on;
-      `difference_errors`: of each value less that of the best candidate, which are smaller, since all poses are scored
-      on the same samples; None for a search that does not score all candidates on all samples.
-    - `trajectories`: those of a gradient search, starting from the best candidates; None for other searches.
-    - `in_vain`: what the acquisition expects, on average, of poses that were taken, see `Problem.expected_in_vain`;
-      None for an acquisition that may gain twice.
+    - `pose`, `value`: the proposed pose and its value, in the units of the search's quantity.
+    - `candidates`, `values`: all candidates and their values; -inf for an excluded one.
+    - `trajectories`: trajectories of a gradient search, from the best candidates; None for other searches.
+    - `standard_errors`: standard errors of the values, as means over the samples on which a candidate was scored.
+    - `difference_errors`: standard errors of the differences to the best value. They are smaller, since all poses are
+      scored on the same samples. None for a search that does not score all candidates on all samples.
+    - `standard_error`: standard error of `value`, a mean over posterior samples. NaN for one sample; None for a search
+      without scores.
+    - `in_vain`: mean value expected at visited poses, see `Problem.expected_in_vain`; None unless the acquisition
+      `gains_once`.
     """
 
     pose: Pose
@@ -50,7 +51,7 @@ class Proposal(eqx.Module):
     in_vain: Float[Array, ""] | None = None
 
     def in_world(self, frame: Frame, length_power: int) -> "Proposal":
-        """The proposal with its values, a power of length, and their errors in world units; poses stay in the scene."""
+        """The proposal with values and errors in world units, by their power of length. Poses stay in the scene."""
 
         def convert(leaf):
             return leaf if isinstance(leaf, Pose) else frame.length_to_world(leaf, length_power)
@@ -58,8 +59,10 @@ class Proposal(eqx.Module):
         return jax.tree.map(convert, self, is_leaf=lambda leaf: isinstance(leaf, Pose))
 
     def tied_with_best(self, errors: float = 2.0) -> Bool[Array, " candidates"] | None:
-        """Which candidates cannot be told from the best one, itself included: those whose value is within so many
-        standard errors of the difference, and what is expected in vain. None where the errors are not known."""
+        """Mask of the candidates that are tied with the best one, including itself; None if errors are unknown.
+
+        A value ties if it differs from the best by at most `errors` standard errors of the difference plus `in_vain`.
+        """
         if self.difference_errors is None:
             return None
         best, in_vain = jnp.max(self.values), 0.0 if self.in_vain is None else self.in_vain
@@ -67,7 +70,7 @@ class Proposal(eqx.Module):
 
     @property
     def num_tied(self) -> int | None:
-        """How many other candidates are tied with the best one; None where that is not known."""
+        """Number of other candidates that are tied with the best one; None if errors are unknown."""
         tied = self.tied_with_best()
         if tied is None or bool(jnp.isnan(jnp.asarray(self.difference_errors)).any()):
             return None
