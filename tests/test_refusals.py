@@ -108,12 +108,12 @@ SCANNING = [
 ]
 SEARCH = [
     (lambda: nbv.SphereCandidates(0), "0 candidates"),
-    (lambda: nbv.SphereCandidates(10, 0.0), "stand 0.0 away"),
+    (lambda: nbv.SphereCandidates(10, 0.0), "are 0.0 away"),
     (lambda: nbv.SphereCandidates(10, math.inf), "radius is inf; it must be a finite number"),
     (lambda: nbv.SphereCandidates(10, 2.5, 2.0), "elevation is 2.0 rad"),
     (lambda: nbv.SphereCandidates(10, up=(0.0, 0.0, 0.0)), "must be a direction"),
     (lambda: nbv.SphereCandidates(40).where(lambda pose: False), "none of 40 candidates is allowed"),
-    (lambda: nbv.Reach(8, 3.0, 2.0), "stand 3.0 to 2.0 away"),
+    (lambda: nbv.Reach(8, 3.0, 2.0), "are 3.0 to 2.0 away"),
     (lambda: nbv.Reach(8, min_elevation=1.0, max_elevation=0.5), "elevations are 1.0 and 0.5 rad"),
     (lambda: nbv.GivenPoses(nbv.look_at((0.0, 0.0, 2.0))), "give a batch"),
     *((lambda wrong=wrong: nbv.DiscreteSearch(wrong), "give how many") for wrong in ("many", 2.5, None)),

@@ -1,4 +1,4 @@
-"""How the next pose is found: among candidates, by gradient, by both, and by the paper's baselines."""
+"""Searches for the next pose: among candidates, by gradient, by both, and the paper's baselines."""
 
 from jaxnbv.search.base import Baseline as Baseline
 from jaxnbv.search.base import CandidateSearch as CandidateSearch

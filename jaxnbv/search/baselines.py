@@ -17,31 +17,31 @@ class FarthestView(Baseline):
     """Farthest point sampling of views: the candidate whose nearest visited camera is farthest away."""
 
     def quantity(self, acquisition: Acquisition) -> Quantity:
-        meaning = "distance from a candidate to the nearest camera so far; the surface is not looked at."
+        meaning = "distance from a candidate to the nearest camera so far, whatever the surface."
         return Quantity("distance to the nearest camera", "", meaning, length_power=1)
 
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
-        """Values are distances in scene units; the key is not used."""
+        """Distances in scene units. The key is not used."""
         return problem.observations.poses.distance(candidates)
 
 
 class RandomView(Baseline):
-    """A candidate drawn uniformly from those not visited yet."""
+    """Random view: a candidate drawn uniformly from those that are not excluded."""
 
     def quantity(self, acquisition: Acquisition) -> Quantity:
-        meaning = "every open candidate drew a lot; the surface is not looked at."
+        meaning = "a random number for each open candidate, whatever the surface."
         return Quantity("lot drawn", "uniform on [0, 1)", meaning, smooth=False)
 
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
-        """Values are the lots that were drawn, uniform on [0, 1)."""
+        """Random numbers, uniform on [0, 1)."""
         return jax.random.uniform(key, (self.candidates.count,))
 
 
 class UncertaintyView(Baseline):
-    """The candidate whose principal ray is the least certain about where it ends (Holalkere et al. 2025).
+    """The candidate whose principal ray has the most uncertain end (Holalkere et al. 2025).
 
-    With the transmittance T(t), the share of the samples whose surface the ray has not entered before t, the value is
-    the length of the ray between the first t with T(t) < 1 and the last t with T(t) > 0.05.
+    The transmittance T(t) is the share of samples whose surface the ray has not entered before t. The value is the
+    length of the ray between the first t with T(t) < 1 and the last t with T(t) > 0.05.
     """
 
     uses_samples: ClassVar[bool] = True
@@ -52,20 +52,20 @@ class UncertaintyView(Baseline):
         return Quantity("uncertain length of the principal ray", "", meaning, length_power=1)
 
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
-        """Values are lengths in scene units; the key is not used."""
+        """Lengths in scene units, given the cost. The key is not used."""
         return problem.apply_cost(uncertain_length(problem, candidates), candidates)
 
 
 def uncertain_length(problem: Problem, poses: Pose) -> Float[Array, " poses"]:
-    """Length between the first T < 1 and the last T > 0.05 along the principal rays, within the samples' grid.
+    """Length between the first T < 1 and the last T > 0.05 along the principal rays, in scene units.
 
-    Rays are looked at every half cell of the grid; a ray that all samples leave open, or that misses the grid, has
-    length zero.
+    T is evaluated every half cell within the samples' grid. The length is zero for a ray that hits no sample, or that
+    misses the grid.
     """
     surfaces = problem.surfaces
     grid = surfaces.grid
     step = 0.5 * grid.spacing
-    # Long enough to cross the grid from any camera outside it that looks at it, and from any inside.
+    # The range of depths crosses the whole grid for any camera inside it, or outside it and looking at it.
     away = jnp.linalg.norm(poses.position, axis=-1, keepdims=True) - 3**0.5 * grid.half_extent
     depth = jnp.maximum(away, 0.0) + step * jnp.arange(int(2 * 3**0.5 * grid.half_extent / step) + 2)
     points = poses.position[:, None] + depth[..., None] * poses.forward[:, None]

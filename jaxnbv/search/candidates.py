@@ -1,4 +1,4 @@
-"""The poses that a search chooses among, as a value: a search says how, its candidates say where."""
+"""Candidates: the sets of poses that a search chooses among."""
 
 import dataclasses
 import math
@@ -20,47 +20,48 @@ _PLASTIC = 1.324717957244746
 
 
 class Candidates(eqx.Module):
-    """Where the camera may stand: a fixed number of poses."""
+    """Base class of candidates: a fixed number of camera poses."""
 
     @property
     @abstractmethod
     def count(self) -> int:
-        """How many poses there are."""
+        """Number of poses."""
 
     @abstractmethod
     def poses(self) -> Pose:
-        """The poses (count,), always the same ones."""
+        """The poses (count,), the same at each call."""
 
     def above(self) -> "Candidates":
-        """The upper half of a whole sphere; any others as they are."""
+        """The upper half of a whole sphere; other candidates unchanged."""
         return self
 
     def where(self, allowed: Callable[[Pose], Bool[AnyArray, ""] | bool]) -> "GivenPoses":
-        """Those that a predicate of one pose allows: that a robot can reach, say.
+        """The candidates that satisfy a predicate of one pose, for example that a robot can reach it.
 
-        **Raises:** `ValueError` if it allows none, or says something else than a truth.
+        **Raises:** `ValueError` if it allows none, or does not return a single bool.
         """
-        require(callable(allowed), f"what is allowed is {shown(allowed)}; give a function of one pose")
+        require(callable(allowed), f"the predicate is {shown(allowed)}; give a function of one pose")
         poses = self.poses()
-        said = [np.asarray(allowed(poses[index])) for index in range(self.count)]
-        for truth in said:
-            single = truth.shape == () and truth.dtype == bool
-            require(single, f"the predicate says {shown(truth)} of a pose; it must say True or False")
-        rows = np.array(said)
+        answers = [np.asarray(allowed(poses[index])) for index in range(self.count)]
+        for answer in answers:
+            is_bool = answer.shape == () and answer.dtype == bool
+            require(is_bool, f"the predicate returned {shown(answer)} for a pose; it must return True or False")
+        rows = np.array(answers)
         require(rows.any(), f"none of {self.count} candidates is allowed: give more, or allow more")
         return GivenPoses(poses[jnp.asarray(np.flatnonzero(rows))])
 
 
 class SphereCandidates(Candidates):
-    """The paper's pool: a Fibonacci sphere of cameras that look at the origin, or the part of it above an elevation.
+    """The paper's candidates: a Fibonacci sphere of cameras that look at the origin, or its part above an elevation.
 
-    - `count`: of cameras, evenly spaced on what there is of the sphere.
-    - `radius`: in scene units.
-    - `min_elevation`: radians above the plane through the origin across `up`; 0 leaves a dome over a table.
-    - `up`: the direction that is upward, in the scene and in the images.
+    - `count`: number of cameras, evenly spaced on this part of the sphere.
+    - `radius`: radius in scene units.
+    - `min_elevation`: lowest elevation in radians, above the plane through the origin normal to `up`; 0 gives a dome
+      over a table.
+    - `up`: upward direction in the scene and in the images.
 
     **Raises:** `ValueError` for no cameras, a radius that is not positive and finite, an elevation that is not within
-    [-pi/2, pi/2), or an `up` without direction.
+    [-pi/2, pi/2), or a zero `up`.
     """
 
     count: int = eqx.field(static=True, default=120)
@@ -84,13 +85,14 @@ class SphereCandidates(Candidates):
 
 
 class Reach(Candidates):
-    """Where an arm can hold a camera that looks at the centre: between two distances and two elevations about `up`.
+    """Cameras that look at the origin from within an arm's reach, between two distances and two elevations.
 
-    - `count`: of places; directions as of a Fibonacci sphere, distances uniform in the volume between them.
-    - `nearest`, `farthest`: in scene units; `min_elevation`, `max_elevation`: in radians above the plane across `up`.
+    - `count`: number of cameras. Their directions are those of a Fibonacci sphere, their distances uniform in volume.
+    - `nearest`, `farthest`: distances from the origin in scene units.
+    - `min_elevation`, `max_elevation`: elevations in radians, above the plane normal to `up`.
+    - `up`: upward direction in the scene and in the images.
 
-    **Raises:** `ValueError` for no places, distances or elevations of which the second is not greater, or an `up`
-    without direction.
+    **Raises:** `ValueError` for no cameras, distances or elevations in the wrong order, or a zero `up`.
     """
 
     count: int = eqx.field(static=True, default=120)
@@ -114,7 +116,7 @@ class Reach(Candidates):
         low, high = math.sin(self.min_elevation), math.sin(self.max_elevation)
         y = high - (high - low) * (index + 0.5) / self.count
         ring, angle = np.sqrt(1.0 - y**2), index * math.pi * (3.0 - math.sqrt(5.0))
-        # The plastic number's sequence, so that directions and distances are even together (Roberts 2018).
+        # A low-discrepancy sequence by the plastic number: directions and distances are even together (Roberts 2018).
         share = (0.5 + index / _PLASTIC**2) % 1.0
         distance = np.cbrt(self.nearest**3 + share * (self.farthest**3 - self.nearest**3))
         places = distance[:, None] * np.stack([ring * np.cos(angle), y, ring * np.sin(angle)], axis=1)
@@ -122,9 +124,11 @@ class Reach(Candidates):
 
 
 class GivenPoses(Candidates):
-    """These poses.
+    """Candidates that are given as poses.
 
-    **Raises:** `ValueError` unless they are a batch (n,) of one at least.
+    - `given`: the poses.
+
+    **Raises:** `ValueError` unless the poses are a batch (n,) with n >= 1.
     """
 
     given: Pose
@@ -145,12 +149,15 @@ class GivenPoses(Candidates):
 def _check_places(number: int, nearest: float, farthest: float, up: tuple[float, float, float]) -> None:
     require(number >= 1, f"the search has {number} candidates; it needs at least one")
     away = nearest if nearest == farthest else f"{nearest} to {farthest}"
-    require(0 < nearest <= farthest < math.inf, f"the candidates stand {away} away; give scene units, above 0")
+    require(
+        0 < nearest <= farthest < math.inf,
+        f"the candidates are {away} away from the origin; give positive scene units, the nearest first",
+    )
     require(0 < math.hypot(*up) < math.inf, f"up is {up}; it must be a direction, such as (0, 1, 0)")
 
 
 def _looking(places: Float[Array, "n 3"], up: tuple[float, float, float]) -> Pose:
-    """Poses at places about the y axis, turned so that it becomes `up`."""
+    """Poses that look at the origin from `places`, rotated so that the y axis becomes `up`."""
     axis = jnp.asarray(up, places.dtype)
     if up[0] or up[2] or up[1] < 0:
         turn = rotation_between(jnp.asarray([0.0, 1.0, 0.0], places.dtype), axis / jnp.linalg.norm(axis))
@@ -159,9 +166,9 @@ def _looking(places: Float[Array, "n 3"], up: tuple[float, float, float]) -> Pos
 
 
 def as_candidates(value: object) -> Candidates:
-    """A number of cameras on the paper's sphere, or a batch of poses, as candidates.
+    """Convert to candidates: a number gives `SphereCandidates`, a batch of poses `GivenPoses`.
 
-    **Raises:** `ValueError` for anything else, and as these do.
+    **Raises:** `ValueError` for anything else, and as these classes do.
     """
     if isinstance(value, Candidates):
         return value

@@ -1,4 +1,4 @@
-"""Discrete candidate search: the paper's Algorithm 1, and a second question where samples cannot answer the first."""
+"""Discrete candidate search (the paper's Algorithm 1), and a variant in which a second acquisition breaks ties."""
 
 from typing import ClassVar
 
@@ -15,31 +15,29 @@ from jaxnbv.search.proposal import Proposal
 
 
 class DiscreteSearch(CandidateSearch):
-    """The candidate of the highest acquisition.
+    """Search that proposes the candidate of the highest acquisition.
 
-    Where a pose that was taken has nothing more to give (`NewSurface`), it is the farthest from the cameras so far
-    among the candidates that are level with the highest: within two standard errors of the difference, and what is
-    expected, on average, of the poses that were taken. There it is expected in vain, and so it may be elsewhere.
+    For an acquisition that `gains_once` (`NewSurface`), it proposes among tied candidates the farthest from the cameras
+    so far. A candidate is tied if its value is below the best by at most two standard errors of the difference plus the
+    mean value expected at visited poses. At these poses the expectation is wrong, and it may be as wrong elsewhere.
     """
 
     uses_samples: ClassVar[bool] = True
 
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
-        """One of the candidates not visited yet; the key is not used."""
+        """Propose one of the candidates that are not excluded. The key is not used."""
         return best_or_farthest(problem, candidates, scores[0])
 
 
 class TieBreakSearch(CandidateSearch):
-    """The candidate of the highest acquisition; among those that the samples cannot tell from it, the one of the
-    highest second acquisition.
+    """Search for the highest acquisition, in which a second acquisition decides between tied candidates.
 
-    While nothing was seen of what matters, no sample shows it either, and the argmax is a view at random. Candidates
-    count as tied within two standard errors of the difference from the best (`Proposal.tied_with_best`), so that the
-    second decides early, and the first as soon as it tells views apart. Both are asked about the same scans.
+    Before any view shows what matters, no sample shows it either, and the argmax is a random view. Candidates are tied
+    if their values differ from the best by at most two standard errors of the difference (`Proposal.tied_with_best`).
+    So the second acquisition decides at first, and the first one as soon as its values differ. Both score the same
+    imagined scans. The proposal's values are those of the first acquisition; the proposed one need not be the highest.
 
-    - `second`: decides between tied candidates, such as `Coverage()`.
-
-    Values of its proposals are the acquisition's; the chosen one need not be the highest.
+    - `second`: acquisition that decides between tied candidates, for example `Coverage()`.
     """
 
     second: Acquisition = eqx.field(kw_only=True)
@@ -49,11 +47,11 @@ class TieBreakSearch(CandidateSearch):
         check_fields(self)
 
     def asks(self, acquisition: Acquisition) -> tuple[Acquisition, ...]:
-        """Both."""
+        """Both acquisitions."""
         return acquisition, self.second
 
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
-        """The argmax of the second acquisition over the tied candidates not visited yet; the key is not used."""
+        """Propose the argmax of the second acquisition over tied candidates that are not excluded; ignores the key."""
         first, second = scores
-        found = best_unvisited(problem, candidates, jnp.mean(first, axis=0), scores=first)
-        return preferred(found, jnp.mean(second, axis=0))
+        proposal = best_unvisited(problem, candidates, jnp.mean(first, axis=0), scores=first)
+        return preferred(proposal, jnp.mean(second, axis=0))
