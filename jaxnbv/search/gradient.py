@@ -1,4 +1,4 @@
-"""Search by gradient: the acquisition is a differentiable function of the pose."""
+"""Gradient searches, which differentiate the acquisition with respect to the pose."""
 
 import dataclasses
 import math
@@ -22,29 +22,31 @@ from jaxnbv.search.pose_space import FreePoses, PoseSpace, SpherePoses
 from jaxnbv.search.problem import Problem
 from jaxnbv.search.proposal import Proposal, Trajectories
 
-# In ranges of the candidates' values, for each scene unit.
+# Penalty for each scene unit of violated clearance, as a multiple of the range of the candidates' values.
 _PENALTY = 10.0
 
 
 class GradientSearch(Search):
-    """Multi-start gradient ascent over 2-DOF or 6-DOF poses, all starts at once, through Optimistix.
+    """Multi-start gradient ascent over 2-DOF or 6-DOF poses, with all starts in one batch, by Optimistix.
 
-    - `dof`: 2 for `SpherePoses()`, 6 for `FreePoses()`; or give a `space` of your own, `ConstrainedPoses()` say.
-    - `num_candidates`: poses, spread evenly over the space and turned at random, that are evaluated first; the ascent
-      starts from the best `num_starts` of them. With as many candidates as starts, every candidate is a start.
-    - `candidates`: in their place, poses of your own, as they are.
-    - `iterations`: steps from each start; each evaluates the acquisition and its gradient once.
-    - `learning_rate`: Adam's, in the units of the space's parameters: radians or scene units, about.
-    - `solver`: a minimiser of Optimistix in place of Adam, such as `optimistix.BFGS(rtol=1e-4, atol=1e-4)`; the
-      objective that it is given is of order 1.
+    - `dof`: 2 for `SpherePoses()`, 6 for `FreePoses()`.
+    - `space`: pose space in place of `dof`, for example `ConstrainedPoses()`.
+    - `num_starts`: number of starts, the best of the candidates.
+    - `iterations`: steps from each start. Each evaluates the acquisition and its gradient once.
+    - `learning_rate`: learning rate of Adam, in the units of the space's parameters: about radians or scene units.
+    - `num_candidates`: number of candidates, which are spread evenly over the space, rotated at random and evaluated
+      first. If it equals `num_starts`, every candidate is a start.
+    - `solver`: Optimistix minimiser in place of Adam, for example `optimistix.BFGS(rtol=1e-4, atol=1e-4)`. Its
+      objective is of order 1.
+    - `candidates`: poses of your own in place of `num_candidates`, not rotated.
 
-    Starts, steps and rate are the paper's. It starts from six views drawn at random, evaluates no others first, and
-    returns the best final value; `num_candidates=6` comes nearest to that. Differentiation keeps what the acquisition
-    computed for all starts and samples, with PointNet++ several gigabytes.
+    The defaults of starts, steps and rate are the paper's. The paper starts from six random views without evaluating
+    others first, and returns the best final value; `num_candidates=6` is closest to this. Differentiation stores the
+    acquisition's intermediate results for all starts and samples: several gigabytes with PointNet++.
 
     **Raises:** `ValueError` for another `dof`, both `dof` and `space`, fewer candidates than starts, no starts or
-    iterations, or a learning rate that is not positive; within a `Planner`, also for an acquisition that JAX cannot
-    differentiate, and a camera that the space is not for.
+    iterations, or a learning rate that is not positive. Within a `Planner`, also for an acquisition that JAX cannot
+    differentiate, or a camera that does not fit the space.
     """
 
     space: PoseSpace
@@ -88,7 +90,7 @@ class GradientSearch(Search):
         )
         require(
             self.num_candidates >= self.num_starts,
-            f"the search has {self.num_candidates} candidates for {self.num_starts} starts: give it as many at least",
+            f"the search has {self.num_candidates} candidates for {self.num_starts} starts: give at least as many",
         )
 
     @property
@@ -96,7 +98,7 @@ class GradientSearch(Search):
         """The solver, by default Adam."""
         if self.solver is not None:
             return self.solver
-        # No tolerance is ever met: as many steps as were asked for.
+        # Zero tolerances are never met, so that all iterations run.
         return optx.OptaxMinimiser(optax.adam(self.learning_rate), rtol=0.0, atol=0.0)
 
     def poses_around(self) -> Pose:
@@ -108,13 +110,15 @@ class GradientSearch(Search):
         return eqx.tree_at(lambda search: search.candidates, self, self.candidates.above())
 
     def check(self, acquisition: Acquisition, camera: Camera, capacity: int) -> None:
-        """Raise `ValueError` if the acquisition has no gradient, or the space makes no sense for the camera."""
+        """Raise `ValueError` if the acquisition has no gradient, or the camera does not fit the space."""
         self.space.check_camera(camera)
         check_traceable(acquisition, capacity, camera, differentiable=True)
 
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
-        """The best pose on the ways from the best candidates, or the best candidate if none is better; the key turns
-        the space's candidates."""
+        """Propose the best pose of all trajectories, or the best candidate if that is better.
+
+        The key rotates the space's candidates.
+        """
         if self.candidates is None:
             candidates = self.space.candidates(self.num_candidates, key if self.turned else None)
         else:
@@ -122,35 +126,41 @@ class GradientSearch(Search):
         scores = problem.scores(candidates)
         values = jnp.mean(scores, axis=0)
         order = jnp.argsort(jnp.where(problem.is_excluded(candidates), -jnp.inf, values), descending=True)
-        # Solvers that search along a line expect differences of order one.
+        # Solvers with a line search expect differences of order one.
         scale = jnp.max(values) - jnp.min(values)
         scale = jnp.where(scale > 0, scale, 1.0)
         starts = candidates[order[: self.num_starts]]
         trajectories, errors = jax.vmap(partial(self._walk, problem, scale))(starts)
-        found = best_unvisited(problem, candidates, values, tie=0.0, scores=scores)
-        passed = best_unvisited(problem, *trajectories.flat, tie=0.0)
-        # Whatever is not a number comes through, so that the planner can say so.
-        better = ~(passed.value <= found.value)
-        # The rows of `passed` are those of the trajectories, turned as `flat` turns them.
-        passed = dataclasses.replace(passed, standard_error=errors.T.reshape(-1)[first_best(passed.values, tie=0.0)])
-        chosen = [(p.pose, p.value, p.standard_error) for p in (passed, found)]
-        pose, value, error = jax.tree.map(partial(jnp.where, better), *chosen)
-        return dataclasses.replace(found, pose=pose, value=value, standard_error=error, trajectories=trajectories)
+        best_candidate = best_unvisited(problem, candidates, values, tie=0.0, scores=scores)
+        best_step = best_unvisited(problem, *trajectories.flat, tie=0.0)
+        # This form lets NaN through, which the planner reports.
+        is_better = ~(best_step.value <= best_candidate.value)
+        # `flat` swaps the axes of the trajectories, so transpose their errors too.
+        best_step = dataclasses.replace(
+            best_step, standard_error=errors.T.reshape(-1)[first_best(best_step.values, tie=0.0)]
+        )
+        options = [(p.pose, p.value, p.standard_error) for p in (best_step, best_candidate)]
+        pose, value, error = jax.tree.map(partial(jnp.where, is_better), *options)
+        return dataclasses.replace(
+            best_candidate, pose=pose, value=value, standard_error=error, trajectories=trajectories
+        )
 
     def _walk(
         self, problem: Problem, scale: Float[Array, ""], start: Pose
     ) -> tuple[Trajectories, Float[Array, " steps"]]:
-        """Where the solver stood (every pose that it evaluated; those that it accepted where it searches along a line),
-        and the standard errors of the values there."""
+        """The trajectory of the solver from a start, and the standard errors of its values.
+
+        It holds every evaluated pose; with a line search, every accepted one.
+        """
         solver = self.minimiser
 
         def loss(parameters, _):
             pose = self.space.retract(start, parameters)
             scores = problem.scores(pose[None])
             value, error = jnp.mean(scores, axis=0)[0], standard_error(jax.lax.stop_gradient(scores))[0]
-            # A pose may hide that the gradient which led to it was not a number.
+            # A pose may be finite although a gradient was NaN and so the parameters are.
             value = jnp.where(jnp.isfinite(parameters).all(), value, jnp.nan)
-            # A pose where no camera may stand is never chosen; the penalty leads out of there.
+            # Poses that violate the clearance are never proposed. The penalty leads away from them.
             return _PENALTY * problem.violation(pose[None])[0] - value / scale, (pose, value, error)
 
         parameters = jnp.zeros(self.space.num_parameters, start.position.dtype)
@@ -162,20 +172,20 @@ class GradientSearch(Search):
             parameters, state = carry
             whole = eqx.combine(state, rest)
             done, _ = solver.terminate(loss, parameters, None, {}, whole, frozenset())
-            moved, whole, seen = solver.step(loss, parameters, None, {}, whole, frozenset())
+            moved, whole, output = solver.step(loss, parameters, None, {}, whole, frozenset())
             after = moved, eqx.filter(whole, eqx.is_array)
-            return jax.tree.map(partial(jnp.where, done), carry, after), seen
+            return jax.tree.map(partial(jnp.where, done), carry, after), output
 
-        # One step more, for the value of the pose that the last one led to.
+        # One more step evaluates the pose after the last iteration.
         _, (poses, values, errors) = jax.lax.scan(step, (parameters, state), length=self.iterations + 1)
         return Trajectories(poses, values), errors
 
 
 class HybridSearch(GradientSearch):
-    """The discrete search, then gradient ascent from its best few candidates: a `GradientSearch` with other defaults.
+    """Discrete search, then gradient ascent from its best few candidates: a `GradientSearch` with other defaults.
 
-    Steps are fewer and longer. The candidates are not turned: on the sphere they are those of a `DiscreteSearch` with
-    as many, so the value found is never below its.
+    It takes fewer and longer steps. The candidates are not rotated: on the sphere they are those of a `DiscreteSearch`
+    with as many candidates, so the value is never lower than there.
     """
 
     turned: ClassVar[bool] = False

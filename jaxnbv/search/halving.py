@@ -1,4 +1,4 @@
-"""Discrete search that spends its samples where they matter."""
+"""Successive halving: discrete search that scores poor candidates on few samples."""
 
 from collections.abc import Callable
 from typing import ClassVar, NamedTuple
@@ -15,7 +15,7 @@ from jaxnbv.search.base import CandidateSearch, Scores
 from jaxnbv.search.problem import Problem
 from jaxnbv.search.proposal import Proposal
 
-# Candidates that are scored at once, at the least; and the rank of those that fill a block.
+# Smallest number of candidates that are scored together, and the rank of empty places in a block.
 _LEAST = 8
 _NOBODY = np.iinfo(np.int32).max
 
@@ -23,11 +23,11 @@ _NOBODY = np.iinfo(np.int32).max
 class HalvingSearch(CandidateSearch):
     """Successive halving over the candidates of a `DiscreteSearch` (Karnin et al. 2013), for slow acquisitions.
 
-    All candidates are scored on the first few posterior samples; the better half on as many again, the better half of
-    these on twice as many, and so on to all S: with 16 samples and `num_first_samples` 2, 5 scores a candidate in place
-    of 16. The view is not always that of the full search.
+    All candidates are scored on the first few posterior samples, the better half on as many more, the better half of
+    these on twice as many more, and so on until all samples are used. With 16 samples and `num_first_samples=2`, this
+    takes 5 scores for each candidate instead of 16. The proposal may differ from that of the full search.
 
-    - `num_first_samples`: posterior samples on which every candidate is scored.
+    - `num_first_samples`: number of posterior samples on which every candidate is scored.
     """
 
     num_first_samples: int = eqx.field(static=True, default=2)
@@ -40,7 +40,7 @@ class HalvingSearch(CandidateSearch):
         )
 
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
-        """As `pick`, but candidates are scored only for as long as they are left."""
+        """Propose as `pick` does, but score only the candidates that are left in each round."""
         candidates = self.candidates.poses()
 
         def score(left: Int[Array, " left"], sample: Int[Array, ""]) -> Float[Array, " left"]:
@@ -49,16 +49,18 @@ class HalvingSearch(CandidateSearch):
         return self._halved(problem, candidates, score)
 
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
-        """The best of the last round; the value of a candidate that left earlier is its mean until then, and so is its
-        standard error."""
+        """Propose the best candidate of the last round.
+
+        The value and standard error of a candidate that left earlier are those of its scores until then.
+        """
         return self._halved(problem, candidates, lambda left, sample: scores[0, sample][left])
 
     def _halved(self, problem: Problem, candidates: Pose, score: Callable) -> Proposal:
         count, is_excluded = self.candidates.count, problem.is_excluded(candidates)
-        nothing = jnp.zeros(count, candidates.position.dtype)
+        zeros = jnp.zeros(count, candidates.position.dtype)
 
         def ranked(state, left):
-            """Candidates by their means so far, those that have left last; and the means."""
+            """Candidates in order of their mean scores, first those that are left; and the means."""
             order, totals, scored = state
             values = jnp.where(is_excluded, -jnp.inf, totals / jnp.maximum(scored, 1))
             among = jnp.where(jnp.arange(count) < left, values[order], -jnp.inf)
@@ -68,17 +70,17 @@ class HalvingSearch(CandidateSearch):
             state, squares = carry
             order, totals, scored = state
             order = jax.lax.cond(block.sorts, lambda: ranked(state, block.left)[0], lambda: order)
-            taken = order.at[block.ranks].get(mode="fill", fill_value=0)
-            rows = jnp.where(block.ranks < count, taken, count)
-            scores, before = score(taken, block.sample), scored[taken]
-            # Squared deviations from the mean, one sample more at a time (Welford 1962).
-            deviation = scores - totals[taken] / jnp.maximum(before, 1)
+            indices = order.at[block.ranks].get(mode="fill", fill_value=0)
+            rows = jnp.where(block.ranks < count, indices, count)
+            scores, before = score(indices, block.sample), scored[indices]
+            # Update the squared deviations from the mean by one sample (Welford 1962).
+            deviation = scores - totals[indices] / jnp.maximum(before, 1)
             squares = squares.at[rows].add(deviation**2 * before / (before + 1), mode="drop")
             totals = totals.at[rows].add(scores, mode="drop")
             return ((order, totals, scored.at[rows].add(1, mode="drop")), squares), None
 
         blocks, left = self._blocks(problem.num_samples)
-        start = (jnp.arange(count), nothing, nothing), nothing
+        start = (jnp.arange(count), zeros, zeros), zeros
         (state, squares), _ = jax.lax.scan(advance, start, blocks)
         order, values = ranked(state, left)
         scored, best = state[2], order[0]
@@ -88,8 +90,7 @@ class HalvingSearch(CandidateSearch):
         )
 
     def _blocks(self, num_samples: int) -> tuple["_Block", int]:
-        """All rounds as blocks of one size, so that what scores them is compiled once; and how many are left in the
-        end."""
+        """All rounds as blocks of one size, so that scoring compiles once; and how many candidates are left."""
         rounds: list[tuple[int, range]] = []
         left, scored = self.candidates.count, 0
         while scored < num_samples:
@@ -110,10 +111,10 @@ class HalvingSearch(CandidateSearch):
 
 
 class _Block(NamedTuple):
-    """Some candidates that are scored on one sample.
+    """Candidates that are scored together on one sample.
 
-    - `sorts`: whether candidates are ranked before, the first `left` of them.
-    - `ranks`: the ranks of those that are scored.
+    - `sorts`: whether to rank the first `left` candidates before.
+    - `ranks`: ranks of the candidates to score; `_NOBODY` for an empty place.
     """
 
     sorts: Bool[np.ndarray, "*blocks"]

@@ -1,7 +1,7 @@
-"""Where a gradient search may move the camera: on the sphere, freely, or within constraints.
+"""Pose spaces of gradient searches: a sphere, all poses, or poses within constraints.
 
-A space moves a pose by a vector of parameters (a *retraction*, in the terms of optimisation on manifolds), so that
-every start is the origin of its own chart: no poles, no angles, no flip of the image.
+A space moves a start pose by a vector of parameters (a *retraction* in optimisation on manifolds). Every start is the
+origin of its own chart, so that there are no poles, angles or image flips.
 """
 
 import math
@@ -21,34 +21,36 @@ from jaxnbv.scanning.sensors import SENSOR_RADIUS
 
 
 class PoseSpace(eqx.Module):
-    """The poses that a gradient search looks among.
+    """Base class of the poses that a gradient search can reach.
 
-    `num_parameters` is how many numbers move a pose.
+    - `num_parameters`: number of parameters that move a pose.
     """
 
     num_parameters: eqx.AbstractClassVar[int]
 
     @abstractmethod
     def candidates(self, count: int, key: PRNGKeyArray | None) -> Pose:
-        """Poses of the space, spread evenly over it: always the same ones, or turned at random by a key."""
+        """Poses spread evenly over the space. A key rotates them at random; without one they are always the same."""
 
     @abstractmethod
     def retract(self, start: Pose, parameters: Float[Array, " parameters"]) -> Pose:
-        """The pose that the parameters lead to from `start`, differentiable in them.
+        """Move `start` by the parameters. Differentiable in them.
 
-        Zeros lead to `start`, if it is in the space.
+        Zero parameters give `start`, if it is in the space.
         """
 
     def check_camera(self, camera: Camera) -> None:
-        """Raise `ValueError` if the space makes no sense for the camera."""
+        """Raise `ValueError` if the camera does not fit the space."""
         return
 
 
 class SpherePoses(PoseSpace):
-    """2-DOF: on the sphere of a radius about the origin, looking at it.
+    """2-DOF poses on a sphere about the origin, looking at the origin.
 
     The parameters (3,) are added to the unit vector from the origin to the start, and the sum is normalised. The camera
-    does not roll, so that nothing singular happens at the poles. A start at another radius is moved to this one.
+    does not roll, so that the poles are not singular. A start at another radius is moved to the sphere.
+
+    - `radius`: radius of the sphere, in scene units.
 
     **Raises:** `ValueError` unless the radius is positive and finite.
     """
@@ -69,12 +71,12 @@ class SpherePoses(PoseSpace):
 
 
 class FreePoses(PoseSpace):
-    """6-DOF: any position and rotation.
+    """6-DOF poses of any position and rotation.
 
     The parameters (9,) are added to the first two columns of the start's rotation (Zhou et al. 2019), and to its
-    position. Nothing keeps the camera from turning away from the object, or from flying into it.
+    position. The camera may turn away from the object, or move into it.
 
-    - `radius`: of the sphere on which candidates for a start stand, in scene units.
+    - `radius`: radius of the sphere of candidates, in scene units.
 
     **Raises:** `ValueError` unless the radius is positive and finite.
     """
@@ -95,15 +97,16 @@ class FreePoses(PoseSpace):
 
 
 class ConstrainedPoses(PoseSpace):
-    """6-DOF within constraints: in a shell of distances, with the object's centre in view.
+    """6-DOF poses within constraints: a range of distances, with the object's centre in view.
 
-    - `nearest`, `farthest`: the camera's distance from the origin, in scene units. By default about the paper's sphere,
-      and outside any object: corners of the scene's cube are 2.17 away.
-    - `off_axis`: greatest angle between the optical axis and the direction to the origin, in radians.
+    - `nearest`, `farthest`: range of distances from the origin, in scene units. The default is around the paper's
+      sphere and outside any object: corners of the scene's cube have distance 2.17.
+    - `off_axis`: largest angle between the optical axis and the direction to the origin, in radians.
 
-    All parameters (8,) lead to poses that obey: of the direction from the origin, as in `SpherePoses` (3); of the
-    distance (1) and of where the origin stands in the image (2), each mapped into its range by s / sqrt(1 + s^2); and
-    of the roll, added to (cos, sin) = (1, 0) and normalised (2). A start that does not obey is moved just inside.
+    Poses of any parameters (8,) satisfy the constraints. Three parameters move the direction from the origin, as in
+    `SpherePoses`. One moves the distance, and two the place of the origin in the image, each mapped into its range by
+    s / sqrt(1 + s^2). Two are added to (cos, sin) = (1, 0) of the roll, which is normalised. A start that violates the
+    constraints is moved just inside them.
 
     **Raises:** `ValueError` unless 0 < nearest < farthest and 0 < off_axis < pi / 2.
     """
@@ -130,7 +133,7 @@ class ConstrainedPoses(PoseSpace):
         return 0.5 * (self.nearest + self.farthest)
 
     def candidates(self, count: int, key: PRNGKeyArray | None) -> Pose:
-        """A sphere of them in the middle of the shell."""
+        """Poses on a sphere in the middle of the range of distances."""
         return _about_origin(count, self._middle, key)
 
     def retract(self, start: Pose, parameters: Float[Array, " parameters"]) -> Pose:
@@ -140,20 +143,20 @@ class ConstrainedPoses(PoseSpace):
         offset = jnp.linalg.norm(start.position, keepdims=True) - self._middle
         position = (self._middle + half * _move(offset / half, distance)) * after
 
-        # Directions to the origin in the camera's frame: as the start sees it, and as it is to be seen.
-        x, y, z = seen = -jnp.matmul(start.rotation.T, before, precision="highest")
+        # Directions to the origin in the camera's frame, now and after the move.
+        x, y, z = to_origin = -jnp.matmul(start.rotation.T, before, precision="highest")
         furthest = math.tan(self.off_axis)
         image = furthest * _move(jnp.stack([x, y]) / (furthest * jnp.maximum(z, 1e-3)), gaze)
-        wanted = jnp.append(image, 1.0) / jnp.sqrt(1.0 + jnp.sum(image**2))
+        target = jnp.append(image, 1.0) / jnp.sqrt(1.0 + jnp.sum(image**2))
         cosine, sine = normalise(roll + jnp.asarray([1.0, 0.0]), jnp.asarray([1.0, 0.0]))
         zero, one = jnp.zeros_like(sine), jnp.ones_like(sine)
         about_axis = jnp.stack([cosine, -sine, zero, sine, cosine, zero, zero, zero, one]).reshape(3, 3)
 
         turned = _product(rotation_between(before, after), start.rotation)
-        return Pose(_product(_product(turned, rotation_between(wanted, seen)), about_axis), position)
+        return Pose(_product(_product(turned, rotation_between(target, to_origin)), about_axis), position)
 
     def check_camera(self, camera: Camera) -> None:
-        """**Raises:** `ValueError` if the origin may leave the image."""
+        """**Raises:** `ValueError` if the image is too narrow to keep the origin in view."""
         left, top, right, bottom = camera.edges
         half = math.atan(min(-left, -top, right, bottom))
         require(
@@ -164,7 +167,7 @@ class ConstrainedPoses(PoseSpace):
 
 
 def _about_origin(count: int, radius: float, key: PRNGKeyArray | None) -> Pose:
-    """A Fibonacci sphere of cameras that look at the origin, turned at random by a key."""
+    """A Fibonacci sphere of cameras that look at the origin, rotated at random if there is a key."""
     places = fibonacci_sphere(count, radius)
     if key is not None:
         turn = rotation_from_6d(jax.random.normal(key, (6,)))
@@ -173,7 +176,7 @@ def _about_origin(count: int, radius: float, key: PRNGKeyArray | None) -> Pose:
 
 
 def _directions(start: Pose, parameters: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-    """Unit vectors from the origin to the camera, before the parameters move it and after."""
+    """Unit vectors from the origin to the camera, before and after the parameters move it."""
     before = normalise(start.position, jnp.asarray([0.0, 0.0, 1.0], start.position.dtype))
     return before, normalise(before + parameters, before)
 
@@ -183,7 +186,7 @@ def _product(a: Float[Array, "3 3"], b: Float[Array, "3 3"]) -> Float[Array, "3 
 
 
 def _move(place: Float[Array, " n"], step: Float[Array, " n"]) -> Float[Array, " n"]:
-    """A point of the open unit ball, moved in coordinates in which the ball is all of space."""
+    """Move a point of the open unit ball, in coordinates that map the ball to the whole space."""
     length = jnp.linalg.norm(place)
     place = place * jnp.where(length > 0.99, 0.99 / jnp.maximum(length, 0.99), 1.0)
     far = place / jnp.sqrt(1.0 - jnp.sum(place**2)) + step
