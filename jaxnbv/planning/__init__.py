@@ -1,1 +1,1 @@
-"""Ask where to look next, tell what was seen: the planner, and the episodes and sessions that call it."""
+"""The planner, and the simulated episodes and live sessions that use it."""

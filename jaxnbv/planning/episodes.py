@@ -26,12 +26,12 @@ from jaxnbv.tasks.identification import weights_by_name
 
 
 class Episodes(eqx.Module):
-    """What `episodes` gives of each episode, along a leading axis; in scene coordinates.
+    """Results of `episodes`, along a leading axis of episodes, in scene coordinates.
 
-    - `poses`: (episodes, views) where the views were taken.
-    - `values`: what the search expected of each view; NaN for the first one, which was given.
+    - `poses`: poses of the views, (episodes, views).
+    - `values`: value that the search expected of each view; NaN for the first one.
     - `clouds`: D after the last view.
-    - `answers`: the values of `View.answer` after each view; None where there are none, or only host code has them.
+    - `answers`: values of `View.answer` after each view; None if there are none, or if they need code outside JAX.
     """
 
     poses: Pose
@@ -50,22 +50,22 @@ def episodes(
     noise: Noise = SensorNoise(),
     batch_size: int | None = None,
 ) -> Episodes:
-    """The episodes `simulate(planner, scene, first, views, key, noise)` of a batch of scenes and keys, as one compiled
-    program. On a CPU poses, values, clouds and answers have the same bits.
+    """Simulate a batch of episodes in one compiled program: as `simulate` for each scene and key.
 
-    Several devices take a share of the episodes each: those of `jax.set_mesh`, by default all that JAX has here.
+    On a CPU poses, values, clouds and answers are the same bit for bit. The episodes are split among several devices:
+    those of `jax.set_mesh`, by default all local devices.
 
-    - `scenes`: a list with a solid or surface for each key, all of one structure; or one with a leading axis on its
-      arrays, as `jax.vmap` makes it. `[scene] * len(keys)` repeats a scene.
-    - `first`: the pose of the first view, or a batch with one for each key.
-    - `views`: views of each episode. The program that was compiled for one number runs for any.
-    - `keys`: one for each episode, `jax.random.split(key, episodes)`.
-    - `batch_size`: episodes that a device computes together, by default one on a CPU and its whole share on a GPU.
-      Memory grows with it, and for more than one values are those of `simulate` to rounding.
+    - `scenes`: a list with a solid or surface for each key, all of one structure, or one with a leading axis on its
+      arrays, as `jax.vmap` returns. `[scene] * len(keys)` repeats a scene.
+    - `first`: pose of the first view, or a batch with one pose for each key.
+    - `views`: number of views of each episode. One compiled program works for any number.
+    - `keys`: a random key for each episode, `jax.random.split(key, episodes)`.
+    - `batch_size`: number of episodes that a device computes together, by default one on a CPU and its whole share on a
+      GPU. Memory grows with it. With more than one, values equal those of `simulate` up to rounding.
 
-    **Raises:** `ValueError` for triangle meshes, for scenes of several structures, unless there are as many scenes and
-    keys, for `views` < 1 or more than the planner has room for, and for episodes in which the first view sees nothing
-    or the value of a view is not finite.
+    **Raises:** `ValueError` for triangle meshes, scenes of different structures, different numbers of scenes and keys,
+    `views` < 1 or greater than the planner's `max_views`, and for episodes in which the first view sees nothing or the
+    value of a view is not finite.
     """
     require(views >= 1, f"asked for {views} views; ask for at least one")
     require(
@@ -95,7 +95,10 @@ def episodes(
 
 
 def _batch_of_poses(first: Pose, count: int) -> Pose:
-    """**Raises:** `ValueError` unless it is one pose or `count`, and for poses that are far from the scene."""
+    """The first pose of each episode, as a batch (count,).
+
+    **Raises:** `ValueError` unless `first` is one pose or `count` poses, or if a pose is far from the scene.
+    """
     batch = first.position.shape[:-1]
     require(
         batch in ((), (count,)),
@@ -107,7 +110,7 @@ def _batch_of_poses(first: Pose, count: int) -> Pose:
 
 
 def _devices(count: int) -> AbstractContextManager:
-    """Where a program runs on as many devices of this process as there are episodes, unless the user chose some."""
+    """Context that uses up to `count` devices of this process, unless the user chose devices."""
     chosen = not get_abstract_mesh().empty or jax.config.jax_default_device is not None  # type: ignore[attr-defined]
     devices = jax.local_devices()[:count]
     return nullcontext() if chosen or len(devices) == 1 else jax.set_mesh(Mesh(np.array(devices), "devices"))
@@ -116,7 +119,7 @@ def _devices(count: int) -> AbstractContextManager:
 def _check(
     planner: Planner, values: Float[np.ndarray, "b v"], clouds: PointCloud, sees: Bool[np.ndarray, " b"]
 ) -> None:
-    """**Raises:** `ValueError` for what `simulate` refuses while it runs."""
+    """**Raises:** `ValueError` if a first view sees nothing, an answer is invalid, or a value is not finite."""
     require(
         bool(sees.all()),
         f"the first view of episode {sees.argmin()} sees nothing: point the camera at the object",
@@ -125,8 +128,8 @@ def _check(
         planner.acquisition.check(clouds[0])
     for episode, view in np.argwhere(~np.isfinite(values[:, 1:])):
         value = values[episode, view + 1]
-        visited = "all candidates have been visited, or no camera may stand there: give the search more candidates"
-        unknown = "call simulate with its scene and key, which names the cause"
+        all_visited = "all candidates have been visited, or no camera may stand there: give the search more candidates"
+        not_finite = "call simulate with its scene and key, which names the cause"
         raise InputError(
-            f"the value of view {view + 2} of episode {episode} is {value}: {visited if value < 0 else unknown}"
+            f"the value of view {view + 2} of episode {episode} is {value}: {all_visited if value < 0 else not_finite}"
         )
