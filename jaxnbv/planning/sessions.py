@@ -1,4 +1,4 @@
-"""Several objects on a table: a session for each, which all look at the same images."""
+"""Several objects on a table: one session for each object, all with the same images."""
 
 import warnings
 from pathlib import Path
@@ -29,24 +29,25 @@ from jaxnbv.scanning.sdf import HalfSpace
 from jaxnbv.surfaces.part_hypotheses import hypotheses_of
 from jaxnbv.surfaces.part_pose import distances_to
 
-# Points of one object are as near as this to others of it, as a share of the longest side of the box.
+# Default gap between objects, as a share of the longest side of the box.
 _GAP = 0.02
-# Fewer rays than these are no object. A cluster is compared with so many of its points.
+# Fewest rays of an object, and number of points of a cluster that are compared with known parts.
 _FEWEST, _COMPARED = 20, 256
 
 
 class Sessions:
-    """Several objects, each one of some known parts: a `Session` for each, which get the same images. An object is a
-    cluster of what an image shows above the table, or what a segmentation of the image says.
+    """Sessions for several objects, each of which is a known part. All get the same images.
 
-    - `camera`, `planner`, `up`, `key`, `until`, `obstacles`, `progress`: as of `Session`; the planner is one for parts
-      and searches candidates.
-    - `box`: two corners of a box about all of the objects, without the table.
-    - `gap`: objects that are farther apart than this are told apart without a segmentation, in world units. By default
+    An object is a cluster of the points above the table, or a label in a segmentation of the image.
+
+    - `camera`, `up`, `key`, `until`, `obstacles`, `progress`: as for `Session`.
+    - `planner`: planner with known parts and a search over candidates.
+    - `box`: two corners of a box about all objects, without the table.
+    - `gap`: smallest distance between objects that are separated without a segmentation, in world units. By default
       2 % of the longest side of the box.
-    - `folder`: holds a folder of each session, with which all goes on.
+    - `folder`: folder that holds a folder for each session. Sessions continue from it.
 
-    **Raises:** `ValueError` as `Session` does, or for a planner that knows no parts.
+    **Raises:** `ValueError` as `Session` does, or for a planner without known parts.
     """
 
     @checked
@@ -63,7 +64,7 @@ class Sessions:
         until: StopRule | None = None,
         progress: bool = True,
     ):
-        # It checks what is given, and places the candidates about all of the objects.
+        # This session checks the arguments, and places the candidates around all objects.
         whole = Session(camera, box, planner, up, key=key, until=until, obstacles=obstacles, progress=progress)
         bank = getattr(planner.sampler.model, "bank", None)
         if bank is None or not planner.sampler.model.carries_hypotheses:
@@ -79,13 +80,13 @@ class Sessions:
         candidates = self._frame.to_world(whole.planner.search.poses_around())
         self._poses = np.asarray(candidates.to_matrix(), np.float64)
         self._folder = None if folder is None else Path(folder)
-        # Numbers of candidates: what `next` gave since the last image, and all that it gave.
+        # Indices of candidates: the one that `next` proposed since the last image, and all that it has proposed.
         self._next: int | None = None
         self._proposed: list[int] = []
         self.objects: dict[int, Session] = {}
         if self._folder is not None:
-            stored = sorted(int(path.name) for path in self._folder.glob("[0-9]*") if path.name.isdigit())
-            self.objects = {number: self._session(number, self.box) for number in stored}
+            numbers = sorted(int(path.name) for path in self._folder.glob("[0-9]*") if path.name.isdigit())
+            self.objects = {number: self._session(number, self.box) for number in numbers}
 
     def __repr__(self) -> str:
         return f"Sessions({', '.join(f'{number}: {session!r}' for number, session in self.objects.items())})"
@@ -98,14 +99,14 @@ class Sessions:
         depth_scale: float = 1.0,
         labels: AnyArray | None = None,
     ) -> None:
-        """Take in an image. What stands where no object is known yet becomes one, with the next number.
+        """Add an image. New objects in it get the next numbers.
 
-        - `depth`, `matrix`, `depth_scale`: as of `Session.add`.
-        - `labels`: which object each pixel shows, by the same number in all images, zero for none. By default clusters
-          of the points above the table: one that meets the points of a known object, or lies on the part that it most
-          likely is, belongs to it.
+        - `depth`, `matrix`, `depth_scale`: as for `Session.add`.
+        - `labels`: number of the object at each pixel, the same in all images, and zero for none. By default, objects
+          are clusters of the points above the table. A cluster belongs to an earlier object if it is within `gap` of
+          its points or of the surface of its likely parts.
 
-        **Raises:** `ValueError` as `Session.add` does, or if the image shows no object and none is known.
+        **Raises:** `ValueError` as `Session.add` does, or if no image so far shows an object.
         """
         pixels = as_numbers(depth, "the depth image", None)
         pose = Pose.from_matrix(as_numbers(matrix, "the matrix of a pose", np.float64))
@@ -124,7 +125,7 @@ class Sessions:
             proper = numbers.shape == pixels.shape and np.issubdtype(numbers.dtype, np.integer)
             require(proper, f"the labels are {shown(labels)}: give whole numbers, one for each of the image's pixels")
         numbers = np.where(inside, numbers, 0)
-        # What a session would take from the image.
+        # The rays that a session uses.
         rows = slice(stride // 2, None, stride)
         shown_numbers, counts = np.unique(numbers[rows, rows].reshape(-1)[np.asarray(cloud.mask)], return_counts=True)
         for number in shown_numbers[counts >= _FEWEST].tolist():
@@ -136,7 +137,7 @@ class Sessions:
         )
         for number, session in self.objects.items():
             corners = np.stack(np.meshgrid(*zip(session.box.low, session.box.high, strict=True)), axis=-1)
-            # An image says nothing of what is behind the camera.
+            # An image has no information about a box behind the camera.
             if np.any((corners - np.asarray(pose.position)) @ np.asarray(pose.forward) > 0):
                 session.add(depth, matrix, depth_scale, mask=numbers == number)
         self._next = None
@@ -145,8 +146,10 @@ class Sessions:
         self._warned_of_mount = self._warned_of_mount or self._mount_error.warns()
 
     def next(self) -> Float[np.ndarray, "4 4"]:
-        """Where to take the next image: the candidate of most value, in world units and summed over the objects for
-        which more are needed. It is the same until an image is added; what was proposed once is not proposed again.
+        """Where to take the next image: a matrix, camera to world.
+
+        It is the candidate of the highest value, in world units, summed over the objects that are not done. It stays
+        the same until an image is added. A pose is proposed only once.
 
         **Raises:** `ValueError` before the first image, if all candidates were proposed, or as `Planner.propose` does.
         """
@@ -161,14 +164,14 @@ class Sessions:
         return self._poses[self._next]
 
     def done(self) -> str | None:
-        """Why no more images are needed, by the rule that was given, for any of the objects; None while they are."""
+        """The reasons to stop once the stop rule holds for all objects; None to continue."""
         reasons = {number: session.done() for number, session in self.objects.items()}
         if not reasons or None in reasons.values():
             return None
         return "; ".join(f"{number}: {reason}" for number, reason in reasons.items())
 
     def _session(self, number: int, box: Box) -> Session:
-        """The session of an object, or the stored one if there is a folder of it."""
+        """A session for an object, loaded from its folder if there is one."""
         folder = None if self._folder is None else self._folder / str(number)
         if folder is not None and folder.exists():
             return Session.load(folder, self._planner, self.until, self._progress)
@@ -187,12 +190,12 @@ class Sessions:
         )
 
     def _table_of(self, cloud: PointCloud) -> Obstacles:
-        """What the objects stand on, in world units; `cloud`: the whole image."""
+        """The table under the objects, in world units, by the cloud of a whole image. Warns if there is none."""
         table = table_under(self._frame.to_scene(cloud), self._frame.to_scene(self.box))
         if table is None:
             warnings.warn(
-                "there is no table under the objects: what they stand on, if it is in the box, is taken for one of "
-                "them. Give obstacles=Obstacles((table,)), or Obstacles() if there is none",
+                "there is no table under the objects: if the box contains their support, it counts as an object. Give "
+                "obstacles=Obstacles((table,)), or Obstacles() if there is none",
                 stacklevel=4,
             )
             return Obstacles()
@@ -200,7 +203,7 @@ class Sessions:
         return Obstacles((HalfSpace(*plane_of(table, self._frame)),), margin, clearance)
 
     def _points(self, image: Image, pose: Pose) -> tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-        """The point of each pixel, in world units, and which lie in the box and on no obstacle."""
+        """The point of each pixel, in world units, and the mask of points in the box and off the obstacles."""
         points = image.points(self.camera, pose)
         depth = (points - np.asarray(pose.position, np.float64)) @ np.asarray(pose.forward, np.float64)
         assert self._obstacles is not None
@@ -209,35 +212,38 @@ class Sessions:
         return points, inside
 
     def _numbers(self, points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
-        """The object that each point is of, by clusters; zero for stray points."""
+        """Number of the object that each point belongs to, by clusters; zero for stray points."""
         owner = np.zeros(len(points), int)
         nearest = np.full(len(points), self._gap)
         for number, session in self.objects.items():
             away, _ = cKDTree(session.cloud.to_numpy()[0]).query(points)
             owner, nearest = np.where(away < nearest, number, owner), np.minimum(nearest, away)
         cluster, last = clusters(points, self._gap), max(self.objects, default=0)
-        for one in range(cluster.max(initial=-1) + 1):
-            own = np.flatnonzero(cluster == one)
+        for index in range(cluster.max(initial=-1) + 1):
+            own = np.flatnonzero(cluster == index)
             has_owner = owner[own] > 0
             if has_owner.any():
                 _, like = cKDTree(points[own[has_owner]]).query(points[own])
                 owner[own] = owner[own[has_owner]][like]
             elif len(own) >= _FEWEST * stride_of(self.camera) ** 2:
-                placed = self._on_a_part(points[own])
-                last = last + 1 if placed is None else last
-                owner[own] = last if placed is None else placed
+                part_owner = self._on_a_part(points[own])
+                last = last + 1 if part_owner is None else last
+                owner[own] = last if part_owner is None else part_owner
         return owner
 
     def _on_a_part(self, points: Float[np.ndarray, "n 3"]) -> int | None:
-        """The object on whose likely parts some points lie, within the gap; None if that is none."""
-        some = points[np.linspace(0, len(points) - 1, _COMPARED).astype(int)]
-        off = {number: _expected_distance(session, some) for number, session in self.objects.items()}
-        best = min(off, key=lambda number: off[number], default=None)
-        return best if best is not None and off[best] < self._gap else None
+        """Number of the object whose likely parts have these points on their surface, within the gap; or None."""
+        few = points[np.linspace(0, len(points) - 1, _COMPARED).astype(int)]
+        distances = {number: _expected_distance(session, few) for number, session in self.objects.items()}
+        best = min(distances, key=lambda number: distances[number], default=None)
+        return best if best is not None and distances[best] < self._gap else None
 
     def _box_about(self, points: Float[np.ndarray, "n 3"]) -> Box:
-        """A cube that holds an object of which some points were seen: as far beyond them as they reach, though no part
-        is longer than the longest. Equal sides, so that all objects run the same programs."""
+        """A cube that holds an object, given some of its points.
+
+        It extends beyond the points by their own extent, up to the length of the longest part. The sides are equal, so
+        that all objects share the same compiled programs.
+        """
         low, high = points.min(axis=0), points.max(axis=0)
         reach = float((high - low).max()) + self._gap
         lowest = np.maximum(low - reach, high - self._longest_part)
@@ -247,8 +253,11 @@ class Sessions:
 
 
 def clusters(points: Float[np.ndarray, "n 3"], gap: float) -> Int[np.ndarray, " n"]:
-    """Which cluster each point is in: two points that are as near as a gap are in one. Points are taken by cells of a
-    quarter of the gap, so that a dense image costs no more than a coarse one."""
+    """Index of the cluster of each point. Points within about `gap` of each other are in one cluster.
+
+    Distances are those of cells with a quarter of the gap as side, so that a dense image costs no more than a coarse
+    one.
+    """
     if len(points) == 0:
         return np.zeros(0, int)
     cells, cell = np.unique(np.floor(4.0 * points / gap).astype(np.int64), axis=0, return_inverse=True)
@@ -258,14 +267,14 @@ def clusters(points: Float[np.ndarray, "n 3"], gap: float) -> Int[np.ndarray, " 
 
 
 def _values(session: Session) -> Float[np.ndarray, " candidates"]:
-    """What the candidates are worth for one object, in world units; -inf for those that it rules out."""
+    """Values of the candidates for one object, in world units; -inf for excluded ones."""
     planner, key = session.planner, jax.random.fold_in(session.key, len(session.views))
     values = planner.propose(session.observations, key).values
     return np.asarray(session.frame.length_to_world(values, planner.quantity.length_power), np.float64)
 
 
 def _expected_distance(session: Session, points: Float[np.ndarray, "n 3"]) -> float:
-    """The median of the distances of points from an object's surface, in world units: the mean over what it may be."""
+    """Median over points of the expected distance from an object's surface, in world units."""
     hypotheses, frame = hypotheses_of(session.observations), session.frame
     own = jnp.asarray(frame.to_scene(points), hypotheses.weights.dtype)
     weights = np.asarray(hypotheses.weights, np.float64)[:-1]
