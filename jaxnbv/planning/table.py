@@ -1,4 +1,4 @@
-"""The plane that an object stands on."""
+"""Detection of the table plane that an object stands on."""
 
 from typing import NamedTuple
 
@@ -11,21 +11,24 @@ from jaxnbv.geometry.volume import Box
 from jaxnbv.scanning import Obstacles
 from jaxnbv.scanning.sdf import HalfSpace
 
-# A table is level to 30 degrees. The normals of its points are noisy and agree with its own to 40.
+# A table is level to 30 degrees. The noisy normals of its points agree with its normal to 40 degrees.
 _LEVEL, _AGREES = np.cos(np.radians(30.0)), np.cos(np.radians(40.0))
-# Shares of the box's longest side: how far below the box a table may lie, and how far beside it is looked at.
+# How far a table may lie below the box, and how far beside the box points are used, as shares of its longest side.
 _BELOW, _BESIDE = 0.25, 0.2
-# The share of the points in the box that may lie below a table, and how many beside the box must lie on it.
+# Largest share of the points in the box below a table, and fewest points outside the box on it.
 _STRAY, _FEWEST = 0.02, 50
-# How far from a plane its points lie, in scene units.
+# Largest distance of a point from its plane, in scene units.
 _TOLERANCE = 0.03
-# Planes that are tried, and points that each is tried on.
+# Number of planes that are tried, and of points that each is tried on.
 _DRAWS, _COUNTED = 1000, 3000
 
 
 class _Points(NamedTuple):
-    """Points of an image from the middle of a box, with their normals. `inside`: in the box; `around`: in, under, over
-    or close beside it. The weight falls with the horizontal distance."""
+    """Points of an image relative to the middle of a box, with normals and weights.
+
+    - `inside`: mask of the points in the box; `around`: mask of those in, under, over or close beside it.
+    - `weights`: weights that fall with the horizontal distance.
+    """
 
     points: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
@@ -38,18 +41,19 @@ class _Points(NamedTuple):
 
 
 def table_under(cloud: PointCloud, box: Box) -> Obstacles | None:
-    """The plane that an object in a box stands on, and all below it; None where an image shows none. In scene
-    coordinates, with y up. Its margin is three standard deviations of its points, or the default if that is larger.
+    """The half space below the plane that an object in a box stands on; None if the image shows none.
 
-    Planes are drawn by RANSAC (Fischler and Bolles 1981). The one of most points outside the box is taken, where near
-    points count for more, among those that can be a table:
+    In scene coordinates, with y up. The margin is three standard deviations of the plane's points, or the default if
+    that is larger. RANSAC (Fischler and Bolles 1981) draws planes, and the one with most points outside the box wins,
+    where near points have more weight. A plane can be a table if it
 
-    - level to 30 degrees, so no wall;
-    - under the middle of the box no higher than its top, and no deeper below it than a quarter of its longest side;
-    - with at most 2 % of the points in the box below it, so not the top of an object;
-    - under the box and close beside it with no more points below it than on it, so no edges of things in the air.
+    - is level to 30 degrees, so that it is no wall,
+    - lies, at the middle of the box, between its top and a quarter of its longest side below its bottom,
+    - has at most 2 % of the points in the box below it, so that it is not the top of an object,
+    - has, under the box and close beside it, at least as many points on it as below it, so that it is not an edge of
+      something in the air.
 
-    `cloud` is the whole image, not only what lies in the box.
+    `cloud` is the whole image, including points outside the box.
     """
     low, high = box.low, box.high
     side, middle = float((high - low).max()), 0.5 * (low + high)
@@ -60,14 +64,14 @@ def table_under(cloud: PointCloud, box: Box) -> Obstacles | None:
     normal, offset = plane
     height = np.abs(image.points @ normal - offset)
     own = image.around & (height <= 4.0 * _TOLERANCE) & (image.normals @ normal >= _AGREES)
-    # The deviation of normal noise, from the median of its sizes.
+    # Standard deviation of normal noise, from the median absolute deviation.
     deviation = 1.4826 * float(np.median(height[own]))
     table = Obstacles((HalfSpace(middle + offset * normal, normal),), max(Obstacles().margin, 3.0 * deviation))
     return table if deviation <= _TOLERANCE else None
 
 
 def plane_of(table: Obstacles, frame: Frame) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """A point and the normal, in the world of a frame, of the plane that `table_under` found in the scene."""
+    """A point and the normal, in world coordinates, of the plane from `table_under`."""
     (plane,) = table.solids
     assert isinstance(plane, HalfSpace)
     point, normal = np.asarray(plane.point, np.float64), np.asarray(plane.normal, np.float64)
@@ -75,15 +79,14 @@ def plane_of(table: Obstacles, frame: Frame) -> tuple[Float[np.ndarray, "3"], Fl
 
 
 def other_ups(cloud: PointCloud, box: Box, up: str) -> tuple[str, ...]:
-    """The other axes by which there is a table under a box, if one of them were upward. Cloud and box are in world
-    units."""
+    """The other axes that would give a table under the box if they were upward. Cloud and box are in world units."""
     frames = [Frame.fit(np.array([box.low, box.high]), up=axis) for axis in AXES if axis != up]
-    found = [table_under(frame.to_scene(cloud), frame.to_scene(box)) for frame in frames]
-    return tuple(frame.up for frame, table in zip(frames, found, strict=True) if table is not None)
+    tables = [table_under(frame.to_scene(cloud), frame.to_scene(box)) for frame in frames]
+    return tuple(frame.up for frame, table in zip(frames, tables, strict=True) if table is not None)
 
 
 def _points_about(cloud: PointCloud, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], side: float) -> _Points:
-    """The points of an image, from the middle of a box."""
+    """The points of an image relative to the middle of a box with corners `low` and `high`."""
     points, normals = (rows.astype(np.float64) for rows in cloud.to_numpy())
     inside = np.all((points > low) & (points < high), axis=1)
     room = np.array([_BESIDE * side, np.inf, _BESIDE * side])
@@ -94,16 +97,18 @@ def _points_about(cloud: PointCloud, low: Float[np.ndarray, "3"], high: Float[np
 
 
 def _plane_of_most(image: _Points, lowest: float, highest: float) -> tuple[Float[np.ndarray, "3"], float] | None:
-    """The normal n and offset d of the plane n . x = d that most points are on, of those that can be a table and have
-    such heights at the middle."""
+    """Normal n and offset d of the plane n . x = d with most points on it, among possible tables; None if none is.
+
+    - `lowest`, `highest`: limits of the plane's height at the middle of the box.
+    """
     draw = np.random.default_rng(0)
-    # What a table within these heights can reach to, seen from above.
+    # A tilted table within these limits may differ in height by this much at a point's horizontal distance.
     reach = np.hypot(image.points[:, 0], image.points[:, 2]) * np.sqrt(1.0 / _LEVEL**2 - 1.0)
     up = image.points[:, 1]
     rows = np.flatnonzero(~image.inside & (image.normals[:, 1] > 0.5) & (up > lowest - reach) & (up < highest + reach))
     if len(rows) < _FEWEST:
         return None
-    # As many points as are counted, drawn by weight, stand for all.
+    # A random subset, drawn by weight, represents all points.
     share = image.weights / image.weights.sum()
     few = image.at(draw.choice(len(share), min(len(share), _COUNTED), replace=False, p=share))
     drawn = draw.choice(rows, (_DRAWS, 3), p=share[rows] / share[rows].sum())
@@ -131,19 +136,19 @@ def _plane_of_most(image: _Points, lowest: float, highest: float) -> tuple[Float
 def _on_and_below(
     image: _Points, normals: Float[np.ndarray, "k 3"], offsets: Float[np.ndarray, " k"]
 ) -> tuple[Bool[np.ndarray, "n k"], Bool[np.ndarray, "n k"]]:
-    """Which points lie on each of some planes, and which below it."""
+    """Masks of the points on and below each plane."""
     height = image.points @ normals.T - offsets
     return (np.abs(height) <= _TOLERANCE) & (image.normals @ normals.T >= _AGREES), height < -_TOLERANCE
 
 
 def _is_table(image: _Points, on: Bool[np.ndarray, "n k"], below: Bool[np.ndarray, "n k"]) -> Bool[np.ndarray, " k"]:
-    """Whether an object can stand on each of some planes, by the points in the box and close beside it."""
+    """Whether an object can stand on each plane, by the points in the box and close beside it."""
     free = below[image.inside].sum(axis=0) <= _STRAY * image.inside.sum()
     return free & (on[image.around].sum(axis=0) >= below[image.around].sum(axis=0))
 
 
 def _fitted(points: _Points) -> tuple[Float[np.ndarray, "3"], float]:
-    """The plane y = h + a x + b z that fits points best, by weighted least squares, as its normal and offset."""
+    """Normal and offset of the plane y = h + a x + b z, fitted to points by weighted least squares."""
     root = np.sqrt(points.weights)
     columns = np.stack([np.ones(len(root)), points.points[:, 0], points.points[:, 2]], axis=1)
     height, across, along = np.linalg.lstsq(root[:, None] * columns, root * points.points[:, 1])[0]

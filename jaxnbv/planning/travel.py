@@ -1,4 +1,4 @@
-"""What it costs to go from one view to the next, and how that counts against the value of a view."""
+"""The cost of going from one view to the next, and how it counts against the value of a view."""
 
 import dataclasses
 import itertools
@@ -19,18 +19,20 @@ from jaxnbv.observations import Observations
 from jaxnbv.utility import Quantity
 
 CostFunction: TypeAlias = Callable[[Pose, Pose], Float[Array, ""]]
-"""What it costs to go from one pose to another, in units of the user's: not negative, made of JAX operations. A
-session's poses are in the world, a simulation's in the scene."""
+"""Function of two poses that returns the cost of going from the first to the second, in any unit, zero or more.
+
+It must use JAX operations. Poses are in world coordinates in a session, and in scene coordinates in a simulation."""
 
 
 _COST, _ONE_NUMBER = "the cost of going from one pose to another", "make it one number a pose, finite and zero or more"
 
 
 class ArcLength(eqx.Module):
-    """Length of the way from one camera's place to another's about a centre: of the great circle where both are equally
-    far from it, hypot(mean distance x angle, difference of distances) in general.
+    """Length of the path between two camera positions around a centre.
 
-    - `center`: by default the middle of the scene, in a session that of the box.
+    It is hypot(mean distance x angle, difference of distances): at equal distances, an arc of the great circle.
+
+    - `center`: the centre, by default the middle of the scene, or of the box in a session.
     """
 
     center: tuple[float, float, float] | None = None
@@ -50,9 +52,10 @@ arc_length = ArcLength()
 
 
 class WorldCost(eqx.Module):
-    """The cost in the world of going from one pose of the scene to another.
+    """Cost function of poses in the scene, by a cost function of poses in the world.
 
-    - `of`: a cost of poses in the world; an `ArcLength` without a centre is one about the middle of the scene.
+    - `of`: cost of poses in world coordinates. An `ArcLength` without a centre uses the middle of the scene.
+    - `frame`: frame of the user's world.
     """
 
     of: CostFunction
@@ -67,11 +70,11 @@ class WorldCost(eqx.Module):
 
 
 class ValuePerCost(eqx.Module):
-    """How the cost of going to a view counts against its value: value / (fixed + cost).
+    """Value of a view divided by the cost of going there: value / (fixed + cost).
 
-    - `of`: what it costs to go from one pose to another: `arc_length`, or a function of yours. In a session it is given
-      poses in the world.
-    - `fixed`: what every view costs wherever it is, such as the time that an image takes, in the units of `of`.
+    - `of`: cost of going from one pose to another: `arc_length`, or your own function. In a session it gets poses in
+      world coordinates.
+    - `fixed`: fixed cost of every view in the units of `of`, for example the time of taking an image.
 
     **Raises:** `ValueError` if `fixed` is not positive.
     """
@@ -86,19 +89,19 @@ class ValuePerCost(eqx.Module):
     def __call__(
         self, values: Float[Array, "*samples poses"], observations: Observations, poses: Pose
     ) -> Float[Array, "*samples poses"]:
-        """The values of poses, given the cost of going there from the last pose that was taken, if there is one."""
+        """Values of poses, divided by the cost of going there from the last view, if there is one."""
         cost = jax.vmap(lambda pose: returned(self.of(observations.poses.last, pose), _COST, 0, _ONE_NUMBER))(poses)
-        # A view is not chosen because its cost is wrong: the planner refuses it, see `total_cost`.
+        # An invalid cost becomes NaN, so that the planner raises and names it, see `total_cost`.
         cost = jnp.where((cost >= 0) & (cost < jnp.inf), cost, jnp.nan)
         return values / (self.fixed + jnp.where(observations.num_views > 0, cost, 0.0))
 
     def in_world(self, frame: Frame) -> "ValuePerCost":
-        """The same for poses of a scene, where `of` is the cost of poses in the world."""
+        """A copy for poses in the scene, given that `of` is the cost of poses in the world."""
         of = self.of.of if isinstance(self.of, WorldCost) else self.of
         return dataclasses.replace(self, of=WorldCost(of, frame))
 
     def quantity(self, value: Quantity) -> Quantity:
-        """What a value over its cost is, for a value of this quantity."""
+        """Quantity of a value of this quantity divided by its cost."""
         meaning = f"{value.meaning.rstrip('.')}, over the cost of going there."
         unit = f"{value.unit or ('' if value.length_power else value.name)} per unit of cost".lstrip()
         return dataclasses.replace(value, name=f"{value.name} per cost", unit=unit, meaning=meaning)
@@ -106,13 +109,13 @@ class ValuePerCost(eqx.Module):
 
 @checked
 def total_cost(poses: Sequence[Pose], cost: CostFunction = arc_length) -> float:
-    """What the way through some poses, in their order, costs; zero for one or none.
+    """Cost of the path through the poses in order; zero for one pose or none.
 
     **Raises:** `ValueError` for a cost that is not one finite number, zero or more.
     """
-    way = 0.0
+    total = 0.0
     for start, end in itertools.pairwise(poses):
-        found = float(returned(cost(start, end), _COST, 0, _ONE_NUMBER))
-        require(0 <= found < math.inf, f"{_COST} is {found}: make it one finite number, zero or more")
-        way += found
-    return way
+        step = float(returned(cost(start, end), _COST, 0, _ONE_NUMBER))
+        require(0 <= step < math.inf, f"{_COST} is {step}: make it one finite number, zero or more")
+        total += step
+    return total
