@@ -1,4 +1,4 @@
-"""What else stands around the box of a session: coarse cells that its images have shown to be occupied."""
+"""Clutter around a session's box: coarse cells that images show to be occupied."""
 
 from typing import NamedTuple
 
@@ -17,19 +17,20 @@ from jaxnbv.scanning.sdf import Sampled
 
 # Cells along a side: about 1.5 cm for an object of 20 cm.
 _CELLS = 48
-# Pixels of one image that a cell needs to count as occupied. Fewer may be flying pixels at an edge.
+# Fewest pixels of one image in an occupied cell. Fewer may be flying pixels at an edge.
 _FEWEST = 5
 
 
-# Tangents of angles off the axis.
+# Largest tangent of the angle off the axis at which the distortion formula is used.
 _WIDEST = 3.0
 
 
 class Clutter(NamedTuple):
     """Cells of a cube about the middle of the scene, in scene coordinates.
 
-    - `votes`: images that show a cell to be occupied, less those that see through it.
-    - `half_extent`: half a side of the cube; `box`: of the object, no cell of which is counted.
+    - `votes`: number of images that show a cell to be occupied, minus those that see through it.
+    - `half_extent`: half the side of the cube.
+    - `box`: box of the object, whose cells do not count.
     """
 
     votes: Int[np.ndarray, "n n n"]
@@ -38,7 +39,7 @@ class Clutter(NamedTuple):
 
     @classmethod
     def empty(cls, half_extent: float, box: Box) -> "Clutter":
-        """Without any image."""
+        """Clutter before any image."""
         return cls(np.zeros((_CELLS,) * 3, np.int64), half_extent, box)
 
     def with_image(
@@ -49,10 +50,10 @@ class Clutter(NamedTuple):
         frame: Frame,
         obstacles: Obstacles,
     ) -> "Clutter":
-        """With the votes of one more image.
+        """A copy with the votes of one more image.
 
-        - `image`, `camera`, `pose`: in world units.
-        - `obstacles`: in scene units, with points of their own.
+        - `image`, `camera`, `pose`: the image, in world units.
+        - `obstacles`: obstacles in scene units. Cells in or next to them do not count.
         """
         depth = np.where(np.isfinite(image.depth), image.scale * np.asarray(image.depth, np.float64), 0.0)
         if image.robot is not None:
@@ -70,11 +71,11 @@ class Clutter(NamedTuple):
         return self._replace(votes=np.where(is_near_box | is_of_obstacle, 0, votes))
 
     def solid(self) -> Sampled | None:
-        """The occupied cells as an obstacle; None where there is none."""
+        """The occupied cells as an obstacle; None if there are none."""
         is_occupied = self.votes > 0
         if not is_occupied.any():
             return None
-        # Distances to the middles of cells, of which the faces are half a cell nearer.
+        # The transforms give distances to the middles of cells. The faces are half a cell nearer.
         inside, outside = distance_transform_edt(is_occupied), distance_transform_edt(~is_occupied)
         cells = np.where(is_occupied, 0.5 - inside, outside - 0.5)
         return Sampled((self.spacing * cells).astype(np.float32), self._centers()[0, 0, 0], self.spacing, 0.0)
@@ -91,13 +92,13 @@ class Clutter(NamedTuple):
     def _is_seen_through(
         self, depth: Float[np.ndarray, "height width"], camera: Camera, pose: Pose, frame: Frame
     ) -> Bool[np.ndarray, "n n n"]:
-        """Cells that lie before what an image measured."""
+        """Mask of the cells in front of the measured depth, by more than a cell."""
         cell = frame.length_to_world(self.spacing)
         centers = np.asarray(frame.to_world(self._centers().reshape(-1, 3)), np.float64)
         local = (centers - np.asarray(pose.position, np.float64)) @ np.asarray(pose.rotation, np.float64)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             place = local[:, :2] / local[:, 2:]
-            # A lens's formula means nothing far beside its image.
+            # The distortion formula is not valid far outside the image.
             place = np.where((np.abs(place) < _WIDEST).all(axis=1, keepdims=True), place, np.nan)
             pixels = pixels_of(place, camera.intrinsics, camera.distortion)
         column, row = (np.nan_to_num(pixel, nan=-1.0) for pixel in pixels)

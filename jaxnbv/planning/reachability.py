@@ -1,4 +1,4 @@
-"""Proposals that an arm can reach: the caller is asked about the best poses first, until one holds."""
+"""Proposals that an arm can reach: poses are checked by the user's function, the best ones first."""
 
 import dataclasses
 import math
@@ -19,12 +19,14 @@ from jaxnbv.geometry.rotations import rotation_about
 from jaxnbv.search import Proposal
 
 Reachable: TypeAlias = Callable[[Float[np.ndarray, "n 4 4"]], Any]
-"""Says of matrices, camera to world, whether the arm can go there. An answer for each: a truth; None if it can, else
-the reason why not; or a score from 0, not at all, to 1, by which the value of the pose is multiplied."""
+"""Function of matrices (n, 4, 4), camera to world, that returns for each whether the arm can go there.
 
-# Poses that are asked about at once.
+An answer is a bool; or None if it can and otherwise the reason; or a score from 0 (not at all) to 1, which multiplies
+the value of the pose."""
+
+# Number of poses in one call of the function.
 _BATCH = 8
-# Turns of the camera about its optical axis, in degrees, where the upright image does not hold.
+# Turns of the camera about its optical axis, in degrees, that are tried if the upright camera cannot reach a pose.
 _ROLLS = (45.0, -45.0, 90.0, -90.0, 135.0, -135.0, 180.0)
 _NO_REASON = "not reachable"
 
@@ -32,7 +34,8 @@ _NO_REASON = "not reachable"
 class Choice(NamedTuple):
     """The best pose that can be reached.
 
-    - `proposal`: with this pose and its value; `refusals`: how many poses cannot be reached, by the reason.
+    - `proposal`: the search's proposal with this pose and its value.
+    - `refusals`: number of poses that cannot be reached, by reason.
     """
 
     proposal: Proposal
@@ -40,14 +43,14 @@ class Choice(NamedTuple):
 
 
 class Refused(NamedTuple):
-    """A pose that was refused, in scene coordinates, and why."""
+    """A pose that was refused, in scene coordinates, and the reason."""
 
     pose: Pose
     reason: str
 
 
 class _Option(NamedTuple):
-    """A pose that can be reached, its value, and the value that it is chosen by."""
+    """A pose that can be reached, its value, and the value times its score."""
 
     pose: Pose
     value: float
@@ -55,10 +58,11 @@ class _Option(NamedTuple):
 
 
 @dataclasses.dataclass
-class _Asked:
-    """What a caller says of poses, those of most value first.
+class _Checks:
+    """Iterator over poses, those of the highest value first, with the answers of the user's function.
 
-    - `poses`, `values`: in the order in which they are asked about; `refusals`: counted as they come.
+    - `poses`, `values`: poses and values in the order in which they are checked.
+    - `refusals`: counts of the reasons so far.
     """
 
     poses: Pose
@@ -69,7 +73,7 @@ class _Asked:
     refusals: Counter[str] = dataclasses.field(default_factory=Counter)
 
     def __iter__(self) -> Iterator[list[_Option]]:
-        """The options of each pose in its order: itself, or turned about its optical axis."""
+        """Yield the options for each pose in order: the pose itself, or turned about its optical axis."""
         for start in range(0, len(self.values), _BATCH):
             rows = range(start, min(start + _BATCH, len(self.values)))
             for row, answer in zip(rows, self.answers(self.poses[jnp.asarray(rows)]), strict=True):
@@ -91,7 +95,7 @@ class _Asked:
         return [self._option(turned[index], float(values[index]), score) for index, score in scores.items()]
 
     def _option(self, pose: Pose, value: float, score: float) -> _Option:
-        # The search breaks ties its own way: no pose counts for more than the one that it proposes.
+        # The search may break ties by other criteria, so no pose counts more than the proposed one.
         least = min(value, float(self.values[0]))
         return _Option(pose, value, least * score if least > 0 else least)
 
@@ -104,33 +108,35 @@ def best_reachable(
     values_at: Callable[[Pose], Float[Array, " n"]] | None = None,
     seconds: float = math.inf,
 ) -> Choice:
-    """The pose of most value, times its score, among all that the search looked at and the arm can reach.
+    """Find the reachable pose with the highest value times score, among all poses that the search evaluated.
 
-    Poses are asked about in batches, those of most value first, until no other can be worth more. A pose that cannot
-    be reached is tried with the camera turned about its optical axis.
+    Poses are checked in batches, those of the highest value first, until no other can be better. A pose that cannot be
+    reached is tried with the camera turned about its optical axis.
 
-    - `reachable`: the caller's, None if all can be reached; `to_matrices`: converts poses of the scene for it.
-    - `refused`: poses that are out of the question, however they are turned.
-    - `values_at`: the values of turned poses; None if a turned image is worth the same, as a square one is.
-    - `seconds`: after this time no more is asked, and the best pose so far is taken.
+    - `reachable`: function of the user; None if all poses can be reached.
+    - `to_matrices`: converts poses of the scene to matrices for it.
+    - `refused`: poses that are excluded in any roll.
+    - `values_at`: function that returns the values of turned poses; None if turning does not change the value, as for
+      square images.
+    - `seconds`: time limit. After it, the best pose so far is used.
 
-    **Raises:** `ValueError` if none can be reached, or the function answers something else.
+    **Raises:** `ValueError` if no pose can be reached, or if the function returns something else.
     """
 
     def answers(batch: Pose) -> list[float | str]:
         return [1.0 for _ in batch.position] if reachable is None else _answers(reachable, to_matrices(batch))
 
     poses, values = _looks(proposal)
-    asked, best, count, start = _Asked(poses, values, answers, refused, values_at), None, 0, time.monotonic()
-    for count, options in enumerate(asked, start=1):
+    checks, best, count, start = _Checks(poses, values, answers, refused, values_at), None, 0, time.monotonic()
+    for count, options in enumerate(checks, start=1):
         for option in options:
             best = option if best is None or option.weighted > best.weighted else best
         is_best = best is not None and best.weighted >= min(values[count : count + 1], default=-math.inf)
         if is_best or time.monotonic() - start > seconds:
             break
     if best is not None:
-        return Choice(_with_pose(proposal, best.pose, best.value), dict(asked.refusals))
-    reasons = ", ".join(f"{number} {reason}" for reason, number in asked.refusals.most_common())
+        return Choice(_with_pose(proposal, best.pose, best.value), dict(checks.refusals))
+    reasons = ", ".join(f"{number} {reason}" for reason, number in checks.refusals.most_common())
     which = f"{count} of the {len(values)} poses" if count < len(values) else f"{count} poses"
     raise InputError(
         f"none of the {which} that the search looked at can be reached ({reasons}): give other candidates, "
@@ -139,7 +145,7 @@ def best_reachable(
 
 
 def _looks(proposal: Proposal) -> tuple[Pose, Float[np.ndarray, " looks"]]:
-    """All that a search looked at: the pose that it proposes, then those of most value first."""
+    """All poses that a search evaluated, with values: the proposed pose, then the others from the highest value."""
     parts = [(proposal.candidates, proposal.values)]
     if proposal.trajectories is not None:
         parts.append(proposal.trajectories.flat)
@@ -152,7 +158,7 @@ def _looks(proposal: Proposal) -> tuple[Pose, Float[np.ndarray, " looks"]]:
 
 
 def _with_pose(proposal: Proposal, pose: Pose, value: float) -> Proposal:
-    """With another pose and its value, and its error where that is known."""
+    """The proposal with another pose and its value, and with its standard error if that is known."""
     error, errors, same = proposal.standard_error, proposal.standard_errors, proposal.values == value
     if value != float(proposal.value):
         error = errors[jnp.argmax(same)] if errors is not None and bool(same.any()) else None
@@ -161,7 +167,7 @@ def _with_pose(proposal: Proposal, pose: Pose, value: float) -> Proposal:
 
 
 def _rolled(pose: Pose) -> Pose:
-    """Turned about its optical axis by each angle, as a batch."""
+    """The pose turned about its optical axis by each angle of `_ROLLS`, as a batch."""
     axis = jnp.array([0.0, 0.0, 1.0], pose.rotation.dtype)
     turns = jax.vmap(lambda angle: rotation_about(axis, angle))(jnp.radians(jnp.array(_ROLLS, axis.dtype)))
     rotations = jnp.matmul(pose.rotation, turns, precision="highest")
@@ -169,32 +175,35 @@ def _rolled(pose: Pose) -> Pose:
 
 
 def _refusal(pose: Pose, refused: Sequence[Refused]) -> str | None:
-    """Why a pose was refused, whatever its roll; None if it was not."""
-    return next((one.reason for one in refused if is_same_view(pose, one.pose)), None)
+    """The reason why a pose was refused, in any roll; None if it was not."""
+    return next((earlier.reason for earlier in refused if is_same_view(pose, earlier.pose)), None)
 
 
 def _answers(reachable: Reachable, matrices: Float[np.ndarray, "n 4 4"]) -> list[float | str]:
-    """For each matrix its score, or why it cannot be reached.
+    """The score of each matrix, or the reason why it cannot be reached.
 
-    **Raises:** `ValueError` if the function answers anything but truths, reasons and scores.
+    **Raises:** `ValueError` unless the function returns a list of bools, reasons or scores.
     """
-    said = reachable(matrices)
-    is_list = isinstance(said, list | tuple) or (hasattr(said, "shape") and len(said.shape) == 1)
+    answers = reachable(matrices)
+    is_list = isinstance(answers, list | tuple) or (hasattr(answers, "shape") and len(answers.shape) == 1)
     require(
-        is_list and len(said) == len(matrices),
-        f"reachable says {shown(said)} of {len(matrices)} poses: give a list of as many answers",
+        is_list and len(answers) == len(matrices),
+        f"reachable returned {shown(answers)} for {len(matrices)} poses: return a list with an answer for each",
     )
-    return [_answer(one) for one in said]
+    return [_answer(answer) for answer in answers]
 
 
-def _answer(said: Any) -> float | str:
-    """**Raises:** `ValueError` for what is no truth, no reason and no score."""
-    if said is None or isinstance(said, str):
-        return 1.0 if said is None else said
-    is_number = isinstance(said, bool | int | float) or (hasattr(said, "dtype") and said.dtype.kind in "bif")
+def _answer(answer: Any) -> float | str:
+    """The score or reason that an answer stands for.
+
+    **Raises:** `ValueError` unless it is a bool, None, a reason or a score.
+    """
+    if answer is None or isinstance(answer, str):
+        return 1.0 if answer is None else answer
+    is_number = isinstance(answer, bool | int | float) or (hasattr(answer, "dtype") and answer.dtype.kind in "bif")
     require(
-        is_number and 0 <= float(said) <= 1,
-        f"reachable says {shown(said)} of a pose: give a truth; None if it can be reached, else why not; or a score "
-        "from 0 to 1",
+        is_number and 0 <= float(answer) <= 1,
+        f"reachable returned {shown(answer)} for a pose: return a bool; None if it can be reached, else the reason; or "
+        "a score from 0 to 1",
     )
-    return float(said) or _NO_REASON
+    return float(answer) or _NO_REASON

@@ -1,4 +1,4 @@
-"""A session is rehearsed before its first image, so that its programs are compiled once the image is there."""
+"""Rehearsal of a session: compiles its programs before the first image."""
 
 import time
 from typing import NamedTuple
@@ -21,9 +21,10 @@ _RADIUS = 0.2
 
 
 class Rehearsal(NamedTuple):
-    """What a rehearsal did.
+    """Result of a rehearsal.
 
-    - `programs`: how many programs it compiled, or read where they are kept; `seconds`: how long it took.
+    - `programs`: number of programs that it compiled, or read from the cache.
+    - `seconds`: duration.
     """
 
     programs: int
@@ -36,7 +37,7 @@ class Rehearsal(NamedTuple):
 def rehearse(intake: Intake, loop: Loop) -> Rehearsal:
     """Add two views of a ball on a table to a session's intake and loop, and propose after each.
 
-    - `intake`, `loop`: without any view; they are of no use afterwards.
+    - `intake`, `loop`: intake and loop without views. Do not use them afterwards.
     """
     start, programs = time.monotonic(), 0
 
@@ -59,14 +60,16 @@ def rehearse(intake: Intake, loop: Loop) -> Rehearsal:
 
 
 def slanted(poses: Pose, count: int) -> Pose:
-    """Those of some poses that look down most nearly at 30 degrees, in scene units: they see what the object is on."""
+    """The `count` poses whose view direction is closest to 30 degrees downward. They see the table."""
     down = -np.asarray(poses.forward)[:, 1]
     return poses[jnp.asarray(np.argsort(np.abs(down - 0.5), kind="stable")[:count])]
 
 
 def ball_on_a_table(camera: Camera, pose: Pose, box: Box) -> Float[np.ndarray, "height width"]:
-    """The depth image of a ball in the middle of a box and of a table under it, by the equations of a ray; zero where
-    neither is met. In scene units, with y up."""
+    """Depth image of a ball in the middle of a box and a table under it; zero where a ray misses both.
+
+    Computed by ray equations, in scene units with y up.
+    """
     origin = np.asarray(pose.position, np.float64)
     ahead = np.asarray(camera.pixel_directions(), np.float64)
     rays = ahead @ np.asarray(pose.rotation, np.float64).T

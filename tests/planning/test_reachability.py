@@ -110,10 +110,10 @@ def test_what_cannot_be_reached_at_all_is_told():
     with pytest.raises(InputError, match="no proposal to refuse: ask session"):
         session.refuse()
     session.reachable = lambda matrices: 0.5
-    with pytest.raises(InputError, match=r"reachable says 0\.5 of 8 poses: give a list of as many answers"):
+    with pytest.raises(InputError, match=r"reachable returned 0\.5 for 8 poses: return a list with an answer for each"):
         session.next()
     session.reachable = lambda matrices: [1.5] * len(matrices)
-    with pytest.raises(InputError, match=r"reachable says 1\.5 of a pose: give a truth; None if .* from 0 to 1"):
+    with pytest.raises(InputError, match=r"reachable returned 1\.5 for a pose: return a bool; None if .* from 0 to 1"):
         session.next()
     session.reachable = lambda matrices: ["collision"] * len(matrices)
     with pytest.raises(InputError, match=r"none of the 1 of the \d+ poses .*\(1 collision\).*, or more seconds"):
