@@ -1,4 +1,4 @@
-"""Images of a session as views: what each shows of the object, where its camera was, and what else stands there."""
+"""Intake of a session's images: turns each into a view, with the table, the clutter and the mount's error."""
 
 import copy
 import dataclasses
@@ -24,11 +24,12 @@ from jaxnbv.scanning import Obstacles
 
 
 class Intake:
-    """The images so far, and what they told about the place.
+    """The images so far, and the table, clutter and mount error that they show.
 
-    - `camera`, `box`, `convention`: those of the session, in world units; `frame`: from its world to the scene.
-    - `planner`: in scene coordinates. If it has no obstacles, the first image is searched for a table, and all images
-      for clutter.
+    - `camera`, `box`, `convention`: as in the session, in world units.
+    - `frame`: frame of the session's world.
+    - `planner`: planner in scene coordinates. If it has no obstacles, the first image is searched for a table, and all
+      images for clutter.
     """
 
     def __init__(self, camera: Camera, box: Box, frame: Frame, convention: str, planner: Planner):
@@ -37,22 +38,22 @@ class Intake:
         self.images: tuple[Image, ...] = ()
         self.mount_error = MountError(camera, convention)
         self.table: Obstacles | None = None
-        # Axes under which there is a table, if there is none by the session's own.
+        # Other axes that would give a table if they were upward, if the session's axis gives none.
         self.other_ups: tuple[str, ...] = ()
         self.clutter = self._no_clutter()
 
     def emptied(self) -> "Intake":
-        """Without its images, to add them again by the mount's corrections, which stay."""
+        """A copy without images, to add them again. It keeps the corrections of the mount's error."""
         intake = copy.copy(self)
         intake.images, intake.clutter = (), self._no_clutter()
         return intake
 
     def add(self, loop: Loop, image: Image, accepted: Callable[[], None] = lambda: None) -> Loop | None:
-        """The loop with one more view; None for a later image that measured nothing.
+        """Add an image to the loop as a view; return the loop, or None for a later image that measured nothing.
 
-        - `accepted`: is called once nothing can refuse the image, before it is added.
+        - `accepted`: called after all checks and before the view is added.
 
-        **Raises:** `ValueError` as `Session.add` does. Nothing is changed then.
+        **Raises:** `ValueError` as `Session.add` does. Nothing changes then.
         """
         index = len(self.images)
         image.check_moved(self.images)
@@ -66,7 +67,7 @@ class Intake:
             whole = clean.cloud(self.camera, pose, self.stride)
             table = table_under(self.frame.to_scene(whole), self.frame.to_scene(self.box))
             ups = other_ups(whole, self.box, self.frame.up) if table is None else ()
-            # Without a table there still are the points of D, which cameras keep clear of.
+            # Without a table, cameras still keep clear of the points of D.
             loop = loop.emptied(dataclasses.replace(self.planner, obstacles=table or Obstacles()))
         if image.mask is not None:
             cloud = only_where(cloud, image.mask, self.camera, self.stride)
@@ -83,7 +84,7 @@ class Intake:
         return loop
 
     def _cloud(self, image: Image, pose: Pose, is_first: bool) -> PointCloud:
-        """What an image shows of the box, and of the room about it that the planner asks for.
+        """The points of an image in the box, and in the room around it that the planner's carving needs.
 
         **Raises:** `ValueError` if the first image shows nothing of the box.
         """
@@ -99,7 +100,7 @@ class Intake:
                 raise InputError(f"the first image shows nothing of the box: {problem}") from problem
 
     def _no_clutter(self) -> Clutter | None:
-        """None where the caller has said what stands around the object."""
+        """Clutter before any image; None if the user gave the obstacles."""
         if self.planner.obstacles is not None:
             return None
         reach = float(np.abs(np.asarray(self.planner.search.poses_around().position)).max())

@@ -1,4 +1,4 @@
-"""The error of the poses of a session: what its images tell, and where the cameras truly were."""
+"""Pose errors of a session: estimates from its images, and corrected poses."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,18 +11,19 @@ from jaxnbv.planning.alignment import Alignment, align_views, errors_of
 from jaxnbv.planning.images import Image, stride_of
 from jaxnbv.planning.session_warnings import warn_of_mount
 
-# Images are compared by every so many-th of the rows and columns that are planned with.
+# Stride over the rows and columns used for planning, when images are compared.
 _COARSER = 3
-# Two views may disagree by chance.
+# Fewest views for a correction or warning. Two may disagree by chance.
 _ENOUGH = 3
-# Corrections that move points by less than this share of the noise are equal.
+# Corrections are equal if they move points by at most this share of the noise.
 _EQUAL = 0.5
 
 
 class MountError:
-    """How far the images of a session disagree, and the corrections of their poses that are used.
+    """The alignment of a session's images, and the corrections of their poses in use.
 
-    - `camera`: the sensor; `convention`: of the images' matrices, see `Pose.from_matrix`.
+    - `camera`: the sensor.
+    - `convention`: axes of the images' matrices, see `Pose.from_matrix`.
     - `corrections`: (views, 4, 4), X of each image: its camera was at `matrix @ X`, in OpenCV's axes.
     """
 
@@ -34,12 +35,12 @@ class MountError:
         self._alignment: Alignment | None = None
 
     def show(self, image: Image, index: int) -> None:
-        """An image of this number, without values that stand for "not measured"; it may be shown again."""
+        """Add the image with this index, without values that mean "not measured". Repeated calls have no effect."""
         if index == len(self._images):
             self._images.append(image)
 
     def alignment(self) -> Alignment:
-        """Of the images, with all that stands around the object.
+        """Alignment of the images so far, by all their points, including those around the object.
 
         **Raises:** `ValueError` for fewer than two images.
         """
@@ -47,15 +48,15 @@ class MountError:
             poses = [Pose.from_matrix(image.matrix, self.convention) for image in self._images]
             stride = stride_of(self.camera)
             strided = self.camera.strided(stride)
-            kept = np.zeros((strided.height, strided.width), bool)
-            kept[_COARSER // 2 :: _COARSER, _COARSER // 2 :: _COARSER] = True
+            coarse = np.zeros((strided.height, strided.width), bool)
+            coarse[_COARSER // 2 :: _COARSER, _COARSER // 2 :: _COARSER] = True
             for image, pose in list(zip(self._images, poses, strict=True))[len(self._clouds) :]:
-                self._clouds.append(image.cloud(self.camera, pose, stride).only(jnp.asarray(kept.reshape(-1))))
+                self._clouds.append(image.cloud(self.camera, pose, stride).only(jnp.asarray(coarse.reshape(-1))))
             self._alignment = align_views(self._clouds, poses)
         return self._alignment
 
     def warns(self) -> bool:
-        """Warn if the images disagree; whether they do."""
+        """Warn if the images disagree, and return whether they do."""
         if len(self._images) < _ENOUGH or not (alignment := self.alignment()).disagrees:
             return False
         warn_of_mount(alignment)
@@ -63,12 +64,12 @@ class MountError:
 
     @property
     def mount(self) -> Float[np.ndarray, "4 4"]:
-        """X of the mount; the identity where each view has its own, or none has any."""
+        """X of the mount; the identity if views have different corrections or none."""
         first = self.corrections[0] if len(self.corrections) else np.eye(4)
         return first if bool(np.all(self.corrections == first)) else np.eye(4)
 
     def pose(self, image: Image, index: int) -> Pose:
-        """Where the camera of an image was, as far as the images so far tell."""
+        """The corrected pose of an image's camera."""
         pose = Pose.from_matrix(image.matrix, self.convention)
         correction = self.corrections[index] if index < len(self.corrections) else self.mount
         if np.array_equal(correction, np.eye(4)):
@@ -76,13 +77,13 @@ class MountError:
         return Pose.from_matrix(np.asarray(pose.to_matrix(), np.float64) @ correction)
 
     def sent(self, poses: Pose) -> Pose:
-        """Where to send the camera, so that it comes to stand at poses (n,)."""
+        """Poses to send the camera to, so that it arrives at poses (n,) despite the mount's error."""
         if np.array_equal(self.mount, np.eye(4)):
             return poses
         return Pose.from_matrix(np.asarray(poses.to_matrix(), np.float64) @ np.linalg.inv(self.mount))
 
     def update(self) -> bool:
-        """Use what the images tell now; whether that moves a camera."""
+        """Update the corrections by the images so far, and return whether that moves a camera."""
         if len(self._images) < _ENOUGH:
             return False
         alignment = self.alignment()

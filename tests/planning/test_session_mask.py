@@ -54,7 +54,7 @@ def test_what_is_to_be_ignored_is_no_part_of_the_object():
     assert np.abs(inside[:, None] - kept[None]).max(axis=-1).min(axis=1).max() < 1e-6
     # Where it is, the rays have ended all the same.
     assert np.array_equal(np.asarray(session.observations.looks.sight), np.asarray(plain.observations.looks.sight))
-    with pytest.raises(nbv.InputError, match=r"ignore says .* points: give a truth for each"):
+    with pytest.raises(nbv.InputError, match=r"ignore returned .* points: return a bool for each"):
         session_of(ignore=lambda points: points).add(image, FIRST, 1e-3)
 
 
