@@ -1,14 +1,15 @@
-"""Where overlapping views disagree, and the error of the poses that explains it.
+"""Disagreement of overlapping views, and the pose error that explains it.
 
 A robot knows the poses T_i of its hand, and the camera truly was at T_i X_i. If the camera's mount is off, X_i = X is
-the same for all views; if single poses are off, each view has its own, and X_0 = I. The X_i are those by which
-overlapping views agree best,
+the same for all views. If single poses are off, each view has its own X_i, and X_0 = I. The X_i make overlapping views
+agree best:
 
     minimise  the sum over points p of view i and their nearest q of view j of  rho(n_q . (T_i X_i p - T_j X_j q)),
 
-rho(r) = c^2 log(1 + r^2 / c^2), n_q the normal at q, all in the cameras' coordinates; and an error that no view tells
-of is small. Neighbours are looked for anew, nearer each time, as the views come to agree (iterative closest points by
-planes, Chen and Medioni 1992). What no view tells of X shows in the smallest eigenvalue of J^T J.
+with rho(r) = c^2 log(1 + r^2 / c^2) and the normal n_q at q, all in the cameras' coordinates. A prior keeps small the
+errors that no view determines. Each round searches neighbours again, within a smaller distance (point-to-plane
+iterative closest points, Chen and Medioni 1992). If the views do not determine all of X, the smallest eigenvalue of
+J^T J is small.
 """
 
 from collections.abc import Sequence
@@ -25,47 +26,47 @@ from jaxnbv.checks import checked, require
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 
-# Points of a view that are compared, and how many others it is compared with: those of the nearest directions.
+# Number of points of a view that are compared, and of other views, those with the nearest directions.
 _POINTS, _OTHERS = 800, 4
-# Views that look from farther apart than this share little surface; nor do pairs with fewer neighbours.
+# Largest angle between the directions of a pair of views, and fewest neighbours of a pair that count as overlap.
 _WIDEST, _FEWEST = np.radians(70.0), 20
-# What rounding does to points, in shares of the distance from the cameras.
+# Rounding error of points, as a share of the distance from the cameras.
 _ROUNDING = 1e-6
-# Two points are of one surface if the cosine of the angle between their normals is larger.
+# Smallest cosine of the angle between the normals of two points of one surface.
 _ALIKE = 0.7
-# How far apart neighbours may lie, in shares of the distance from the cameras, one round each.
+# Largest distance between neighbours in each round, as a share of the distance from the cameras.
 _REACHES = (0.08, 0.08, 0.08, 0.04, 0.04, 0.04, 0.02, 0.02, 0.01, 0.01)
-# c in medians of the disagreement, and the steps of a round.
+# c in medians of the disagreement, and number of steps in a round.
 _SCALE, _STEPS = 2.0, 3
-# How large an error is before any view: radians, and shares of the distance from the cameras. Neighbouring points err
-# together: so many count as one.
+# Prior size of an error, in radians and as a share of the distance from the cameras. Errors of neighbouring points are
+# correlated, so that this many points count as one.
 _ERROR, _TOGETHER = 0.03, 50
-# The smallest eigenvalue of J^T J in shares of the largest from which on all of X is told: 4e-6 for three views of a
-# shelf from one side, 1e-3 and more where the views told it.
+# The views determine all of X if the smallest eigenvalue of J^T J is above this share of the largest. It is 4e-6 for
+# three views of a shelf from one side, and 1e-3 or more for views that determine X.
 _TOLD = 3e-4
-# A correction that moves points by more than this share of their distance is no small error of a mount.
+# A correction that moves points by more than this share of their distance is not the small error of a mount.
 _MOST = 0.15
-# Views that differ by so many times the noise disagree. A correction is used if what it leaves is so many times less.
+# Views disagree if they differ by this multiple of the noise. A correction must reduce that by this factor.
 _OFF, _LESS = 3.0, 1.5
 _Corrections: TypeAlias = Float[np.ndarray, "views 4 4"]
 
 
 class Alignment(eqx.Module):
-    """How far views disagree, and which error of the poses explains it. Lengths are in the units of the poses.
+    """How far views disagree, and the pose error that explains it. Lengths are in the units of the poses.
 
-    - `disagreement`: of each view with those that overlap it, the median distance of a point from the plane at its
-      nearest in another view; `angle`: between their normals, in radians, the median too. With the poses as they were
-      given; NaN for a view that overlaps no other.
-    - `noise`: the median of the same distance between neighbours of one view.
-    - `corrected`: the disagreement that is left with the corrections.
-    - `corrections`: (views, 4, 4), X of each view: its camera was at `matrix @ X`. Identities where the views agree
-      little better with others.
-    - `is_mount`: whether that is one X for all views, the error of the mount; `covariance`: of its turn (a rotation
-      vector, radians) and its shift, in the camera's axes.
-    - `is_told`: whether the views tell all of the mount's error. What they do not tell is taken for zero.
-    - `weakest`: the turn and shift, in radians and lengths, of which the views tell least.
-    - `num_pairs`: how many pairs of views were compared: each with up to four that look nearly the same way.
-    - `distance`: of points from the cameras, the median.
+    - `disagreement`: for each view and those that overlap it, the median distance of a point from the plane at its
+      nearest point in another view, with uncorrected poses. NaN for a view that overlaps no other.
+    - `angle`: the same for the angle between the two normals, in radians.
+    - `noise`: the median of the same distance between neighbours in one view.
+    - `corrected`: disagreement with the corrections.
+    - `corrections`: (views, 4, 4), X of each view: its camera was at `matrix @ X`. Identities if corrections improve
+      the agreement too little.
+    - `is_mount`: whether X is the same for all views, an error of the mount.
+    - `covariance`: covariance of the mount's turn (a rotation vector, radians) and shift, in the camera's axes.
+    - `is_told`: whether the views determine all of the mount's error. Undetermined components count as zero.
+    - `weakest`: the turn and shift, in radians and lengths, that the views determine least.
+    - `num_pairs`: number of pairs of views that were compared: each view with up to four of similar direction.
+    - `distance`: median distance of points from the cameras.
     """
 
     disagreement: Float[np.ndarray, " views"]
@@ -82,8 +83,7 @@ class Alignment(eqx.Module):
 
     @property
     def disagrees(self) -> bool:
-        """Whether a view disagrees with the others by more than three times the noise, and a correction mends that or
-        the views cannot tell."""
+        """Whether a view disagrees by more than three times the noise, and a correction helps or is undetermined."""
         is_off = bool(np.any(self.disagreement > _OFF * self.noise))
         return is_off and (self.is_corrected or not self.is_told)
 
@@ -93,14 +93,14 @@ class Alignment(eqx.Module):
 
     @property
     def errors(self) -> tuple[Float[np.ndarray, " views"], Float[np.ndarray, " views"]]:
-        """By which angle, in radians, and by which length each camera is off."""
+        """Error of each camera's pose: an angle in radians, and a length."""
         return errors_of(self.corrections)
 
     @property
     def motion(self) -> str:
-        """The motion of the camera that would tell most of what the views do not.
+        """The motion of the camera that would best determine the weakest component of the mount's error.
 
-        A shift, or a turn, along an axis that no motion between the views turns looks the same from all of them.
+        A shift along an axis that no motion between the views rotates, or a turn about it, looks the same in all views.
         """
         axis = self.weakest[3:] if np.linalg.norm(self.weakest[3:]) > 0 else self.weakest[:3]
         is_ahead = abs(axis[2]) > 0.8 * np.linalg.norm(axis)
@@ -108,7 +108,7 @@ class Alignment(eqx.Module):
 
 
 class _View(NamedTuple):
-    """Points and normals in the camera's coordinates, and the camera's matrix."""
+    """A view: points and normals in the camera's coordinates, and the camera's matrix."""
 
     points: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
@@ -120,9 +120,10 @@ class _View(NamedTuple):
 
 
 class _Matches(NamedTuple):
-    """Neighbours in pairs of views, in the coordinates of their cameras.
+    """Neighbouring points in pairs of views, in the coordinates of their cameras.
 
-    - `views`: which two; `normals`: at the second points; `own_normals`: at the first.
+    - `views`: indices of the two views.
+    - `first`, `second`: the two points; `own_normals`, `normals`: the normals there.
     """
 
     views: Int[np.ndarray, "n 2"]
@@ -134,15 +135,14 @@ class _Matches(NamedTuple):
 
 @checked
 def align_views(clouds: Sequence[PointCloud], poses: Sequence[Pose]) -> Alignment:
-    """Compare overlapping views, and find the error of the camera's mount, or of single poses, by which they disagree.
+    """Compare overlapping views, and estimate the error of the camera's mount, or of single poses.
 
-    - `clouds`: the points and normals of each view, in the coordinates of the poses; what stands around the object
-      helps.
-    - `poses`: from where they were taken, as they are known.
+    If no two views overlap, the disagreement is NaN and nothing is determined.
 
-    Where no two views overlap, nothing is told, and what they disagree by is NaN.
+    - `clouds`: points and normals of each view, in the coordinates of the poses. Points around the object help.
+    - `poses`: pose of each view, possibly with an error.
 
-    **Raises:** `ValueError` for fewer than two views, other numbers of clouds and poses, or clouds without points.
+    **Raises:** `ValueError` for fewer than two views, different numbers of clouds and poses, or clouds without points.
     """
     require(len(clouds) == len(poses), f"there are {len(clouds)} clouds and {len(poses)} poses: give a pose for each")
     require(len(clouds) >= 2, f"there are {len(clouds)} views: only two or more can disagree")
@@ -154,7 +154,7 @@ def align_views(clouds: Sequence[PointCloud], poses: Sequence[Pose]) -> Alignmen
 
     off, angle = _compared(views, pairs, still, away)
     mount = _solved(views, pairs, still, away, is_mount=True)
-    # In units in which turns and shifts move points alike.
+    # Units in which a turn and a shift of the same size move points by the same length.
     unit = np.repeat([1.0, away], 3)
     matches = _matched(views, pairs, mount, _REACHES[-1] * away)
     _, rows = _linearised(views, matches, mount, is_mount=True)
@@ -170,7 +170,7 @@ def align_views(clouds: Sequence[PointCloud], poses: Sequence[Pose]) -> Alignmen
         after, _ = _compared(views, pairs, each, away)
         if _is_plausible(each, away) and _LESS * np.nanmax(after) < np.nanmax(left):
             corrections, is_mount, left = each, False, after
-    # Where nothing is told, an error is as large as it was thought to be before any view.
+    # Undetermined components keep the prior variance.
     error = _TOGETHER * (1.4826 * np.nan_to_num(_median(left))) ** 2
     covariance = (vectors / (values / max(error, 1e-30) + _ERROR**-2)) @ vectors.T
     return Alignment(
@@ -189,7 +189,7 @@ def align_views(clouds: Sequence[PointCloud], poses: Sequence[Pose]) -> Alignmen
 
 
 def _in_camera(cloud: PointCloud, pose: Pose) -> _View:
-    """Some of a view's points, at random."""
+    """A view in its camera's coordinates, with a random subset of the points."""
     points, normals = (rows.astype(np.float64) for rows in cloud.to_numpy())
     rows = np.random.default_rng(0).permutation(len(points))[:_POINTS]
     matrix = np.asarray(pose.to_matrix(), np.float64)
@@ -197,18 +197,18 @@ def _in_camera(cloud: PointCloud, pose: Pose) -> _View:
 
 
 def _pairs(views: Sequence[_View]) -> list[tuple[int, int]]:
-    """Each view with the few others that look most nearly the same way, where these may show the same surface."""
+    """Pairs of each view and the few others of the nearest directions that may show the same surface."""
     ahead = np.stack([view.matrix[:3, 2] for view in views])
     angles = np.arccos(np.clip(ahead @ ahead.T, -1.0, 1.0))
     np.fill_diagonal(angles, np.inf)
     nearest = np.argsort(angles, axis=1, kind="stable")[:, :_OTHERS]
-    return [(one, int(other)) for one, row in enumerate(nearest) for other in row if angles[one, other] < _WIDEST]
+    return [(view, int(other)) for view, row in enumerate(nearest) for other in row if angles[view, other] < _WIDEST]
 
 
 def _matched(
     views: Sequence[_View], pairs: Sequence[tuple[int, int]], corrections: _Corrections, reach: float
 ) -> _Matches:
-    """Each point of the first view of a pair with its nearest in the second, within reach and turned alike."""
+    """Match each point of a pair's first view with its nearest in the second, within `reach` and of similar normal."""
     placed = [view.placed(correction) for view, correction in zip(views, corrections, strict=True)]
     trees = [cKDTree(points) for points, _ in placed]
     rows = [(np.zeros((0, 2), int), *[np.zeros((0, 3))] * 4)]
@@ -225,20 +225,20 @@ def _matched(
 
 
 def _is_plausible(corrections: _Corrections, away: float) -> bool:
-    """Whether points move little, as by a small error."""
+    """Whether the corrections move points by as little as a small error does."""
     turn, shift = errors_of(corrections)
     return bool(np.max(away * turn + shift) < _MOST * away)
 
 
 def errors_of(corrections: _Corrections) -> tuple[Float[np.ndarray, " views"], Float[np.ndarray, " views"]]:
-    """The angle and the length of each correction."""
+    """Angle in radians and length of each correction."""
     return Rotation.from_matrix(corrections[:, :3, :3]).magnitude(), np.linalg.norm(corrections[:, :3, 3], axis=1)
 
 
 def _solved(
     views: Sequence[_View], pairs: Sequence[tuple[int, int]], start: _Corrections, away: float, is_mount: bool
 ) -> _Corrections:
-    """The corrections by which views agree best."""
+    """The corrections with which views agree best."""
     corrections, num_steps = start, 1 if is_mount else len(views) - 1
     for reach in _REACHES:
         matches = _matched(views, pairs, corrections, reach * away)
@@ -246,11 +246,11 @@ def _solved(
             break
         off, rows = _linearised(views, matches, corrections, is_mount)
         scale = max(_SCALE * float(np.median(np.abs(off))), _ROUNDING * away)
-        errors = np.concatenate([_logarithm(one) for one in corrections[-num_steps:]])
+        errors = np.concatenate([_logarithm(matrix) for matrix in corrections[-num_steps:]])
         prior = _TOGETHER * (scale / (_ERROR * np.tile(np.repeat([1.0, away], 3), num_steps))) ** 2
         step = _robust(off, rows, scale, errors, prior)
         steps = np.tile(step, (len(views), 1)) if is_mount else np.concatenate([np.zeros(6), step]).reshape(-1, 6)
-        corrections = corrections @ np.stack([_exponential(one) for one in steps])
+        corrections = corrections @ np.stack([_exponential(row) for row in steps])
     return corrections
 
 
@@ -261,8 +261,10 @@ def _robust(
     errors: Float[np.ndarray, " steps"],
     prior: Float[np.ndarray, " steps"],
 ) -> Float[np.ndarray, " steps"]:
-    """The step that makes the sum of rho(off + rows @ step), and of prior (errors + step)^2, least: by reweighted least
-    squares."""
+    """The step that minimises the sum of rho(off + rows @ step) and prior (errors + step)^2.
+
+    By iteratively reweighted least squares.
+    """
     step = np.zeros(rows.shape[1])
     for _ in range(_STEPS):
         weight = 1.0 / (1.0 + ((off + rows @ step) / scale) ** 2)
@@ -274,13 +276,16 @@ def _robust(
 def _linearised(
     views: Sequence[_View], matches: _Matches, corrections: _Corrections, is_mount: bool
 ) -> tuple[Float[np.ndarray, " n"], csr_array]:
-    """n_q . (T_i X_i p - T_j X_j q), and its derivative by steps X <- X exp(step): of all views, or of each but the
-    first. A view's share of a row is (p x m, m), p and the normal m before its camera."""
+    """n_q . (T_i X_i p - T_j X_j q), and its derivative with respect to steps X <- X exp(step).
+
+    The steps are one of the mount, or one of each view but the first. A view's part of a row is (p x m, m), with the
+    point p and the normal m in its camera's coordinates.
+    """
     true = np.stack([view.matrix for view in views]) @ corrections
     (first, second), count = matches.views.T, len(matches.views)
     normals = np.einsum("nij,nj->ni", true[second, :3, :3], matches.normals)
     apart = _placed(true[first], matches.first) - _placed(true[second], matches.second)
-    # The plane turns with its view: what counts is where the first point is before the second camera.
+    # The plane turns with its view, so the lever arm is the first point in the second camera's coordinates.
     opposite = matches.second + np.einsum("nij,ni->nj", true[second, :3, :3], apart)
     shares = [
         (view, sign * np.concatenate([np.cross(points, turned), turned], axis=1))
@@ -301,7 +306,7 @@ def _placed(matrices: Float[np.ndarray, "n 4 4"], points: Float[np.ndarray, "n 3
 
 
 def _exponential(step: Float[np.ndarray, "6"]) -> Float[np.ndarray, "4 4"]:
-    """The motion of a rotation vector and a shift."""
+    """The motion matrix of a rotation vector and a shift."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = Rotation.from_rotvec(step[:3]).as_matrix(), step[3:]
     return matrix
@@ -314,7 +319,7 @@ def _logarithm(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6"]:
 def _compared(
     views: Sequence[_View], pairs: Sequence[tuple[int, int]], corrections: _Corrections, away: float
 ) -> tuple[Float[np.ndarray, " views"], Float[np.ndarray, " views"]]:
-    """The median distances of each view from planes at the nearest points, and the median angles between normals."""
+    """For each view, the median distance from planes at the nearest points, and the median angle between normals."""
     matches = _matched(views, pairs, corrections, _REACHES[0] * away)
     off, _ = _linearised(views, matches, corrections, is_mount=True)
     turns = np.stack([view.matrix for view in views])[:, :3, :3] @ corrections[:, :3, :3]
@@ -332,13 +337,13 @@ def _compared(
 
 
 def _median(values: Float[np.ndarray, " n"]) -> float:
-    """Of those that are numbers; NaN for none."""
+    """Median of the finite values; NaN if there are none."""
     numbers = values[np.isfinite(values)]
     return float(np.median(numbers)) if len(numbers) else np.nan
 
 
 def _noise(views: Sequence[_View]) -> float:
-    """The median distance of a point from the plane at its nearest in the same view."""
+    """Median distance of a point from the plane at its nearest neighbour in the same view."""
     off = [np.zeros(0)]
     for points, normals, _ in views:
         if len(points) < 2:
