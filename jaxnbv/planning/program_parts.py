@@ -1,4 +1,4 @@
-"""Parts of a larger program that compute the bits which they compute as programs of their own."""
+"""Calls within a compiled program that give the same bits as outside `jit`."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,11 +14,11 @@ from jaxnbv.sharding import on_cpu
 
 
 def in_parts(function: Callable[..., Any], *arguments: Any) -> Any:
-    """`function(*arguments)` under `jit` with the bits that it has outside, on a CPU.
+    """Compute `function(*arguments)` under `jit` with the same bits as outside `jit`, on a CPU.
 
-    Outside `jit`, each operation and each jitted function that the function calls is a program of its own. In one
-    program XLA would fuse them, and a fused product and sum are rounded once. Here each is a call that XLA does not
-    inline, between barriers that hide what is constant. On a GPU, which keeps no bits, this is the function alone.
+    Outside `jit`, each operation and each jitted function that the function calls is a separate program. In one program
+    XLA would fuse them, and a fused product and sum are rounded once. Here each is a call that XLA does not inline,
+    between barriers that hide constants. On a GPU, which does not reproduce bits, this only calls the function.
     """
     if not on_cpu():
         return function(*arguments)
@@ -41,7 +41,7 @@ def _part(equation: JaxprEqn) -> Callable[..., list[Any]]:
     """One equation as a function of its inputs."""
 
     def part(*inputs: Any) -> list[Any]:
-        # Before JAX 0.12 also functions.
+        # Before JAX 0.12, this returns functions too.
         bound = equation.primitive.get_bind_params(equation.params)
         functions, settings = bound if isinstance(bound, tuple) else ((), bound)
         with equation.ctx.manager:
@@ -52,7 +52,7 @@ def _part(equation: JaxprEqn) -> Callable[..., list[Any]]:
 
 
 def _in_order(array: Any) -> Any:
-    """An array whose last axis varies fastest, as those of arguments and results of a program do."""
+    """The array with its last axis varying fastest, as in the arguments and results of a program."""
     if array.ndim < 2 or jnp.issubdtype(array.dtype, jax.dtypes.prng_key):
         return array
     return with_layout_constraint(array, Layout(tuple(range(array.ndim))))

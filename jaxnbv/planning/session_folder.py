@@ -1,4 +1,4 @@
-"""The folder of a session: its images, its proposals and what was refused, each stored before it is acted on."""
+"""The folder of a session: images, proposals and refused poses, each stored before it is used."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,9 +17,10 @@ _KIND = "session"
 
 
 class SessionFolder:
-    """What a session stores, in the order in which it happened.
+    """The stored images, proposals and refused poses of a session, in order.
 
-    - `path`: the folder; `config`: what the session is made of, as it was given.
+    - `path`: the folder.
+    - `config`: arguments of the session.
 
     **Raises:** `ValueError` for a folder of another session.
     """
@@ -28,16 +29,18 @@ class SessionFolder:
         self._folder = RunFolder(path, _KIND, config)
 
     @staticmethod
-    def config_of(path: str | Path, **known: Any) -> dict[str, Any]:
-        """What the session of a folder is made of; `known` takes the place of what cannot be read.
+    def config_of(path: str | Path, **replacements: Any) -> dict[str, Any]:
+        """Arguments of the session in a folder. `replacements` are used for values that cannot be restored.
 
         **Raises:** `ValueError` if the folder holds no session.
         """
-        return RunFolder.config_of(path, _KIND, **known)
+        return RunFolder.config_of(path, _KIND, **replacements)
 
     @contextmanager
     def writing(self, num_images: int) -> Iterator[None]:
-        """While nobody else writes there. `num_images`: how many images the session knows.
+        """Context with exclusive write access.
+
+        - `num_images`: number of images in the session.
 
         **Raises:** `ValueError` if another process writes there, or has added images.
         """
@@ -51,39 +54,39 @@ class SessionFolder:
 
     @property
     def num_images(self) -> int:
-        """How many images are stored."""
+        """Number of stored images."""
         return self._folder.count("image")
 
     def image(self, index: int) -> Image:
-        """The image of a number, from 0 on."""
-        stored = self._folder.read("image", index)
-        image = Image.of(stored["depth"], stored["matrix"], float(stored["depth_scale"]), stored.get("mask"))
-        return image._replace(robot=stored.get("robot"))
+        """The image with an index from 0."""
+        entry = self._folder.read("image", index)
+        image = Image.of(entry["depth"], entry["matrix"], float(entry["depth_scale"]), entry.get("mask"))
+        return image._replace(robot=entry.get("robot"))
 
     def store_image(self, index: int, image: Image) -> None:
-        """Store an image. A proposal that was planned from images which were deleted since goes."""
+        """Store an image, and remove an outdated proposal after it, which used images that were deleted since."""
         self._folder.file("proposal", index + 1).unlink(missing_ok=True)
         pixels = {"mask": image.mask, "robot": image.robot}
         pixels = {name: rows for name, rows in pixels.items() if rows is not None}
         self._folder.write("image", index, depth=image.depth, matrix=image.matrix, depth_scale=image.scale, **pixels)
 
     def proposal(self, num_images: int) -> Proposal | None:
-        """What was proposed after so many images; None for nothing."""
+        """The proposal after `num_images` images; None if there is none."""
         if not self._folder.file("proposal", num_images).exists():
             return None
         return self._folder.read("proposal", num_images)["proposal"]
 
     def store_proposal(self, num_images: int, proposal: Proposal) -> None:
-        """Store what is proposed after so many images."""
+        """Store the proposal after `num_images` images."""
         self._folder.write("proposal", num_images, proposal=proposal)
 
     def refused(self) -> list[Refused]:
-        """Poses that were refused."""
-        stored = [self._folder.read("refused", index) for index in range(self._folder.count("refused"))]
-        return [Refused(one["pose"], str(one["reason"])) for one in stored]
+        """The refused poses."""
+        entries = [self._folder.read("refused", index) for index in range(self._folder.count("refused"))]
+        return [Refused(entry["pose"], str(entry["reason"])) for entry in entries]
 
     def store_refused(self, num_images: int, refused: Refused) -> None:
-        """Store that the proposal after so many images is refused, which is no proposal any more."""
+        """Store a refused pose, and remove the proposal after `num_images` images."""
         index = self._folder.count("refused")
         self._folder.write("refused", index, pose=refused.pose, reason=np.asarray(refused.reason))
         self._folder.file("proposal", num_images).unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""A session's box and planner, in the coordinates of its scene."""
+"""A session's box, and its planner in scene coordinates."""
 
 import dataclasses
 
@@ -16,19 +16,22 @@ from jaxnbv.scanning import Obstacles
 from jaxnbv.search import DiscreteSearch
 from jaxnbv.tasks import NewSurface
 
-# On recordings twice as many showed no more.
+# Default number of samples. Twice as many did not improve the views of recordings.
 _SAMPLES = 8
 
 
 def usual_planner() -> Planner:
-    """What a session plans by where nothing else is given."""
+    """The default planner of a session."""
     return Planner(
         NewSurface(), DiscreteSearch(), Camera(height=24, width=32), SurfaceSampler(num_samples=_SAMPLES), capacity=2000
     )
 
 
 def box_of(corners) -> Box:
-    """**Raises:** `ValueError` for what is neither a `Box` nor two corners."""
+    """The box of two corners, or a `Box` unchanged.
+
+    **Raises:** `ValueError` for anything else.
+    """
     if isinstance(corners, Box):
         return corners
     require(np.shape(corners) == (2, 3), f"the box is {shown(corners)}; give two corners, (low, high), or a Box")
@@ -44,9 +47,10 @@ def in_scene(
     matrices: Float[np.ndarray, "n 4 4"] | None,
     obstacles: Obstacles | None,
 ) -> Planner:
-    """The planner at a sensor and a box, in scene coordinates.
+    """The planner for a sensor and a box, in scene coordinates.
 
-    - `camera`, `box`, `matrices`, `obstacles`: as a `Session` gets them, in world units; None for the planner's own.
+    - `camera`, `box`: as for `Session`, in world units.
+    - `matrices`, `obstacles`: as for `Session`, in world units; None for the planner's own.
     """
     search = planner.search.above()
     if matrices is not None:

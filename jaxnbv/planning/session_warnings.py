@@ -1,4 +1,4 @@
-"""What a session says of what it was given: a box that cuts the object, a table, views that are worth nothing."""
+"""Warnings of a session, for example of a box that cuts the object, a table, or views of no value."""
 
 import math
 import warnings
@@ -12,30 +12,31 @@ from jaxnbv.planning.alignment import Alignment
 from jaxnbv.planning.table import plane_of
 from jaxnbv.scanning import Obstacles
 
-# Of the points, as for a volume that holds the object: fewer may be stray.
+# Smallest share of points beyond a face for a warning. Fewer may be stray.
 _STRAY = 0.01
-# Where a session's method was called: from its warning, past the method, which for `add` is in a wrapper of checks.
+# `stacklevel` of the call of a session's method. `add` has one more level, the wrapper that checks its arguments.
 _CALLER, _CALLER_OF_ADD = 3, 4
 
 
-def warn_of_cut(box: Box, points: Float[np.ndarray, "n 3"], voxel: float, told: frozenset[str]) -> frozenset[str]:
-    """Warn of faces that the object seems to go on beyond; the faces that were told of so far.
+def warn_of_cut(box: Box, points: Float[np.ndarray, "n 3"], voxel: float, faces: frozenset[str]) -> frozenset[str]:
+    """Warn of faces of the box at which the object seems to continue; return all faces with a warning so far.
 
-    - `box`, `points`, and `voxel`, the side of a cell of the planner's grid: in world units. What lies beyond a face is
-      kept within about a voxel of it.
+    - `box`, `points`: box and points in world units. Points beyond a face are kept within about a voxel of it.
+    - `voxel`: side of a cell of the planner's grid, in world units.
+    - `faces`: faces with an earlier warning, which is not repeated.
     """
     shares = {face: share for face, share in box.passed(points, 0.5 * voxel).items() if share >= _STRAY}
-    for face in sorted(shares.keys() - told):
+    for face in sorted(shares.keys() - faces):
         warnings.warn(
             f"the object seems to go on beyond the box at {face}: {100 * shares[face]:.0f} % of the points lie within "
-            "a voxel beyond that face. Give a larger box, unless it is to cut the object",
+            "a voxel beyond that face. Give a larger box, unless this one should cut the object",
             stacklevel=_CALLER_OF_ADD,
         )
-    return told.union(shares)
+    return faces.union(shares)
 
 
 def warn_of_table(table: Obstacles, frame: Frame) -> None:
-    """Warn of a plane that was taken for a table. `table`: one half space, in scene coordinates."""
+    """Warn of a plane that the session takes for a table. `table` is one half space, in scene coordinates."""
     point, normal = plane_of(table, frame)
     warnings.warn(
         f"the object stands on a plane through {np.round(point, 4).tolist()} with the normal "
@@ -54,12 +55,12 @@ def warn_of_blank() -> None:
 
 
 def warn_of_no_table(up: str, others: tuple[str, ...]) -> None:
-    """Warn that no table was found under the object. `others`: the axes, if one were up, under which there is one."""
+    """Warn that there is no table under the object. `others` are the axes that would give one if they were upward."""
     if others:
         axes = " or ".join(f'up="{axis}"' for axis in others)
         problem = f'no table is found with up="{up}", but a plane would be one with {axes}: give that if it is upward'
     else:
-        problem = f'no table is found under the box with up="{up}", so points of one may be taken for the object\'s'
+        problem = f'no table is found under the box with up="{up}", so points of a table may count as the object\'s'
     warnings.warn(
         f"{problem}. Give the table as obstacles=Obstacles((sdf.HalfSpace(point, normal),)) in world units, or "
         "obstacles=Obstacles() if there is none",
@@ -88,7 +89,7 @@ def warn_of_mount(alignment: Alignment) -> None:
 
 
 def warn_of_inside(box: Box, cameras: Float[np.ndarray, "n 3"], candidates: Float[np.ndarray, "m 3"]) -> None:
-    """Warn, of the first camera that stands in the box, if no candidate does. All in world units."""
+    """Warn at the first camera inside the box if no candidate is inside. All arguments are in world units."""
     low, high = box.low, box.high
     is_inside, any_inside = (np.all((x > low) & (x < high), axis=1) for x in (cameras, candidates))
     if is_inside[-1] and is_inside.sum() == 1 and not any_inside.any():
@@ -101,16 +102,16 @@ def warn_of_inside(box: Box, cameras: Float[np.ndarray, "n 3"], candidates: Floa
 
 
 def warn_of_little(value: float, error: float | None, in_vain: float) -> None:
-    """Warn of a best view that may be worth nothing: of candidates that look elsewhere, or once all has been seen.
+    """Warn of a best view that may be worth nothing, because candidates look elsewhere or all has been seen.
 
-    - `value`, its standard `error` and what is expected `in_vain` are in world units.
+    - `value`, `error`, `in_vain`: value, standard error, and value expected in vain, in world units.
     """
-    known = error is not None and math.isfinite(error)
-    if value <= (3.0 * error if known and error is not None else 0.0) + in_vain:
-        sure = f" ± {error:.2g}" if known else ""
-        vain = f", and so much as {in_vain:.2g} is expected where cameras were" if in_vain > 0 else ""
+    has_error = error is not None and math.isfinite(error)
+    if value <= (3.0 * error if has_error and error is not None else 0.0) + in_vain:
+        spread = f" ± {error:.2g}" if has_error else ""
+        vain = f", while {in_vain:.2g} is expected even at earlier poses" if in_vain > 0 else ""
         warnings.warn(
-            f"the best view is worth {value:.3g}{sure}{vain}: none is sure to show anything new. Stop, or give poses "
+            f"the best view is worth {value:.3g}{spread}{vain}: none is sure to show anything new. Stop, or give poses "
             "that look at the box from elsewhere",
             stacklevel=_CALLER,
         )
