@@ -83,7 +83,7 @@ class Alignment(eqx.Module):
 
     @property
     def disagrees(self) -> bool:
-        """Whether a view disagrees by more than three times the noise, and a correction helps or is undetermined."""
+        """Whether a view is off by more than three times the noise, and a correction helps or is undetermined."""
         is_off = bool(np.any(self.disagreement > _OFF * self.noise))
         return is_off and (self.is_corrected or not self.is_told)
 

@@ -52,8 +52,8 @@ def episodes(
 ) -> Episodes:
     """Simulate a batch of episodes in one compiled program: as `simulate` for each scene and key.
 
-    On a CPU poses, values, clouds and answers are the same bit for bit. The episodes are split among several devices:
-    those of `jax.set_mesh`, by default all local devices.
+    On a CPU poses, values, clouds and answers are the same bit for bit. The episodes are split among the devices of
+    `jax.set_mesh`, by default all local devices.
 
     - `scenes`: a list with a solid or surface for each key, all of one structure, or one with a leading axis on its
       arrays, as `jax.vmap` returns. `[scene] * len(keys)` repeats a scene.

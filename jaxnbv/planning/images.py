@@ -108,7 +108,7 @@ class Image(NamedTuple):
 
 
 def only_where(cloud: PointCloud, pixels: Bool[np.ndarray, "height width"], camera: Camera, stride: int) -> PointCloud:
-    """A cloud with only the points of some pixels of its image. The rays of the other pixels keep their ends."""
+    """A cloud with only the points of some pixels of its image. Other rays still end where they did."""
     if camera.distortion:
         # The rows of a cloud are pixels of a pinhole camera.
         place = np.asarray(camera.pixel_directions(), np.float64).reshape(*pixels.shape, 3)[..., :2]

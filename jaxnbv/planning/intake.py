@@ -1,4 +1,4 @@
-"""Intake of a session's images: turns each into a view, with the table, the clutter and the mount's error."""
+"""Intake of a session's images: turns each into a view, and finds table, clutter and mount error."""
 
 import copy
 import dataclasses
@@ -49,7 +49,7 @@ class Intake:
         return intake
 
     def add(self, loop: Loop, image: Image, accepted: Callable[[], None] = lambda: None) -> Loop | None:
-        """Add an image to the loop as a view; return the loop, or None for a later image that measured nothing.
+        """Add an image to the loop as a view, and return the loop; None for a later blank image.
 
         - `accepted`: called after all checks and before the view is added.
 

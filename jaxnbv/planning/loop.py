@@ -57,7 +57,7 @@ class View(eqx.Module):
     hypotheses: eqx.Module | None = None
 
     def answer(self, acquisition: Acquisition) -> Answer | None:
-        """The acquisition's answer after this view. If it has none and there are known parts, which part it is."""
+        """The acquisition's answer after this view; if it has none, the part's identity if parts are known."""
         answer = acquisition.answer(self.cloud)
         if answer is None and isinstance(self.hypotheses, PartHypotheses):
             return identity_answer(self.hypotheses, acquisition)
@@ -183,7 +183,7 @@ class Loop:
 
     @own_settings()
     def take(self, sensor: Sensor, first: Pose) -> Step | None:
-        """Take the next view with a sensor at the proposed pose, and add it; None if the stop rule ends the episode.
+        """Take the next view with a sensor at the proposed pose, and add it; None if the episode has ended.
 
         - `first`: pose of the first view.
 

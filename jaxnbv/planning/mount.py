@@ -35,7 +35,7 @@ class MountError:
         self._alignment: Alignment | None = None
 
     def show(self, image: Image, index: int) -> None:
-        """Add the image with this index, without values that mean "not measured". Repeated calls have no effect."""
+        """Add the image with this index, without values for "not measured". Repeated calls have no effect."""
         if index == len(self._images):
             self._images.append(image)
 

@@ -59,7 +59,7 @@ class _Option(NamedTuple):
 
 @dataclasses.dataclass
 class _Checks:
-    """Iterator over poses, those of the highest value first, with the answers of the user's function.
+    """Iterator over poses, from the highest value, with the answers of the user's function.
 
     - `poses`, `values`: poses and values in the order in which they are checked.
     - `refusals`: counts of the reasons so far.
@@ -108,7 +108,7 @@ def best_reachable(
     values_at: Callable[[Pose], Float[Array, " n"]] | None = None,
     seconds: float = math.inf,
 ) -> Choice:
-    """Find the reachable pose with the highest value times score, among all poses that the search evaluated.
+    """Find the reachable pose with the highest value times score, among all poses of the search.
 
     Poses are checked in batches, those of the highest value first, until no other can be better. A pose that cannot be
     reached is tried with the camera turned about its optical axis.

@@ -1,4 +1,4 @@
-"""Live sessions: add depth images of a real sensor, get the next camera pose, all in world coordinates."""
+"""Live sessions: add images of a real sensor, and get the next camera pose, in world coordinates."""
 
 import math
 import threading
@@ -51,7 +51,7 @@ _NO_IMAGE = "the session has no image yet: add one first, session.add(depth, mat
 
 
 class NextView(eqx.Module):
-    """Where to take the next image.
+    """The proposed pose for the next image.
 
     - `matrix`: the pose to send the camera to: camera to world, in the session's convention. With `correct_mount` it
       compensates for the error of the mount, so that the camera arrives where it should.
@@ -241,7 +241,7 @@ class Session:
     @property
     @own_settings()
     def alignment(self) -> Alignment:
-        """How far the images disagree with their poses as added, and the pose error that explains it, in world units.
+        """How far the images disagree, and the error of their poses that explains it, in world units.
 
         **Raises:** `ValueError` for fewer than two images.
         """
@@ -277,7 +277,9 @@ class Session:
         depth_scale: float = 1.0,
         mask: AnyArray | None = None,
     ) -> None:
-        """Add an image, and store it first. A later image that measured nothing is left out with a `UserWarning`.
+        """Add an image, and store it first.
+
+        A later image that measured nothing is left out with a `UserWarning`.
 
         - `depth`: depth image, see `PointCloud.from_depth`.
         - `matrix`: the camera's actual pose, which may differ from the proposed one.
@@ -316,7 +318,7 @@ class Session:
 
     @own_settings()
     def next(self, seconds: float = math.inf) -> NextView:
-        """Where to take the next image.
+        """Propose the pose for the next image.
 
         The result is stored, and stays the same until an image is added. A pose is proposed only once, since one that
         the sensor could not take need not be tried again. Warns if the best value is at most three standard errors plus

@@ -19,7 +19,7 @@ _CALLER, _CALLER_OF_ADD = 3, 4
 
 
 def warn_of_cut(box: Box, points: Float[np.ndarray, "n 3"], voxel: float, faces: frozenset[str]) -> frozenset[str]:
-    """Warn of faces of the box at which the object seems to continue; return all faces with a warning so far.
+    """Warn of faces where the object seems to extend beyond the box; return all faces warned of so far.
 
     - `box`, `points`: box and points in world units. Points beyond a face are kept within about a voxel of it.
     - `voxel`: side of a cell of the planner's grid, in world units.
@@ -55,7 +55,7 @@ def warn_of_blank() -> None:
 
 
 def warn_of_no_table(up: str, others: tuple[str, ...]) -> None:
-    """Warn that there is no table under the object. `others` are the axes that would give one if they were upward."""
+    """Warn that no table is under the object. `others` are axes that would give one if they were upward."""
     if others:
         axes = " or ".join(f'up="{axis}"' for axis in others)
         problem = f'no table is found with up="{up}", but a plane would be one with {axes}: give that if it is upward'
@@ -102,7 +102,7 @@ def warn_of_inside(box: Box, cameras: Float[np.ndarray, "n 3"], candidates: Floa
 
 
 def warn_of_little(value: float, error: float | None, in_vain: float) -> None:
-    """Warn of a best view that may be worth nothing, because candidates look elsewhere or all has been seen.
+    """Warn of a best view that may be worth nothing: candidates look elsewhere, or all has been seen.
 
     - `value`, `error`, `in_vain`: value, standard error, and value expected in vain, in world units.
     """

@@ -146,7 +146,7 @@ class Sessions:
         self._warned_of_mount = self._warned_of_mount or self._mount_error.warns()
 
     def next(self) -> Float[np.ndarray, "4 4"]:
-        """Where to take the next image: a matrix, camera to world.
+        """Propose the pose for the next image: a matrix, camera to world.
 
         It is the candidate of the highest value, in world units, summed over the objects that are not done. It stays
         the same until an image is added. A pose is proposed only once.
@@ -255,7 +255,7 @@ class Sessions:
 def clusters(points: Float[np.ndarray, "n 3"], gap: float) -> Int[np.ndarray, " n"]:
     """Index of the cluster of each point. Points within about `gap` of each other are in one cluster.
 
-    Distances are those of cells with a quarter of the gap as side, so that a dense image costs no more than a coarse
+    Distances are between cells with a side of a quarter of the gap, so that a dense image costs no more than a coarse
     one.
     """
     if len(points) == 0:

@@ -126,9 +126,9 @@ def checked_reason(rule: StopRule, reason: str | None) -> str | None:
 
 
 class Sure(StopRule):
-    """Stop once the most probable class has this probability given D, and given each of several random halves of D.
+    """Stop once the most probable class has this probability, given D and also given random halves of D.
 
-    The halves are there because a single answer may be sure by chance.
+    The halves count too because a single answer may be sure by chance.
 
     - `probability`: within (0, 1).
     - `num_resamplings`: number of random halves.

@@ -79,7 +79,7 @@ def plane_of(table: Obstacles, frame: Frame) -> tuple[Float[np.ndarray, "3"], Fl
 
 
 def other_ups(cloud: PointCloud, box: Box, up: str) -> tuple[str, ...]:
-    """The other axes that would give a table under the box if they were upward. Cloud and box are in world units."""
+    """The other axes that would give a table if they were upward. Cloud and box are in world units."""
     frames = [Frame.fit(np.array([box.low, box.high]), up=axis) for axis in AXES if axis != up]
     tables = [table_under(frame.to_scene(cloud), frame.to_scene(box)) for frame in frames]
     return tuple(frame.up for frame, table in zip(frames, tables, strict=True) if table is not None)

@@ -40,7 +40,7 @@ class Search(eqx.Module):
     uses_cost: ClassVar[bool] = True
 
     def check(self, acquisition: Acquisition, camera: Camera, capacity: int) -> None:
-        """Raise `ValueError` if the search cannot work with an acquisition, a camera and clouds of `capacity` rows."""
+        """Raise `ValueError` if the search cannot work with this acquisition, camera and cloud capacity."""
         return
 
     def quantity(self, acquisition: Acquisition) -> Quantity:
@@ -171,7 +171,7 @@ def best_or_farthest(problem: Problem, candidates: Pose, scores: Float[Array, "s
 
 
 def preferred(proposal: Proposal, preference: Float[Array, " candidates"]) -> Proposal:
-    """Change a proposal to the candidate of the highest preference among those tied with its best and not excluded."""
+    """Change a proposal to the most preferred candidate that is tied with its best and not excluded."""
     tied, errors = proposal.tied_with_best(), proposal.standard_errors
     assert tied is not None
     assert errors is not None

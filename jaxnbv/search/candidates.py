@@ -52,9 +52,9 @@ class Candidates(eqx.Module):
 
 
 class SphereCandidates(Candidates):
-    """The paper's candidates: a Fibonacci sphere of cameras that look at the origin, or its part above an elevation.
+    """The paper's candidates: a Fibonacci sphere, or part of one, of cameras that look at the origin.
 
-    - `count`: number of cameras, evenly spaced on this part of the sphere.
+    - `count`: number of cameras, evenly spaced on the part of the sphere above `min_elevation`.
     - `radius`: radius in scene units.
     - `min_elevation`: lowest elevation in radians, above the plane through the origin normal to `up`; 0 gives a dome
       over a table.
@@ -85,9 +85,9 @@ class SphereCandidates(Candidates):
 
 
 class Reach(Candidates):
-    """Cameras that look at the origin from within an arm's reach, between two distances and two elevations.
+    """Cameras within an arm's reach that look at the origin, between two distances and two elevations.
 
-    - `count`: number of cameras. Their directions are those of a Fibonacci sphere, their distances uniform in volume.
+    - `count`: number of cameras. Directions lie on a Fibonacci sphere, and distances are uniform in volume.
     - `nearest`, `farthest`: distances from the origin in scene units.
     - `min_elevation`, `max_elevation`: elevations in radians, above the plane normal to `up`.
     - `up`: upward direction in the scene and in the images.

@@ -1,4 +1,4 @@
-"""Discrete candidate search (the paper's Algorithm 1), and a variant in which a second acquisition breaks ties."""
+"""Discrete candidate search (the paper's Algorithm 1), and a variant with a second acquisition."""
 
 from typing import ClassVar
 
@@ -35,7 +35,7 @@ class TieBreakSearch(CandidateSearch):
     Before any view shows what matters, no sample shows it either, and the argmax is a random view. Candidates are tied
     if their values differ from the best by at most two standard errors of the difference (`Proposal.tied_with_best`).
     So the second acquisition decides at first, and the first one as soon as its values differ. Both score the same
-    imagined scans. The proposal's values are those of the first acquisition; the proposed one need not be the highest.
+    imagined scans. The proposal has the values of the first acquisition; the proposed one need not be the highest.
 
     - `second`: acquisition that decides between tied candidates, for example `Coverage()`.
     """
@@ -51,7 +51,7 @@ class TieBreakSearch(CandidateSearch):
         return acquisition, self.second
 
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
-        """Propose the argmax of the second acquisition over tied candidates that are not excluded; ignores the key."""
+        """Propose the argmax of the second acquisition over tied candidates. The key is not used."""
         first, second = scores
         proposal = best_unvisited(problem, candidates, jnp.mean(first, axis=0), scores=first)
         return preferred(proposal, jnp.mean(second, axis=0))

@@ -182,10 +182,10 @@ class GradientSearch(Search):
 
 
 class HybridSearch(GradientSearch):
-    """Discrete search, then gradient ascent from its best few candidates: a `GradientSearch` with other defaults.
+    """Discrete search, then gradient ascent from its best: a `GradientSearch` with other defaults.
 
-    It takes fewer and longer steps. The candidates are not rotated: on the sphere they are those of a `DiscreteSearch`
-    with as many candidates, so the value is never lower than there.
+    It takes fewer and longer steps. The candidates are not rotated. On the sphere they equal the candidates of a
+    `DiscreteSearch` of the same number, so the value is never lower than there.
     """
 
     turned: ClassVar[bool] = False

@@ -21,10 +21,10 @@ _NOBODY = np.iinfo(np.int32).max
 
 
 class HalvingSearch(CandidateSearch):
-    """Successive halving over the candidates of a `DiscreteSearch` (Karnin et al. 2013), for slow acquisitions.
+    """Successive halving over candidates (Karnin et al. 2013), a faster `DiscreteSearch`.
 
     All candidates are scored on the first few posterior samples, the better half on as many more, the better half of
-    these on twice as many more, and so on until all samples are used. With 16 samples and `num_first_samples=2`, this
+    these on twice as many more, and so on until all samples are used. For 16 samples and `num_first_samples=2`, this
     takes 5 scores for each candidate instead of 16. The proposal may differ from that of the full search.
 
     - `num_first_samples`: number of posterior samples on which every candidate is scored.
@@ -51,7 +51,7 @@ class HalvingSearch(CandidateSearch):
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
         """Propose the best candidate of the last round.
 
-        The value and standard error of a candidate that left earlier are those of its scores until then.
+        The value and standard error of a candidate that left earlier come from its scores until then.
         """
         return self._halved(problem, candidates, lambda left, sample: scores[0, sample][left])
 

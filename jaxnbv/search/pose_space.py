@@ -30,7 +30,7 @@ class PoseSpace(eqx.Module):
 
     @abstractmethod
     def candidates(self, count: int, key: PRNGKeyArray | None) -> Pose:
-        """Poses spread evenly over the space. A key rotates them at random; without one they are always the same."""
+        """Poses spread evenly over the space, rotated at random if there is a key."""
 
     @abstractmethod
     def retract(self, start: Pose, parameters: Float[Array, " parameters"]) -> Pose:

@@ -51,7 +51,7 @@ class Proposal(eqx.Module):
     in_vain: Float[Array, ""] | None = None
 
     def in_world(self, frame: Frame, length_power: int) -> "Proposal":
-        """The proposal with values and errors in world units, by their power of length. Poses stay in the scene."""
+        """The proposal with values and errors in world units, by their power of length. Poses stay."""
 
         def convert(leaf):
             return leaf if isinstance(leaf, Pose) else frame.length_to_world(leaf, length_power)
@@ -59,7 +59,7 @@ class Proposal(eqx.Module):
         return jax.tree.map(convert, self, is_leaf=lambda leaf: isinstance(leaf, Pose))
 
     def tied_with_best(self, errors: float = 2.0) -> Bool[Array, " candidates"] | None:
-        """Mask of the candidates that are tied with the best one, including itself; None if errors are unknown.
+        """Mask of the candidates that are tied with the best one (itself included); None without errors.
 
         A value ties if it differs from the best by at most `errors` standard errors of the difference plus `in_vain`.
         """
