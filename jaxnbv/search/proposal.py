@@ -51,7 +51,7 @@ class Proposal(eqx.Module):
     in_vain: Float[Array, ""] | None = None
 
     def in_world(self, frame: Frame, length_power: int) -> "Proposal":
-        """The proposal with values and errors in world units, by their power of length. Poses stay."""
+        """The proposal with values and errors in world units (powers of length). Poses stay in the scene."""
 
         def convert(leaf):
             return leaf if isinstance(leaf, Pose) else frame.length_to_world(leaf, length_power)
