@@ -1,4 +1,4 @@
-"""An episode: views that were chosen of an object, and all that they depend on."""
+"""Episodes: the views of one object, with the planner, scene and key that they depend on."""
 
 import dataclasses
 import itertools
@@ -30,11 +30,12 @@ def _score(acquisition: Acquisition, context: Any, view: ImaginedView) -> Float[
 
 
 class Episode(eqx.Module):
-    """Views that a planner chose of a scene, in scene coordinates, and what they depend on.
+    """The views that a planner chose of a scene, in scene coordinates, and all inputs that they depend on.
 
-    - `scene`, `noise`: None where a real sensor took the views.
-    - `stopped`: why there are not as many views as were asked for; None where there are.
-    - `frame`: of the user's world, in which the episode is shown and its cloud is written.
+    - `scene`, `noise`: true surface and sensor noise; None if a real sensor took the views.
+    - `first`: pose of the first view.
+    - `stopped`: reason of the stop rule that ended the episode; None if no rule did.
+    - `frame`: frame of the user's world, in which the episode is shown and its cloud is saved.
     """
 
     planner: Planner
@@ -57,21 +58,23 @@ class Episode(eqx.Module):
         return self.views[-1].cloud
 
     def observations(self) -> Iterator[Observations]:
-        """The planner's observations after each view, made again from the scans."""
+        """Yield the planner's observations after each view, computed again from the scans."""
         return self.planner.replay(((view.pose, view.scan) for view in self.views), self.sensor)
 
     def observations_after(self, views: int) -> Observations:
         """The planner's observations after the first `views` views.
 
-        **Raises:** `ValueError` unless there are as many, and at least one.
+        **Raises:** `ValueError` unless 1 <= `views` <= the number of views.
         """
         check_type(views, int, "the number of views")
-        require(1 <= views <= len(self.views), f"asked for {views} of {len(self.views)} views; ask for one at least")
+        require(1 <= views <= len(self.views), f"asked for {views} of {len(self.views)} views; ask for at least one")
         return next(itertools.islice(self.observations(), views - 1, None))
 
     def found(self) -> Iterator[float | None]:
-        """What each view added of what the planner's acquisition is about: the score of its scan given the observations
-        before it, beside the value that its proposal promised. None for the first view; in scene units."""
+        """Yield the score of each view's actual scan, given the observations before it.
+
+        In scene units; None for the first view. Compare it with the value that the proposal expected.
+        """
         yield None
         acquisition = self.planner.acquisition
         for before, view in zip(self.observations(), self.views[1:], strict=False):
@@ -80,16 +83,16 @@ class Episode(eqx.Module):
 
     @classmethod
     def load(cls, path: str | Path, planner: Planner | None = None, scene: Surface | None = None) -> "Episode":
-        """The episode of a folder, as it was saved or as far as `simulate` has come.
+        """Load a saved episode, or the views that `simulate` has stored so far.
 
-        - `planner`, `scene`: in place of the stored ones, where these hold a function or a network that cannot be made
-          again from its description; they must have the same description.
+        - `planner`, `scene`: replace the stored ones. Needed if these hold a function or network that cannot be
+          restored from its description. Both must have the same description.
 
-        **Raises:** `ValueError` if the folder holds no episode, or no view, or if its planner or scene cannot be made
-        again.
+        **Raises:** `ValueError` if the folder holds no episode or no view, or if its planner or scene cannot be
+        restored.
         """
-        given = {name: value for name, value in (("planner", planner), ("scene", scene)) if value is not None}
-        config = RunFolder.config_of(path, "episode", **given)
+        replacements = {name: value for name, value in (("planner", planner), ("scene", scene)) if value is not None}
+        config = RunFolder.config_of(path, "episode", **replacements)
         folder = RunFolder(path, "episode", config)
         stored = read_views(folder)
         require(len(stored) > 0, f"{path} holds no view yet")
@@ -103,17 +106,16 @@ class Episode(eqx.Module):
         return dataclasses.replace(episode, views=views, stopped=_read_end(folder, len(views)))
 
     def save(self, path: str | Path) -> None:
-        """Write the episode to a folder (see `jaxnbv.storage` for its files); `simulate` can continue from it.
+        """Save the episode to a folder (see `jaxnbv.storage` for its files). `simulate` can continue from it.
 
-        **Raises:** `ValueError` if the folder holds an episode of another configuration or a longer one, or other
-        files.
+        **Raises:** `ValueError` if the folder holds other files, an episode of another configuration, or a longer one.
         """
         folder = self.open(path)
         with folder.writing():
-            held = folder.count("view")
+            count = folder.count("view")
             require(
-                held <= len(self.views),
-                f"{path} already holds {held} views of this episode, which has {len(self.views)}: "
+                count <= len(self.views),
+                f"{path} already holds {count} views of this episode, which has {len(self.views)}: "
                 "choose another folder",
             )
             for index, view in enumerate(self.views):
@@ -121,13 +123,13 @@ class Episode(eqx.Module):
             self.write_end(folder)
 
     def write_end(self, folder: RunFolder) -> None:
-        """Write why the episode ended, and its cloud in world units."""
+        """Write the reason why the episode ended, and its cloud in world units."""
         reason = None if self.stopped is None else np.array(self.stopped)
         folder.write("end", 0, reason=reason, views=np.array(len(self.views)))
         folder.write_cloud(self.frame.to_world(self.cloud))
 
     def open(self, path: str | Path) -> RunFolder:
-        """The folder of this episode's configuration, for its views.
+        """Open a folder for the views of an episode of this configuration.
 
         **Raises:** `ValueError` as `RunFolder` does.
         """
@@ -137,16 +139,16 @@ class Episode(eqx.Module):
 
 
 def read_views(folder: RunFolder) -> list[tuple[Pose, PointCloud, Proposal | None]]:
-    """Pose, scan and proposal of every view that a folder holds.
+    """Pose, scan and proposal of every view in a folder.
 
-    **Raises:** `ValueError` if one is damaged, or missing between others.
+    **Raises:** `ValueError` if a view is damaged, or missing between others.
     """
     views = (folder.read("view", index) for index in range(folder.count("view")))
     return [(view["pose"], view["scan"], view.get("proposal")) for view in views]
 
 
 def _read_end(folder: RunFolder, views: int) -> str | None:
-    """Why an episode of as many views ended; None if it went on since, or was not ended by a rule."""
+    """Reason why an episode of `views` views ended; None if it was continued since, or no rule ended it."""
     if not folder.file("end", 0).exists():
         return None
     end = folder.read("end", 0)

@@ -1,4 +1,4 @@
-"""Simulated episodes as one program: what `simulate` does, in JAX alone."""
+"""Simulated episodes as one compiled program: the same computation as `simulate`, in JAX only."""
 
 from typing import Any, NamedTuple
 
@@ -22,8 +22,11 @@ from jaxnbv.surfaces.part_hypotheses import hypotheses_of
 
 
 class ViewRecord(NamedTuple):
-    """What is kept of a view. `value` is NaN for the first one. `answer` holds the values of the acquisition's answer,
-    or `PartHypotheses.part_weights` where `answers_by_parts`."""
+    """The record of a view.
+
+    - `value`: value that the search expected; NaN for the first view.
+    - `answer`: values of the acquisition's answer, or `PartHypotheses.part_weights` if `answers_by_parts`.
+    """
 
     pose: Pose
     value: Float[Array, ""]
@@ -31,7 +34,7 @@ class ViewRecord(NamedTuple):
 
 
 def answers_by_parts(planner: Planner) -> bool:
-    """Whether `View.answer` says which of some known parts the object is."""
+    """Whether `View.answer` names a known part, because the acquisition has no answer of its own."""
     return type(planner.acquisition).answer is Acquisition.answer and planner.sampler.model.carries_hypotheses
 
 
@@ -43,10 +46,13 @@ def run(
     rows: tuple[Surface, Pose, Key[Array, " episodes"]],
     at_once: int,
 ) -> tuple[ViewRecord, PointCloud, Bool[Array, " episodes"]]:
-    """Records (episodes, max_views) of the views, D after the last view, and whether the first view saw anything.
+    """Run episodes, and return their records, last clouds and whether the first views saw anything.
 
-    - `rows`: scene, first pose and key of each episode along a leading axis, of which each device gets a share.
-    - `at_once`: episodes that a device computes together.
+    The records have axes (episodes, max_views).
+
+    - `views`: number of views of each episode.
+    - `rows`: scene, first pose and key of each episode along a leading axis, which is split among the devices.
+    - `at_once`: number of episodes that a device computes together.
     """
 
     def of_share(rows: Any, planner: Planner, views: Int[Array, ""]) -> Any:
@@ -63,7 +69,7 @@ def _episode(
     records = jax.tree.map(lambda leaf: jnp.zeros((room, *leaf.shape), leaf.dtype).at[0].set(leaf), record)
     arrays, rest = eqx.partition(observations, eqx.is_array)
 
-    # A loop of any number of rounds, so that one program has any number of views.
+    # A loop with a traced number of rounds, so that one program works for any number of views.
     def add(index: Any, state: Any) -> Any:
         arrays, pending, records = state
         before = eqx.combine(arrays, rest), pending

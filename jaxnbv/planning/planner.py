@@ -1,4 +1,4 @@
-"""The planner: propose the next view, and observe its scan. Simulations and real sensors call the same methods."""
+"""The planner: proposes the next view and observes its scan, for simulations and real sensors."""
 
 import dataclasses
 from collections.abc import Iterable, Iterator
@@ -150,7 +150,9 @@ class Planner(eqx.Module):
     def observe(
         self, observations: Observations, pose: Pose, scan: PointCloud, camera: Camera | None = None
     ) -> Observations:
-        """Add a scan from a pose to the observations (scene coordinates). A scan that hit nothing adds no points.
+        """Add a scan from a pose to the observations, in scene coordinates.
+
+        A scan that hit nothing adds no points.
 
         - `camera`: the camera that took the scan, by default the planner's. Scans of one capacity and camera share one
           compilation.
@@ -199,7 +201,7 @@ class Planner(eqx.Module):
 
     @own_settings()
     def step_inputs(self, observations: Observations, key: PRNGKeyArray) -> StepInputs:
-        """First half of `propose`: the posterior and its samples, or only the observations if the search needs none."""
+        """First half of `propose`: the posterior and samples, or only the observations if no samples are used."""
         check_type(observations, Observations, "observations")
         return self.sampled(observations, key) if self.search.uses_samples else StepInputs(observations)
 
@@ -207,8 +209,8 @@ class Planner(eqx.Module):
     def sampled(self, observations: Observations, key: PRNGKeyArray) -> StepInputs:
         """Condition the model on the observations, and draw the samples of a step.
 
-        With `measurable_only`, sampled surface that a view should have measured and did not is left out. For an
-        acquisition about hypotheses, the only sample is the likeliest part.
+        If the acquisition is `measurable_only`, surface that a view should have measured and did not is left out of the
+        samples. If it is about hypotheses, the only sample is the likeliest part.
         """
         if self.acquisition.needs_hypotheses:
             return StepInputs(observations, None, hypotheses_of(observations).surfaces(self.sampler.grid, 1))
@@ -220,7 +222,7 @@ class Planner(eqx.Module):
 
     @own_settings()
     def choose(self, inputs: StepInputs, key: PRNGKeyArray, pending: PoseList | None = None) -> Proposal:
-        """Second half of `propose`: search, given the step's inputs. Their samples may come from a model of your own.
+        """Second half of `propose`: search, given the step's inputs, for example with samples of your own.
 
         **Raises:** `ValueError` if every candidate has been visited, or a score is not finite.
         """
@@ -236,7 +238,7 @@ class Planner(eqx.Module):
     @jax.debug_nans(False)
     @eqx.filter_jit
     def values_at(self, inputs: StepInputs, poses: Pose) -> Float[Array, " poses"]:
-        """Values that the search maximises, at poses (n,) in scene coordinates. Include the cost of going there.
+        """Values that the search maximises, with the cost of going there, at poses (n,) of the scene.
 
         **Raises:** `ValueError` for inputs without samples.
         """
@@ -246,7 +248,7 @@ class Planner(eqx.Module):
     @jax.debug_nans(False)
     @eqx.filter_jit
     def expected_depth(self, surfaces: GridSurface, pose: Pose) -> Float[Array, "h w"]:
-        """Expected depth image from a pose in scene units: `mean_depth` over the samples, with the planner's camera."""
+        """Expected depth image from a pose, in scene units: `mean_depth` over the samples."""
         scans = scan_samples(surfaces, self.camera, pose[None], barrier_of(self.obstacles, self.camera, pose[None]))
         depth = mean_depth(jax.tree.map(lambda rows: rows[:, 0], scans), pose)
         return depth.reshape(self.camera.height, self.camera.width)

@@ -1,4 +1,4 @@
-"""The simulated episode: the loop at a sensor that scans a known surface."""
+"""Simulated episodes: the planning loop with a sensor that scans a known surface."""
 
 import dataclasses
 import itertools
@@ -36,18 +36,21 @@ def simulate(
     until: StopRule | None = None,
     each: Callable[[Step], None] | None = None,
 ) -> Episode:
-    """Scan a known surface, solid or mesh of trimesh's from `first`, then from the views that the planner asks for:
-    `views` in all, or as many as it takes `until` a rule of stopping ends it, `Sure(0.95) | Budget(seconds=60)` say.
+    """Simulate an episode: scan a known surface from `first`, then from the planner's proposals.
 
-    View i depends on the key and i alone, not on how many follow. With `folder`, every finished view is written there;
-    a run that was interrupted goes on after the last of them and, on a CPU with the same versions, ends with the same
-    bits as one that was not. (A GPU may add in another order from run to run.) The rule is asked after the last view
-    that is there, so a folder can be continued with another one.
+    View i depends only on the key and i, not on the number of views. An interrupted run with a folder continues after
+    its last view. On a CPU with the same versions, the result is the same bit for bit. (A GPU may add in another order
+    from run to run.) The stop rule is checked after the last stored view, so you can continue with another rule.
 
-    - `each`: is called with the step to every view once it is done, those that the folder holds included.
+    - `scene`: surface, solid or trimesh mesh.
+    - `views`: total number of views, unless the stop rule ends the episode earlier.
+    - `folder`: folder that stores every finished view.
+    - `progress`: whether a bar shows the stages.
+    - `until`: stop rule, for example `Sure(0.95) | Budget(seconds=60)`.
+    - `each`: called with the step of every view when it is done, stored views included.
 
-    **Raises:** `ValueError` if `views` < 1 or more than the planner has room for, if the first view sees nothing, or
-    if the folder belongs to another configuration or holds more views already.
+    **Raises:** `ValueError` if `views` < 1 or greater than the planner's `max_views`, if the first view sees nothing,
+    or if the folder belongs to another configuration or already holds more views.
     """
     require(views >= 1, f"asked for {views} views; ask for at least one")
     require(
@@ -82,7 +85,7 @@ def simulate(
                     store.write("view", index, pose=step.view.pose, scan=step.view.scan, proposal=step.view.proposal)
                 if each is not None:
                     each(step)
-                # Its posterior may be large, and is not to be held beside that of the next step.
+                # A posterior may be large: free it before the next step computes another.
                 del step
             bar.update(bar.total - bar.n)
         stopped = loop.stopped if len(loop.views) < views else None
@@ -100,7 +103,7 @@ def observe_scene(
     key: PRNGKeyArray,
     obstacles: Obstacles | None = None,
 ) -> PointCloud:
-    """A noisy scan of the true surface, past obstacles; compiled where the surface allows it."""
+    """A noisy scan of the true surface, behind obstacles; compiled if the surface supports it."""
     barrier = None if obstacles is None else _barrier(obstacles, camera, pose)
     observe = _noisy_scan_in_jit if scene.in_jit else _noisy_scan
     return observe(scene, camera, pose, barrier, noise, key)
