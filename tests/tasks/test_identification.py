@@ -95,7 +95,7 @@ def test_derivative_in_the_pose():
 
 
 def test_what_it_needs():
-    with pytest.raises(nbv.InputError, match="knows none"):
+    with pytest.raises(nbv.InputError, match="needs known parts"):
         nbv.Planner(nbv.Identify())
     with pytest.raises(nbv.InputError, match="2 names for 3 parts"):
         information(nbv.Identify(group=["a", "b"]), (0.5, 0.5, 0.0), (ABOVE,))
