@@ -99,7 +99,7 @@ class Session:
       multiplies the value, for example 1 / (1 + seconds of motion). It gets the best poses of the search in batches. An
       unreachable pose is tried again with the camera turned about its optical axis.
     - `ignore`: function of points (n, 3) in the world that returns for each whether it belongs to the robot. Such
-      points are not part of the object, but hide what is behind them. Called once for each image, with all measured points.
+      points are not part of the object, but hide what is behind them. Called once an image, with all measured points.
     - `progress`: whether a bar shows the stages of planning.
 
     **Raises:** `ValueError` for an empty box, a missing `up`, poses that the search cannot use, or a folder of another
