@@ -1,4 +1,4 @@
-"""What has been observed: the points that are kept, the poses that were taken, and which space is empty."""
+"""The observations: kept points, poses of the views, and space that was seen to be empty."""
 
 import dataclasses
 from typing import NamedTuple
@@ -16,29 +16,29 @@ from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.pose_list import PoseList
 from jaxnbv.scanning import Carving, Grid, Looks, Obstacles, barrier_of
 
-# A model takes a hundred or two of the empty points, and the time to choose them grows with how many there are.
+# A model uses 100 to 200 empty points, and the time to choose them grows with the number offered.
 _POINTS_ALONG_AXIS = 20
-# Of one scan, so that the time does not grow with the square of the capacity; more go with the next.
+# Points checked per scan, since the time grows with this times the capacity. Others wait for the next scan.
 _MOST_STRAY = 512
 
 
 class EmptyPoints(NamedTuple):
-    """Points (scene coordinates) that were seen to be empty. Rows whose mask is False hold nothing."""
+    """Points (scene coordinates) that were seen to be empty. Rows with a False mask are padding."""
 
     points: Float[Array, "m 3"]
     mask: Bool[Array, " m"]
 
 
 class Observations(eqx.Module):
-    """What has been observed, in scene coordinates. Immutable and of fixed shapes, so that nothing recompiles.
+    """Everything observed so far, in scene coordinates. Immutable, with fixed shapes, so that nothing recompiles.
 
-    - `cloud`: D, the points that are kept.
-    - `poses`: the poses that views were taken from.
-    - `grid`: of what follows; None where none of it is kept.
-    - `looks`: what has been measured, and how far each view saw.
-    - `empty_nodes`: the nodes that a scan has shown to be empty.
-    - `obstacle_nodes`: the nodes within known obstacles, where the object cannot be.
-    - `hypotheses`: what a model carries from view to view, see `SurfaceModel.observed`; None for nothing.
+    - `cloud`: D, the kept points.
+    - `poses`: the poses of the views.
+    - `grid`: the grid of the next three; None if they are not kept.
+    - `looks`: the measured surface, and how far each view saw.
+    - `empty_nodes`: mask of the nodes that some scan showed to be empty.
+    - `obstacle_nodes`: mask of the nodes inside known obstacles, where the object cannot be.
+    - `hypotheses`: the state that a model carries from view to view, see `SurfaceModel.observed`; None without one.
     """
 
     cloud: PointCloud
@@ -58,9 +58,9 @@ class Observations(eqx.Module):
         obstacle_nodes: Bool[Array, "g g g"] | None = None,
         camera: Camera = Camera(),
     ) -> "Observations":
-        """A cloud before any pose is added, with room for `max_views` poses. No node of the grid is empty yet.
+        """The observations of a cloud before any view, with room for `max_views` poses. No node is empty yet.
 
-        - `camera`: by whose rays looks are kept.
+        - `camera`: the camera along whose rays `looks` stores how far each view saw.
         """
         empty = None if grid is None else jnp.zeros((grid.resolution,) * 3, bool)
         looks = None if grid is None else Looks.none(grid, camera, max_views).with_points(cloud)
@@ -68,12 +68,12 @@ class Observations(eqx.Module):
 
     @property
     def num_views(self) -> Int[Array, ""]:
-        """How many poses were taken."""
+        """Number of views."""
         return self.poses.count
 
     @property
     def empty_points(self) -> EmptyPoints:
-        """The empty nodes, of every few along each axis, for a model to condition on."""
+        """Empty nodes from a coarser subgrid of at most 20 nodes per axis, for a model to condition on."""
         if self.empty_nodes is None or self.grid is None:
             return EmptyPoints(jnp.zeros((1, 3), self.cloud.points.dtype), jnp.zeros(1, bool))
         stride = -(-self.grid.resolution // _POINTS_ALONG_AXIS)
@@ -82,28 +82,31 @@ class Observations(eqx.Module):
         return EmptyPoints(nodes, self.empty_nodes[::stride, ::stride, ::stride].reshape(-1))
 
     def add_points(self, scan: PointCloud) -> "Observations":
-        """The observations with a scan's points in D, which is thinned to its capacity by farthest point sampling and
-        loses stray points: those that lie alone where a view has looked through."""
+        """A copy with a scan's points added to D.
+
+        D is thinned to its capacity by farthest point sampling. It loses stray points, which lie alone in space that a
+        view saw to be empty.
+        """
         return dataclasses.replace(self, cloud=_joined(self.cloud, scan, self.empty_nodes, self.grid))
 
     def add_view(
         self, pose: Pose, scan: PointCloud, camera: Camera, carving: Carving | None, obstacles: Obstacles | None
     ) -> "Observations":
-        """The observations with a pose, what the scan from there has measured, and the nodes that it shows to be empty.
+        """A copy with a view's pose, the surface that its scan measured, and the nodes that it shows to be empty.
 
-        - `carving`: how far from its rays a scan shows a node to be empty; None keeps `empty_nodes` as they are.
-        - `obstacles`: what stands before the object; beyond it a ray shows nothing.
+        - `carving`: the margin around rays within which nodes count as empty; None leaves `empty_nodes` unchanged.
+        - `obstacles`: solids that may hide the object; a ray shows nothing behind them.
         """
-        # Without D, whose capacity need not compile this again.
-        seen = self.poses, self.looks, self.empty_nodes
-        poses, looks, empty = _with_view(*seen, pose, scan, camera, carving, obstacles)
+        # D is left out, so that another capacity does not compile this again.
+        fields = self.poses, self.looks, self.empty_nodes
+        poses, looks, empty = _with_view(*fields, pose, scan, camera, carving, obstacles)
         return dataclasses.replace(self, poses=poses, looks=looks, empty_nodes=empty)
 
 
 def as_observations(value: Observations | PointCloud) -> Observations:
-    """Observations as they are; a cloud alone as observations from no pose.
+    """Convert a cloud alone to observations without views; return observations unchanged.
 
-    **Raises:** `ValueError` for anything else, and for a batch of clouds.
+    **Raises:** `ValueError` for another type, and for a batch of clouds.
     """
     check_type(value, Observations | PointCloud, "the observations")
     if isinstance(value, Observations):
@@ -119,10 +122,10 @@ def _joined(cloud: PointCloud, scan: PointCloud, empty: Bool[Array, "g g g"] | N
 
 
 def _is_stray(cloud: PointCloud, empty: Bool[Array, "g g g"], grid: Grid) -> Bool[Array, " n"]:
-    """Which points lie in a cell that some view has seen to be empty, and alone.
+    """Whether each point lies in a cell that was seen to be empty, and has no neighbour within twice the spacing.
 
-    A thin part that a view has missed does not lie alone, nor does a surface whose images' poses are a little off:
-    thinned, what is connected has a neighbour within twice the spacing.
+    Points of a thin part that a view missed, or of a surface whose images have slightly wrong poses, do have such a
+    neighbour: in a thinned cloud, points of connected surface are about one spacing apart.
     """
     crossed = jax.lax.reduce_window(empty, True, jax.lax.bitwise_and, (2, 2, 2), (1, 1, 1), "VALID")
     cell = tuple(grid.cell_of(cloud.points).T)

@@ -1,4 +1,4 @@
-"""The surfaces that are possible given the observations: p(f | D), and samples of it on a grid."""
+"""The posterior over surfaces, p(f | D), and its samples on a grid."""
 
 import dataclasses
 import warnings
@@ -42,19 +42,19 @@ from jaxnbv.surfaces import (
 )
 from jaxnbv.surfaces.known_shapes import short_ranged
 
-# How far beyond the faces of a box that may cut the object this may go on, in scene units: 8 % of the longest side.
+# How far the object may continue beyond a box that cuts it, in scene units: 8 % of the longest side.
 _ROOM = 0.2
 
 MODELS = ("screened", "paper")
-"""The names of `SurfaceSampler.preset`."""
+"""The names that `SurfaceSampler.preset` accepts."""
 
 
 class StepInputs(eqx.Module):
-    """What one step looks at, computed once.
+    """The inputs of one step, computed once.
 
-    - `observations`: what has been seen.
-    - `posterior`: p(f | observations); None where nothing asks for it.
-    - `surfaces`: S samples of it along a leading axis; None where nothing asks for them.
+    - `observations`: the observations so far.
+    - `posterior`: p(f | observations); None if nothing needs it.
+    - `surfaces`: S samples of it along a leading axis; None if nothing needs them.
     """
 
     observations: Observations
@@ -63,18 +63,18 @@ class StepInputs(eqx.Module):
 
 
 class SurfaceSampler(eqx.Module):
-    """A distribution over surfaces, and how it is sampled.
+    """A distribution over surfaces, and the settings for sampling it.
 
     - `model`: the prior over surfaces.
-    - `grid`: where samples are evaluated and scanned; empty space is kept at its nodes.
-    - `num_samples`: S, posterior samples a step.
-    - `carving`: what samples are cut by: empty space, on which the model is conditioned too where it can be, and the
-      outside of a volume. None leaves samples as the model draws them from D, which is the paper's own behaviour.
+    - `grid`: samples are evaluated and scanned on it; empty space is stored at its nodes.
+    - `num_samples`: S, posterior samples per step.
+    - `carving`: removes sampled surface in empty space and outside a volume. A model that can use empty space is also
+      conditioned on it. None leaves samples as the model draws them from D, as in the paper.
 
-    No sample is inside a known obstacle, with carving or without. Observations are `Observations` of the same grid, or
+    No sample extends into a known obstacle, with or without carving. Methods accept `Observations` of the same grid, or
     a cloud alone.
 
-    **Raises:** `ValueError` for no samples, or a grid beyond the torus [-pi, pi]^3.
+    **Raises:** `ValueError` if `num_samples` is below 1, or if the grid extends beyond the torus [-pi, pi]^3.
     """
 
     model: SurfaceModel = eqx.field(default_factory=ScreenedSPSR)
@@ -87,7 +87,7 @@ class SurfaceSampler(eqx.Module):
         require(self.num_samples >= 1, f"num_samples is {self.num_samples}; it must be at least 1")
         require(
             self.grid.half_extent <= np.pi,
-            f"the grid reaches to {self.grid.half_extent}, beyond the torus [-pi, pi]^3: give Grid(half_extent=...)",
+            f"the grid extends to {self.grid.half_extent}, beyond the torus [-pi, pi]^3: give Grid(half_extent=...)",
         )
 
     @classmethod
@@ -100,16 +100,15 @@ class SurfaceSampler(eqx.Module):
         volume: Volume | None = None,
         solid: bool = False,
     ) -> "SurfaceSampler":
-        """The surfaces of a name, for an object whose box has this longest side, in scene units.
+        """The sampler with this name, for an object whose box has this longest side, in scene units.
 
-        - `screened`: the default `ScreenedSPSR`, whose lengths are taken in proportion to the longest side and for
-          which the boundary of the volume is outside; carved, so that nothing is inside where the sensor saw empty
-          space, nor outside the volume.
-        - `paper`: the published model at its published values, which conditions on normals alone; not carved.
-        - `quick`: with fewer frequencies.
-        - `volume`: by default the cube of the longest side about the origin. One that is given may cut the object.
-        - `solid`: for a body that is nowhere thin, such as the pyramid: its hidden side is as large as the one that was
-          seen, so that nothing follows for the space beside what was seen empty (`SeenEmpty`).
+        - `name`: "screened" is the default `ScreenedSPSR`, with lengths in proportion to the longest side. The boundary
+          of the volume counts as outside. Samples are carved, so they avoid empty space and stay in the volume.
+          "paper" is the published model with its published values. It uses normals only and is not carved.
+        - `quick`: use fewer frequencies.
+        - `volume`: by default the cube of the longest side about the origin. A volume given here may cut the object.
+        - `solid`: set this for a body that is nowhere thin, such as the pyramid. Its hidden side is as large as the
+          visible one, so space next to empty space need not be empty: `SeenEmpty` is left out.
 
         **Raises:** `ValueError` for another name, or a longest side that is not positive.
         """
@@ -128,10 +127,11 @@ class SurfaceSampler(eqx.Module):
 
     @own_settings()
     def with_bank(self, bank: ShapeBank, poses: ShapePoses) -> "SurfaceSampler":
-        """A copy whose prior is a mixture over a bank: `KnownShapes`, registered within the volume. The present model
-        is its "none of these".
+        """A copy whose prior is `KnownShapes`, a mixture over a bank. The present model is its "none of these".
 
-        - `poses`: how the shapes can stand in the scene.
+        Shapes are registered within the volume.
+
+        - `poses`: the possible placements of the shapes in the scene.
         """
         box = Box() if self.carving is None else bounding_box(self.carving.volume)
         longest_side = float(np.max(box.high - box.low))
@@ -142,23 +142,23 @@ class SurfaceSampler(eqx.Module):
 
     @property
     def without_bank(self) -> "SurfaceSampler":
-        """A copy whose prior has no bank."""
+        """A copy without a bank: its prior is the model that `KnownShapes` uses for "none of these"."""
         return dataclasses.replace(self, model=self.model.unknown) if isinstance(self.model, KnownShapes) else self
 
     @own_settings()
     def within(self, volume: Box) -> "SurfaceSampler":
-        """A copy for an object in another box, which takes the place of the default one, `Box()`, and may cut it."""
+        """A copy with this box in place of every default one, `Box()`. The box may cut the object."""
 
-        def placed(leaf):
+        def replace(leaf):
             if isinstance(leaf, OutsideBoundary):
-                return dataclasses.replace(leaf, volume=volume, room=_ROOM) if placed(leaf.volume) is volume else leaf
+                return dataclasses.replace(leaf, volume=volume, room=_ROOM) if replace(leaf.volume) is volume else leaf
             return volume if isinstance(leaf, Box) and leaf == Box() else leaf
 
-        return jax.tree.map(placed, self, is_leaf=lambda leaf: isinstance(leaf, Box | OutsideBoundary))
+        return jax.tree.map(replace, self, is_leaf=lambda leaf: isinstance(leaf, Box | OutsideBoundary))
 
     @own_settings()
     def posterior(self, observations: Observations | PointCloud) -> SurfacePosterior:
-        """p(f | observations), of which `sample` draws before it carves. Empty nodes count within the volume alone.
+        """p(f | observations) before carving. Only empty nodes within the volume count.
 
         **Raises:** `ValueError` as the model's `condition` does, and for observations of another grid.
         """
@@ -172,16 +172,16 @@ class SurfaceSampler(eqx.Module):
     def sample(
         self, observations: Observations | PointCloud, key: PRNGKeyArray, posterior: SurfacePosterior | None = None
     ) -> GridSurface:
-        """S samples of the surface given the observations, carved, on the grid, along a leading axis.
+        """S samples of the surface given the observations, on the grid and carved, along a leading axis.
 
-        - `posterior`: that of the observations, where it is at hand already.
+        - `posterior`: the result of `posterior(observations)`, if it is already computed.
 
-        **Raises:** `ValueError` as `posterior` does, and if the model gives values that are not finite.
+        **Raises:** `ValueError` as `posterior` does, and if the samples are not finite.
         """
         check_key(key)
         check_type(posterior, SurfacePosterior | None, "the posterior")
         observations = self.adapt(observations)
-        # On its own, so that whoever asks for the posterior too compiles it once.
+        # A program of its own, so that callers who also use the posterior compile it once.
         posterior = self.posterior(observations) if posterior is None else posterior
         surfaces = _sample(self, observations, key, posterior)
         if not is_traced(surfaces):
@@ -207,8 +207,9 @@ class SurfaceSampler(eqx.Module):
     def carve(
         self, observations: Observations | PointCloud, values: Float[Array, "*s g g g"]
     ) -> Float[Array, "*s g g g"]:
-        """Values of f minus its level at the grid's nodes, made positive where the object cannot be: at empty nodes,
-        outside its volume, and within obstacles.
+        """Carve values of f minus its level at the grid's nodes.
+
+        They become positive where the object cannot be: at empty nodes, outside the volume, and inside obstacles.
 
         **Raises:** `ValueError` if the values or the observations are of another grid.
         """
@@ -224,7 +225,7 @@ class SurfaceSampler(eqx.Module):
     def mean(
         self, observations: Observations | PointCloud, posterior: SurfacePosterior | None = None
     ) -> Float[Array, "g g g"]:
-        """E f minus the level at the grid's nodes, carved as the samples are.
+        """E f minus the level at the grid's nodes, carved like the samples.
 
         **Raises:** `ValueError` as `posterior` does.
         """
@@ -234,8 +235,9 @@ class SurfaceSampler(eqx.Module):
 
     @own_settings()
     def probability_inside(self, observations: Observations | PointCloud) -> Float[Array, "g g g"]:
-        """P(f < level | observations) at the grid's nodes: the share of S samples under a fixed key, carved, so that
-        any model will do.
+        """P(f < level | observations) at the grid's nodes: the share of S carved samples with a fixed key.
+
+        This works for any model.
 
         **Raises:** `ValueError` as `sample` does.
         """
@@ -243,17 +245,17 @@ class SurfaceSampler(eqx.Module):
 
     @own_settings()
     def mean_mesh(self, observations: Observations | PointCloud) -> TriangleMesh:
-        """The surface where the posterior mean equals its level, by marching cubes on the grid, carved as the samples.
+        """The surface where the carved posterior mean equals its level, by marching cubes on the grid.
 
-        The mesh is in scene coordinates (its frame is the identity), its faces wound outward. Where nothing was scanned
-        it is the model's guess. Pieces on which fewer than four points of the cloud lie are left out, and a warning
-        says how many. It is open where it leaves the grid.
+        The mesh is in scene coordinates (its frame is the identity), with faces wound outward. Where nothing was
+        scanned it is the model's guess. Pieces with fewer than four points of the cloud are left out, and a warning
+        says how many. The mesh is open where it leaves the grid.
 
         **Raises:** `ValueError` if the mean does not cross its level within the grid, and as `posterior` does.
         """
         values = np.array(self.mean(observations))
-        found = level_triangles(values, self.grid)
-        if found is None:
+        triangles = level_triangles(values, self.grid)
+        if triangles is None:
             half = self.grid.half_extent
             raise InputError(
                 f"the posterior mean less its level runs from {values.min():.4g} to {values.max():.4g} on the grid, so "
@@ -261,20 +263,20 @@ class SurfaceSampler(eqx.Module):
                 "cloud"
             )
         points, _ = self.adapt(observations).cloud.to_numpy()
-        vertices, faces, dropped = held_pieces(*found[:2], points, self.grid.spacing)
+        vertices, faces, dropped = held_pieces(*triangles[:2], points, self.grid.spacing)
         if dropped:
             warnings.warn(
-                f"{dropped} piece{'s' * (dropped > 1)} of the mesh with hardly a point of the cloud on "
-                f"{'them' if dropped > 1 else 'it'} {'were' if dropped > 1 else 'was'} left out",
+                f"left out {dropped} piece{'s' * (dropped > 1)} of the mesh with hardly any points of the cloud",
                 stacklevel=2,
             )
         return TriangleMesh(vertices, faces, Frame())
 
     def adapt(self, observations: Observations | PointCloud) -> Observations:
-        """The observations as this sampler uses them: without empty nodes where it does not carve; a cloud alone with
-        no node empty.
+        """The observations in the form that this sampler uses.
 
-        **Raises:** `ValueError` for observations of another grid, or without a grid where samples are carved.
+        Without carving, empty nodes are dropped. A cloud alone becomes observations without an empty node.
+
+        **Raises:** `ValueError` for observations of another grid, or without a grid if samples are carved.
         """
         grid = None if self.carving is None else self.grid
         if isinstance(observations, PointCloud):
@@ -286,8 +288,8 @@ class SurfaceSampler(eqx.Module):
             observations = dataclasses.replace(observations, grid=None, looks=None)
         require(
             bool(observations.grid == grid),
-            f"the observations keep empty space on {observations.grid}, but surfaces are carved on {self.grid}: make "
-            "them with the init of the planner that they are given to",
+            f"the observations keep empty space on {observations.grid}, but surfaces are carved on {self.grid}: start "
+            "them with `init` of the planner that uses them",
         )
         return observations if self.carving is not None else dataclasses.replace(observations, empty_nodes=None)
 
@@ -301,5 +303,5 @@ def _sample(
     surfaces = GridSurface.from_values(sampler.carve(observations, values), 0.0, sampler.grid)
     if sampler.carving is None:
         return surfaces
-    # A volume cuts through the inside of what goes on beyond it.
+    # The cut that a volume makes through an object that continues beyond it is no surface.
     return surfaces.void(touched_cells((values <= 0) & sampler.carving.outside(sampler.grid)))
