@@ -1,4 +1,4 @@
-"""p(f) and p(f | D): distributions over implicit surfaces."""
+"""Distributions over implicit surfaces: priors p(f) and posteriors p(f | D)."""
 
 from jaxnbv.surfaces.base import Fields as Fields
 from jaxnbv.surfaces.base import SurfaceModel as SurfaceModel

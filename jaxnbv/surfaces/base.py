@@ -1,4 +1,4 @@
-"""What the rest of the library asks of a distribution over implicit surfaces: condition it, and sample."""
+"""The interface of a distribution over implicit surfaces: condition it on observations, and sample it."""
 
 import functools
 import math
@@ -24,20 +24,22 @@ HALF_WIDTH = 0.5 * math.pi
 _ESTIMATED_BY = 64
 
 
-def _on_torus(is_given: Callable[[Any], bool], wanted: str) -> Callable[..., Any]:
-    """Of a method, that its arguments are arrays of a shape, on the torus, [-pi, pi]^3: beyond it functions only
-    repeat. Its eighth in the middle is the scene; outside that nothing is known but that the surface is not there."""
+def _on_torus(has_shape: Callable[[Any], bool], wanted: str) -> Callable[..., Any]:
+    """Decorator: check that a method's arguments are arrays of this shape with coordinates in [-pi, pi].
+
+    Beyond this torus functions only repeat. The scene is the middle eighth of the torus, and no surface lies elsewhere.
+    """
 
     def checking(method: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(method)
         def call(self: Any, *arrays: Any) -> Any:
             arrays = tuple(map(native, arrays))
             for array in arrays:
-                found = array if is_traced(array) else as_numbers(array, "the coordinates", None)
-                require(is_given(found), f"the coordinates have shape {found.shape}: give {wanted}")
-                if is_traced(found, self) or not found.size:
+                coordinates = array if is_traced(array) else as_numbers(array, "the coordinates", None)
+                require(has_shape(coordinates), f"the coordinates have shape {coordinates.shape}: give {wanted}")
+                if is_traced(coordinates, self) or not coordinates.size:
                     continue
-                furthest = float(np.abs(found).max())
+                furthest = float(np.abs(coordinates).max())
                 require(
                     furthest <= 2.0 * HALF_WIDTH + 1e-6,
                     f"a point has a coordinate of {furthest:.4g}, outside [-pi, pi]^3, where surfaces only repeat; the "
@@ -56,7 +58,7 @@ on_grid_of_torus = _on_torus(lambda axis: axis.ndim == 1, "the nodes along one a
 
 
 def sampling_method(method: Callable[..., Any]) -> Callable[..., Any]:
-    """A method of a key and a number of samples, at least one."""
+    """Decorator for a method of a key and a number of samples: check both."""
 
     @functools.wraps(method)
     def call(self: Any, key: PRNGKeyArray, num_samples: int) -> Any:
@@ -70,66 +72,66 @@ def sampling_method(method: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class Fields(eqx.Module):
-    """Sampled implicit functions f_1, ..., f_S, each to be evaluated anywhere in the scene."""
+    """Sampled implicit functions f_1, ..., f_S that can be evaluated anywhere in the scene."""
 
     @abstractmethod
     def __call__(self, x: Float[AnyArray, "n 3"]) -> Float[Array, "s n"]:
-        """All samples at the points x (scene coordinates)."""
+        """Values of all samples at the points x (scene coordinates)."""
 
     @on_torus
     def gradient(self, x: Float[AnyArray, "n 3"]) -> Float[Array, "s n 3"]:
-        """The gradients of all samples at the points x, here by forward differentiation of their values."""
+        """Gradients of all samples at the points x. By default they are forward derivatives of the values."""
         x = jnp.asarray(x)
 
         def along(direction):
-            # A value depends on its own point alone, so that all points can be moved at once.
+            # Each value depends only on its own point, so one sweep can move all points.
             return jax.jvp(self, (x,), (jnp.broadcast_to(direction, x.shape),))[1]
 
         return jnp.moveaxis(jax.vmap(along)(jnp.eye(3, dtype=x.dtype)), 0, -1)
 
     @on_grid_of_torus
     def on_grid(self, axis: Float[AnyArray, " g"]) -> Float[Array, "s g g g"]:
-        """All samples on the tensor grid axis x axis x axis (scene coordinates)."""
+        """Values of all samples on the tensor grid axis x axis x axis (scene coordinates)."""
         return on_tensor_grid(self, axis)
 
 
 class SurfacePosterior(eqx.Module):
-    """p(f | D): the surface is where f equals `level`, and f is greater outside.
+    """The posterior p(f | D). The surface is where f equals `level`, and f is greater outside.
 
-    An implementation gives `level` and `sample`. One that has closed forms overrides `mean`, `variance` and
-    `probability_inside` by them; those that it leaves are estimated from S = 64 samples drawn under a fixed key,
-    the same functions for all points.
+    A subclass defines `level` and `sample`. If it has closed forms, it overrides `mean`, `variance` and
+    `probability_inside`. The methods that it leaves are estimates from S = 64 samples with a fixed key, the same
+    functions for all points.
     """
 
     level: eqx.AbstractVar[Float[Array, ""]]
 
     @abstractmethod
     def sample(self, key: PRNGKeyArray, num_samples: int) -> Fields:
-        """`num_samples` independent samples of the whole function f."""
+        """Draw `num_samples` independent samples of the whole function f."""
 
     @property
     def has_closed_forms(self) -> bool:
-        """Whether it has its own `mean`; else moments are estimated from samples."""
+        """Whether the class overrides `mean`; otherwise moments are estimated from samples."""
         return type(self).mean is not SurfacePosterior.mean
 
     def kinds(self) -> dict[str, float]:
-        """How likely the object is of each kind of known shape, most likely first; empty where no shapes are known."""
+        """Probability of each kind of known shape, most likely first; empty without known shapes."""
         return {}
 
     def names_of_samples(self, key: PRNGKeyArray, num_samples: int) -> list[str]:
-        """The known shape that each of the samples of `sample` is about; empty names where no shapes are known."""
+        """Name of the known shape behind each sample of `sample`; empty names without known shapes."""
         return [""] * num_samples
 
     def mean(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
-        """E f(x), here the mean of samples, of standard error sqrt(Var f / S)."""
+        """E f(x). By default the mean of S samples, with standard error sqrt(Var f / S)."""
         return jnp.mean(self._kept()(x), axis=0)
 
     def variance(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
-        """Var f(x), here that of samples, S - 1 in its denominator."""
+        """Var f(x). By default the variance of S samples, with denominator S - 1."""
         return jnp.var(self._kept()(x), axis=0, ddof=1)
 
     def probability_inside(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
-        """P(f(x) < level), here the share of samples."""
+        """P(f(x) < level). By default the share of samples below the level."""
         return jnp.mean(self._kept()(x) < self.level, axis=0)
 
     @on_grid_of_torus
@@ -145,26 +147,29 @@ class SurfacePosterior(eqx.Module):
 
 
 class SurfaceModel(eqx.Module):
-    """p(f): a prior over implicit surfaces that can be conditioned on what was seen."""
+    """A prior p(f) over implicit surfaces that can be conditioned on observations."""
 
     @abstractmethod
     def condition(self, observations: Observations | PointCloud) -> SurfacePosterior:
-        """p(f | observations): the filled rows of its cloud and, where the model can make use of it, the space that was
-        seen empty. A cloud alone is observations too; `as_observations` makes it so."""
+        """The posterior p(f | observations).
+
+        Models use the filled rows of the cloud, and some also use the space that was seen to be empty. An
+        implementation converts a cloud alone by `as_observations`.
+        """
 
     def observed(self, observations: Observations) -> Observations:
-        """The observations with what the model carries from view to view; asked after each view."""
+        """Add the state that the model carries from view to view. Called after each view."""
         return observations
 
     def in_scene(self, frame: Frame) -> "SurfaceModel":
-        """The model, given in the world of a frame as far as it knows true sizes, in the scene."""
+        """The model in scene units, if it has true sizes in the world units of a frame; otherwise unchanged."""
         return self
 
     @property
     def carries_hypotheses(self) -> bool:
-        """Whether `observed` keeps hypotheses about which known part the object is, see `PartHypotheses`."""
+        """Whether `observed` keeps hypotheses about the identity of a known part, see `PartHypotheses`."""
         return False
 
     def check(self, cloud: PointCloud) -> None:
-        """Warn where a cloud, whose values are known, is not one that the model makes much of."""
+        """Warn if the model can make little use of a cloud. The cloud's values must be concrete."""
         return

@@ -1,14 +1,14 @@
 """Gaussian posteriors over band-limited functions: closed forms, and samples by pathwise conditioning.
 
-A sample is a draw of the prior, moved by what the data say of the draw (Matheron's rule; Wilson et al. 2020). It can be
-drawn about mean functions m_1, ..., m_S as well as about zero: the prior is then f_s = m_s + g, with g of mean zero,
+A sample is a draw of the prior plus a correction at the data (Matheron's rule; Wilson et al. 2020). It can be drawn
+about mean functions m_1, ..., m_S as well as about zero. The prior is then f_s = m_s + g, with g of mean zero:
 
-    data     normals n_j - grad m_s(x_j) and values z_k - m_s(y_k), in place of n_j and z_k, are those of g
-    scale    the draws of the prior and of the noise are multiplied by rho_s: what the data say of the mean stays, the
-             covariance is rho_s^2 times the posterior's
+    data     g has the normals n_j - grad m_s(x_j) and the values z_k - m_s(y_k), in place of n_j and z_k
+    scale    the draws of the prior and of the noise are multiplied by rho_s. This leaves the posterior mean unchanged,
+             and the covariance becomes rho_s^2 times the posterior's
     sample   f_s = m_s + g_s
 
-The covariances are those of g, so all means share one factorisation, and each adds a right-hand side.
+All covariances are those of g, so all means share one factorisation, and each adds a right-hand side.
 """
 
 from abc import abstractmethod
@@ -27,21 +27,21 @@ from jaxnbv.surfaces.trigonometric import TrigonometricFields
 
 
 class MeansAtData(NamedTuple):
-    """What mean functions are where the posterior has data: their gradients at its normals, and their values."""
+    """Gradients of mean functions at a posterior's normals, and their values at its value points."""
 
     gradients: Float[Array, "s n 3"]
     values: Float[Array, "s m"]
 
 
 class DataPoints(NamedTuple):
-    """Where a posterior asks mean functions for their gradients and for their values."""
+    """Points at which a posterior needs the gradients and the values of mean functions."""
 
     gradients: Float[Array, "n 3"]
     values: Float[Array, "m 3"]
 
 
 class FieldsAbout(Fields):
-    """f_s = m_s + r_s: samples about mean functions.
+    """Samples about mean functions, f_s = m_s + r_s.
 
     - `means`: m_1, ..., m_S.
     - `residual`: r_1, ..., r_S.
@@ -61,9 +61,9 @@ class FieldsAbout(Fields):
 
 
 class TrigonometricPosterior(SurfacePosterior):
-    """A Gaussian posterior whose prior, and so whose mean and samples about zero, are band-limited functions.
+    """A Gaussian posterior with a band-limited prior. Its mean and its samples are band-limited too.
 
-    - `mean_coefficients`: of E f.
+    - `mean_coefficients`: coefficients of E f, see `surfaces/trigonometric.py`.
     """
 
     mean_coefficients: eqx.AbstractVar[Float[Array, "a a a"]]
@@ -89,15 +89,17 @@ class TrigonometricPosterior(SurfacePosterior):
     @on_torus
     @eqx.filter_jit
     def probability_inside(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
-        """P(f(x) < level) = Phi((level - E f(x)) / sqrt(Var f(x))) at points in scene coordinates. As costly as the
-        variance."""
+        """P(f(x) < level) = Phi((level - E f(x)) / sqrt(Var f(x))) at points in scene coordinates.
+
+        It costs as much as the variance.
+        """
         variance = self.variance(x)
         deviation = jnp.sqrt(jnp.maximum(variance, jnp.finfo(variance.dtype).tiny))
         return norm.cdf((self.level - self.mean(x)) / deviation)
 
     @sampling_method
     def sample(self, key: PRNGKeyArray, num_samples: int) -> TrigonometricFields:
-        """`num_samples` joint samples of f by pathwise conditioning: functions, to be evaluated anywhere."""
+        """Draw `num_samples` samples of the function f by pathwise conditioning."""
         about_zero = _at_data(_Zeros(num_samples), self.data_points())
         return TrigonometricFields(_sampled(self, key, about_zero, None))
 
@@ -105,18 +107,18 @@ class TrigonometricPosterior(SurfacePosterior):
     def sample_about(
         self, means: Fields, key: PRNGKeyArray, noise_scale: float | int | Float[AnyArray, "*s"] = 1.0
     ) -> FieldsAbout:
-        """One sample of f about each of S mean functions: m_s + g_s, with the prior's g given normals n - grad m_s and
-        values less those of m_s. With a mean of zero it is that of `sample` under the same key.
+        """Draw one sample m_s + g_s of f about each of S mean functions.
 
-        The samples are relative to the level of this posterior, whatever that of the mean is: a surface is where
-        `fields(x) == posterior.level`.
+        g_s is a sample given the normals n - grad m_s and the values minus those of m_s. A mean of zero gives the
+        samples of `sample` with the same key. Samples use the level of this posterior, whatever the level of the mean:
+        a surface is where `fields(x) == posterior.level`.
 
-        - `means`: any functions, differentiable once.
-        - `noise_scale`: rho, one number or one for each mean function. The samples' deviation from their mean is rho
-          times that of the posterior; 0 gives E f about each m_s, whatever the key.
+        - `means`: any functions that are differentiable once.
+        - `noise_scale`: rho, one number, or one for each mean function. The samples' standard deviation is rho times
+          that of the posterior. 0 gives E f about each m_s, whatever the key.
 
-        **Raises:** `ValueError` for means that are no `Fields`, a noise scale that is negative or not finite, another
-        number of them than of mean functions, or means that are not finite at the data.
+        **Raises:** `ValueError` for means that are not `Fields`, a noise scale that is negative or not finite, a number
+        of noise scales that differs from the number of mean functions, or means that are not finite at the data.
         """
         check_key(key)
         at_data = _at_data(means, self.data_points())
@@ -147,23 +149,23 @@ class TrigonometricPosterior(SurfacePosterior):
 
     @abstractmethod
     def data_points(self) -> DataPoints:
-        """Where mean functions are asked for their gradients and values."""
+        """The points at which this posterior needs gradients and values of mean functions."""
 
     @abstractmethod
     def level_about(self, means: MeansAtData) -> Float[Array, " s"]:
-        """How much higher the level is about mean functions than about zero."""
+        """Difference between the level about each mean function and the level about zero."""
 
     @abstractmethod
     def prior_draws(self, key: PRNGKeyArray, num_samples: int) -> Any:
-        """Draws of the prior and of the noise of the data: arrays of mean zero, with a leading axis of samples."""
+        """Draw the prior and the noise of the data: arrays of mean zero, with a leading axis of samples."""
 
     @abstractmethod
     def conditioned(self, draws: Any, means: MeansAtData) -> Float[Array, "s a a a"]:
-        """Coefficients of the draws, given the data less the means: jointly linear in draws, data and means."""
+        """Coefficients of the draws given the data minus the means: jointly linear in draws, data and means."""
 
 
 class _Zeros(Fields):
-    """The mean functions of a prior about zero."""
+    """Mean functions that are zero everywhere."""
 
     count: int = eqx.field(static=True)
 
@@ -175,12 +177,15 @@ class _Zeros(Fields):
 
 
 def filled(points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Float[Array, "n 3"]:
-    """The points with the first one that holds something in place of those that hold nothing: zeros stand there, where
-    a mean function may have no gradient, and its derivatives would not be finite though they count for nothing."""
+    """The points with the first filled row copied into all unfilled rows.
+
+    Unfilled rows are zero. A mean function may have no gradient there, and its derivatives would then not be finite,
+    although the rows do not count.
+    """
     return jnp.where(mask[:, None], points, points[jnp.argmax(mask)])
 
 
-# One program each for samples about zero and about means, so that they are the same to the last digit.
+# Samples about zero and about means run the same two programs, so that they are equal to the last digit.
 
 
 @eqx.filter_jit
@@ -199,7 +204,7 @@ def _sampled(
     posterior: TrigonometricPosterior, key: PRNGKeyArray, means: MeansAtData, scale: Float[Array, "*s"] | None
 ) -> Float[Array, "s a a a"]:
     draws = posterior.prior_draws(key, len(means.values))
-    # A product by one would change how the sums it stands in are rounded.
+    # Multiplying by one would change how XLA rounds the sums around it.
     if scale is not None:
         draws = jax.tree.map(lambda draw: draw * scale.reshape(-1, *(1,) * (draw.ndim - 1)), draws)
     return posterior.conditioned(draws, means)

@@ -1,15 +1,16 @@
-"""Poisson surfaces that know values too: screened and enveloped stochastic Poisson surface reconstruction.
+"""Poisson surfaces given normals and values: screened and enveloped stochastic Poisson surface reconstruction.
 
-A second step of Bayes' rule after `GeometricSPSR`, whose posterior given the normals has mean m and covariance k:
+This is a second step of Bayes' rule after `GeometricSPSR`, whose posterior given the normals has mean m and
+covariance k:
 
     level    c ~ N(0, tau^2), broad and independent of f;   g = f - c, and the surface is where g = 0
     data     g(y_k) = h value_k + e_k,   e_k ~ N(0, h^2 noise_k^2),   k = 1, ..., M
     factor   S = k(Y, Y) + tau^2 11^T + Sigma,   k(Y, Y) = K_ff - sum_d K_fd A^-1 K_df
     mean     E g(x) = m(x) + (k(x, Y) + tau^2 1^T) w,   w = S^-1 (h value - m(Y))
-    sample   f a sample given the normals, c and e of the prior;   w = S^-1 (h value - f(Y) + c - e)
+    sample   f a sample given the normals, c and e from the prior;   w = S^-1 (h value - f(Y) + c - e)
 
-so that f moves by k(., Y) w: the weights of the normals change by u_d = -A^-1 K_df w, the coefficients of f by
-s(n) / |n|^2 sum_k w_k e^{-i n.y_k} besides, and c by -tau^2 1^T w. A stays shared by the components.
+So f changes by k(., Y) w: the weights of the normals change by u_d = -A^-1 K_df w, the coefficients of f also by
+s(n) / |n|^2 sum_k w_k e^{-i n.y_k}, and c by -tau^2 1^T w. The components still share A.
 """
 
 import math
@@ -40,16 +41,17 @@ _JUMP_POINTS = 256
 class ScreenedSPSR(SurfaceModel):
     """`GeometricSPSR` conditioned on values of f as well as on normals.
 
-    The defaults are what `benchmarks/imagination.py` found best over validation objects.
+    The defaults were the best over validation objects in `benchmarks/imagination.py`.
 
-    - `base`: the prior, and the noise of the normals. The default has a short scale for detail and a long one for the
-      body, of which values can make use.
-    - `values`: what is known of values, see `jaxnbv.surfaces.values`.
-    - `level_deviation`: tau, the prior standard deviation of the level; broad beside the values of f.
-    - `offset`: scene units; h is half the median of E f(x_j + offset n_j) - E f(x_j - offset n_j) over the data, given
-      the normals alone, but at least half the prior standard deviation of f: the two sides of a thin sheet cancel.
+    - `base`: the prior, and the noise of the normals. The default has a short lengthscale for detail, and a long one
+      for the body, which values can use.
+    - `values`: sources of values, see `jaxnbv.surfaces.values`.
+    - `level_deviation`: tau, the prior standard deviation of the level, which is broad compared with the values of f.
+    - `offset`: distance to both sides of the data, in scene units. h is half the median over the data of
+      E f(x_j + offset n_j) - E f(x_j - offset n_j) given the normals alone. It is at least half the prior standard
+      deviation of f, because the two sides of a thin sheet cancel.
 
-    The cost beyond that of `base` is 3 N^2 M + M^3 for N normals and M values.
+    N normals and M values cost 3 N^2 M + M^3 in addition to `base`.
 
     **Raises:** `ValueError` without values, or if tau or the offset is not positive.
     """
@@ -61,8 +63,10 @@ class ScreenedSPSR(SurfaceModel):
 
     def __check_init__(self):
         check_fields(self)
-        known = isinstance(self.values, tuple) and all(isinstance(value, ValueSource) for value in self.values)
-        require(known, f"the values are {shown(self.values)}; give a tuple such as (OutsideBoundary(), OnSurface())")
+        are_sources = isinstance(self.values, tuple) and all(isinstance(value, ValueSource) for value in self.values)
+        require(
+            are_sources, f"the values are {shown(self.values)}; give a tuple such as (OutsideBoundary(), OnSurface())"
+        )
         require(len(self.values) > 0, "no values are given: name some, such as OutsideBoundary(), or use GeometricSPSR")
         for name in ("level_deviation", "offset"):
             value = getattr(self, name)
@@ -72,11 +76,13 @@ class ScreenedSPSR(SurfaceModel):
         self.base.check(cloud)
 
     def condition(self, observations: Observations | PointCloud) -> "ScreenedSPSRPosterior":
-        """p(g | D, what was seen empty). The cost is that of the base, and of M triangular solves with its factor.
+        """The posterior p(g | D, empty space).
 
-        **Raises:** `ValueError` as `GeometricSPSR.condition` does, for a capacity above 16,384, for values at points
-        outside [-pi/2, pi/2]^3 or that are not finite, and if S is singular in the precision at hand; under `jit`
-        numbers cannot be checked, and the posterior is NaN instead.
+        It costs as much as the base, plus M triangular solves with the base's factor.
+
+        **Raises:** `ValueError` as `GeometricSPSR.condition` does, for a capacity above 16,384, for values that are not
+        finite or at points outside [-pi/2, pi/2]^3, and if S is singular in the dtype's precision. Under `jit` values
+        cannot be checked, and the posterior is NaN instead.
         """
         observations = as_observations(observations)
         capacity = observations.cloud.capacity
@@ -100,7 +106,7 @@ class ScreenedSPSR(SurfaceModel):
 def _condition(
     model: ScreenedSPSR, base: GeometricSPSRPosterior, observations: Observations
 ) -> "ScreenedSPSRPosterior":
-    # What stands in rows that are not filled must not reach the products.
+    # The contents of unfilled rows must not reach the products.
     observations = eqx.tree_at(lambda e: e.cloud, observations, base.cloud)
     spectrum, rows = model.base.spectrum, joined(model.values, observations)
     half_jump = _half_jump(base, model.offset)
@@ -109,10 +115,10 @@ def _condition(
     level_variance = model.level_deviation**2
     covariance = function_covariance(rows.points, rows.points, spectrum) - explained + level_variance
     block = jnp.where(rows.mask[:, None] & rows.mask, covariance, 0.0)
-    # A row that is not filled is one of the identity, and its weight is zero.
+    # An unfilled row is a row of the identity, and its weight is zero.
     factor = CholeskyFactor.of(block + jnp.diag(jnp.where(rows.mask, (half_jump * rows.noise) ** 2, 1.0)))
 
-    # Given the normals alone, until the weights of the values are known.
+    # The posterior given the normals alone, until the weights of the values are computed.
     level, nothing = jnp.zeros_like(base.level), jnp.zeros_like(rows.values)
     posterior = ScreenedSPSRPosterior(
         level, base.mean_coefficients, model, base, rows, half_jump, whitened, factor, nothing
@@ -127,7 +133,7 @@ def _condition(
 
 
 def _half_jump(base: GeometricSPSRPosterior, offset: float) -> Float[Array, ""]:
-    """h: half the median rise of E f given the normals across the data, from `offset` behind to `offset` before."""
+    """h: half the median rise of E f given the normals, from `offset` behind the data to `offset` in front."""
     chosen = some_rows(base.cloud, _JUMP_POINTS)
     points, step = base.cloud.points[chosen], offset * base.cloud.normals[chosen]
     mean = base.mean_field
@@ -136,7 +142,7 @@ def _half_jump(base: GeometricSPSRPosterior, offset: float) -> Float[Array, ""]:
 
 
 class ScreenedDraws(NamedTuple):
-    """v and eps, the level c and the noise e of the values, drawn from the prior."""
+    """Draws of v and eps, of the level c, and of the noise e of the values, from the prior."""
 
     normals: NormalDraws
     level: Float[Array, " s"]
@@ -144,15 +150,16 @@ class ScreenedDraws(NamedTuple):
 
 
 class ScreenedSPSRPosterior(TrigonometricPosterior):
-    """p(g | D) under `ScreenedSPSR`, g = f - c, in closed form and as pathwise samples.
+    """The posterior p(g | D) under `ScreenedSPSR`, g = f - c, in closed form and as pathwise samples.
 
-    - `level`: zero; g is relative to the level.
-    - `mean_coefficients`: of E g, see `surfaces/trigonometric.py`.
-    - `base`: p(f | normals).
-    - `rows`: the values; `half_jump`: their unit h.
+    - `level`: zero, because g is relative to the level.
+    - `mean_coefficients`: coefficients of E g, see `surfaces/trigonometric.py`.
+    - `base`: the posterior p(f | normals).
+    - `rows`: the values.
+    - `half_jump`: h, the unit of the values.
     - `whitened`: C^-1 K_df with A = C C^T.
-    - `factor`: Cholesky factor of S.
-    - `weights`: w of the mean.
+    - `factor`: the Cholesky factor of S.
+    - `weights`: the w of the mean.
     """
 
     level: Float[Array, ""]
@@ -173,7 +180,7 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
         prior = function_variance(spectrum) + self.model.level_deviation**2
 
         def at_point(point):
-            # Whitened covariances of g with the normals, and with what the values say beyond them.
+            # Whitened covariances of g with the normals, and with the values given the normals.
             normals = self.base.solver.whitened_cross(point[None])
             cross = function_covariance(self.rows.points, point[None], spectrum) + self.model.level_deviation**2
             cross = cross - jnp.einsum("dnm,dnx->mx", self.whitened, normals, precision="highest")
@@ -183,11 +190,11 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
         return jax.lax.map(at_point, x, batch_size=points_at_once(len(x), self.base.cloud.capacity))
 
     def data_points(self) -> DataPoints:
-        """The cloud's for gradients, and those of the values."""
+        """The points of the cloud for gradients, and the points of the value rows for values."""
         return DataPoints(self.base.data_points().gradients, filled(self.rows.points, self.rows.mask))
 
     def level_about(self, means: MeansAtData) -> Float[Array, " s"]:
-        """None: g is relative to the level, which the values tie to m_s + f."""
+        """Zeros: g is relative to the level, which the values tie to m_s + f."""
         return jnp.zeros(len(means.values), self.weights.dtype)
 
     def prior_draws(self, key: PRNGKeyArray, num_samples: int) -> ScreenedDraws:
@@ -200,7 +207,7 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
         return ScreenedDraws(normals, level, noise)
 
     def conditioned(self, draws: ScreenedDraws, means: MeansAtData) -> Float[Array, "s a a a"]:
-        """Coefficients of g: the draws moved by what the normals say, and then by what the values say."""
+        """Coefficients of g: the draws, conditioned on the normals and then on the values."""
         residual = self.base.whitened_residual(draws.normals, means)
         coefficients, level, noise = draws.normals.coefficients, draws.level, draws.noise
         transform = NonuniformTransform(self.rows.points, self.model.base.truncation)
@@ -211,7 +218,7 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
         return self._updated(coefficients, residual, -level, weights)
 
     def solve(self, residual: Float[Array, " m"]) -> Float[Array, " m"]:
-        """w = S^-1 r; zero in rows that are not filled."""
+        """The weights w = S^-1 r; zero in unfilled rows."""
         return self.factor.solve(jnp.where(self.rows.mask, residual, 0.0))
 
     def _updated(
@@ -221,7 +228,7 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
         constant: Float[Array, " s"],
         weights: Float[Array, "s m"],
     ) -> Float[Array, "s a a a"]:
-        """Coefficients of g for each v, its whitened residual at the normals, minus its level, and its w."""
+        """Coefficients of g for each sample's v, whitened residual at the normals, negative level, and w."""
         moved = residual - jnp.einsum("dnm,sm->snd", self.whitened, weights, precision="highest")
         fields = self.base.updated(coefficients, moved)
         transform = NonuniformTransform(self.rows.points, self.model.base.truncation)
@@ -233,12 +240,15 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
 
 
 def _values(normals: Float[Array, "3 a a a"], transform: NonuniformTransform) -> Float[Array, " m"]:
-    """Of the f that a normal field reconstructs, at the points of the transform."""
+    """Values, at the points of the transform, of the f that is reconstructed from a normal field."""
     return transform.evaluate(solve_poisson(normals)[None])[:, 0]
 
 
 def _reconstructed(
     weights: Float[Array, " m"], transform: NonuniformTransform, variance: Float[Array, "a a a"]
 ) -> Float[Array, "a a a"]:
-    """Coefficients of minus cov(f, f(Y)) w, Y the points of the transform, for modes of this variance of v."""
+    """Coefficients of -cov(f, f(Y)) w, where Y are the transform's points.
+
+    - `variance`: prior variances of the coefficients of v.
+    """
     return inverse_laplacian(variance * transform.adjoint(weights[:, None])[0])

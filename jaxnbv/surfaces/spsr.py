@@ -1,4 +1,4 @@
-"""Geometric stochastic Poisson surface reconstruction (Holalkere et al. 2025), consistent for the truncated model.
+"""Geometric stochastic Poisson surface reconstruction (Holalkere et al. 2025), exact for the truncated prior.
 
     prior    v_1, v_2, v_3 independent Gaussian processes on the torus of period 2 pi,
              cov(v_d(x), v_d(y)) = sum_{|n|_inf <= L} s(n) cos(n.(x - y)),   s(n) = s1(n_1) s1(n_2) s1(n_3),
@@ -7,8 +7,8 @@
     data     n_j = v(x_j) + eps_j,   eps_j ~ N(0, noise^2 I),   A = k(X, X) + noise^2 I
     sample   v_post = v + k(., X) A^-1 (n - v(X) - eps), v and eps from the prior;   f = Poisson(v_post)
 
-The prior part of a sample, its residual at the data and its update come from the same draw (Matheron's rule; Wilson et
-al. 2020), so samples have exactly the posterior's distribution.
+A sample's prior part, residual at the data and update come from the same draw (Matheron's rule; Wilson et al. 2020), so
+samples have exactly the posterior's distribution.
 """
 
 import functools
@@ -33,7 +33,7 @@ from jaxnbv.surfaces.trigonometric import basis_variance
 
 _SPARSE = 2.5
 
-# Numbers and tuples are converted on the way in, which mypy cannot see.
+# The converter also accepts numbers and tuples, which mypy cannot see.
 if TYPE_CHECKING:
     Scales: TypeAlias = Any
 else:
@@ -45,20 +45,20 @@ def _to_float(value) -> Float[Array, "*scales"]:
 
 
 class GeometricSPSR(SurfaceModel):
-    """Matern prior on the normal field over the torus, and f as its Poisson reconstruction.
+    """Matern prior on the normal field over the torus, with f as its Poisson reconstruction.
 
-    - `lengthscale`: ell, in units of the circumference 2 pi: 0.005 is 0.031 in scene units. Several make a sum of
-      independent priors, short ones for detail and long ones for the body.
-    - `variance`: per axis, so that without truncation Var v_d = variance^3; one for each lengthscale.
+    - `lengthscale`: ell, in units of the circumference 2 pi: 0.005 is 0.031 in scene units. Several lengthscales make a
+      sum of independent priors: short ones for detail, long ones for the body.
+    - `variance`: variance per axis, one for each lengthscale. Without truncation, Var v_d = variance^3.
     - `noise`: standard deviation of each component of the observed normals.
     - `nu`: smoothness, 1/2, 3/2 or 5/2.
-    - `truncation`: L; frequencies up to L along each axis are kept. They hold `kept_variance` of the prior's variance:
-      49 % at the default values, which are the paper's.
+    - `truncation`: L, the largest frequency along each axis. Frequencies up to L hold `kept_variance` of the prior's
+      variance: 49 % for the defaults, which are the paper's values.
 
-    `lengthscale`, `variance` and `noise` are array leaves: the posterior is differentiable in them.
+    `lengthscale`, `variance` and `noise` are array leaves, so the posterior is differentiable in them.
 
-    **Raises:** `ValueError` for values that are not positive or a `nu` that is not offered; warns where less than a
-    third of the variance is kept.
+    **Raises:** `ValueError` for values that are not positive, or another `nu`. Warns if less than a third of the
+    variance is kept.
     """
 
     lengthscale: Scales = eqx.field(converter=_to_float, default=0.005)
@@ -95,7 +95,7 @@ class GeometricSPSR(SurfaceModel):
 
     @property
     def spectrum(self) -> Spectra:
-        """s1(0), ..., s1(L), with a leading axis where there are several lengthscales."""
+        """s1(0), ..., s1(L), with a leading axis if there are several lengthscales."""
         of_one = functools.partial(circle_spectrum, self.nu, truncation=self.truncation)
         if jnp.ndim(self.lengthscale) == 0:
             return of_one(self.lengthscale, self.variance)
@@ -103,12 +103,15 @@ class GeometricSPSR(SurfaceModel):
 
     @property
     def kept_variance(self) -> Float[Array, ""]:
-        """Share of the prior's variance within the truncation, in three dimensions."""
+        """Share of the prior's variance at frequencies up to L, in three dimensions."""
         return _kept_variance(self)
 
     def check(self, cloud: PointCloud) -> None:
-        """Warn where points are so far apart that samples vary between them as if nothing had been seen: at 2.5
-        lengthscales the standard deviation of f less its level, at the data, is 0.9 of the prior's."""
+        """Warn if the points are more than 2.5 of the longest lengthscale apart.
+
+        Between such points samples vary nearly as in the prior: at 2.5 lengthscales the standard deviation of f minus
+        its level, at the data, is 0.9 of the prior's.
+        """
         points, _ = cloud.to_numpy()
         if len(points) < 2 or is_traced(self):
             return
@@ -123,12 +126,14 @@ class GeometricSPSR(SurfaceModel):
             )
 
     def condition(self, observations: Observations | PointCloud) -> GeometricSPSRPosterior:
-        """p(f | D): of the observations it takes the cloud alone. The cost is that of a Cholesky factorisation of the
-        cloud's capacity; beyond a capacity of 16,384, of some hundred transforms a solve.
+        """The posterior p(f | D), given only the cloud of the observations.
+
+        The cost is one Cholesky factorisation with the cloud's capacity as its size. Beyond a capacity of 16,384 it is
+        some hundred transforms per solve.
 
         **Raises:** `ValueError` if the cloud is empty, has entries that are not finite, a normal longer than 10 or
-        points outside [-pi/2, pi/2]^3 (scene coordinates), or if A is singular in the precision at hand; under `jit`
-        numbers cannot be checked, and the posterior of points outside is NaN.
+        points outside [-pi/2, pi/2]^3 (scene coordinates), or if A is singular in the dtype's precision. Under `jit`
+        values cannot be checked, and points outside make the posterior NaN.
         """
         cloud = as_observations(observations).cloud
         if not is_traced(cloud):

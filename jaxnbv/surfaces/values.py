@@ -1,7 +1,7 @@
-"""What is known of the function itself, beside its gradient: values of f relative to the level, at points.
+"""Observed values of f relative to the level, at points. They add to the normals, which observe its gradient.
 
-Values are in units of h, half of how much the mean of f given the normals rises across the scanned sheet: the scale of
-f is the prior's, and h is what it makes of the data.
+Values are in units of h, half the rise of the mean of f, given the normals, across the scanned sheet. The prior sets the
+scale of f, and h is this scale at the data.
 """
 
 import math
@@ -22,9 +22,11 @@ from jaxnbv.surfaces.base import HALF_WIDTH
 
 
 class ValueRows(eqx.Module):
-    """f(y_k) - c = value_k + e_k with e_k ~ N(0, noise_k^2), in units of h. Rows whose mask is False hold nothing.
+    """Observed values, f(y_k) - c = value_k + e_k with e_k ~ N(0, noise_k^2), in units of h.
 
-    - `points`: in scene coordinates, within [-pi/2, pi/2]^3.
+    Rows with a False mask are padding.
+
+    - `points`: y_k in scene coordinates, within [-pi/2, pi/2]^3.
 
     **Raises:** `ValueError` for arrays of other shapes.
     """
@@ -43,7 +45,7 @@ class ValueRows(eqx.Module):
         )
 
     def check(self) -> None:
-        """Check the filled rows, where their numbers are known.
+        """Check the filled rows. Under `jit` this does nothing.
 
         **Raises:** `ValueError` for numbers that are not finite, negative noise, or a point outside [-pi/2, pi/2]^3.
         """
@@ -67,26 +69,27 @@ class ValueRows(eqx.Module):
 
 
 class ValueSource(eqx.Module):
-    """A kind of knowledge about values of f."""
+    """A source of observed values of f."""
 
     @abstractmethod
     def rows(self, observations: Observations) -> ValueRows:
-        """The rows that it adds, as many for all observations of one capacity; run under `jit`.
+        """The rows that this source adds. Called under `jit`, so their number may depend only on the capacity.
 
-        A filled row outside [-pi/2, pi/2]^3 is refused when the model is conditioned; where that runs under `jit` too,
-        its numbers cannot be checked, and the posterior is NaN.
+        Conditioning the model raises an error for a filled row outside [-pi/2, pi/2]^3. If that runs under `jit` too,
+        values cannot be checked, and the posterior is NaN.
         """
 
 
 class OutsideBoundary(ValueSource):
-    """f(b) - c ~ N(h, s_b^2) at points b on the boundary of the volume that holds the object (the "envelope" of Poisson
-    reconstruction, Kazhdan et al. 2020, as an observation).
+    """f(b) - c ~ N(h, s_b^2) at points b on the boundary of the volume that holds the object.
+
+    This is the "envelope" of Poisson reconstruction (Kazhdan et al. 2020) as an observation.
 
     - `volume`: see `jaxnbv.geometry.volume`; by default the box that scenes are scaled to.
-    - `num_points`: points, spread evenly as seen from the origin.
+    - `num_points`: number of points, spread evenly as seen from the origin.
     - `value`, `noise`: mean and standard deviation, in units of h.
-    - `room`: how far outside the boundary the points lie, in scene units, as far as the scene goes: for a volume that
-      may cut the object, which then does not close at the cut.
+    - `room`: distance of the points outside the boundary, in scene units, limited to the scene. A volume that cuts the
+      object needs room, so that the object does not close at the cut.
 
     **Raises:** `ValueError` for a count below one, noise that is not positive, negative room, or a boundary that leaves
     the scene, [-pi/2, pi/2]^3, or does not enclose the origin.
@@ -124,15 +127,15 @@ class OutsideBoundary(ValueSource):
 
     def rows(self, observations: Observations) -> ValueRows:
         points = boundary_points(self.volume, self.num_points, self.room).astype(observations.cloud.points.dtype)
-        # The scene's own border, as a number of this type rounds it.
+        # Clipped to the scene's border as this dtype rounds it.
         points = jnp.clip(points, -HALF_WIDTH, HALF_WIDTH)
         return _rows(points, self.value, self.noise, jnp.ones(self.num_points, bool))
 
 
 class OnSurface(ValueSource):
-    """f(x_j) - c ~ N(0, s_f^2) at some of the data, farthest points (the "screening" of Kazhdan and Hoppe 2013).
+    """f(x_j) - c ~ N(0, s_f^2) at some of the data: the "screening" of Kazhdan and Hoppe (2013).
 
-    - `num_points`: how many, or all where there are fewer.
+    - `num_points`: number of points, chosen by farthest point sampling; all if there are fewer.
     - `noise`: standard deviation s_f, in units of h.
 
     **Raises:** `ValueError` for a count below one or noise that is not positive.
@@ -151,11 +154,12 @@ class OnSurface(ValueSource):
 
 
 class SeenEmpty(ValueSource):
-    """f(z) - c ~ N(value, s^2) with a positive value, at points z that were seen empty: what was not seen beside them
-    is likely to be empty too. True of thin things such as furniture, false of a body whose hidden side is as large as
-    the one that was seen.
+    """f(z) - c ~ N(value, s^2) with a positive value, at points z that were seen to be empty.
 
-    - `num_points`: how many, or all where there are fewer; farthest points.
+    It says that unseen space next to empty space is likely to be empty too. This holds for thin objects such as
+    furniture, but not for a body whose hidden side is as large as its visible side.
+
+    - `num_points`: number of points, chosen by farthest point sampling; all if there are fewer.
     - `value`, `noise`: mean and standard deviation, in units of h.
 
     **Raises:** `ValueError` for a count below one or noise that is not positive.
@@ -170,24 +174,24 @@ class SeenEmpty(ValueSource):
         _check(self.num_points, self.noise)
 
     def rows(self, observations: Observations) -> ValueRows:
-        empty, seen = observations.empty_points
-        mask = seen & jnp.all(jnp.abs(empty) <= HALF_WIDTH, axis=1)
-        index = farthest_point_indices(empty, mask, self.num_points)
-        kept = jnp.arange(self.num_points) < jnp.sum(mask)
-        points = jnp.where(kept[:, None], empty[index], 0.0).astype(observations.cloud.points.dtype)
-        return _rows(points, self.value, self.noise, kept)
+        nodes, is_empty = observations.empty_points
+        mask = is_empty & jnp.all(jnp.abs(nodes) <= HALF_WIDTH, axis=1)
+        index = farthest_point_indices(nodes, mask, self.num_points)
+        is_filled = jnp.arange(self.num_points) < jnp.sum(mask)
+        points = jnp.where(is_filled[:, None], nodes[index], 0.0).astype(observations.cloud.points.dtype)
+        return _rows(points, self.value, self.noise, is_filled)
 
 
 def joined(sources: tuple[ValueSource, ...], observations: Observations) -> ValueRows:
-    """The rows of all sources, one behind the other, with zeros in those that are not filled.
+    """Concatenate the rows of all sources, with zeros in unfilled rows.
 
-    **Raises:** `ValueError` for a source that gives no rows of values.
+    **Raises:** `ValueError` if a source does not return `ValueRows`.
     """
     parts = [source.rows(observations) for source in sources]
     for source, part in zip(sources, parts, strict=True):
-        check_type(part, ValueRows, f"what {type(source).__name__}.rows gives")
+        check_type(part, ValueRows, f"the result of {type(source).__name__}.rows")
     rows = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
-    # Whatever stands in the others, NaN included, must not reach the products.
+    # The contents of unfilled rows, which may be NaN, must not reach the products.
     points = jnp.where(rows.mask[:, None], rows.points, 0.0)
     values, noise = (jnp.where(rows.mask, leaf, 0.0) for leaf in (rows.values, rows.noise))
     return ValueRows(points, values, noise, rows.mask)
