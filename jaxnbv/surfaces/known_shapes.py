@@ -3,11 +3,11 @@
     prior      f = m_k(T^-1 x) + g,   k ~ pi over shapes 1..K and 0 for none of these,   g a Gaussian process
     mean       m_k = h tanh(d_k / h), d_k the signed distance, h half the residual's jump across the surface
     weights    w_k proportional to exp(-beta E_k) over the modes of the fit,  w_0 to exp(-beta E_0)
-    sample     shapes by systematic resampling of w; then f about the mean m_k, or for k = 0 a sample of the model that
-               knows no shapes
+    sample     shapes by systematic resampling of w; then f about the mean m_k, or for k = 0 a sample of the model
+               without known shapes
 
-The weights are tempered: the likelihood of thousands of normals, which are not independent, would always choose one.
-See `surfaces/registration.py` for E.
+The weights are tempered, because thousands of normals are not independent, and their likelihood would always choose one
+shape. See `surfaces/registration.py` for E.
 """
 
 import dataclasses
@@ -38,31 +38,31 @@ from jaxnbv.surfaces.values import OnSurface
 
 
 def short_ranged(longest_side: float = 2.5, truncation: int = 32) -> ScreenedSPSR:
-    """The usual residual, for an object whose box has this longest side, in scene units.
+    """The default residual model, for an object whose box has this longest side, in scene units.
 
-    - `truncation`: the most frequencies along an axis.
+    - `truncation`: largest frequency along each axis.
     """
     scale = longest_side / 2.5
-    # With long scales, or values beside the surface, it pulls the surface back to what it would say by itself. The
-    # noise is that of the shape's normals: beside an edge that is a little off, they are those of the other face. The
-    # level is that of the shape, and values are known no better than where it was put.
+    # Long lengthscales, or values beside the surface, would pull the surface back to the residual's own guess. The
+    # noise is the error of the shape's normals: beside a slightly misplaced edge, they are those of the other face.
+    # The level is the shape's own, and the values are no more precise than the placement.
     base = GeometricSPSR(0.01 * scale, truncation=min(round(32 / scale), truncation), noise=0.2)
     return ScreenedSPSR(base, (OnSurface(noise=0.3),), level_deviation=0.02, offset=0.1 * scale)
 
 
 class KnownShapes(SurfaceModel):
-    """A mixture over known shapes that fit what was seen, and a model that knows none.
+    """A mixture prior over known shapes that fit the scan, and a model for "none of these".
 
     - `bank`: the shapes.
-    - `residual`: what samples may differ by from the shape, where the scan says so; short-ranged.
-    - `poses`: how shapes can stand in the scene; `box`: what holds the object, and no more than it needs.
-    - `unknown`: the model of what none of the shapes is.
-    - `num_starts`: placements that are tried, over all shapes.
-    - `noise_scale`: rho, of the residual's deviation where nothing was seen; one as large as the prior's breaks thin
-      parts and lets pieces float about them.
-    - `inverse_temperature`: beta; `misfit_of_none`: E_0, the misfit at which a shape is as likely as none.
-
-    With an empty bank it is `unknown`.
+    - `residual`: the short-ranged model of the difference between the object and the shape, near the scan.
+    - `poses`: the possible placements of shapes in the scene.
+    - `box`: a tight box around the object.
+    - `unknown`: the model for an object that is none of the shapes. With an empty bank this is the whole model.
+    - `num_starts`: number of placements tried, over all shapes.
+    - `noise_scale`: rho, which scales the residual's standard deviation. At 1 the prior's deviation in unseen places
+      breaks thin parts and leaves pieces floating around them.
+    - `inverse_temperature`: beta.
+    - `misfit_of_none`: E_0, the misfit at which a shape is as likely as "none of these".
 
     **Raises:** `ValueError` for a number out of its range.
     """
@@ -88,14 +88,14 @@ class KnownShapes(SurfaceModel):
 
     @property
     def carries_hypotheses(self) -> bool:
-        """For parts at true size."""
+        """Whether the bank has parts at true size."""
         return self.bank.is_true_size and self.bank.solids is not None
 
     def in_scene(self, frame: Frame) -> "KnownShapes":
         return dataclasses.replace(self, bank=self.bank.in_scene(frame))
 
     def observed(self, observations: Observations) -> Observations:
-        """The observations with the `PartHypotheses` of parts at true size."""
+        """Add the `PartHypotheses` of parts at true size; no change for a bank of categories."""
         if not self.carries_hypotheses:
             return observations
         before = observations.hypotheses
@@ -105,7 +105,7 @@ class KnownShapes(SurfaceModel):
         )
 
     def condition(self, observations: Observations | PointCloud) -> SurfacePosterior:
-        """p(f | observations), the shapes registered to its cloud and to the space that was seen empty.
+        """The posterior p(f | observations), with the shapes registered to the cloud and to empty space.
 
         **Raises:** `ValueError` as the `condition` of `residual` and `unknown` does.
         """
@@ -118,23 +118,26 @@ class KnownShapes(SurfaceModel):
                 self.observed(observations).hypotheses if observations.hypotheses is None else observations.hypotheses
             )
             assert isinstance(hypotheses, PartHypotheses)
-            found, weights = hypotheses.placed, hypotheses.weights
+            fits, weights = hypotheses.placed, hypotheses.weights
         else:
-            found = register(self.bank, Prior(self.poses, self.box), Seen.of(observations), self.num_starts)
-            weights = _weights(found, self.inverse_temperature, self.misfit_of_none)
+            fits = register(self.bank, Prior(self.poses, self.box), Seen.of(observations), self.num_starts)
+            weights = _weights(fits, self.inverse_temperature, self.misfit_of_none)
         return KnownShapesPosterior(
-            jnp.zeros_like(unknown.level), self, found, weights, self.residual.condition(observations), unknown
+            jnp.zeros_like(unknown.level), self, fits, weights, self.residual.condition(observations), unknown
         )
 
 
 @eqx.filter_jit
-def _weights(found: Hypotheses, inverse_temperature: float, misfit_of_none: float) -> Float[Array, " h_and_none"]:
-    misfit = jnp.append(found.misfit, misfit_of_none)
-    return jax.nn.softmax(-inverse_temperature * misfit, where=jnp.append(found.is_mode, True))
+def _weights(fits: Hypotheses, inverse_temperature: float, misfit_of_none: float) -> Float[Array, " h_and_none"]:
+    misfit = jnp.append(fits.misfit, misfit_of_none)
+    return jax.nn.softmax(-inverse_temperature * misfit, where=jnp.append(fits.is_mode, True))
 
 
 class Hypothesis(NamedTuple):
-    """What the object may be: a shape's name, how likely it is, how well it fits, and where it stands."""
+    """A possible identity of the object: a shape's name, weight, misfit E and placement.
+
+    The placement of "none of these" is None.
+    """
 
     name: str
     weight: float
@@ -143,12 +146,13 @@ class Hypothesis(NamedTuple):
 
 
 class KnownShapesPosterior(SurfacePosterior):
-    """p(f | D) under `KnownShapes`.
+    """The posterior p(f | D) under `KnownShapes`.
 
     - `level`: zero.
-    - `found`: the shapes that were registered.
-    - `weights`: of each of them, and last of none.
-    - `residual`: p(g | D), about which samples are drawn; `unknown`: p(f | D, none of the shapes).
+    - `found`: the registered shapes.
+    - `weights`: weight of each of them, and last of "none of these".
+    - `residual`: p(g | D), which gives the samples about the shapes.
+    - `unknown`: p(f | D, none of the shapes).
     """
 
     level: Float[Array, ""]
@@ -160,73 +164,73 @@ class KnownShapesPosterior(SurfacePosterior):
 
     @property
     def hypotheses(self) -> list[Hypothesis]:
-        """What the object may be, most likely first, "none of these" among it."""
-        # On the host at once, not row by row.
-        found, weights = jax.tree.map(np.asarray, self.found), np.asarray(self.weights)
+        """The hypotheses, including "none of these", most likely first."""
+        # One transfer to the host, not one per row.
+        fits, weights = jax.tree.map(np.asarray, self.found), np.asarray(self.weights)
         names = self.model.bank.names
-        known = [
+        of_shapes = [
             Hypothesis(
-                names[found.shape[row]],
+                names[fits.shape[row]],
                 float(weights[row]),
-                float(found.misfit[row]),
+                float(fits.misfit[row]),
                 jax.tree.map(lambda rows, row=row: rows[row], self.found.placement),
             )
-            for row in np.flatnonzero(found.is_mode)
+            for row in np.flatnonzero(fits.is_mode)
         ]
         none = Hypothesis(NONE, float(weights[-1]), self.model.misfit_of_none, None)
-        return sorted([*known, none], key=lambda one: -one.weight)
+        return sorted([*of_shapes, none], key=lambda one: -one.weight)
 
     def kinds(self) -> dict[str, float]:
-        """How likely each kind of shape is, most likely first: "chair 3" and "chair 12" are of one kind."""
-        found: dict[str, float] = {}
+        """Probability of each kind of shape, most likely first: "chair 3" and "chair 12" are of one kind."""
+        weights: dict[str, float] = {}
         for one in self.hypotheses:
             kind = kind_of(one.name)
-            found[kind] = found.get(kind, 0.0) + one.weight
-        return dict(sorted(found.items(), key=lambda item: -item[1]))
+            weights[kind] = weights.get(kind, 0.0) + one.weight
+        return dict(sorted(weights.items(), key=lambda item: -item[1]))
 
     def names_of_samples(self, key: PRNGKeyArray, num_samples: int) -> list[str]:
-        """Which shapes the samples of `sample` are about."""
+        """Name of the shape behind each sample of `sample` with the same key."""
         of_bank = self.model.bank.names
         names = [*(of_bank[index] for index in np.asarray(self.found.shape)), NONE]
         return [names[index] for index in np.asarray(_drawn(self, key, num_samples))]
 
     @sampling_method
     def sample(self, key: PRNGKeyArray, num_samples: int) -> "MixtureFields":
-        """`num_samples` samples of f; which shapes they are about is drawn jointly, by systematic resampling."""
+        """Draw `num_samples` samples of f. Their shapes are drawn jointly, by systematic resampling."""
         return _sample(self, key, num_samples)
 
 
 @eqx.filter_jit
 def _sample(posterior: KnownShapesPosterior, key: PRNGKeyArray, num_samples: int) -> "MixtureFields":
     _, residual_key, unknown_key = jax.random.split(key, 3)
-    found, bank = posterior.found, posterior.model.bank
+    fits, bank = posterior.found, posterior.model.bank
     index = _drawn(posterior, key, num_samples)
-    is_none = index == len(found.shape)
+    is_none = index == len(fits.shape)
     row = jnp.where(is_none, 0, index)
-    solids = bank.shape(found.shape[row]).solid
-    placement = jax.tree.map(lambda rows: rows[row], found.placement)
+    solids = bank.shape(fits.shape[row]).solid
+    placement = jax.tree.map(lambda rows: rows[row], fits.placement)
     means = PlacedShapes(solids, placement, posterior.residual.half_jump)
-    known = posterior.residual.sample_about(means, residual_key, posterior.model.noise_scale)
+    about_shapes = posterior.residual.sample_about(means, residual_key, posterior.model.noise_scale)
 
     def draw():
         return posterior.unknown.sample(unknown_key, num_samples)
 
     nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), eqx.filter_eval_shape(draw))
     unknown = jax.lax.cond(jnp.any(is_none), draw, lambda: nothing)
-    return MixtureFields(known, unknown, posterior.unknown.level, is_none)
+    return MixtureFields(about_shapes, unknown, posterior.unknown.level, is_none)
 
 
 @eqx.filter_jit
 def _drawn(posterior: KnownShapesPosterior, key: PRNGKeyArray, num_samples: int) -> Int[Array, " s"]:
-    """The hypothesis that each sample is about; the last is none."""
+    """Index of each sample's hypothesis; the last index is "none of these"."""
     shape_key, order_key = jax.random.split(jax.random.split(key, 3)[0])
     index = systematic_resampling(shape_key, posterior.weights, num_samples)
-    # The first few samples are no different from the rest.
+    # Shuffled, so that the first few samples are as representative as all.
     return jax.random.permutation(order_key, index)
 
 
 def kind_of(name: str) -> str:
-    """A shape's name without its number."""
+    """Kind of a shape: its name without the number."""
     head, _, last = name.rpartition(" ")
     return head if head and last.isdigit() else name
 
@@ -234,16 +238,16 @@ def kind_of(name: str) -> str:
 def systematic_resampling(
     key: PRNGKeyArray, weights: Float[Array, " n"], num_samples: int
 ) -> Int[Array, " num_samples"]:
-    """Indices so that each is drawn as often as its weight says, but for less than one (Kitagawa 1996)."""
+    """Draw indices with counts that differ by less than one from their expectations (Kitagawa 1996)."""
     places = (jnp.arange(num_samples) + jax.random.uniform(key)) / num_samples
     total = jnp.cumsum(weights)
     return jnp.clip(jnp.searchsorted(total / total[-1], places, side="right"), 0, len(weights) - 1)
 
 
 class PlacedShapes(Fields):
-    """h tanh(d / h) of solids, each where it was placed: as steep as the distance at the surface, and bounded.
+    """h tanh(d / h) for placed solids: bounded, and as steep at the surface as the signed distance d.
 
-    - `solids`, `placements`: with a leading axis.
+    - `solids`, `placements`: batches along a leading axis.
     - `width`: h, in scene units.
     """
 
@@ -260,10 +264,11 @@ class PlacedShapes(Fields):
 
 
 class MixtureFields(Fields):
-    """Samples each of which is of one of two kinds.
+    """Samples that come from one of two batches.
 
-    - `known`, `unknown`: as many of both; `level`: that of the unknown, which is taken from it.
-    - `is_unknown`: which kind each is of.
+    - `known`, `unknown`: the two batches, of the same size.
+    - `level`: the level of `unknown`, which is subtracted from its values.
+    - `is_unknown`: whether each sample comes from `unknown`.
     """
 
     known: Fields
@@ -283,8 +288,8 @@ class MixtureFields(Fields):
     def _merged(self, evaluate: Any, relative: bool = True) -> Array:
         shape = jax.eval_shape(lambda: evaluate(self.known))
         zero = jnp.zeros(shape.shape, shape.dtype)
-        # What is asked of none is not computed.
-        known = jax.lax.cond(jnp.all(self.is_unknown), lambda: zero, lambda: evaluate(self.known))
-        unknown = jax.lax.cond(jnp.any(self.is_unknown), lambda: evaluate(self.unknown), lambda: zero)
-        which = self.is_unknown.reshape(-1, *(1,) * (zero.ndim - 1))
-        return jnp.where(which, unknown - self.level if relative else unknown, known)
+        # A batch that gives no sample is not evaluated.
+        of_known = jax.lax.cond(jnp.all(self.is_unknown), lambda: zero, lambda: evaluate(self.known))
+        of_unknown = jax.lax.cond(jnp.any(self.is_unknown), lambda: evaluate(self.unknown), lambda: zero)
+        is_unknown = self.is_unknown.reshape(-1, *(1,) * (zero.ndim - 1))
+        return jnp.where(is_unknown, of_unknown - self.level if relative else of_unknown, of_known)

@@ -1,4 +1,4 @@
-"""How a known shape can stand in the scene: a placement, and which placements are possible."""
+"""Placements of known shapes in the scene, and classes of possible placements."""
 
 import math
 from abc import abstractmethod
@@ -19,11 +19,11 @@ _SILVER = 1.0 / math.sqrt(2.0)
 
 
 class Placement(eqx.Module):
-    """Points u of a shape's own frame stand at R (s u) + t in the scene, s along each axis of the shape.
+    """The map u -> R (s u) + t from a shape's own frame to the scene. Leading axes make a batch.
 
-    Leading axes make a batch.
-
-    - `rotation`: R. `shift`: t, in scene units. `scale`: s > 0.
+    - `rotation`: R.
+    - `shift`: t, in scene units.
+    - `scale`: s > 0, one factor for each axis of the shape.
     """
 
     rotation: Float[Array, "*batch 3 3"]
@@ -32,13 +32,13 @@ class Placement(eqx.Module):
 
     @property
     def factor(self) -> Float[Array, "*batch"]:
-        """Scene units per unit of the shape's signed distance: the geometric mean of s, exact where all are equal."""
+        """Scene units per unit of the shape's distance: the geometric mean of s, exact if all are equal."""
         return jnp.exp(jnp.mean(jnp.log(self.scale), axis=-1))
 
     def to_shape(self, x: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-        """Points of the scene in the shape's own frame."""
+        """Map points of the scene to the shape's own frame."""
         away = x - self.shift
-        # R^T x as a sum, which XLA fuses with what follows where it would not a matrix product.
+        # R^T x as a sum, which XLA fuses with the next operations. It would not fuse a matrix product.
         turned = sum(away[..., i, None] * self.rotation[i] for i in range(3))
         return turned / self.scale
 
@@ -47,8 +47,10 @@ class Placement(eqx.Module):
         return self.factor * solid(self.to_shape(x))
 
     def moved(self, step: Float[Array, "9"]) -> "Placement":
-        """Turned by the rotation vector of the first three numbers about t, shifted by the next three, and scaled by
-        the exponentials of the last."""
+        """A copy turned about t, shifted and scaled.
+
+        - `step`: rotation vector (3), shift (3), and logarithms of the scale factors (3).
+        """
         return Placement(
             jnp.matmul(rotation_from_vector(step[:3]), self.rotation, precision="highest"),
             self.shift + step[3:6],
@@ -57,13 +59,13 @@ class Placement(eqx.Module):
 
 
 class ShapePoses(eqx.Module):
-    """Which placements of known shapes are possible.
+    """A set of possible placements of known shapes.
 
-    - `scale`: the least and the greatest s, as shares of the scale at which the shape fills the box that holds the
-      object; the same twice fixes it.
-    - `by_axis`: whether the axes of a shape are scaled each on its own.
+    - `scale`: smallest and largest s, as multiples of the scale at which the shape fills the box around the object. Two
+      equal numbers fix the scale.
+    - `by_axis`: whether each axis of a shape is scaled separately.
 
-    **Raises:** `ValueError` for scales that are not positive, or the least above the greatest.
+    **Raises:** `ValueError` for scales that are not positive, or a smallest scale above the largest.
     """
 
     scale: tuple[float, float] = eqx.field(static=True, default=(0.8, 1.25), kw_only=True)
@@ -76,31 +78,34 @@ class ShapePoses(eqx.Module):
 
     @abstractmethod
     def rotations(self, count: int) -> Float[AnyArray, "m 3 3"]:
-        """At most `count` rotations, spread evenly over those that are possible: where a search starts."""
+        """At most `count` rotations, spread evenly over the possible ones, from which a search starts."""
 
     @abstractmethod
     def turns(self) -> Float[np.ndarray, "3 k"]:
-        """The axes about which a placement can be turned, one a column."""
+        """Axes about which a placement can be turned, as columns."""
 
     @property
     def moves(self) -> Float[np.ndarray, "9 k"]:
-        """The independent steps of `Placement.moved` without a change of scale, one a column."""
+        """Independent steps of `Placement.moved` that keep the scale, as columns."""
         return scipy.linalg.block_diag(self.turns(), np.eye(3), np.zeros((3, 0)))
 
     @property
     def steps(self) -> Float[np.ndarray, "9 k"]:
-        """The independent steps of `Placement.moved`, one a column."""
+        """Independent steps of `Placement.moved`, as columns."""
         least, most = self.scale
         scales = np.zeros((3, 0)) if least == most else np.eye(3) if self.by_axis else np.full((3, 1), 3**-0.5)
         return scipy.linalg.block_diag(self.turns(), np.eye(3), scales)
 
     def rotations_of(self, num_shapes: int, count: int) -> Float[AnyArray, "k m 3 3"]:
-        """At most `count` rotations of each of some shapes; a first axis of one where they are those of all."""
+        """At most `count` rotations for each of the first shapes of a bank.
+
+        The first axis has length one if all shapes have the same rotations.
+        """
         return self.rotations(count)[None]
 
 
 class FreeRotation(ShapePoses):
-    """Any rotation: an object that may lie on any side."""
+    """Any rotation, for an object that may lie on any side."""
 
     def rotations(self, count: int) -> Float[np.ndarray, "m 3 3"]:
         """A super-Fibonacci spiral of unit quaternions (Alexa 2022)."""
@@ -117,10 +122,10 @@ class FreeRotation(ShapePoses):
 class Upright(ShapePoses):
     """Any turn about the vertical.
 
-    - `axis`: the vertical, of shapes and scene alike.
-    - `within`: radians to either side to which a turn is searched; refined ones may exceed them.
+    - `axis`: the vertical in the frames of the shapes and in the scene.
+    - `within`: largest angle to either side at which the search starts, in radians. Refined turns may exceed it.
 
-    **Raises:** `ValueError` also for an axis of zero, or an angle that is not in (0, pi].
+    **Raises:** `ValueError` also for a zero axis, or an angle outside (0, pi].
     """
 
     axis: tuple[float, float, float] = eqx.field(static=True, default=(0.0, 1.0, 0.0))
@@ -146,7 +151,7 @@ class Upright(ShapePoses):
 
 
 class AsGiven(ShapePoses):
-    """Not turned: as the bank holds it, but for shift and scale."""
+    """Only shift and scale, with the orientation that shapes have in the bank."""
 
     def rotations(self, count: int) -> Float[np.ndarray, "m 3 3"]:
         return np.eye(3)[None]

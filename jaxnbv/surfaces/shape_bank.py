@@ -1,4 +1,4 @@
-"""A bank of known shapes: the shapes that a model remembers."""
+"""A bank of known shapes, the components of the mixture prior."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -21,7 +21,7 @@ from jaxnbv.surfaces.mesh_shapes import listed, mesh_paths, shapes_of_meshes
 
 NUM_EXTREMES, _FAR, _STRIDES, _ARRIVED = 128, 4.0, 40, 0.01
 _LONGEST_NAME = 64
-# Lengths of the units in which parts are drawn, in metres.
+# Units that meshes may be drawn in, in metres.
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 
 
@@ -29,7 +29,7 @@ class Shape(NamedTuple):
     """One shape of a bank, or several along a leading axis.
 
     - `solid`: its signed distance.
-    - `extremes`: points of its surface, among them those that are farthest in any direction, nearly.
+    - `extremes`: points on its surface that include, nearly, the farthest one in every direction.
     """
 
     solid: SignedDistance
@@ -37,17 +37,16 @@ class Shape(NamedTuple):
 
 
 class ShapeBank(eqx.Module):
-    """Known shapes, each centred in a frame of its own; shapes of a kind stand alike in theirs.
+    """Known shapes, each centred in its own frame. Shapes of one kind have the same orientation in it.
 
-    - `solids`: all of them as one, whose arrays have a leading axis of shapes; None for a bank of none.
-    - `extremes`: of each, as of a `Shape`.
-    - `codes`: their names in UTF-8. No program that is compiled depends on them.
-    - `from_mesh`: (k, 4, 4) matrices from the coordinates of each mesh to those of its shape, similarities; None where
-      the shapes come from no meshes.
-    - `is_true_size`: whether the shapes are as large as the objects that they stand for, so that no placement scales
-      them.
+    - `solids`: all shapes as one batch, whose arrays have a leading axis of shapes; None for an empty bank.
+    - `extremes`: extreme points of each shape, as in `Shape`.
+    - `codes`: the names in UTF-8, as arrays so that compiled programs do not depend on them.
+    - `from_mesh`: (k, 4, 4) similarities from the coordinates of each mesh to those of its shape; None if the shapes
+      do not come from meshes.
+    - `is_true_size`: whether the shapes are as large as the real objects, so that placements do not scale them.
 
-    **Raises:** `ValueError` for another number of names than of shapes.
+    **Raises:** `ValueError` if the arrays have different numbers of rows.
     """
 
     solids: SignedDistance | None
@@ -70,12 +69,15 @@ class ShapeBank(eqx.Module):
     def of(
         cls, solids: Sequence[SignedDistance], names: Sequence[str] | None = None, is_true_size: bool = False
     ) -> "ShapeBank":
-        """A bank of solids of one kind, as exact as they are: one compiled program evaluates any of them.
+        """A bank of solids of one type.
 
-        - `names`: by default their numbers.
-        - `is_true_size`: whether they are as large as the objects that they stand for, see `from_meshes`.
+        Their distances stay exact, and one compiled program evaluates any of the solids.
 
-        **Raises:** `ValueError` for what is no solid, solids of several kinds, or another number of names.
+        - `names`: by default the indices.
+        - `is_true_size`: whether they are as large as the real objects, see `from_meshes`.
+
+        **Raises:** `ValueError` for entries that are not solids, for solids of several types, or if the number of names
+        differs from that of solids.
         """
         solids = listed(solids, "the bank's solids")
         for index, solid in enumerate(solids):
@@ -106,22 +108,23 @@ class ShapeBank(eqx.Module):
         scale: float | str | None = None,
         up: str = "y",
     ) -> "ShapeBank":
-        """A bank of meshes, centred: their signed distances on grids, which are kept in the user's cache. Soups and
-        open meshes will do.
+        """A bank of centred meshes, stored as signed distances on grids.
 
-        - `meshes`: files and meshes of trimesh's, or a folder of which all are taken, also in folders within.
+        Triangle soups and open meshes also work. The grids are cached in the user's cache folder.
+
+        - `meshes`: a list of files and `trimesh` meshes, or a folder, which is searched with its subfolders.
         - `resolution`: nodes along the longest side.
-        - `sheet`: how thick faces are that have the outside on both sides, where the longest side of a mesh is 2.5.
-        - `names`: by default the names of the files, of a folder's with their place in it, and numbers.
-        - `scale`: the length of the meshes' unit in the world, for parts at their true size: a number, or "m", "cm",
-          "mm", "in" or "ft" for a world in metres. None for examples of categories, whose sizes do not matter: their
-          longest sides are 2.5.
-        - `up`: the meshes' axis that is upward, see `Frame`.
+        - `sheet`: thickness given to faces with the outside on both sides, where the mesh's longest side is 2.5.
+        - `names`: by default file names, paths within the folder, or for meshes their indices.
+        - `scale`: the length of the meshes' unit in world units, for parts at true size. A number, or "m", "cm", "mm",
+          "in" or "ft" for a world in metres. None for examples of categories, whose size does not matter: the longest
+          side becomes 2.5.
+        - `up`: the upward axis of the meshes, see `Frame`.
 
-        A `UserWarning` names each mesh that cannot be used and is left out, and parts at true size that are the same.
+        A `UserWarning` names each unusable mesh, which is left out, and parts at true size that are the same.
 
-        **Raises:** `ValueError` if none can be used, for another number of names, for numbers out of their ranges, or
-        another unit.
+        **Raises:** `ValueError` if no mesh can be used, if the number of names differs from that of meshes, for numbers
+        out of range, or for another unit.
         """
         factor = None if scale is None else _metres(scale)
         require(resolution >= 8, f"the resolution is {resolution}; it must be at least 8")
@@ -145,11 +148,11 @@ class ShapeBank(eqx.Module):
         return dataclasses.replace(bank, is_true_size=True)._resized(sizes)
 
     def in_scene(self, frame: Frame) -> "ShapeBank":
-        """The bank at the size that it has in the scene of a frame; as it is, if sizes do not matter."""
+        """A copy in scene units of a frame, if the bank is at true size in world units; otherwise unchanged."""
         return self._resized(jnp.full(len(self), frame.scale)) if self.is_true_size else self
 
     def _resized(self, factors: Float[Array, " k"]) -> "ShapeBank":
-        """The bank with each shape as many times as large."""
+        """A copy with each shape enlarged by its factor."""
         if self.solids is None:
             return self
         if isinstance(self.solids, Scaled):
@@ -165,12 +168,12 @@ class ShapeBank(eqx.Module):
 
     @property
     def shapes(self) -> Shape:
-        """All of them; there are some."""
+        """All shapes as one batch. The bank must not be empty."""
         assert self.solids is not None
         return Shape(self.solids, self.extremes)
 
     def shape(self, index: Int[Array, "*s"]) -> Shape:
-        """One of them, or several."""
+        """The shape at an index, or a batch of shapes at several."""
         return jax.tree.map(lambda rows: rows[index], self.shapes)
 
     def __len__(self) -> int:
@@ -178,13 +181,13 @@ class ShapeBank(eqx.Module):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of all shapes."""
+        """Names of all shapes."""
         return tuple(bytes(code).rstrip(b"\0").decode(errors="ignore") for code in np.asarray(self.codes))
 
     def chosen(self, indices: Sequence[int]) -> "ShapeBank":
-        """A bank of some of the shapes.
+        """A bank of the shapes at these indices.
 
-        **Raises:** `ValueError` for an index that it does not have.
+        **Raises:** `ValueError` for an index out of range.
         """
         indices = listed(indices, "the indices")
         for index in indices:
@@ -197,7 +200,10 @@ class ShapeBank(eqx.Module):
 
 
 def _metres(scale: float | str) -> float:
-    """**Raises:** `ValueError` for a unit that is not known, or a length that is not positive."""
+    """Length of a unit in metres, or the number itself.
+
+    **Raises:** `ValueError` for an unknown unit, or a length that is not positive.
+    """
     if isinstance(scale, str):
         require(
             scale in _METRES, f"the unit is {scale!r}: give one of {', '.join(_METRES)}, or its length in the world"
@@ -209,21 +215,21 @@ def _metres(scale: float | str) -> float:
 
 
 def _as_names(names: Sequence[str]) -> tuple[str, ...]:
-    found = listed(names, "the names")
-    for name in found:
+    strings = listed(names, "the names")
+    for name in strings:
         check_type(name, str, "a name of a shape")
-    return found
+    return strings
 
 
 def encoded(names: Sequence[str]) -> UInt8[Array, "k c"]:
-    """Names as the rows of `ShapeBank.codes`, which end after 64 bytes."""
+    """Encode names as rows of `ShapeBank.codes`, cut after 64 bytes."""
     rows = [name.encode()[:_LONGEST_NAME].ljust(_LONGEST_NAME, b"\0") for name in names]
     return jnp.asarray(np.frombuffer(b"".join(rows), np.uint8).reshape(-1, _LONGEST_NAME))
 
 
 @eqx.filter_jit
 def _extremes(solids: SignedDistance) -> Float[Array, "k p 3"]:
-    """Points of a sphere far about each solid, brought to its surface along the gradient."""
+    """Points on each solid's surface: points of a large sphere around it, moved along the gradient."""
     start = fibonacci_sphere(NUM_EXTREMES, _FAR)
 
     def of_solid(solid):
@@ -233,7 +239,7 @@ def _extremes(solids: SignedDistance) -> Float[Array, "k p 3"]:
             return points - (distance / jnp.where(square > 0, square, 1.0))[:, None] * gradient, None
 
         points = jax.lax.scan(stride, start, length=_STRIDES)[0]
-        # Where the distance is a bound, some are still on their way.
+        # If the distance is only a bound, some points have not reached the surface yet.
         arrived = jnp.abs(solid(points)) < _ARRIVED
         return jnp.where(arrived[:, None], points, points[jnp.argmax(arrived)])
 
@@ -243,7 +249,10 @@ def _extremes(solids: SignedDistance) -> Float[Array, "k p 3"]:
 def values_and_gradients(
     function: Callable[[Float[Array, "n 3"]], Float[Array, " n"]], points: Float[Array, "n 3"]
 ) -> tuple[Float[Array, " n"], Float[Array, "n 3"]]:
-    """Of a function that treats every point by itself, so that one sweep a direction gives all gradients."""
+    """Values and gradients of a function at points, by one forward sweep for each of three directions.
+
+    - `function`: must treat each point separately.
+    """
     values, along = jax.linearize(function, points)
     columns = [along(jnp.broadcast_to(direction, points.shape)) for direction in jnp.eye(3, dtype=points.dtype)]
     return values, jnp.stack(columns, axis=-1)

@@ -1,6 +1,6 @@
 """Observed values of f relative to the level, at points. They add to the normals, which observe its gradient.
 
-Values are in units of h, half the rise of the mean of f, given the normals, across the scanned sheet. The prior sets the
+Values are in units of h, half the rise across the scanned sheet of the mean of f given the normals. The prior sets the
 scale of f, and h is this scale at the data.
 """
 
