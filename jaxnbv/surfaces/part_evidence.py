@@ -1,21 +1,20 @@
-"""How well placed parts explain what every ray of every view came back with, and what follows for their weights.
+"""Evidence of the rays of all views for placed parts, and the weights that follow from it.
 
-A ray that met the object at x, and came there through space that is empty, speaks of a placed part of signed distance d
-by how far x is from its surface, and how deep the ray went through it:
+A ray that passes through empty space and meets the object at x tests a placed part with signed distance d twice: x
+should lie on its surface, and the ray should not pass through it:
 
     L = sum over rays of  l(d(x)) + l(min over the ray of min(d, 0)),   l(r) = log(1 + r^2 / 2 tau^2)
 
-without the first term for a ray that did not meet the object. No term is more than C = l(4 tau): what is far off says
-no more than what is off. tau is twice the noise of the sights, which their third differences from pixel to pixel show,
-and no less than 0.03 scene units, to which a part's surface is known on its grid. A ray from which nothing came back
-counts where it went through a part in space that was seen to be empty: a sensor may miss a surface. Misfits add up, so
-that weights sharpen with evidence; but rays that meet the object closer together than 0.12 err together, and count as
-fewer:
+A ray that did not meet the object has only the second term. No term exceeds C = l(4 tau), so outliers count no more
+than that. tau is twice the noise of the sights, estimated from their third differences between pixels, but at least
+0.03 scene units, the accuracy of a part's surface on its grid. A sensor may miss a surface, so a ray without a return
+counts only if it goes through the part in space that was seen to be empty. Misfits add up, so weights sharpen with
+evidence. Rays that meet the object less than 0.12 apart have dependent errors, so they count as fewer:
 
-    w_h proportional to exp(-L_h),   w_0 (none of these) to exp(-L_0),   L_0 = sum over rays of e_0 + o,
+    w_h proportional to exp(-L_h),   w_0 (none of these) to exp(-L_0),   L_0 = sum over rays of e_0 + o
 
-over the rays that met the object, o what the best of all hypotheses leaves of l(d(x)) beyond e_0: a point that none
-explains is none of the object's, of a fifth of the points at most.
+The sum for L_0 is over the rays that met the object. o is the excess over e_0 of l(d(x)) for the hypothesis that
+explains x best: a point that no hypothesis explains belongs to something else. At most a fifth of the points do.
 """
 
 import math
@@ -35,33 +34,33 @@ from jaxnbv.scanning import Grid
 from jaxnbv.surfaces.registration import Hypotheses
 from jaxnbv.surfaces.shape_bank import ShapeBank
 
-# tau at least, in scene units; in standard deviations of the noise; and where misfits end, in tau.
+# Smallest tau in scene units, tau in standard deviations of the noise, and the residual with misfit C, in tau.
 LEAST_TAU, _TAU_OF_NOISE, _FAR = 0.03, 2.0, 4.0
 MOST = math.log1p(_FAR**2 / 2.0)
-# The standard deviation of a normal distribution in lower quartiles of its absolute value. More than half of the
-# differences of a thin object go across its edges, so that a median would take these for noise.
+# Standard deviation of a normal distribution divided by the lower quartile of its absolute value. On a thin object more
+# than half of the differences cross its edges, and a median would count them as noise.
 _BY_QUARTILE = 1.0 / 0.31864
-# The least stride along a ray, and how many are taken.
+# Smallest stride along a ray in scene units, and number of strides.
 _STRIDE, _NUM_STRIDES = 0.04, 40
-# All views together speak by so many rays, at most.
+# Most rays used from all views together.
 _NUM_RAYS = 4096
-# Rays that are closer together on the object err together: scene units.
+# Rays closer together than this on the object have dependent errors; scene units.
 _APART = 0.12
-# Parts that are right leave up to 0.15 a ray, and most objects that are none of them 0.3 or more.
+# e_0. The right part leaves up to 0.15 per ray, and for most objects that are none of the parts 0.3 or more is left.
 _NONE_MISFIT = 0.25
-# The share of the points that met something else, at most.
+# Largest share of points that belong to something else.
 _STRAY = 0.2
 
 
 class Rays(NamedTuple):
-    """What rays of the views so far came back with, in random order.
+    """Rays of the views so far, in random order.
 
-    - `sight`: how far each went, without end where nothing came back; zero for a row that holds none.
-    - `is_object`: whether it met the object there.
-    - `weight`: what each counts: one, or less where rays are closer together than the errors of a surface, and more
-      where it stands for others.
-    - `empty_nodes`: of `grid`, those that were seen empty.
-    - `tau`: how far a point may lie from the surface that it was measured on, in scene units.
+    - `sight`: length of each ray in scene units; infinite without a return, zero for padding.
+    - `is_object`: whether the ray ended on the object.
+    - `weight`: number of independent rays that each stands for. It is below one if rays are denser than `_APART`, and
+      higher if the ray represents others.
+    - `empty_nodes`: mask of the nodes of `grid` that were seen to be empty.
+    - `tau`: the tau of l, in scene units.
     """
 
     origins: Float[Array, "n 3"]
@@ -76,7 +75,7 @@ class Rays(NamedTuple):
     @classmethod
     @eqx.filter_jit
     def of(cls, observations: Observations, box: Box) -> "Rays | None":
-        """Those that enter a box; None where the observations keep no looks."""
+        """The rays that enter a box; None if the observations keep no looks."""
         looks, poses = observations.looks, observations.poses
         if looks is None or observations.empty_nodes is None:
             return None
@@ -97,7 +96,7 @@ class Rays(NamedTuple):
             chosen.append(order.at[rows].get(mode="fill", fill_value=count))
             share = jnp.maximum(2.0 * jnp.sum(kind) / _NUM_RAYS, 1.0)
             weights.append(jnp.broadcast_to(share * jnp.minimum(weight_of(away, looks.camera), 1.0), rows.shape))
-        # One of each kind in turn, so that the first few are of both.
+        # Both kinds alternate, so that the first few rays contain both.
         picked, weight = (jnp.stack(parts, axis=1).reshape(-1) for parts in (chosen, weights))
         at = jnp.minimum(picked, count - 1)
         return cls(
@@ -112,7 +111,7 @@ class Rays(NamedTuple):
         )
 
     def first(self, count: int) -> "Rays":
-        """The first few, each of which stands for more."""
+        """The first `count` rays, with their weights increased to stand for all."""
         weight, holds = self.weight[:count], self.sight > 0
         for kind in (self.is_object & holds, ~self.is_object & holds):
             share = jnp.sum(kind) / jnp.maximum(jnp.sum(kind[:count]), 1)
@@ -124,18 +123,20 @@ class Rays(NamedTuple):
 def _noise_of(
     sight: Float[Array, "views rays"], is_object: Bool[Array, " all_rays"], camera: Camera
 ) -> Float[Array, ""]:
-    """The standard deviation of the sights of an object, from differences of the third order along rows and columns,
-    which surfaces that bend little leave at zero; zero where there are none."""
+    """Standard deviation of the noise of the sights on the object; zero without data.
+
+    It is estimated from third differences along rows and columns, which are near zero on a surface of low curvature.
+    """
     images = jnp.where(is_object, sight.reshape(-1), jnp.nan).reshape(-1, camera.height, camera.width)
     changes = [jnp.diff(images, 3, axis=axis).reshape(-1) for axis in (1, 2)]
-    # The coefficients 1, 3, 3, 1 sum to 20 in squares.
+    # The squares of the coefficients 1, 3, 3, 1 sum to 20.
     quartile = jnp.nanquantile(jnp.abs(jnp.concatenate(changes)), 0.25)
     return jnp.nan_to_num(_BY_QUARTILE / math.sqrt(20.0) * quartile)
 
 
 @eqx.filter_jit
 def evidence(bank: ShapeBank, hypotheses: Hypotheses, rays: Rays) -> tuple[Float[Array, " h"], Float[Array, ""]]:
-    """L of each hypothesis, and L_0."""
+    """L of each hypothesis, and L_0 of "none of these"."""
     points = rays.origins + jnp.where(rays.is_object, rays.sight, 0.0)[:, None] * rays.directions
 
     def of_part(one):
@@ -156,22 +157,26 @@ def evidence(bank: ShapeBank, hypotheses: Hypotheses, rays: Rays) -> tuple[Float
 
 
 def weight_of(away: Float[Array, ""], camera: Camera) -> Float[Array, ""]:
-    """How many independent rays a camera's ray stands for, so far from an object: its area there by that within which
-    rays err together."""
+    """Number of independent rays that a camera's ray stands for, at this distance from the object.
+
+    It is the ray's area on the object divided by the area within which rays have dependent errors.
+    """
     across, down = camera.focal_lengths
     return away**2 / (across * down * _APART**2)
 
 
 def misfit_of(distance: Float[Array, "*n"], tau: Float[Array, ""]) -> Float[Array, "*n"]:
-    """l of a length in scene units, at most C."""
+    """The misfit l of a residual in scene units, at most C."""
     return jnp.minimum(jnp.log1p(distance**2 / (2.0 * tau**2)), MOST)
 
 
 def _deepest(
     distance: Callable[[Float[Array, "n 3"]], Float[Array, " n"]], rays: Rays
 ) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
-    """The least signed distance along each ray, short of what it met, zero where the ray passes beside the solid; and
-    whether the ray is known to have gone there."""
+    """Smallest signed distance along each ray before its end, and whether the ray surely went there.
+
+    The distance is zero if the ray passes beside the solid.
+    """
 
     def stride(state, _):
         along, deepest, place = state

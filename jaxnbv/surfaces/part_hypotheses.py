@@ -1,4 +1,4 @@
-"""Which part the object is and how it lies: hypotheses with weights, carried from view to view."""
+"""Weighted hypotheses about the part and its placement, carried from view to view."""
 
 import equinox as eqx
 import jax
@@ -17,19 +17,19 @@ from jaxnbv.surfaces.registration import NUM_POINTS, Hypotheses, Seen
 from jaxnbv.surfaces.shape_bank import ShapeBank
 
 NONE = "none of these"
-# Placements that are tried with each part.
+# Number of placements tried for each part.
 _NUM_STARTS = 1024
-# Where there is a cloud alone, its points count as so many rays; and E at which a part is as likely as none.
+# Without rays, for a cloud alone: number of rays that its points stand for, and the E of "none of these".
 _NUM_RAYS, _NONE_MISFIT = 0.3 * NUM_POINTS, 0.6
 
 
 class PartHypotheses(eqx.Module):
-    """Parts of a bank, each with a placement, the likeliest first.
+    """Parts of a bank, each with a placement, the most likely first.
 
-    - `bank`: at true size, in scene units.
-    - `placed`: which part and where; the same part may stand in several places, and equal surfaces count once.
-    - `weights`: how likely each is, and last how likely the object is none of the bank's.
-    - `tau`: how far a measured point may lie from the surface, in scene units, see `part_evidence`.
+    - `bank`: the parts at true size, in scene units.
+    - `placed`: part and placement of each hypothesis. A part may have several placements; equal surfaces occur once.
+    - `weights`: probability of each hypothesis, and last of "none of these".
+    - `tau`: scale of the distance between measured points and the surface, in scene units, see `part_evidence`.
     """
 
     bank: ShapeBank
@@ -38,22 +38,24 @@ class PartHypotheses(eqx.Module):
     tau: Float[Array, ""]
 
     def surfaces(self, grid: Grid, count: int) -> GridSurface:
-        """The first few placed parts as surfaces on a grid, along a leading axis."""
+        """The first `count` placed parts as surfaces on a grid, along a leading axis."""
         return _on_grid(self, grid, count)
 
     @property
     def shape_weights(self) -> Float[Array, " k"]:
-        """How likely each part of the bank is."""
+        """Probability of each part of the bank."""
         return jnp.zeros(len(self.bank)).at[self.placed.shape].add(self.weights[:-1])
 
     @property
     def part_weights(self) -> Float[Array, " k_and_none"]:
-        """How likely each part of the bank is, and last how likely the object is none of them."""
+        """Probability of each part of the bank, and last of "none of these"."""
         return jnp.append(self.shape_weights, self.weights[-1])
 
     def names(self) -> dict[str, float]:
-        """How likely the object is each part, most likely first, and "none of these"; parts that no hypothesis is
-        about are left out."""
+        """Probability of each part by name, most likely first, including "none of these".
+
+        Parts without a hypothesis are left out.
+        """
         each = np.asarray(self.shape_weights, np.float64)
         listed = {name: float(weight) for name, weight in zip(self.bank.names, each, strict=True) if weight > 0}
         listed[NONE] = float(self.weights[-1])
@@ -61,7 +63,7 @@ class PartHypotheses(eqx.Module):
 
     @property
     def likeliest(self) -> tuple[int, Placement]:
-        """Index in the bank of the likeliest part, and the likeliest of its placements."""
+        """Index in the bank of the most likely part, and its most likely placement."""
         shapes, weights = np.asarray(self.placed.shape), np.asarray(self.weights)[:-1]
         part = int(np.argmax(np.bincount(shapes, weights, len(self.bank))))
         row = int(np.argmax(np.where(shapes == part, weights, -1.0)))
@@ -69,9 +71,9 @@ class PartHypotheses(eqx.Module):
 
 
 def hypotheses_of(observations: Observations) -> PartHypotheses:
-    """What the observations hold of known parts.
+    """The hypotheses about known parts in the observations.
 
-    **Raises:** `ValueError` if that is nothing.
+    **Raises:** `ValueError` if there are none.
     """
     if not isinstance(observations.hypotheses, PartHypotheses):
         raise InputError("there are no hypotheses: the planner knows no parts; use Planner.for_parts(bank)")
@@ -83,8 +85,10 @@ def identify(
 ) -> PartHypotheses:
     """The hypotheses given the observations.
 
-    - `bank`: at true size, in scene units; `poses`: how its parts can lie; `box`: what holds the object.
-    - `before`: those of the view before, which stay for as long as they fit.
+    - `bank`: the parts at true size, in scene units.
+    - `poses`: the possible placements of the parts.
+    - `box`: a box around the object.
+    - `before`: the hypotheses of the previous view, which are kept while they fit.
     """
     seen = Seen.of(observations)
     previous = nothing_before(seen.points.dtype) if before is None else before.placed

@@ -1,4 +1,4 @@
-"""Where the likeliest part lies: its pose in the world, how sure that is, and the poses that are equally right."""
+"""The pose of the most likely part in the world, its covariance, and the equivalent poses of a symmetric part."""
 
 import equinox as eqx
 import jax
@@ -16,24 +16,24 @@ from jaxnbv.surfaces.registration import Seen
 from jaxnbv.surfaces.shape_bank import Shape, values_and_gradients
 
 _NUM_PROBES = 4096
-# Turns about each axis of a part that may be symmetries.
+# Step between the turns about each axis that are tested as symmetries of a part.
 _STEP = np.radians(5.0)
-# Standard deviations of what the points say nothing of: a turn in radians, a shift in scene units.
+# Prior standard deviations of a turn (radians) and a shift (scene units), for directions that the points do not fix.
 _UNKNOWN_TURN, _UNKNOWN_SHIFT = np.pi / np.sqrt(3.0), 1.0
-# Scene units: the part's surface is known no better on its grid. And the standard deviation of a normal distribution
-# in medians of its absolute value.
+# Smallest error of the points in scene units, the accuracy of a part's surface on its grid. Standard deviation of a
+# normal distribution divided by the median of its absolute value.
 _LEAST_ERROR, _BY_MEDIAN = 0.005, 1.4826
 
 
 class ObjectPose(eqx.Module):
-    """Where a part lies in the world.
+    """Pose of a part in the world.
 
-    - `name`: the part's.
-    - `matrix`: from the coordinates of the part's mesh, in world units, to the world; a rigid motion.
-    - `covariance`: of a turn (rotation vector about the part's centre, radians, the world's axes) and of the position
-      of the centre (world units): how well the points say so, if the part is right.
-    - `alternatives`: the matrices that are equally right since the part is symmetric, `matrix` first. A part that is
-      round about an axis has 72 of them, five degrees apart, or 144 if its ends are equal.
+    - `name`: name of the part.
+    - `matrix`: rigid motion from the coordinates of the part's mesh, in world units, to the world.
+    - `covariance`: covariance of a turn (rotation vector about the part's centre, radians, world axes) and of the
+      centre's position (world units). It reflects the errors of the points, and assumes that the part is right.
+    - `alternatives`: the equivalent matrices of a symmetric part, `matrix` first. A part that is round about an axis
+      has 72 of them, five degrees apart, or 144 if its ends are equal.
     """
 
     name: str
@@ -43,7 +43,7 @@ class ObjectPose(eqx.Module):
 
 
 def object_pose(hypotheses: PartHypotheses, observations: Observations, frame: Frame) -> ObjectPose:
-    """The pose of the likeliest part in the world of a frame."""
+    """The pose of the most likely part, in the world of a frame."""
     part, placement = hypotheses.likeliest
     bank = hypotheses.bank
     shape = bank.shape(jnp.asarray(part))
@@ -58,8 +58,10 @@ def object_pose(hypotheses: PartHypotheses, observations: Observations, frame: F
 
 
 def surface_error(hypotheses: PartHypotheses, observations: Observations) -> float:
-    """By how much the surface of the likeliest part may be off, in scene units: the root mean square over its surface,
-    by the errors of the points and by the other hypotheses."""
+    """Expected error of the most likely part's surface, in scene units: root mean square over its surface.
+
+    It includes the errors of the points and the differences from the other hypotheses.
+    """
     part, placement = hypotheses.likeliest
     shape = hypotheses.bank.shape(jnp.asarray(part))
     covariance = _covariance(shape, placement, Seen.of(observations))
@@ -67,7 +69,7 @@ def surface_error(hypotheses: PartHypotheses, observations: Observations) -> flo
     off, gradient = (
         np.asarray(rows, np.float64) for rows in distances_to(hypotheses, jnp.asarray(points.T, jnp.float32))
     )
-    # What moves along the surface does not move it.
+    # Only motion along the normal counts, since motion along the surface leaves the surface in place.
     rows = np.concatenate([np.cross(gradient[0], points.T - np.asarray(placement.shift)), -gradient[0]], axis=1)
     by_points = float(np.mean(np.einsum("ni,ij,nj->n", rows, covariance, rows)))
     by_others = float(np.asarray(hypotheses.weights, np.float64)[:-1] @ np.mean(off**2, axis=1))
@@ -78,7 +80,7 @@ def surface_error(hypotheses: PartHypotheses, observations: Observations) -> flo
 def distances_to(
     hypotheses: PartHypotheses, points: Float[Array, "p 3"]
 ) -> tuple[Float[Array, "h p"], Float[Array, "h p 3"]]:
-    """The distances of points to each hypothesis, and their gradients."""
+    """Signed distances of points to each hypothesis, and their gradients."""
     solids = hypotheses.bank.shape(hypotheses.placed.shape).solid
 
     def of_part(placed):
@@ -89,8 +91,11 @@ def distances_to(
 
 
 def symmetries(shape: Shape) -> Float[np.ndarray, "n 3 3"]:
-    """The turns about a shape's own axes, through its centre, that leave it as it is; none first. Tried are turns by
-    multiples of five degrees about each axis, those of a cube, and both in turn."""
+    """Rotations about a shape's centre that leave it unchanged, the identity first.
+
+    The candidates are turns by multiples of five degrees about each axis, the turns of a cube, and products of one of
+    each.
+    """
     vectors = [angle * axis for axis in np.eye(3) for angle in np.arange(0.0, 2.0 * np.pi, _STEP)]
     about_axes, of_cube = Rotation.from_rotvec(vectors).as_matrix(), Rotation.create_group("O").as_matrix()
     turns = np.concatenate([about_axes, of_cube])
@@ -99,7 +104,7 @@ def symmetries(shape: Shape) -> Float[np.ndarray, "n 3 3"]:
     change = _largest_change(shape, jnp.asarray(turns, shape.extremes.dtype), jnp.asarray(probes, shape.extremes.dtype))
     is_symmetry = np.asarray(change) < SAME
     left, right = about_axes[is_symmetry[: len(about_axes)]], of_cube[is_symmetry[len(about_axes) :]]
-    # One after another they are symmetries too.
+    # A product of two symmetries is a symmetry too.
     both = np.concatenate([np.eye(3)[None], np.einsum("aij,bjk->abik", left, right).reshape(-1, 3, 3)])
     _, first = np.unique(np.round(both, 6).reshape(-1, 9) + 0.0, axis=0, return_index=True)
     return both[np.sort(first)]
@@ -116,8 +121,11 @@ def _largest_change(shape: Shape, turns: Float[Array, "n 3 3"], probes: Float[Ar
 
 
 def _covariance(shape: Shape, placement: Placement, seen: Seen) -> Float[np.ndarray, "6 6"]:
-    """Of a turn about the part's centre and its shift, in the scene: the inverse of J^T J / s^2, J how the distances of
-    the points change, s their error."""
+    """Covariance of a turn about the part's centre and of its shift, in the scene.
+
+    It is the inverse of J^T J / s^2 plus a broad prior, with J the derivative of the points' distances and s their
+    error.
+    """
     distance, gradient = values_and_gradients(lambda x: placement.distance(shape.solid, x), seen.points)
     mask = np.asarray(seen.mask)
     distance, gradient = np.asarray(distance, np.float64)[mask], np.asarray(gradient, np.float64)[mask]
@@ -135,6 +143,6 @@ def _matrix(linear: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"]) -> 
 
 
 def _rigid(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """The matrix with the rotation nearest to its linear part, which rounding has left a little off."""
+    """The matrix with its linear part, which has rounding errors, replaced by the nearest rotation."""
     left, _, right = np.linalg.svd(matrix[:3, :3])
     return _matrix(left @ right, matrix[:3, 3])

@@ -1,9 +1,9 @@
-"""Which parts of known size fit what was seen, and how they lie: a search in which no part crowds out another.
+"""Search for parts of known size and their placements that fit the scan, with an equal share of tries for each part.
 
-Every part is tried in many placements, and its best few are refined by Gauss-Newton steps on the misfit E of
-`registration`; the best of these that lie apart are refined again, on more points, together with the hypotheses of the
-view before. Where any part came to stand then, all of them are tried. So a part never loses its place to look-alikes,
-nor misses one that a look-alike has; and time grows linearly with the number of parts.
+Each part is tried in many placements, and its best few are refined by Gauss-Newton steps on the misfit E of
+`registration`. The best distinct results are refined again on more points, together with the hypotheses of the previous
+view. Finally all parts are tried in each of the best placements so far. So look-alikes do not crowd a part out, and a
+part is also tried in the placements that its look-alikes reached. The time grows linearly with the number of parts.
 """
 
 import dataclasses
@@ -22,20 +22,22 @@ from jaxnbv.surfaces.registration import Hypotheses, Prior, Seen, first_of_each,
 from jaxnbv.surfaces.shape_bank import ShapeBank
 
 NUM_HYPOTHESES = 32
-# Each rotation is tried in so many places.
+# Number of positions tried for each rotation.
 _PLACES = 4
-# How many of each part are refined, by how many points and steps: of all tried, and of the best of these. Then so many
-# placements are tried with all parts, and the best few refined by so many steps more.
+# Starts per part, points and steps of the first refinement, and of the second. Then the number of placements tried with
+# all parts, and the steps of the last refinement.
 _COARSE, _FINE, _SHARED, _LAST = (10, 48, 5), (4, 128, 10), 16, 3
-# Placements that are turned alike and moved by less than this are one to begin with: scene units.
+# Placements with nearly equal rotations count as one until the last stage if their shifts differ by less than this, in
+# scene units.
 _MOVE = 0.15
-# How far a part may reach beyond the box, and how far two placed parts may differ that count as one: scene units.
+# How far a part may extend beyond the box, and the surface difference below which placements of a part count as one, in
+# scene units.
 _ROOM, SAME = 0.2, 0.03
 _NUM_PROBES, _FEW_RAYS = 4096, 1024
 
 
 def nothing_before(dtype: Any) -> Hypotheses:
-    """Hypotheses before the first view: the first part as it is, which one start more does no harm."""
+    """Placeholder hypotheses for the first view: the first part unmoved, a harmless extra start."""
     still = Placement(jnp.eye(3, dtype=dtype), jnp.zeros(3, dtype), jnp.ones(3, dtype))
     one = Hypotheses(jnp.zeros((), int), still, jnp.asarray(jnp.inf, dtype), jnp.asarray(False))
     return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (NUM_HYPOTHESES, *leaf.shape)), one)
@@ -45,12 +47,15 @@ def nothing_before(dtype: Any) -> Hypotheses:
 def search_parts(
     bank: ShapeBank, poses: ShapePoses, box: Box, seen: Seen, rays: Rays | None, before: Hypotheses, num_starts: int
 ) -> Hypotheses:
-    """The 32 placed parts of least misfit, best first, by rays or by E where there are none. Those whose surfaces are
-    equal, by symmetry say, count once.
+    """The 32 placed parts of smallest misfit, best first.
 
-    - `bank`: parts at true size, in scene units; `box`: what holds the object.
-    - `before`: the hypotheses of the view before, which are refined and kept for as long as they fit.
-    - `num_starts`: placements that are tried with each part.
+    The misfit is the evidence of the rays, or E without rays. Placements with equal surfaces, for example by symmetry,
+    count once.
+
+    - `bank`: parts at true size, in scene units.
+    - `box`: a box around the object.
+    - `before`: the hypotheses of the previous view, which are refined and kept while they fit.
+    - `num_starts`: number of placements tried for each part.
     """
     prior = Prior(poses, box, is_true_size=True)
     few, some = seen.first(_COARSE[1]), seen.first(_FINE[1])
@@ -74,7 +79,10 @@ def search_parts(
 
 
 def _of_each(hypotheses: Hypotheses, num_shapes: int) -> Hypotheses:
-    """The hypotheses of each shape along a second axis; they come in the order of the shapes, as many of each."""
+    """Split hypotheses by shape: the second axis has those of one shape.
+
+    They must be sorted by shape, with equally many for each.
+    """
     return jax.tree.map(lambda rows: rows.reshape(num_shapes, -1, *rows.shape[1:]), hypotheses)
 
 
@@ -83,8 +91,10 @@ def _flat(hypotheses: Hypotheses) -> Hypotheses:
 
 
 def _apart(hypotheses: Hypotheses, count: int) -> Hypotheses:
-    """The best few that are turned or moved from all better ones, whatever their shape; where these are too few, others
-    without end to their misfit."""
+    """The best `count` hypotheses with distinct placements, whatever their shape.
+
+    If there are too few, others fill up with infinite misfit.
+    """
     ordered = hypotheses.best(len(hypotheses.misfit))
     shift = ordered.placement.shift
     moved = jnp.linalg.norm(shift[:, None] - shift, axis=-1)
@@ -93,16 +103,16 @@ def _apart(hypotheses: Hypotheses, count: int) -> Hypotheses:
 
 
 def _starts(bank: ShapeBank, prior: Prior, seen: Seen, num_starts: int) -> Placement:
-    """Placements of each shape, along a second axis: rotations, each in a few places where the shape would hold what
-    was seen.
+    """Placements of each shape along a second axis: rotations, each at a few positions.
 
-    Where the whole of the object was in view, there is one such place across the line of sight, and along it the one
-    whose front is what was seen. Where a view shows a patch, places are spread over all that hold it.
+    The shape spans the scan at each of them. If the whole object was in view, there is one such position across the
+    line of sight, and along it one with the scan on the shape's front. If a view shows a patch, positions are spread
+    over all that contain the patch.
     """
     dtype = seen.points.dtype
     rotations = jnp.asarray(prior.poses.rotations_of(len(bank), max(1, num_starts // _PLACES)), dtype)
     count = rotations.shape[1]
-    # A sequence of low discrepancy (Roberts 2018); the first place is the middle, in front.
+    # A low-discrepancy sequence (Roberts 2018). The first position is the middle, with the scan on the front.
     steps = np.array([0.8191725134, 0.6710436067, 0.5497004779])
     spread = (0.5 + np.arange(1, count * (_PLACES - 1) + 1)[:, None] * steps) % 1.0
     middle = np.tile([[[0.5, 0.5, 1.0]]], (1, count, 1))
@@ -118,7 +128,7 @@ def _starts(bank: ShapeBank, prior: Prior, seen: Seen, num_starts: int) -> Place
         turned = jnp.matmul(shape.extremes, rotation.T, precision="highest")
         own = jnp.matmul(turned, axes.T, precision="highest")
         first, last = most - jnp.max(own, axis=0), least - jnp.min(own, axis=0)
-        # A shape that is smaller than what was seen stands in its middle; its front is what was seen all the same.
+        # The two ends in order, also for a shape that is smaller than the scan.
         first, last = jnp.minimum(first, last), jnp.maximum(first, last)
         shift = jnp.matmul(last + share * (first - last), axes, precision="highest")
         inside = jnp.clip(shift, low - jnp.min(turned, axis=0), high - jnp.max(turned, axis=0))
@@ -134,7 +144,7 @@ def _starts(bank: ShapeBank, prior: Prior, seen: Seen, num_starts: int) -> Place
 
 
 def _axes_of_sight(seen: Seen) -> Float[Array, "3 3"]:
-    """Two directions across the line of sight, and last the one to the sensor: the mean of the normals."""
+    """Two directions across the line of sight, and the direction to the sensor: the mean of the normals."""
     mean = jnp.sum(jnp.where(seen.mask[:, None], seen.normals, 0.0), axis=0)
     length = jnp.linalg.norm(mean)
     ahead = jnp.where(length > 0, mean / jnp.where(length > 0, length, 1.0), jnp.eye(3, dtype=mean.dtype)[2])
@@ -144,8 +154,7 @@ def _axes_of_sight(seen: Seen) -> Float[Array, "3 3"]:
 
 
 def _distinct(bank: ShapeBank, box: Box, hypotheses: Hypotheses) -> Hypotheses:
-    """The hypotheses with `is_mode` false, and no misfit that could be best, for all whose surface is that of a better
-    one."""
+    """The hypotheses, with `is_mode` false and infinite misfit if a better one has the same surface."""
     dtype = hypotheses.misfit.dtype
     low, high = jnp.asarray(box.low, dtype) - _ROOM, jnp.asarray(box.high, dtype) + _ROOM
     probes = low + (high - low) * jnp.asarray(np.random.default_rng(0).random((_NUM_PROBES, 3)), dtype)

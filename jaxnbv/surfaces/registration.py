@@ -1,14 +1,14 @@
-"""Which known shapes fit what was seen, and where they stand: a search over shapes and placements.
+"""Search for known shapes and placements that fit the scan.
 
-The misfit of a shape of signed distance d, placed by T,
+A shape with signed distance d, placed by T, has the misfit
 
     E = mean_j [ log(1 + d(x_j)^2 / 2 tau^2) + (1 - n_j . grad d(x_j)) / 2 ]
         + 2 mean_i log(1 + min(d(z_i) + margin, 0)^2 / tau^2) + prior(T)
 
-is that of scanned points x_j with normals n_j, and of points z_i that were seen empty: without these, fits collapse
-onto the patch that was seen. The prior is weak, on shift and scale. All shapes are tried in many rotations; the best
-are refined, all at once, by Gauss-Newton steps on E with its logarithms as weights (iteratively reweighted least
-squares), tau falling from 0.12 to 0.03.
+for scanned points x_j with normals n_j, and points z_i that were seen to be empty. Without the latter, fits shrink onto
+the visible patch. The prior on shift and scale is weak. All shapes are tried in many rotations. The best are refined
+together by Gauss-Newton steps on E, with weights from its logarithms (iteratively reweighted least squares), while tau
+falls from 0.12 to 0.03.
 """
 
 import dataclasses
@@ -29,12 +29,12 @@ from jaxnbv.surfaces.shape_bank import Shape, ShapeBank, values_and_gradients
 NUM_POINTS, _NUM_EMPTY = 256, 512
 _MARGIN = 0.05
 _FIRST_TAU, _LAST_TAU = 0.12, 0.03
-# Standard deviations of shift (scene units) and of the logarithm of the scale about what fills the box, and what this
-# prior weighs in E.
+# Prior standard deviations of the shift (scene units) and of the logarithm of the scale, relative to the placement that
+# fills the box, and the weight of this prior in E.
 _SHIFT, _STRETCH, _PRIOR = 0.2, 0.15, 0.02
-# How many are refined, by how many points and steps: of those tried, of the best of these, and of all in the end.
+# Hypotheses, points and steps of the first refinement, of the second, and of the last.
 _COARSE, _FINE, _LAST = (192, 48, 4), (48, 128, 8), (96, 128, 8)
-# Placements that are tried with all shapes.
+# Number of placements that are tried with all shapes.
 _NUM_SHARED = 4
 _AT_ONCE = 256
 _DAMPING = 1e-3
@@ -42,7 +42,10 @@ _LARGEST_STEP = 0.3
 
 
 class Seen(NamedTuple):
-    """What shapes are fitted to, in an order whose beginnings are spread as evenly as the whole."""
+    """Data that shapes are fitted to: points with normals, and empty points, in scene coordinates.
+
+    The first rows of each are spread as evenly as all rows.
+    """
 
     points: Float[Array, "n 3"]
     normals: Float[Array, "n 3"]
@@ -52,14 +55,13 @@ class Seen(NamedTuple):
 
     @classmethod
     def of(cls, observations: Observations) -> "Seen":
-        """Some of the cloud, by farthest point sampling, and some of the nodes seen empty, or within obstacles, at
-        random."""
+        """Points of the cloud by farthest point sampling, and random nodes that are empty or inside obstacles."""
         cloud = farthest_point_subsample(observations.cloud, NUM_POINTS)
         empty, is_empty = _some_empty(observations)
         return cls(cloud.points, cloud.normals, cloud.mask, empty.astype(cloud.points.dtype), is_empty)
 
     def first(self, count: int) -> "Seen":
-        """The first so many of each."""
+        """The first `count` rows of each."""
         return Seen(*(rows[:count] for rows in self))
 
 
@@ -70,28 +72,28 @@ def _some_empty(observations: Observations) -> tuple[Float[Array, "m 3"], Bool[A
     if observations.obstacle_nodes is not None:
         empty = empty | observations.obstacle_nodes
     order = np.random.default_rng(0).permutation(empty.size)
-    node, is_empty = _first_seen(empty, order)
+    node, is_empty = _first_empty(empty, order)
     return jnp.asarray(observations.grid.axis)[node], is_empty
 
 
 @jax.jit
-def _first_seen(
+def _first_empty(
     empty_nodes: Bool[Array, "g g g"], order: Int[Array, " nodes"]
 ) -> tuple[Int[Array, "m 3"], Bool[Array, " m"]]:
-    """The first nodes in an order of those that were seen empty."""
-    seen = empty_nodes.reshape(-1)[order]
-    place = jnp.where(seen, jnp.cumsum(seen) - 1, _NUM_EMPTY)
+    """Indices of the first empty nodes in an order, and a mask of the filled rows."""
+    is_empty = empty_nodes.reshape(-1)[order]
+    place = jnp.where(is_empty, jnp.cumsum(is_empty) - 1, _NUM_EMPTY)
     chosen = jnp.zeros(_NUM_EMPTY, jnp.int32).at[place].set(order, mode="drop")
-    return jnp.stack(jnp.unravel_index(chosen, empty_nodes.shape), axis=-1), jnp.arange(_NUM_EMPTY) < jnp.sum(seen)
+    return jnp.stack(jnp.unravel_index(chosen, empty_nodes.shape), axis=-1), jnp.arange(_NUM_EMPTY) < jnp.sum(is_empty)
 
 
 class Hypotheses(eqx.Module):
-    """Shapes of a bank, each with a placement: the modes of the fit, best first.
+    """Shapes of a bank, each with a placement, best first.
 
-    - `shape`: indices of the bank.
-    - `placement`: where each stands.
+    - `shape`: index of each shape in the bank.
+    - `placement`: placement of each shape.
     - `misfit`: E.
-    - `is_mode`: false for one found within 15 degrees of a better one of the same shape.
+    - `is_mode`: false if a better hypothesis of the same shape is within 15 degrees.
     """
 
     shape: Int[Array, "*h"]
@@ -100,16 +102,17 @@ class Hypotheses(eqx.Module):
     is_mode: Bool[Array, "*h"]
 
     def best(self, count: int) -> "Hypotheses":
-        """Those of the least misfit."""
+        """The hypotheses of smallest misfit, best first."""
         _, rows = jax.lax.top_k(-self.misfit, min(count, len(self.misfit)))
         return jax.tree.map(lambda leaf: leaf[rows], self)
 
 
 class Prior(NamedTuple):
-    """What is known of placements before anything was seen.
+    """Prior over placements.
 
-    - `poses`: which are possible. `box`: what holds the object, which fills it more or less.
-    - `is_true_size`: whether shapes are as large as they are, and need not fill the box.
+    - `poses`: the possible placements.
+    - `box`: a box that the object more or less fills.
+    - `is_true_size`: whether shapes are at true size. They keep their scale and need not fill the box.
     """
 
     poses: ShapePoses
@@ -118,11 +121,11 @@ class Prior(NamedTuple):
 
     @property
     def steps(self) -> Float[np.ndarray, "9 k"]:
-        """The independent steps of `Placement.moved`, one a column."""
+        """Independent steps of `Placement.moved`, as columns."""
         return self.poses.moves if self.is_true_size else self.poses.steps
 
     def filling(self, shape: Shape, rotation: Float[Array, "3 3"]) -> Placement:
-        """A shape turned so, as large as the box has room for, in its middle."""
+        """The placement with this rotation that centres the shape in the box, as large as fits."""
         turned = jnp.matmul(shape.extremes, rotation.T, precision="highest")
         low, high = jnp.min(turned, axis=0), jnp.max(turned, axis=0)
         least, most = jnp.asarray(self.box.low, turned.dtype), jnp.asarray(self.box.high, turned.dtype)
@@ -130,7 +133,7 @@ class Prior(NamedTuple):
         return Placement(rotation, 0.5 * (least + most) - 0.5 * scale * (low + high), jnp.broadcast_to(scale, 3))
 
     def deviation(self, shape: Shape, placement: Placement) -> Float[Array, "9"]:
-        """By how much a placement departs from what fills the box: no turn, the shift, the logarithms of the scale."""
+        """Difference from the placement that fills the box: zero turn, shift, logarithms of scale ratios."""
         if self.is_true_size:
             return jnp.zeros(9, placement.shift.dtype)
         usual = self.filling(shape, placement.rotation)
@@ -138,7 +141,7 @@ class Prior(NamedTuple):
         return jnp.concatenate([jnp.zeros_like(shift), shift, stretch])
 
     def within(self, shape: Shape, placement: Placement) -> Placement:
-        """The placement with its scale clipped to what is possible."""
+        """The placement with its scale clipped to the possible range."""
         if self.is_true_size:
             return placement
         usual = self.filling(shape, placement.rotation).scale
@@ -151,9 +154,9 @@ _PRECISION = _PRIOR * np.array([0.0] * 3 + [_SHIFT**-2] * 3 + [_STRETCH**-2 / 3.
 
 @eqx.filter_jit
 def register(bank: ShapeBank, prior: Prior, seen: Seen, num_starts: int) -> Hypotheses:
-    """The shapes and placements that fit what was seen best.
+    """The shapes and placements that fit the scan best.
 
-    All shapes are tried in many rotations. Where the best of them came to stand, all others are tried too.
+    All shapes are tried in many rotations. Then all shapes are tried in the placements of the best.
     """
     few, some = seen.first(_COARSE[1]), seen.first(_FINE[1])
     turned = _turned(bank, prior, few, num_starts)
@@ -162,15 +165,15 @@ def register(bank: ShapeBank, prior: Prior, seen: Seen, num_starts: int) -> Hypo
     others = _exchanged(bank, prior, fine, few).best(_LAST[0])
     both = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), fine, others)
     last = refined(bank, prior, both.best(_LAST[0]), some, _LAST[2])
-    found = judged(bank, prior, last, seen).best(_LAST[0])
-    return dataclasses.replace(found, is_mode=_modes(found.shape, found.placement.rotation))
+    fits = judged(bank, prior, last, seen).best(_LAST[0])
+    return dataclasses.replace(fits, is_mode=_modes(fits.shape, fits.placement.rotation))
 
 
 def _turned(bank: ShapeBank, prior: Prior, seen: Seen, num_starts: int) -> Hypotheses:
-    """All shapes in some rotations each, as they fill the box."""
+    """All shapes in several rotations each, filling the box."""
     all_of_them = jnp.asarray(prior.poses.rotations(num_starts), seen.points.dtype)
     count = max(1, min(len(all_of_them), num_starts // len(bank)))
-    # Each shape has its own, evenly spread, so that together they leave no gaps.
+    # Each shape has rotations of its own, evenly spread, so that together the shapes leave no gaps.
     offsets = np.random.default_rng(0).permutation(len(bank)) / len(bank)
     places = (np.arange(count) + offsets[:, None]) * len(all_of_them) / count
 
@@ -182,7 +185,10 @@ def _turned(bank: ShapeBank, prior: Prior, seen: Seen, num_starts: int) -> Hypot
 
 
 def _exchanged(bank: ShapeBank, prior: Prior, first: Hypotheses, seen: Seen) -> Hypotheses:
-    """All shapes where a few of the best stand that are of different rotations, filling as much of the box."""
+    """All shapes in the placements of a few of the best hypotheses with different rotations.
+
+    Each shape departs from filling the box by as much as that hypothesis does.
+    """
     ordered = first.best(len(first.misfit))
     mode = _modes(jnp.zeros_like(ordered.shape), ordered.placement.rotation)
     few = jax.tree.map(lambda leaf: leaf[jnp.argsort(~mode, stable=True)[:_NUM_SHARED]], ordered)
@@ -196,7 +202,7 @@ def _exchanged(bank: ShapeBank, prior: Prior, first: Hypotheses, seen: Seen) -> 
 
 
 def tried(bank: ShapeBank, prior: Prior, placements: Placement, seen: Seen) -> Hypotheses:
-    """The misfits of each shape at its own placements, along a second axis."""
+    """Compute the misfit of each shape at its own placements, which lie along a second axis."""
     num_shapes, count = placements.scale.shape[:2]
 
     def of_shape(one):
@@ -210,7 +216,10 @@ def tried(bank: ShapeBank, prior: Prior, placements: Placement, seen: Seen) -> H
 
 
 def refined(bank: ShapeBank, prior: Prior, starts: Hypotheses, seen: Seen, num_steps: int) -> Hypotheses:
-    """The best along Gauss-Newton steps, by E at the last tau, while the tau of the steps falls."""
+    """Refine each start by Gauss-Newton steps with falling tau.
+
+    The result is the iterate of smallest E at the last tau.
+    """
     taus = jnp.append(jnp.geomspace(_FIRST_TAU, _LAST_TAU, num_steps), _LAST_TAU)
     basis = jnp.asarray(prior.steps, seen.points.dtype)
 
@@ -221,7 +230,7 @@ def refined(bank: ShapeBank, prior: Prior, starts: Hypotheses, seen: Seen, num_s
             current, best, least = state
             step, misfit = _newton_step(shape, prior, current, seen, tau, basis)
             best = jax.tree.map(lambda a, b: jnp.where(misfit < least, a, b), current, best)
-            # The last step is not judged, and lost.
+            # The result of the last step is not evaluated, and is dropped.
             return (prior.within(shape, current.moved(step)), best, jnp.minimum(misfit, least)), None
 
         state = start.placement, start.placement, jnp.asarray(jnp.inf, seen.points.dtype)
@@ -232,7 +241,7 @@ def refined(bank: ShapeBank, prior: Prior, starts: Hypotheses, seen: Seen, num_s
 
 
 def judged(bank: ShapeBank, prior: Prior, hypotheses: Hypotheses, seen: Seen) -> Hypotheses:
-    """The hypotheses with their E by all that was seen, at the last tau."""
+    """The hypotheses with E recomputed from all rows of `seen`, at the last tau."""
 
     def judge(one):
         return _misfit(bank.shape(one.shape), prior, one.placement, seen, _LAST_TAU)
@@ -247,7 +256,7 @@ def _mean(values: Float[Array, " n"], mask: Bool[Array, " n"]) -> Float[Array, "
 def _misfit(
     shape: Shape, prior: Prior, placement: Placement, seen: Seen, tau: Float[Array, ""] | float
 ) -> Float[Array, ""]:
-    """E, with the derivative along the normals as `jax.jvp` gives it."""
+    """E of a placement, with n_j . grad d from `jax.jvp`."""
     distance, slope = jax.jvp(lambda x: placement.distance(shape.solid, x), (seen.points,), (seen.normals,))
     empty = placement.distance(shape.solid, seen.empty)
     return _summed(distance, slope, empty, prior.deviation(shape, placement), seen, tau)
@@ -275,12 +284,14 @@ def _newton_step(
     tau: Float[Array, ""],
     basis: Float[Array, "9 k"],
 ) -> tuple[Float[Array, "9"], Float[Array, ""]]:
-    """A damped Gauss-Newton step of E, its normals compared as (n - grad d)^2 / 4, within a trust region; and E at the
-    last tau before it."""
+    """A damped Gauss-Newton step of E within a trust region, and E before the step at the last tau.
+
+    Normals enter the step as (n - grad d)^2 / 4.
+    """
     points = jnp.concatenate([seen.points, seen.empty])
     distance, gradient = values_and_gradients(lambda x: placement.distance(shape.solid, x), points)
     count = len(seen.points)
-    # What the distance at a fixed point of the scene does as the shape is turned about t, shifted and scaled.
+    # Derivatives of the distance at a fixed point of the scene, as the shape is turned about t, shifted and scaled.
     away = points - placement.shift
     own = jnp.matmul(away, placement.rotation, precision="highest")
     own_gradient = jnp.matmul(gradient, placement.rotation, precision="highest")
@@ -318,18 +329,18 @@ def _newton_step(
 
 
 def _modes(shape: Int[Array, " h"], rotation: Float[Array, "h 3 3"]) -> Bool[Array, " h"]:
-    """Which of the hypotheses, best first, are farther than 15 degrees from all better modes of their shape."""
+    """Whether each hypothesis, best first, is more than 15 degrees from all better modes of its shape."""
     return first_of_each(turned_alike(rotation) & (shape[:, None] == shape))
 
 
 def turned_alike(rotation: Float[Array, "h 3 3"]) -> Bool[Array, "h h"]:
-    """Which rotations are within 15 degrees of each other."""
+    """Whether each two rotations are within 15 degrees of each other."""
     trace = jnp.einsum("aij,bij->ab", rotation, rotation, precision="highest")
     return 0.5 * (trace - 1.0) > np.cos(np.radians(15.0))
 
 
 def first_of_each(is_same: Bool[Array, "h h"]) -> Bool[Array, " h"]:
-    """Which rows are not the same as an earlier one of these."""
+    """Mask of the rows to keep: a row is dropped if it is the same as an earlier row that is kept."""
     order = jnp.arange(is_same.shape[0])
 
     def keep(modes, index):

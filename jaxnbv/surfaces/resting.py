@@ -1,4 +1,4 @@
-"""How parts can lie on a table: turned about the vertical in the poses in which they do not topple."""
+"""Placements of parts that rest on a table: stable poses, turned about the vertical."""
 
 from typing import cast
 
@@ -12,42 +12,42 @@ from jaxnbv.checks import AnyArray, require
 from jaxnbv.surfaces.placement import ShapePoses
 from jaxnbv.surfaces.shape_bank import ShapeBank
 
-# Stable poses of a part that are tried, at most; those whose upward directions are nearer count as one, in radians.
+# Most stable poses used per part, and the angle between their upward directions below which two count as one (radians).
 _MOST, _NEAR = 8, np.radians(10.0)
 _NODES = 32
-# From z, which is upward to trimesh, to y.
+# Rotation from trimesh's upward axis z to y.
 _UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
 class Resting(ShapePoses):
-    """Parts that rest on a table, y upward: any turn about the vertical, in one of a part's stable poses.
+    """Parts resting on a table, y upward: any turn about the vertical, in one of a part's stable poses.
 
-    A search starts from these; refined hypotheses may tilt.
+    A search starts from these poses. Refined hypotheses may tilt.
 
-    - `stable`: (k, p, 3, 3) rotations of each part of a bank, likeliest first.
+    - `stable`: (k, p, 3, 3) rotations of each part of a bank, the most likely first.
     """
 
     stable: Float[Array, "k p 3 3"]
 
     @classmethod
     def of(cls, bank: ShapeBank) -> "Resting":
-        """The stable poses of a bank's parts, by their convex hulls and centres of mass, as if they were solid.
+        """The stable poses of a bank's parts, from their convex hulls and their centres of mass as solids.
 
         **Raises:** `ValueError` for an empty bank.
         """
         require(len(bank) > 0, "the bank is empty: give one with parts")
         each = [_stable_poses(bank, index) for index in range(len(bank))]
         most = max(len(poses) for poses in each)
-        # Parts with fewer repeat theirs.
+        # Parts with fewer poses repeat them.
         rows = [poses[np.arange(most) % len(poses)] for poses in each]
         return cls(jnp.asarray(np.stack(rows), jnp.result_type(float)))
 
     def rotations(self, count: int) -> Float[AnyArray, "m 3 3"]:
-        """Those of the first part."""
+        """The rotations of the first part."""
         return self.rotations_of(1, count)[0]
 
     def rotations_of(self, num_shapes: int, count: int) -> Float[AnyArray, "k m 3 3"]:
-        """Evenly spaced turns of each stable pose."""
+        """Evenly spaced turns of each stable pose of each part."""
         stable = self.stable[:num_shapes]
         num_turns = max(1, count // stable.shape[1])
         angles = 2.0 * np.pi * np.arange(num_turns) / num_turns
@@ -71,7 +71,7 @@ def _stable_poses(bank: ShapeBank, index: int) -> Float[np.ndarray, "p 3 3"]:
     chosen: list[np.ndarray] = []
     for transform in transforms[np.argsort(-probabilities)]:
         rotation = _UPRIGHT @ transform[:3, :3]
-        # A turn about the vertical leaves what is upward in the part as it is.
+        # Poses that differ only by a turn about the vertical have the same upward direction in the part.
         if all(rotation[1] @ other[1] < np.cos(_NEAR) for other in chosen):
             chosen.append(rotation)
     return np.stack(chosen[:_MOST]) if chosen else np.eye(3)[None]
