@@ -1,14 +1,14 @@
-"""The Matern spectrum on the circle, and covariances of the implicit function f and the normal field v under the prior.
+"""The Matern spectrum on the circle, and prior covariances of the implicit function f and the normal field v.
 
     cov(v_d(x), v_d(y)) = sum_n s(n) cos(n.(x - y))
     cov(f(x), v_d(y))   = sum_n s(n) n_d / |n|^2 sin(n.(x - y))
     cov(f(x), f(y))     = sum_n s(n) / |n|^2 cos(n.(x - y)),   n != 0
 
-The prior may be a sum of several spectra, one a scale; so is then each covariance.
+If the prior is a sum of spectra, one for each lengthscale, each covariance is the sum of theirs.
 
-With one spectrum the first is a product over the axes. The other two become a short sum of such products by the
-trapezoidal rule for 1 / r = int exp(-r e^u) e^u du (Beylkin and Monzon 2010), so no array over the (2 L + 1)^3
-frequencies is ever made.
+For one spectrum the first covariance is a product over the axes. The other two are a short sum of such products, by the
+trapezoidal rule for 1 / r = int exp(-r e^u) e^u du (Beylkin and Monzon 2010). This avoids an array over the (2 L + 1)^3
+frequencies.
 """
 
 import functools
@@ -28,11 +28,13 @@ Spectra = Float[Array, "*scales l_plus_1"]
 
 @functools.partial(jax.jit, static_argnames=("nu", "truncation"))
 def circle_spectrum(nu: float, lengthscale: Scalar, variance: Scalar, truncation: int) -> Float[Array, "l_plus_1"]:
-    """s1(0), ..., s1(L) with s1(n) = variance w(n) / sum_{m in Z} w(m), w(n) = (2 nu / ell^2 + 4 pi^2 n^2)^-(nu + 1/2).
+    """The Matern spectrum s1(0), ..., s1(L) on the circle.
 
-    So sum_{n in Z} s1(n) cos(n t) is the Matern kernel on the circle, of value `variance` at t = 0 (Borovitskiy et al.
-    2020). The sum over all integers is in closed form, so what the truncation leaves out is missing from the kernel
-    and not spread over the frequencies that are kept.
+    s1(n) = variance w(n) / sum_{m in Z} w(m),   w(n) = (2 nu / ell^2 + 4 pi^2 n^2)^-(nu + 1/2)
+
+    So sum_{n in Z} s1(n) cos(n t) is the Matern kernel on the circle, with value `variance` at t = 0 (Borovitskiy et
+    al. 2020). The sum over m has a closed form and includes all integers. So truncation removes the variance of higher
+    frequencies from the kernel, and does not spread it over the kept ones.
 
     - `nu`: smoothness, one of 1/2, 3/2, 5/2.
     - `lengthscale`: ell, in units of the circumference.
@@ -45,7 +47,10 @@ def circle_spectrum(nu: float, lengthscale: Scalar, variance: Scalar, truncation
 
 
 def _lattice_sum(nu: float, a: Float[Array, ""]) -> Float[Array, ""]:
-    """sum_{m in Z} (1 + (2 pi m / a)^2)^-p for p = nu + 1/2: a coth(a/2) / 2 for p = 1, then by derivatives in a."""
+    """sum_{m in Z} (1 + (2 pi m / a)^2)^-p for p = nu + 1/2.
+
+    It is a coth(a/2) / 2 for p = 1. Larger p follow by derivatives with respect to a.
+    """
     decay = jnp.exp(-a)
     coth = (1.0 + decay) / (1.0 - decay)
     csch2 = 4.0 * decay / (1.0 - decay) ** 2
@@ -57,7 +62,7 @@ def _lattice_sum(nu: float, a: Float[Array, ""]) -> Float[Array, ""]:
 
 
 def normal_covariance(x: Float[Array, "n 3"], y: Float[Array, "m 3"], spectrum: Spectra) -> Float[Array, "n m"]:
-    """cov(v_d(x), v_d(y)), the same for each component d; different components are independent."""
+    """cov(v_d(x), v_d(y)), the same for each component d. Different components are independent."""
     return _over_scales(lambda of_scale: _normal_covariance(x, y, of_scale), spectrum)
 
 
@@ -100,7 +105,7 @@ def function_variance(spectrum: Spectra) -> Float[Array, ""]:
 
 
 def mode_variance(spectrum: Spectra) -> Float[Array, "a a a"]:
-    """Prior variances of the coefficients of a component of v, see `surfaces/trigonometric.py`."""
+    """Prior variances of the coefficients of each component of v, see `surfaces/trigonometric.py`."""
 
     def of_one(spectrum):
         variance = basis_variance(spectrum)
@@ -117,7 +122,7 @@ def _even(x: Float[Array, " n"], y: Float[Array, " m"], spectrum: Spectrum) -> F
 
 
 def _odd(x: Float[Array, " n"], y: Float[Array, " m"], spectrum: Spectrum) -> Float[Array, "n m"]:
-    """sum_{n in Z} s1(|n|) sign(n) sin(n (x - y)); sin(n (x - y)) = sin(n x) cos(n y) - cos(n x) sin(n y)."""
+    """sum_{n in Z} s1(|n|) sign(n) sin(n (x - y)), by sin(n (x - y)) = sin(n x) cos(n y) - cos(n x) sin(n y)."""
     truncation = spectrum.shape[0] - 1
     sign = jnp.sign(jnp.arange(-truncation, truncation + 1))
     # Reversing the basis swaps the sine and the cosine of each frequency.
@@ -126,28 +131,31 @@ def _odd(x: Float[Array, " n"], y: Float[Array, " m"], spectrum: Spectrum) -> Fl
 
 
 def _over_squared_frequency(products, spectrum: Spectrum):
-    """A sum over frequencies n, given as products over the axes, with each term divided by |n|^2."""
+    """Divide each term of a sum over frequencies n by |n|^2.
+
+    - `products`: the sum as a function of a spectrum, built from products over the axes.
+    """
     frequency = jnp.arange(spectrum.shape[0], dtype=spectrum.dtype)
 
     def add(total, node):
         rate, weight = node
         return total + weight * products(spectrum * jnp.exp(-rate * frequency**2)), None
 
-    # A loop and not unrolled terms, which XLA would hold in memory all at once.
+    # A loop, because XLA would hold all unrolled terms in memory at once.
     nodes = tuple(jnp.asarray(a, dtype=spectrum.dtype) for a in _inverse_quadrature(spectrum))
     shape = jax.eval_shape(products, spectrum)
     return jax.lax.scan(add, jnp.zeros(shape.shape, shape.dtype), nodes)[0]
 
 
 def _inverse_quadrature(spectrum: Spectrum) -> tuple[np.ndarray, np.ndarray]:
-    """Rates t_q and weights w_q with 1 / r = sum_q w_q exp(-t_q r) for 1 <= r <= 3 L^2, to the dtype's precision."""
+    """Rates t_q and weights w_q with 1 / r = sum_q w_q exp(-t_q r) for 1 <= r <= 3 L^2, in the dtype's precision."""
     tolerance = 10 * float(jnp.finfo(spectrum.dtype).eps)
     largest = 3.0 * (spectrum.shape[0] - 1) ** 2
     step = math.pi**2 / math.log(10.0 / tolerance)
     low, high = math.log(tolerance / largest), math.log(math.log(1.0 / tolerance))
     rate = np.exp(np.arange(low, high + step, step))
     weight = step * rate
-    # Rates this slow are one exponential of their common mean, up to its third order.
+    # The slowest rates merge into one exponential with their weighted mean, which is accurate to third order.
     slow = rate < tolerance ** (1 / 3) / largest
     together = weight[slow].sum()
     mean = (weight * rate)[slow].sum() / together

@@ -9,9 +9,9 @@ Rows = Float[Array, "n *columns"]
 
 
 class CholeskyFactor(eqx.Module):
-    """C, lower triangular, with A = C C^T.
+    """The lower triangular C with A = C C^T.
 
-    - `upper`: C^T, which lies in memory as C does by columns. LAPACK takes matrices by columns; others are turned
+    - `upper`: C^T. Its row-major memory is the column-major C that LAPACK takes. A row-major C would be transposed
       first, which takes ten times as long as a solve.
     """
 
@@ -19,23 +19,23 @@ class CholeskyFactor(eqx.Module):
 
     @classmethod
     def of(cls, matrix: Float[Array, "n n"]) -> "CholeskyFactor":
-        """That of a symmetric A, of which one triangle is read; not finite where A is not positive definite."""
+        """Factorise a symmetric A, reading one triangle. Not finite if A is not positive definite."""
         return cls(jnp.linalg.cholesky(matrix.T, symmetrize_input=False).T)
 
     def leading(self, size: int) -> "CholeskyFactor":
-        """That of the first rows and columns of A."""
+        """The factor of the first `size` rows and columns of A."""
         return CholeskyFactor(self.upper[:size, :size])
 
     def whiten(self, rows: Rows) -> Rows:
-        """C^-1 applied to columns."""
+        """Apply C^-1 to columns."""
         return solve_triangular(self.upper.T, rows, lower=True)
 
     def unwhiten(self, rows: Rows) -> Rows:
-        """C^-T applied to columns."""
+        """Apply C^-T to columns."""
         return solve_triangular(self.upper.T, rows, lower=True, trans="T")
 
     def solve(self, rows: Rows) -> Rows:
-        """A^-1 applied to columns."""
+        """Apply A^-1 to columns."""
         return self.unwhiten(self.whiten(rows))
 
     @property

@@ -1,10 +1,10 @@
-"""p(f | D) under `GeometricSPSR`: its closed forms, and what is drawn and solved for its samples.
+"""The posterior p(f | D) under `GeometricSPSR`: closed forms, and the draws and solves of its samples.
 
     solver   A^-1 for A = k(X, X) + noise^2 I, see `surfaces/solver.py`
     mean     Poisson(k(., X) A^-1 n)
     sample   Poisson(v + k(., X) A^-1 (n - v(X) - eps)), v and eps from the prior
 
-Names are those of `jaxnbv.surfaces.spsr`.
+Symbols are those of `jaxnbv.surfaces.spsr`.
 """
 
 from typing import NamedTuple
@@ -31,20 +31,20 @@ from jaxnbv.surfaces.trigonometric import NonuniformTransform, solve_poisson
 
 
 class NormalDraws(NamedTuple):
-    """v drawn from the prior, by its coefficients, and v(X) + eps."""
+    """Draws from the prior: coefficients of v, and v(X) + eps."""
 
     coefficients: Float[Array, "s 3 a a a"]
     at_data: Float[Array, "s n 3"]
 
 
 class GeometricSPSRPosterior(TrigonometricPosterior):
-    """p(f | D) under `GeometricSPSR`, in closed form and as pathwise samples.
+    """The posterior p(f | D) under `GeometricSPSR`, in closed form and as pathwise samples.
 
-    - `level`: mean over the data of E f(x_j); the surface is where f equals it.
-    - `mean_coefficients`: of E f, see `surfaces/trigonometric.py`.
+    - `level`: mean over the data of E f(x_j). The surface is where f equals it.
+    - `mean_coefficients`: coefficients of E f, see `surfaces/trigonometric.py`.
     - `weights`: A^-1 n.
-    - `solver`: A^-1, with the cloud, the spectrum and the noise that make A. By conjugate gradients, which more than
-      16,384 points take, `covariance` and `log_marginal_likelihood` are not offered.
+    - `solver`: A^-1, with the cloud, spectrum and noise that define A. For more than 16,384 points it uses conjugate
+      gradients, and `covariance` and `log_marginal_likelihood` are not available.
     """
 
     level: Float[Array, ""]
@@ -54,30 +54,30 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
 
     @property
     def cloud(self) -> PointCloud:
-        """D, with zeros in the rows that are not filled."""
+        """D, with zeros in unfilled rows."""
         return self.solver.cloud
 
     @property
     def spectrum(self) -> Spectra:
-        """The prior's."""
+        """The spectrum of the prior."""
         return self.solver.spectrum
 
     @property
     def truncation(self) -> int:
-        """L."""
+        """L, the largest frequency along each axis."""
         return self.spectrum.shape[-1] - 1
 
     @on_torus
     @eqx.filter_jit
     def variance(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
-        """Var f(x) at points in scene coordinates: the prior's, less what the data explain."""
+        """Var f(x) at points in scene coordinates: the prior variance minus the part that the data explain."""
         x = jnp.asarray(x, dtype=self.weights.dtype)
         return jnp.maximum(function_variance(self.spectrum) - self.solver.explained_variance(x), 0.0)
 
     @on_torus
     @eqx.filter_jit
     def covariance(self, x: Float[AnyArray, "n 3"], y: Float[AnyArray, "m 3"]) -> Float[Array, "n m"]:
-        """Cov(f(x), f(y)) between points in scene coordinates, all at once."""
+        """Cov(f(x), f(y)) between points in scene coordinates, in one batch."""
         x, y = (jnp.asarray(points, dtype=self.weights.dtype) for points in (x, y))
         explained = jnp.einsum("djn,djm->nm", *map(self.solver.whitened_cross, (x, y)), precision="highest")
         return function_covariance(x, y, self.spectrum) - explained
@@ -89,18 +89,21 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
         return -0.5 * (fit + 3.0 * self.solver.factor.log_determinant + 3.0 * count * jnp.log(2.0 * jnp.pi))
 
     def data_points(self) -> DataPoints:
-        """The cloud's, for gradients and for values."""
+        """The points of the cloud, for gradients and for values."""
         points = filled(self.cloud.points, self.cloud.mask)
         return DataPoints(points, points)
 
     def level_about(self, means: MeansAtData) -> Float[Array, " s"]:
-        """Mean over the data of what m_s adds to E f(x_j): m_s(x_j) itself, less what grad m_s takes from the normals.
-        The latter is linear in them, so that its slope is computed once for all means."""
+        """Mean over the data of the change that m_s makes to E f(x_j).
+
+        It is m_s(x_j) minus the effect of subtracting grad m_s from the normals. The level is linear in the normals, so
+        its slope is computed once for all means.
+        """
         explained = jnp.einsum("snd,nd->s", means.gradients, _level_slope(self), precision="highest")
         return jnp.mean(means.values, axis=1, where=self.cloud.mask) - explained
 
     def prior_draws(self, key: PRNGKeyArray, num_samples: int) -> NormalDraws:
-        """Draws of v and of eps."""
+        """Draw v and eps."""
         scale, dtype = jnp.sqrt(mode_variance(self.spectrum)), self.weights.dtype
         modes, shape = scale.shape[0], self.cloud.points.shape
         transform = NonuniformTransform(self.cloud.points, self.truncation)
@@ -119,11 +122,11 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
         return self._reconstructed(draws.coefficients, self.solver.solve(self._residual(draws, means)))
 
     def _residual(self, draws: NormalDraws, means: MeansAtData) -> Float[Array, "s n 3"]:
-        """n - grad m - v(X) - eps, zero in rows that are not filled."""
+        """n - grad m - v(X) - eps, zero in unfilled rows."""
         return jnp.where(self.cloud.mask[:, None], self.cloud.normals - means.gradients - draws.at_data, 0.0)
 
     def whitened_residual(self, draws: NormalDraws, means: MeansAtData) -> Float[Array, "s n 3"]:
-        """C^-1 (n - grad m - v(X) - eps), zero in rows that are not filled."""
+        """C^-1 (n - grad m - v(X) - eps), zero in unfilled rows."""
         return self.solver.whiten(self._residual(draws, means))
 
     def updated(
@@ -146,8 +149,8 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
 
 @eqx.filter_jit
 def given_normals(cloud: PointCloud, spectrum: Spectra, noise: Scalar) -> GeometricSPSRPosterior:
-    """p(f | D), with the solver that the cloud's capacity asks for."""
-    # Whatever stands in rows that are not filled, NaN included, must not reach the products.
+    """The posterior p(f | D), with a solver that suits the cloud's capacity."""
+    # The contents of unfilled rows, which may be NaN, must not reach the products.
     points, normals = (jnp.where(cloud.mask[:, None], rows, 0.0) for rows in (cloud.points, cloud.normals))
     cloud = PointCloud(points, normals, cloud.mask)
     solver = solver_of(cloud, spectrum, noise)
@@ -161,28 +164,28 @@ def given_normals(cloud: PointCloud, spectrum: Spectra, noise: Scalar) -> Geomet
 def reconstruct(
     transform: NonuniformTransform, weights: Float[Array, "n 3"], spectrum: Spectra
 ) -> Float[Array, "a a a"]:
-    """Coefficients of the f that k(., X) weights reconstructs: its Laplacian is their divergence."""
+    """Coefficients of the f whose Laplacian is the divergence of the field k(., X) w, with w the weights."""
     return solve_poisson(mode_variance(spectrum) * transform.adjoint(weights))
 
 
 def mean_at_data(
     transform: NonuniformTransform, coefficients: Float[Array, "a a a"], cloud: PointCloud
 ) -> Float[Array, ""]:
-    """Mean of f over the filled rows of a cloud, the points of the transform."""
+    """Mean of f over the filled rows of a cloud, whose points are those of the transform."""
     at_data = transform.evaluate(coefficients[None])[:, 0]
     return jnp.sum(jnp.where(cloud.mask, at_data, 0.0)) / jnp.sum(cloud.mask)
 
 
 @eqx.filter_jit
 def _level_slope(posterior: GeometricSPSRPosterior) -> Float[Array, "n 3"]:
-    """Derivative of the level with respect to the normals: A^-1 of that with respect to A^-1 n."""
+    """Derivative of the level with respect to n: A^-1 times the derivative with respect to A^-1 n."""
     cloud, spectrum = posterior.cloud, posterior.spectrum
     transform = NonuniformTransform(cloud.points, posterior.truncation)
 
     def damped(fields):
         return solve_poisson(mode_variance(spectrum) * fields)
 
-    # The transforms are each other's transposes, and take a tenth of the time of those that JAX derives.
+    # `adjoint` and `evaluate` are each other's transposes, ten times as fast as the transposes that JAX derives.
     at_data = transform.adjoint(cloud.mask[:, None] / jnp.sum(cloud.mask))[0]
     fields = jax.ShapeDtypeStruct((3, *at_data.shape), at_data.dtype)
     slope = transform.evaluate(jax.linear_transpose(damped, fields)(at_data)[0])

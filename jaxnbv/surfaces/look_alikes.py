@@ -1,4 +1,4 @@
-"""Parts of a bank that no scan tells apart: the same surface, at the same size, however it was drawn."""
+"""Detection of parts in a bank with the same surface at the same size, which no scan can tell apart."""
 
 import itertools
 import warnings
@@ -11,19 +11,19 @@ from scipy.spatial.transform import Rotation
 
 from jaxnbv.surfaces.mesh_shapes import MeshShape
 
-# Places at which signed distances are compared, before those far from the surface are left out; and how many cells of
-# the grid are near.
+# Number of points at which signed distances are compared, before those far from the surface are dropped. Points within
+# this many cells of the grid are near.
 _PROBES, _NEAR = 8192, 3.0
-# Turns of a cube onto itself: parts are often drawn along other axes.
+# Rotations of a cube onto itself, because parts are often drawn along other axes.
 _TURNS = Rotation.create_group("O").as_matrix()
 
 
 def warn_of_look_alikes(
     shapes: Sequence[MeshShape], names: Sequence[str], sizes: Float[np.ndarray, " k"], stacklevel: int
 ) -> None:
-    """A `UserWarning` for each pair of parts that are the same within a cell of their grids, turned by right angles.
+    """Warn of each pair of parts that are equal within a cell of their grids, up to turns by right angles.
 
-    - `sizes`: world units for a unit of each shape.
+    - `sizes`: world units per unit of each shape.
     """
     grids = [_Grid(shape) for shape in shapes]
     for one, other in itertools.combinations(range(len(shapes)), 2):
@@ -37,7 +37,7 @@ def warn_of_look_alikes(
 
 
 class _Grid:
-    """The signed distances of a shape as NumPy has them, and half of its sides."""
+    """Signed distances of a shape as NumPy arrays, and half of its side lengths."""
 
     def __init__(self, shape: MeshShape):
         solid = shape.solid
@@ -50,17 +50,18 @@ class _Grid:
 
 
 def _difference(one: _Grid, other: _Grid, ratio: float) -> float:
-    """How much the distances to two centred shapes differ near the first of them, at most, however the other one is
-    turned by right angles; infinite where their sides differ.
+    """Largest difference between the distances to two centred shapes near the surface of `one`.
 
-    - `ratio`: how many times as large the other one is as it is drawn.
+    It is for the turn of `other` by right angles with the smallest difference, and infinite if the side lengths differ.
+
+    - `ratio`: factor that scales `other` to the units of `one`.
     """
     least, points = np.inf, None
     for turn in _TURNS:
         if np.abs(ratio * np.abs(turn) @ other.half - one.half).max() > 0.5 * one.spacing:
             continue
         if points is None:
-            drawn = np.random.default_rng(0).uniform(-1.0, 1.0, (_PROBES, 3)) * (one.half + one.spacing)
-            points = drawn[np.abs(one(drawn)) < _NEAR * one.spacing]
+            probes = np.random.default_rng(0).uniform(-1.0, 1.0, (_PROBES, 3)) * (one.half + one.spacing)
+            points = probes[np.abs(one(probes)) < _NEAR * one.spacing]
         least = min(least, float(np.abs(one(points) - ratio * other(points @ turn / ratio)).max()))
     return least

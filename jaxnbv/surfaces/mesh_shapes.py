@@ -1,4 +1,4 @@
-"""Meshes as shapes of a bank: their signed distances on grids, kept in the user's cache."""
+"""Meshes as shapes of a bank: signed distances on grids, cached in the user's cache folder."""
 
 import hashlib
 import os
@@ -23,14 +23,17 @@ from jaxnbv.scanning.mesh import TriangleMesh
 from jaxnbv.scanning.mesh_files import load_mesh
 from jaxnbv.scanning.sdf import Sampled, solid_of_mesh
 
-# What is kept is made anew where what makes it has changed.
+# Increase this when the code changes that computes the cached arrays.
 _VERSION = 3
 _ARRAYS = ("values", "low", "spacing", "padding", "extremes", "from_mesh")
 _T = TypeVar("_T")
 
 
 def listed(values: Sequence[_T], name: str) -> tuple[_T, ...]:
-    """**Raises:** `ValueError` for what cannot be listed."""
+    """The values as a tuple.
+
+    **Raises:** `ValueError` for values that are not iterable.
+    """
     try:
         return tuple(values)
     except TypeError as error:
@@ -38,10 +41,11 @@ def listed(values: Sequence[_T], name: str) -> tuple[_T, ...]:
 
 
 def mesh_paths(meshes: str | Path | Sequence[str | Path | trimesh.Trimesh]) -> list[Path | trimesh.Trimesh]:
-    """The files and meshes that are named, or all meshes in a folder and those within it: files whose names end as a
-    format that trimesh reads.
+    """The listed files and meshes, or all mesh files in a folder and its subfolders.
 
-    **Raises:** `ValueError` for a folder that is not there or holds no mesh, or for no files.
+    Mesh files are those with the extension of a format that trimesh reads.
+
+    **Raises:** `ValueError` for a folder that does not exist or holds no mesh, or for an empty list.
     """
     if isinstance(meshes, str | Path):
         folder = Path(meshes)
@@ -50,18 +54,19 @@ def mesh_paths(meshes: str | Path | Sequence[str | Path | trimesh.Trimesh]) -> l
         meshes = [path for path in sorted(folder.rglob("*")) if path.suffix[1:].lower() in formats and path.is_file()]
         ends = ", ".join(sorted(formats))
         require(len(meshes) > 0, f"the folder {folder} holds no mesh: its files must end in {ends}")
-    named = listed(meshes, "the meshes")
-    require(len(named) > 0, "no meshes are named: give their files, or a folder")
-    for path in named:
+    items = listed(meshes, "the meshes")
+    require(len(items) > 0, "no meshes are named: give their files, or a folder")
+    for path in items:
         check_type(path, str | Path | trimesh.Trimesh, "a mesh")
-    return [path if isinstance(path, trimesh.Trimesh) else Path(path) for path in named]
+    return [path if isinstance(path, trimesh.Trimesh) else Path(path) for path in items]
 
 
 class MeshShape(NamedTuple):
-    """A mesh as a shape of a bank.
+    """A mesh as a shape of a bank, scaled so that its longest side is 2.5.
 
-    - `solid`: its signed distance, where its longest side is 2.5; `extremes`: points that are extreme on it.
-    - `from_mesh`: the similarity from the coordinates of the mesh.
+    - `solid`: its signed distance.
+    - `extremes`: its farthest points in evenly spread directions.
+    - `from_mesh`: the similarity from the coordinates of the mesh to those of the shape.
     """
 
     solid: Sampled
@@ -72,13 +77,13 @@ class MeshShape(NamedTuple):
 def shapes_of_meshes(
     paths: Sequence[Path | trimesh.Trimesh], resolution: int, sheet: float, num_extremes: int, up: str, progress: bool
 ) -> tuple[list[MeshShape], list[int]]:
-    """The shapes of the meshes that can be used, and which these are.
+    """Shapes of the usable meshes, and their indices.
 
-    A `UserWarning` names each mesh that cannot be used, and why.
+    A `UserWarning` names each mesh that cannot be used, and the reason.
 
-    **Raises:** `ValueError` if none can.
+    **Raises:** `ValueError` if no mesh can be used.
     """
-    shapes, used = [], []
+    shapes, rows = [], []
     for index, path in enumerate(progress_bar(paths, progress, desc="meshes read")):
         try:
             shape = _shape(path, resolution, sheet, num_extremes, up)
@@ -86,9 +91,9 @@ def shapes_of_meshes(
             warnings.warn(f"{path} is left out of the bank: {error}", stacklevel=3)
             continue
         shapes.append(shape)
-        used.append(index)
-    require(len(used) > 0, f"none of the {len(paths)} meshes can be used, the first of them {paths[0]}")
-    return shapes, used
+        rows.append(index)
+    require(len(rows) > 0, f"none of the {len(paths)} meshes can be used, the first of them {paths[0]}")
+    return shapes, rows
 
 
 def _shape(mesh: Path | trimesh.Trimesh, resolution: int, sheet: float, num_extremes: int, up: str) -> MeshShape:
@@ -106,11 +111,11 @@ def _kept(path: Path, resolution: int, sheet: float, num_extremes: int, up: str)
         raise InputError(f"cannot read {path} ({error.strerror or error})") from error
     settings = f"{_VERSION} {path.suffix} {resolution} {sheet} {num_extremes} {up} ".encode()
     file = platformdirs.user_cache_path("jaxnbv") / "shapes" / f"{hashlib.sha256(settings + content).hexdigest()}.npz"
-    found = _read(file)
-    if found is None:
-        found = _sampled(load_mesh(path, up), resolution, sheet, num_extremes)
-        _keep(file, found)
-    return found
+    arrays = _read(file)
+    if arrays is None:
+        arrays = _sampled(load_mesh(path, up), resolution, sheet, num_extremes)
+        _keep(file, arrays)
+    return arrays
 
 
 def _sampled(mesh: TriangleMesh, resolution: int, sheet: float, num_extremes: int) -> dict[str, np.ndarray]:
@@ -129,7 +134,7 @@ def _sampled(mesh: TriangleMesh, resolution: int, sheet: float, num_extremes: in
 
 
 def _read(file: Path) -> dict[str, np.ndarray] | None:
-    """What was kept; None where nothing was, or what was is damaged."""
+    """Read cached arrays; None if there is no file or it is damaged."""
     try:
         with np.load(file) as stored:
             return {name: stored[name] for name in _ARRAYS}
@@ -138,7 +143,7 @@ def _read(file: Path) -> dict[str, np.ndarray] | None:
 
 
 def _keep(file: Path, arrays: dict[str, Any]) -> None:
-    """Keep them for the next time, if the disk has room."""
+    """Write arrays to the cache; warn if that fails, for example on a full disk."""
     partial = file.with_suffix(f".{secrets.token_hex(8)}.npz")
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -146,4 +151,4 @@ def _keep(file: Path, arrays: dict[str, Any]) -> None:
         partial.replace(file)
     except OSError as error:
         partial.unlink(missing_ok=True)
-        warnings.warn(f"the shape is not kept for the next time ({error.strerror or error})", stacklevel=2)
+        warnings.warn(f"the shape cannot be stored in the cache ({error.strerror or error})", stacklevel=2)

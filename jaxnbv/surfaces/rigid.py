@@ -1,12 +1,12 @@
 """Registration of a partial scan with a triangle mesh of the same size: iterative closest points from many starts.
 
 A motion x -> R x + t takes the points p and normals n of the scan to the mesh. With c the nearest point of the mesh and
-m the normal there, a Gauss-Newton step reduces
+m its normal, a Gauss-Newton step reduces
 
     sum_p w (m . (R p + t - c))^2,    w = max(m . R n, 0) / (1 + |R p + t - c|^2 / s^2)
 
-(Chen and Medioni 1992, with Cauchy weights), while s falls. The mean of w is the fit of the motion, 1 at best. Lengths
-are shares of the diagonal of the mesh's bounding box.
+(Chen and Medioni 1992, with Cauchy weights). The scale s falls from step to step. The mean of w is the fit of the
+motion, at best 1. Lengths are in units of the diagonal of the mesh's bounding box.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,23 +23,24 @@ from jaxnbv.errors import optional
 from jaxnbv.scanning.sdf.sampled import winding_number
 from jaxnbv.surfaces.placement import FreeRotation
 
-# Starts: rotations, and places for each. Samples that stand for the mesh until motions are nearly right.
+# Number of rotations to start from, shifts for each, and points of the mesh used until motions are nearly right.
 _ROTATIONS, _PLACES, _SAMPLES = 400, 3, 4000
-# Points of the scan in each stage, scales of its steps, and number of motions that go on to the next.
+# Points of the scan in each stage, scales of its steps, and number of motions kept for the next.
 _FIRST, _SECOND, _THIRD, _LAST = 64, 400, 1000, 20_000
 _SCALES = np.geomspace(0.1, 0.03, 8), np.geomspace(0.05, 0.01, 12), np.geomspace(0.02, 0.003, 12)
 _KEPT_FIRST, _KEPT_SECOND, _ROUNDS = 40, 6, 12
-# Scale in medians of the distances, at least this. Damping in shares of the trace of the normal equations.
+# Scale in medians of the distances, smallest scale, damping relative to the trace of the normal equations, and the
+# largest step.
 _MEDIANS, _LEAST, _DAMPING, _LARGEST_STEP = 2.0, 1e-9, 1e-5, 0.5
-# Motions within this angle (as a cosine) and shift count as one.
+# Motions that differ by less than this angle (as a cosine) and this shift count as one.
 _SAME_TURN, _SAME_SHIFT = np.cos(np.radians(10.0)), 0.05
 # Turns about the axis that the scan determines least: an almost round part has a local optimum at many of them.
 _TURNS = 72
-# A motion rivals the best if its fit is this share of it, and it lays the mesh elsewhere by this mean distance.
+# A motion is a rival of the best if it has this share of its fit, and its mesh lies this far away on average.
 _RIVAL, _ELSEWHERE = 0.97, 0.01
 
 Nearest = Callable[[Float[np.ndarray, "n 3"]], tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]]
-"""From places to the nearest points of a mesh, and the normals there."""
+"""A function from points to the nearest points of a mesh, and the normals there."""
 
 
 class Registration(NamedTuple):
@@ -47,7 +48,7 @@ class Registration(NamedTuple):
 
     - `matrix`: the motion from the scan to the mesh.
     - `median`: median distance of the scan from the mesh.
-    - `rival`: mean distance between the mesh and where another motion of nearly the same fit lays it; 0 without one.
+    - `rival`: mean distance of the mesh from its place under another motion of nearly the same fit; 0 without one.
     """
 
     matrix: Float[np.ndarray, "4 4"]
@@ -64,7 +65,11 @@ class _Motions(NamedTuple):
 
 
 class _Equations(NamedTuple):
-    """Normal equations of a step for each motion, distances of the points, and how well their normals agree."""
+    """Normal equations of a step for each motion.
+
+    - `gaps`: distances of the points from the surface.
+    - `alike`: agreement of the normals, from 0 to 1.
+    """
 
     matrix: Float[np.ndarray, "s 6 6"]
     vector: Float[np.ndarray, "s 6"]
@@ -76,7 +81,7 @@ class _Equations(NamedTuple):
 
 
 class _Stage(NamedTuple):
-    """Points and normals of a scan, and the surface that they are laid on."""
+    """Points and normals of a scan, and the surface that they are registered to."""
 
     points: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
@@ -84,7 +89,7 @@ class _Stage(NamedTuple):
     is_solid: bool
 
     def equations(self, motions: _Motions, scale: float | None = None) -> _Equations:
-        """Normal equations at a scale; without one, each motion has twice the median of its distances."""
+        """Normal equations at a scale, by default twice the median distance of each motion."""
         arms = np.einsum("nj,sij->sni", self.points, motions.turns)
         places = arms + motions.shifts[:, None]
         feet, outer = (rows.reshape(places.shape) for rows in self.nearest(places.reshape(-1, 3)))
@@ -110,7 +115,7 @@ class _Stage(NamedTuple):
         return motions
 
     def best(self, motions: _Motions, scale: float, count: int) -> _Motions:
-        """The motions of the best fit that are turned or shifted from all better ones."""
+        """The `count` motions of best fit that differ from all better ones."""
         rows: list[int] = []
         for row in np.argsort(-self.equations(motions, scale).fit(scale), kind="stable").tolist():
             cosine = 0.5 * (np.einsum("kij,ij->k", motions.turns[rows], motions.turns[row]) - 1.0)
@@ -122,7 +127,7 @@ class _Stage(NamedTuple):
         return motions.at(rows)
 
     def swept(self, motion: _Motions) -> _Motions:
-        """One motion followed by turns about the axis about which the fit changes least: a screw in general."""
+        """One motion followed by turns about the axis that changes the fit least, in general a screw axis."""
         weakest = np.linalg.eigh(self.equations(motion).matrix[0])[1][:, 0]
         twist = np.zeros((4, 4))
         twist[:3, :3], twist[:3, 3] = np.cross(np.eye(3), weakest[:3]), weakest[3:]
@@ -132,10 +137,10 @@ class _Stage(NamedTuple):
 
 
 def outward(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, bool]:
-    """The mesh without doubled vertices and faces of zero area, its faces wound outward; and whether it has an inside.
+    """Clean a mesh and wind its faces outward, and return whether it has an inside.
 
-    Winding numbers on both sides of the surface tell a solid, which may have holes, from a sheet. A sheet keeps its
-    winding.
+    Duplicate vertices and faces of zero area are removed. Winding numbers on both sides of the surface distinguish a
+    solid, which may have holes, from a sheet. A sheet keeps its winding.
     """
     mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     mesh.merge_vertices()
@@ -148,7 +153,7 @@ def outward(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, bool]:
     inner, outer = (np.abs(winding_number(at, mesh.vertices, mesh.faces)) for at in (points - step, points + step))
     inside = float(np.mean(inner - outer))
     if inside < -0.5:
-        # `Trimesh.invert` leaves normals as they were.
+        # `Trimesh.invert` does not update the normals.
         mesh = trimesh.Trimesh(mesh.vertices, mesh.faces[:, ::-1], process=False)
     return mesh, abs(inside) > 0.5
 
@@ -160,10 +165,10 @@ def register_scan(
     is_solid: bool,
     start: Float[np.ndarray, "4 4"] | None = None,
 ) -> Registration:
-    """The motion that lays points with outward normals on a mesh: of all, or near a start.
+    """Find the motion that registers points with outward normals to a mesh.
 
-    - `mesh`, `is_solid`: as `outward` gives them. The normals of a sheet may point to either side.
-    - `start`: from the scan to the mesh.
+    - `mesh`, `is_solid`: the results of `outward`. The normals of a sheet may point to either side.
+    - `start`: motion from the scan to the mesh to start from; without it, the search is over all motions.
     """
     unit, center, middle = mesh.scale, points.mean(axis=0), mesh.bounds.mean(axis=0)
     order = np.random.default_rng(0).permutation(len(points))[:_LAST]
@@ -225,8 +230,10 @@ def _nearest_point(vertices: Float[np.ndarray, "v 3"], mesh: trimesh.Trimesh) ->
 def _starts(
     points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], samples: Float[np.ndarray, "m 3"]
 ) -> _Motions:
-    """Rotations, each with some shifts that put the scan inside the mesh's box. The first shift lays the scan on the
-    front of the mesh along the mean normal."""
+    """Rotations, each with some shifts that put the scan inside the mesh's box.
+
+    The first shift lays the scan on the front of the mesh along the mean normal.
+    """
     turns = FreeRotation().rotations(_ROTATIONS)
     views = np.einsum("nj,sij->sni", points[:_THIRD], turns)
     low, high = views.min(axis=1), views.max(axis=1)
@@ -240,6 +247,6 @@ def _starts(
 
 
 def _apart(first: _Motions, second: _Motions, samples: Float[np.ndarray, "m 3"], nearest: Nearest) -> float:
-    """Mean distance between the mesh where a motion lays it before the scan, and where another does."""
+    """Mean distance between the mesh placed relative to the scan by one motion, and by another."""
     moved = (samples - second.shifts[0]) @ second.turns[0] @ first.turns[0].T + first.shifts[0]
     return float(np.mean(np.linalg.norm(moved - nearest(moved)[0], axis=1)))

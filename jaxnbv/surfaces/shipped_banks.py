@@ -1,4 +1,4 @@
-"""Banks of known shapes that ship: procedural objects of the training scenes, and a few real ones."""
+"""Banks of known shapes that ship with jaxnbv: procedural objects of the training scenes, and a few real ones."""
 
 from collections.abc import Callable
 from importlib import resources
@@ -14,17 +14,17 @@ from jaxnbv.scanning.sdf import UNUSED, ImprintedPyramid, LabelledSolid, Sampled
 from jaxnbv.surfaces.placement import FreeRotation, ShapePoses, Upright
 from jaxnbv.surfaces.shape_bank import ShapeBank, encoded
 
-# One unit of the stored distances of a mesh, which are clipped to 127 of them.
+# Unit of the stored distances of a mesh, which are clipped to 127 units.
 QUANTUM = 0.008
-# Upright, of any proportions.
+# Upright, with any proportions.
 _FURNITURE = Upright(by_axis=True)
 
 
 class ShippedBank(NamedTuple):
-    """A bank that ships.
+    """Description of a bank that ships.
 
-    - `form`: makes any solid of its kind.
-    - `poses`: how such objects stand in a scene.
+    - `form`: makes a solid with the structure of the bank's solids.
+    - `poses`: the possible placements of the bank's objects.
     """
 
     form: Callable[[], SignedDistance]
@@ -54,14 +54,14 @@ SHIPPED_BANKS = {
     "heat": ShippedBank(_labelled, _FURNITURE),
     "household-real": ShippedBank(_sampled, _FURNITURE),
 }
-"""The banks that ship, by name."""
+"""Banks that ship, by name."""
 
 
 def shape_bank(name: str) -> ShapeBank:
-    """A bank that ships.
+    """Load a bank that ships.
 
-    - `name`: "pyramid", "truck", "household", "parts" or "heat", procedural objects of the training split; or
-      "household-real", pieces of furniture that were modelled by people, credited in `docs/how_to/known_shapes.md`.
+    - `name`: "pyramid", "truck", "household", "parts" or "heat" for procedural objects of the training split;
+      "household-real" for furniture modelled by people, credited in `docs/how_to/known_shapes.md`.
 
     **Raises:** `ValueError` for another name.
     """
@@ -73,15 +73,17 @@ def shape_bank(name: str) -> ShapeBank:
 
 
 def bank_poses(name: str) -> ShapePoses:
-    """How the shapes of a bank that ships stand in a scene."""
+    """The possible placements of the shapes of a bank that ships."""
     return SHIPPED_BANKS[name].poses
 
 
 def read_bank(path: Path, like: SignedDistance) -> ShapeBank:
-    """The bank that `scripts/make_banks.py` wrote of solids of this form.
+    """Read a bank that `scripts/make_banks.py` wrote.
 
-    Stored are numbers in sixteen bits, and in eight bits integers and distances on grids, these as differences of
-    neighbours in units of `QUANTUM`.
+    The file stores numbers in 16 bits, and integers in 8. Distances on grids are 8-bit differences of neighbours in
+    units of `QUANTUM`.
+
+    - `like`: a solid with the structure of the bank's solids.
     """
     wide = {"f": np.float32, "i": np.int32, "b": np.bool_}
     with np.load(path) as stored:

@@ -1,11 +1,10 @@
-"""A^-1 for A = k(X, X) + noise^2 I, the covariance of observed normals, in two ways.
+"""Two solvers for A = k(X, X) + noise^2 I, the covariance of the observed normals.
 
-    DenseSolver               A = C C^T, factorised once; the factor gives covariances and likelihoods too
-    ConjugateGradientSolver   A is never made: A = Phi S Phi^T + noise^2 I, with Phi the basis at the data and S the
+    DenseSolver               factorises A = C C^T once; the factor also gives covariances and likelihoods
+    ConjugateGradientSolver   never forms A: A = Phi S Phi^T + noise^2 I, with Phi the basis at the data and S the
                               variances of the modes, so a product is a transform to coefficients and back
 
-Clouds are partly filled: a row of A that is not filled is one of the identity, which changes neither solves nor
-determinants.
+Clouds are partly filled. Unfilled rows of A are rows of the identity, which changes neither solves nor determinants.
 """
 
 import functools
@@ -32,7 +31,7 @@ from jaxnbv.surfaces.factor import CholeskyFactor
 from jaxnbv.surfaces.trigonometric import NonuniformTransform
 
 MOST_FACTORISED = 16384
-"""The capacity up to which A is factorised: 1.1 GB in float32, and as much again while it is."""
+"""Largest capacity for which A is factorised. It takes 1.1 GB in float32, and twice that during factorisation."""
 
 _CHUNK_VALUES = 2**24
 _ALWAYS_WHOLE = 2048
@@ -40,12 +39,13 @@ _MOST_PRODUCTS = 2000
 
 
 class Solver(eqx.Module):
-    """A^-1 for the normals of a cloud.
+    """A solver for the covariance A of the normals of a cloud.
 
-    - `cloud`: D, with zeros in the rows that are not filled.
-    - `spectrum`, `noise`: of the prior and of the normals.
+    - `cloud`: D, with zeros in unfilled rows.
+    - `spectrum`: spectrum of the prior.
+    - `noise`: standard deviation of the normals' components.
 
-    `whiten`, `unwhiten` and `whitened_cross` need the factor, and raise as `factor` does where there is none.
+    `whiten`, `unwhiten` and `whitened_cross` need the factor, and raise as `factor` does if there is none.
     """
 
     cloud: eqx.AbstractVar[PointCloud]
@@ -55,29 +55,29 @@ class Solver(eqx.Module):
     @property
     @abstractmethod
     def factor(self) -> CholeskyFactor:
-        """C.
+        """C, the Cholesky factor of A.
 
-        **Raises:** `ValueError` where A is not factorised.
+        **Raises:** `ValueError` if A is not factorised.
         """
 
     @abstractmethod
     def solve(self, blocks: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
-        """A^-1 applied to the columns of each block, which are zero in rows that are not filled."""
+        """Apply A^-1 to the columns of each block, which must be zero in unfilled rows."""
 
     @abstractmethod
     def explained_variance(self, x: Float[Array, "n 3"]) -> Float[Array, " n"]:
-        """By how much the data lower Var f(x), at points in scene coordinates."""
+        """Reduction of Var f(x) by the data, at points in scene coordinates."""
 
     def whiten(self, blocks: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
-        """C^-1 applied to the columns of each block."""
+        """Apply C^-1 to the columns of each block."""
         return _of_columns(self.factor.whiten, blocks)
 
     def unwhiten(self, blocks: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
-        """C^-T applied to the columns of each block."""
+        """Apply C^-T to the columns of each block."""
         return _of_columns(self.factor.unwhiten, blocks)
 
     def whitened_cross(self, x: Float[Array, "n 3"]) -> Float[Array, "3 capacity n"]:
-        """C^-1 cov(v_d(X), f(x)): the sum of its squares is the variance that the data explain."""
+        """C^-1 cov(v_d(X), f(x)). The sum of its squares is the variance that the data explain."""
         capacity, factor = self.cloud.capacity, self.factor
 
         def leading(size: int):
@@ -90,7 +90,7 @@ class Solver(eqx.Module):
 
 
 class DenseSolver(Solver):
-    """The Cholesky factor of A, with as many rows as the cloud has room for. See `Solver`."""
+    """A solver with the Cholesky factor of A, which has one row for each row of the cloud. See `Solver`."""
 
     cloud: PointCloud
     spectrum: Spectra
@@ -99,7 +99,7 @@ class DenseSolver(Solver):
 
     @classmethod
     def of(cls, cloud: PointCloud, spectrum: Spectra, noise: Scalar) -> "DenseSolver":
-        """The solver of a cloud, its A factorised."""
+        """Factorise the A of a cloud."""
         capacity = cloud.capacity
 
         def leading(size: int):
@@ -119,7 +119,7 @@ class DenseSolver(Solver):
         return _of_columns(self.cholesky.solve, blocks)
 
     def explained_variance(self, x: Float[Array, "n 3"]) -> Float[Array, " n"]:
-        """As `Solver` says. The cost grows with (number of points) x (capacity)^2."""
+        """Reduction of Var f(x) by the data. The cost grows with (number of points) x (capacity)^2."""
         return jax.lax.map(
             lambda point: jnp.sum(self.whitened_cross(point[None]) ** 2),
             x,
@@ -128,9 +128,10 @@ class DenseSolver(Solver):
 
 
 class ConjugateGradientSolver(Solver):
-    """Conjugate gradients for more points than can be factorised: about 200 products for 50,000 points with L = 50.
+    """A solver by conjugate gradients, for more points than can be factorised. See `Solver`.
 
-    A solve that did not converge is NaN. Solutions are exact to 1e-4 of the largest value in float32. See `Solver`.
+    A solve takes about 200 products for 50,000 points with L = 50. The result is accurate to 1e-4 of the largest value
+    in float32, or NaN if the solve did not converge.
     """
 
     cloud: PointCloud
@@ -140,7 +141,7 @@ class ConjugateGradientSolver(Solver):
     @property
     def factor(self) -> CholeskyFactor:
         raise InputError(
-            f"the factor of more than {MOST_FACTORISED} points is not made, and covariances and likelihoods need it: "
+            f"covariances and likelihoods need a factorisation, which is done for at most {MOST_FACTORISED} points: "
             "keep fewer points"
         )
 
@@ -159,7 +160,7 @@ class ConjugateGradientSolver(Solver):
         return shared_map(solved, blocks, transform, mode_variance(self.spectrum), self.noise, self.cloud.mask[:, None])
 
     def explained_variance(self, x: Float[Array, "n 3"]) -> Float[Array, " n"]:
-        """As `Solver` says, by a solve for each point."""
+        """Reduction of Var f(x) by the data. It takes one solve per point."""
 
         def at_point(point):
             cross = function_normal_covariance(point[None], self.cloud.points, self.spectrum)[:, 0].T
@@ -170,20 +171,23 @@ class ConjugateGradientSolver(Solver):
 
 
 def solver_of(cloud: PointCloud, spectrum: Spectra, noise: Scalar) -> Solver:
-    """The solver of a cloud: dense up to a capacity of `MOST_FACTORISED`, by conjugate gradients beyond."""
+    """The solver of a cloud: dense up to a capacity of `MOST_FACTORISED`, conjugate gradients above."""
     if cloud.capacity > MOST_FACTORISED:
         return ConjugateGradientSolver(cloud, spectrum, noise)
     return DenseSolver.of(cloud, spectrum, noise)
 
 
 def points_at_once(count: int, capacity: int) -> int:
-    """How many of `count` points to whiten together, to bound the memory."""
+    """Number of points, out of `count`, to whiten together so that memory stays bounded."""
     return max(1, min(count, _CHUNK_VALUES // capacity))
 
 
 def _on_filled_rows(cloud: PointCloud, leading: Callable[[int], Float[Array, "*of"]]) -> Float[Array, "*of"]:
-    """`leading(size)` for a share of the rows, the leading ones, that holds all that are filled: so the time follows
-    them while the shapes stay fixed. Each share is compiled, which few rows are not worth."""
+    """Call `leading(size)` with the smallest of a few sizes for which the leading rows include all filled rows.
+
+    So the time follows the number of filled rows, while shapes stay fixed. A small cloud uses its capacity, because
+    each size is compiled separately.
+    """
     capacity = cloud.capacity
     if capacity <= _ALWAYS_WHOLE:
         return leading(capacity)
@@ -195,6 +199,6 @@ def _on_filled_rows(cloud: PointCloud, leading: Callable[[int], Float[Array, "*o
 
 
 def _of_columns(function: Callable[[Array], Array], blocks: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
-    """A function of columns applied to those of all blocks together."""
+    """Apply a function of columns to the columns of all blocks at once."""
     columns = jnp.moveaxis(blocks, 0, 1)
     return jnp.moveaxis(function(columns.reshape(len(columns), -1)).reshape(columns.shape), 1, 0)

@@ -1,11 +1,11 @@
 """Band-limited functions on the torus of period 2 pi, in a real tensor basis.
 
 The basis on the circle is phi_a(x) = cos(a x) for a = 0, ..., L and phi_a(x) = sin(-a x) for a = -L, ..., -1. The
-products phi_a(x1) phi_b(x2) phi_c(x3) are as many real functions as the Hermitian half of the paper's exponentials has
-real and imaginary parts, and they span the same space; but evaluation is a chain of real matrix products, and the
-derivative of a function with coefficients C_a has the coefficients a C_{-a}.
+products phi_a(x1) phi_b(x2) phi_c(x3) span the same space as the paper's exponentials. There are as many of them as the
+Hermitian half of the exponentials has real and imaginary parts. In this basis evaluation is a chain of real matrix
+products, and the derivative of a function with coefficients C_a has the coefficients a C_{-a}.
 
-All products ask for full float32 precision, which some GPUs would otherwise trade for speed.
+All products request full float32 precision, which some GPUs would otherwise trade for speed.
 """
 
 import math
@@ -31,7 +31,7 @@ def circle_basis(x: Float[Array, "*n"], truncation: int) -> Float[Array, "*n a"]
 
 
 def basis_variance(spectrum: Float[Array, "l_plus_1"]) -> Float[Array, " a"]:
-    """Variances of the coefficients of phi_a under which the kernel on the circle is sum_n s1(n) cos(n t), n in Z."""
+    """Variances of the coefficients of phi_a for the kernel sum_n s1(n) cos(n t), n in Z, on the circle."""
     positive = 2.0 * spectrum[1:]
     return jnp.concatenate([positive[::-1], spectrum[:1], positive])
 
@@ -42,13 +42,13 @@ def differentiate(coefficients: Float[Array, "*s a a a"], axis: int) -> Float[Ar
 
 
 def solve_poisson(vector_field: Float[Array, "*s 3 a a a"]) -> Float[Array, "*s a a a"]:
-    """Coefficients of the f of mean zero with Laplacian f = div v: f_hat(n) = -i n . v_hat(n) / |n|^2."""
+    """Coefficients of the zero-mean f with Laplacian f = div v: f_hat(n) = -i n . v_hat(n) / |n|^2."""
     x, y, z = (differentiate(vector_field[..., axis, :, :, :], axis) for axis in range(3))
     return inverse_laplacian(x + y + z)
 
 
 def inverse_laplacian(function: Float[Array, "*s a a a"]) -> Float[Array, "*s a a a"]:
-    """Coefficients of the f of mean zero whose Laplacian is the function less its mean: -g_hat(n) / |n|^2."""
+    """Coefficients of the zero-mean f whose Laplacian is g minus its mean: f_hat(n) = -g_hat(n) / |n|^2."""
     a, b, c = (_frequency(function, axis) for axis in range(3))
     squared = a**2 + b**2 + c**2
     return -function / jnp.where(squared == 0, jnp.inf, squared)
@@ -64,7 +64,7 @@ def _frequency(coefficients: Float[Array, "*s a a a"], axis: int) -> Float[Array
 def evaluate_on_grid(
     coefficients: Float[Array, "*s a a a"], basis: Float[Array, "g a"] | Float[np.ndarray, "g a"]
 ) -> Float[Array, "*s g g g"]:
-    """Values on a tensor grid, given the basis at the nodes of its axis: three matrix products a function."""
+    """Values on a tensor grid, given the basis at its axis' nodes: three matrix products per function."""
     values = jnp.einsum("...abc,kc->...abk", coefficients, basis, precision="highest")
     values = jnp.einsum("...abk,jb->...ajk", values, basis, precision="highest")
     return jnp.einsum("...ajk,ia->...ijk", values, basis, precision="highest")
@@ -73,14 +73,17 @@ def evaluate_on_grid(
 class TrigonometricFields(Fields):
     """Band-limited functions, exact everywhere on the torus.
 
-    - `coefficients`: of phi_a(x1) phi_b(x2) phi_c(x3), one block a function.
+    - `coefficients`: coefficients of phi_a(x1) phi_b(x2) phi_c(x3), one block per function.
     """
 
     coefficients: Float[Array, "s a a a"]
 
     @on_torus
     def __call__(self, x: Float[AnyArray, "n 3"]) -> Float[Array, "s n"]:
-        """All functions at the points x (scene coordinates): one matrix product over the first axis of frequencies."""
+        """Values of all functions at the points x (scene coordinates).
+
+        The sum over the first axis of frequencies is one matrix product.
+        """
         x = jnp.asarray(x, dtype=self.coefficients.dtype)
         samples, modes = self.coefficients.shape[0], self.coefficients.shape[-1]
 
@@ -99,7 +102,7 @@ class TrigonometricFields(Fields):
 
     @on_grid_of_torus
     def on_grid(self, axis: Float[AnyArray, " g"]) -> Float[Array, "s g g g"]:
-        """All functions on the tensor grid axis x axis x axis, one after the other to bound the memory."""
+        """Values on the tensor grid axis x axis x axis, one function at a time to bound the memory."""
         basis = circle_basis(jnp.asarray(axis, dtype=self.coefficients.dtype), self.coefficients.shape[-1] // 2)
         return shared_map(evaluate_on_grid, self.coefficients, basis)
 
@@ -107,10 +110,10 @@ class TrigonometricFields(Fields):
 class NonuniformTransform(eqx.Module):
     """Fast transforms between coefficients up to frequency L and values at given points of the scene.
 
-    A function is evaluated on a tensor grid that covers the scene, twice as fine as its highest frequency asks for, and
-    interpolated from there with a Kaiser-Bessel window whose effect on each frequency is divided out first. The error
-    is of the order of the rounding (some 1e-6 in float32, 1e-12 in float64). The adjoint is the transpose. (Dutt and
-    Rokhlin 1993; Barnett, Magland and af Klinteberg 2019 on windows.)
+    A function is evaluated on a tensor grid that covers the scene, twice as fine as its highest frequency needs. Values
+    are interpolated from there with a Kaiser-Bessel window, whose effect on each frequency is divided out first (Dutt
+    and Rokhlin 1993; Barnett, Magland and af Klinteberg 2019 on windows). The error is near rounding error, some 1e-6
+    in float32 and 1e-12 in float64. The adjoint is the transpose.
 
     - `start`: first node of each point's window, per axis.
     - `weights`: the window's values at its nodes, per axis.
@@ -122,15 +125,15 @@ class NonuniformTransform(eqx.Module):
 
     def __init__(self, points: Float[Array, "n 3"], truncation: int):
         window, beta, step = _window(truncation, points.dtype)
-        # XLA may compute `first` once for `start` and again for `weights`. A multiplication followed by a subtraction
-        # may be rounded differently there, and the two would be a node apart: only ceil follows the multiplication.
+        # XLA may compute `first` once for `start` and again for `weights`. It may round a multiplication followed by a
+        # subtraction differently each time, and the two would be a node apart. So only ceil follows the multiplication.
         position = (points + HALF_WIDTH) * (1.0 / step)
         first = jnp.ceil(position) - window // 2
         offset = position[..., None] - first[..., None] - jnp.arange(window)
         radicand = jnp.maximum(1.0 - (2.0 * offset / window) ** 2, jnp.finfo(points.dtype).eps ** 2)
         self.start = (first + window // 2).astype(jnp.int32)
         weights = jnp.i0(beta * jnp.sqrt(radicand)) / float(i0(beta))
-        # A slice that starts beyond its array is clamped, and would be of other nodes.
+        # JAX clamps a slice that starts beyond its array, so it would contain other nodes.
         in_grid = (self.start >= 0) & (self.start <= 2 * truncation + 1)
         self.weights = jnp.where(in_grid[..., None], weights, jnp.nan)
         self.truncation = truncation
@@ -152,7 +155,7 @@ class NonuniformTransform(eqx.Module):
 
         if not on_cpu():
             return jax.vmap(at_point)(self.start, self.weights)
-        # As many points at once as leave their windows in the cache.
+        # The windows of this many points fit in the processor's cache.
         return jax.lax.map(lambda point: at_point(*point), (self.start, self.weights), batch_size=128)
 
     def _spread(self, values: Float[Array, "n k"], nodes: int) -> Float[Array, "nodes nodes nodes k"]:
@@ -166,7 +169,7 @@ class NonuniformTransform(eqx.Module):
             block = x[:, None, None, None] * y[:, None, None] * z[:, None] * values[row]
             return jax.lax.dynamic_update_slice(grid, self._window_of(grid, start) + block, (*start, jnp.int32(0)))
 
-        # On a CPU point by point, six times as fast as XLA's scatter.
+        # On a CPU a loop over points is six times as fast as XLA's scatter.
         return jax.lax.fori_loop(0, len(values), add, grid)
 
     def _window_of(self, grid: Float[Array, "g g g k"], start: Int[Array, "3"]) -> Float[Array, "w w w k"]:
@@ -174,7 +177,7 @@ class NonuniformTransform(eqx.Module):
         return jax.lax.dynamic_slice(grid, (*start, jnp.int32(0)), (window, window, window, grid.shape[-1]))
 
     def _node_basis(self, dtype) -> Float[Array, "g a"]:
-        """The basis at the grid's nodes, each frequency divided by the window's Fourier transform there."""
+        """The basis at the grid's nodes, with each frequency divided by the window's Fourier transform at it."""
         window, beta, step = _window(self.truncation, dtype)
         nodes = -HALF_WIDTH + step * (np.arange(2 * self.truncation + window + 1) - window // 2)
         frequency = np.abs(np.arange(-self.truncation, self.truncation + 1))
@@ -184,6 +187,6 @@ class NonuniformTransform(eqx.Module):
 
 
 def _window(truncation: int, dtype) -> tuple[int, float, float]:
-    """Nodes under the window, its shape parameter, and the grid's spacing: two nodes for each that L asks for."""
+    """Number of nodes under the window, its shape parameter, and the spacing of the grid."""
     nodes = 8 if dtype == jnp.float32 else 14
     return nodes, 0.75 * math.pi * nodes, HALF_WIDTH / truncation

@@ -81,9 +81,9 @@ def test_what_does_not_converge_is_refused(few, monkeypatch):
 
 def test_what_needs_the_factor_is_refused(few, monkeypatch):
     model = nbv.GeometricSPSR(**SETTINGS)
-    with pytest.raises(ValueError, match=r"more than 36 points is not made"):
+    with pytest.raises(ValueError, match=r"need a factorisation, which is done for at most 36 points"):
         model.condition(cloud(42)).log_marginal_likelihood()
-    with pytest.raises(ValueError, match=r"more than 36 points is not made"):
+    with pytest.raises(ValueError, match=r"need a factorisation, which is done for at most 36 points"):
         model.condition(cloud(42)).covariance(QUERIES, QUERIES)
     monkeypatch.setattr("jaxnbv.surfaces.screened.MOST_FACTORISED", 36)
     with pytest.raises(ValueError, match=r"room for 39 points.*36 at most: lower the planner's capacity"):

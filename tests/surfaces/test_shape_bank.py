@@ -111,5 +111,5 @@ def test_a_full_disk_costs_no_shape(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(mesh_shapes.np, "savez_compressed", refuse)
-    with pytest.warns(UserWarning, match="not kept for the next time .No space left"):
+    with pytest.warns(UserWarning, match="cannot be stored in the cache .No space left"):
         assert len(bank_of(ball(tmp_path / "ball.ply"), resolution=16)) == 1
