@@ -30,11 +30,13 @@ class EmptyPoints(NamedTuple):
 
 
 class Observations(eqx.Module):
-    """Everything observed so far, in scene coordinates. Immutable, with fixed shapes, so that nothing recompiles.
+    """Everything observed so far, in scene coordinates. Immutable.
+
+    Shapes are fixed, so that nothing recompiles.
 
     - `cloud`: D, the kept points.
     - `poses`: the poses of the views.
-    - `grid`: the grid of the next three; None if they are not kept.
+    - `grid`: the grid of `looks`, `empty_nodes` and `obstacle_nodes`; None if they are not kept.
     - `looks`: the measured surface, and how far each view saw.
     - `empty_nodes`: mask of the nodes that some scan showed to be empty.
     - `obstacle_nodes`: mask of the nodes inside known obstacles, where the object cannot be.
@@ -92,7 +94,7 @@ class Observations(eqx.Module):
     def add_view(
         self, pose: Pose, scan: PointCloud, camera: Camera, carving: Carving | None, obstacles: Obstacles | None
     ) -> "Observations":
-        """A copy with a view's pose, the surface that its scan measured, and the nodes that it shows to be empty.
+        """A copy with a view's pose, the surface that its scan measured, and the nodes that it saw empty.
 
         - `carving`: the margin around rays within which nodes count as empty; None leaves `empty_nodes` unchanged.
         - `obstacles`: solids that may hide the object; a ray shows nothing behind them.

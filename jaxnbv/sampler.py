@@ -66,7 +66,7 @@ class SurfaceSampler(eqx.Module):
     """A distribution over surfaces, and the settings for sampling it.
 
     - `model`: the prior over surfaces.
-    - `grid`: samples are evaluated and scanned on it; empty space is stored at its nodes.
+    - `grid`: the grid on which samples are evaluated and scanned, and empty space is stored.
     - `num_samples`: S, posterior samples per step.
     - `carving`: removes sampled surface in empty space and outside a volume. A model that can use empty space is also
       conditioned on it. None leaves samples as the model draws them from D, as in the paper.
@@ -127,9 +127,9 @@ class SurfaceSampler(eqx.Module):
 
     @own_settings()
     def with_bank(self, bank: ShapeBank, poses: ShapePoses) -> "SurfaceSampler":
-        """A copy whose prior is `KnownShapes`, a mixture over a bank. The present model is its "none of these".
+        """A copy whose prior is `KnownShapes`, a mixture over a bank.
 
-        Shapes are registered within the volume.
+        Shapes are registered within the volume. The present model is the mixture's "none of these".
 
         - `poses`: the possible placements of the shapes in the scene.
         """
