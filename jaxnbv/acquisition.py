@@ -20,6 +20,7 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud, concatenate, limit_capacity
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.observations import Observations, as_observations
+from jaxnbv.programs import program
 from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning import GridSurface, Surface, scan
 from jaxnbv.scanning.grid import samples_at_once
@@ -267,7 +268,7 @@ def _inputs(acquisition: Acquisition, seen: StepInputs | Observations | PointClo
     return acquisition.inputs(step)
 
 
-@eqx.filter_jit
+@program
 def _context_of(acquisition: Acquisition, inputs: StepInputs) -> Any:
     return acquisition.context(inputs)
 

@@ -14,6 +14,7 @@ from jaxnbv.geometry.cloud import PointCloud, check_single, concatenate, limit_c
 from jaxnbv.geometry.neighbours import distance_to_others, spacing
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.pose_list import PoseList
+from jaxnbv.programs import program
 from jaxnbv.scanning import Carving, Grid, Looks, Obstacles, barrier_of
 
 # A model uses 100 to 200 empty points, and the time to choose them grows with the number offered.
@@ -117,7 +118,7 @@ def as_observations(value: Observations | PointCloud) -> Observations:
     return Observations.start(value)
 
 
-@eqx.filter_jit
+@program
 def _joined(cloud: PointCloud, scan: PointCloud, empty: Bool[Array, "g g g"] | None, grid: Grid | None) -> PointCloud:
     joined = limit_capacity(concatenate(cloud, scan), cloud.capacity)
     return joined if empty is None or grid is None else joined.only(~_is_stray(joined, empty, grid))
@@ -137,7 +138,7 @@ def _is_stray(cloud: PointCloud, empty: Bool[Array, "g g g"], grid: Grid) -> Boo
     return jnp.zeros(cloud.capacity, bool).at[rows].set(is_alone, mode="drop")
 
 
-@eqx.filter_jit
+@program
 def _with_view(
     poses: PoseList,
     looks: Looks | None,

@@ -25,6 +25,7 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.volume import Box, Volume, bounding_box
 from jaxnbv.observations import Observations, as_observations
+from jaxnbv.programs import program
 from jaxnbv.scanning import Carving, Grid, GridSurface, TriangleMesh, carve
 from jaxnbv.scanning.grid import touched_cells
 from jaxnbv.scanning.mesh import held_pieces, level_triangles
@@ -294,7 +295,7 @@ class SurfaceSampler(eqx.Module):
         return observations if self.carving is not None else dataclasses.replace(observations, empty_nodes=None)
 
 
-@eqx.filter_jit
+@program
 def _sample(
     sampler: SurfaceSampler, observations: Observations, key: PRNGKeyArray, posterior: SurfacePosterior
 ) -> GridSurface:

@@ -13,6 +13,7 @@ ORDER = (
     "version",
     "errors",
     "compiled",
+    "programs",
     "progress",
     "checks",
     "sharding",

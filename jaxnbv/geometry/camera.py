@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from jaxnbv.checks import AnyArray, as_numbers, check_fields, checked, is_traced, require
 from jaxnbv.geometry.distortion import check_distortion
 from jaxnbv.geometry.pose import Pose
+from jaxnbv.programs import program
 
 _Places = TypeVar("_Places", Float[Array, "*n 2"], Float[np.ndarray, "*n 2"])
 # Skew below this fraction of fx counts as zero.
@@ -192,7 +193,7 @@ class Camera(eqx.Module):
         (fx, fy), (cx, cy) = self.focal_lengths, self.center
         return image * np.array([fx, fy], image.dtype) + np.array([cx * self.width, cy * self.height], image.dtype)
 
-    @eqx.filter_jit
+    @program
     def rays(self, pose: Pose) -> tuple[Float[Array, "*batch rays 3"], Float[Array, "*batch rays 3"]]:
         """Origins and unit directions of all rays in scene coordinates, for one pose or a batch."""
         directions = self.pixel_directions()

@@ -3,7 +3,6 @@
 import math
 import warnings
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +16,7 @@ from jaxnbv.geometry.plane_fit import fitted_planes
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.sentinels import sentinel_pixels
 from jaxnbv.geometry.volume import Box, ray_interval
+from jaxnbv.programs import program
 
 Rows = tuple[Float[Array, "n 3"], Float[Array, "n 3"], Bool[Array, " n"], Bool[Array, " n"], Float[Array, " n"]]
 # Depths that differ from the box's by more than this factor are in other units.
@@ -70,7 +70,7 @@ def points_of_depth(
     return points, normals, mask, missed, sight
 
 
-@eqx.filter_jit
+@program
 def _oriented(
     depth: Float[Array, "h w"],
     missed: Bool[Array, "h w"],

@@ -6,12 +6,12 @@ With (x, y) = (X / Z, Y / Z) and r^2 = x^2 + y^2 a point appears at
     g = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)
 """
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxnbv.checks import AnyArray, as_numbers, require
+from jaxnbv.programs import program
 
 _SHAPES = ((4,), (5,), (8,))
 # Neighbouring depths are not averaged if their relative difference exceeds both _ALIKE and _STEEPEST / focal length.
@@ -77,7 +77,7 @@ def check_distortion(coefficients: tuple[float, ...], radius: float) -> None:
     )
 
 
-@eqx.filter_jit
+@program
 def undistorted(
     depth: Float[Array, "h w"],
     missed: Bool[Array, "h w"],

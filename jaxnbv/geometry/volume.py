@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from jaxnbv.checks import AnyArray, InputError, require, shown, takes_native
 from jaxnbv.geometry.pose import fibonacci_sphere
+from jaxnbv.programs import program
 
 Volume = Callable[[Float[Array, "n 3"]], Float[Array, " n"]]
 """A function of points (scene coordinates): negative inside the volume, positive outside. Its magnitude is at most the
@@ -76,7 +77,7 @@ class Box(eqx.Module):
         return cls((-0.5 * side,) * 3, (0.5 * side,) * 3)
 
     @takes_native
-    @eqx.filter_jit
+    @program
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         """The exact signed distance at the points x."""
         x = jnp.asarray(x)
@@ -107,7 +108,7 @@ def ray_interval(
     return enter, leave
 
 
-@eqx.filter_jit
+@program
 def boundary_points(volume: Volume, count: int, beyond: float = 0.0) -> Float[Array, "count 3"]:
     """Points where `count` evenly spread rays from the origin cross the volume's boundary.
 

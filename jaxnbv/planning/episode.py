@@ -19,12 +19,13 @@ from jaxnbv.geometry.pose import Pose
 from jaxnbv.observations import Observations
 from jaxnbv.planning.loop import View
 from jaxnbv.planning.planner import Planner
+from jaxnbv.programs import program
 from jaxnbv.scanning import Noise, Surface
 from jaxnbv.search import Proposal
 from jaxnbv.storage import RunFolder
 
 
-@eqx.filter_jit
+@program
 def _score(acquisition: Acquisition, context: Any, view: ImaginedView) -> Float[Array, ""]:
     return acquisition.score(context, view)
 

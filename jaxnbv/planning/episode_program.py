@@ -16,6 +16,7 @@ from jaxnbv.planning.loop import view_keys
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.program_parts import in_parts
 from jaxnbv.planning.simulate import observe_scene
+from jaxnbv.programs import program
 from jaxnbv.scanning import Noise, Surface
 from jaxnbv.sharding import batched_map, shared
 from jaxnbv.surfaces.part_hypotheses import hypotheses_of
@@ -38,7 +39,7 @@ def answers_by_parts(planner: Planner) -> bool:
     return type(planner.acquisition).answer is Acquisition.answer and planner.sampler.model.carries_hypotheses
 
 
-@eqx.filter_jit
+@program
 def run(
     planner: Planner,
     noise: Noise,

@@ -12,10 +12,11 @@ from typing import NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
+import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from jaxnbv.acquisition import Acquisition
-from jaxnbv.checks import InputError, own_settings
+from jaxnbv.checks import AnyArray, InputError, own_settings
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
@@ -24,6 +25,7 @@ from jaxnbv.geometry.pose_list import PoseList
 from jaxnbv.observations import Observations
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.stopping import StopContext, StopRule, checked_reason
+from jaxnbv.programs import program
 from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning import GridSurface
 from jaxnbv.scanning.sdf import SignedDistance
@@ -298,6 +300,11 @@ class Loop:
 
 def view_keys(key: PRNGKeyArray, index: int | Int[Array, ""]) -> tuple[PRNGKeyArray, PRNGKeyArray, PRNGKeyArray]:
     """Keys for view `index` (from 0) of an episode: for posterior samples, search and sensor noise."""
+    return _view_keys(key, index if isinstance(index, Array) else np.uint32(index))
+
+
+@program
+def _view_keys(key: PRNGKeyArray, index: Int[AnyArray, ""]) -> tuple[PRNGKeyArray, PRNGKeyArray, PRNGKeyArray]:
     step_key, noise_key = jax.random.split(jax.random.fold_in(key, index))
     sample_key, search_key = jax.random.split(step_key)
     return sample_key, search_key, noise_key

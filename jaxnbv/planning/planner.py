@@ -1,6 +1,7 @@
 """The planner: proposes the next view and observes its scan, for simulations and real sensors."""
 
 import dataclasses
+import math
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -27,6 +28,7 @@ from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.pose_list import PoseList
 from jaxnbv.observations import Observations
 from jaxnbv.planning.travel import ValuePerCost, total_cost
+from jaxnbv.programs import program
 from jaxnbv.sampler import StepInputs, SurfaceSampler
 from jaxnbv.scanning import Grid, GridSurface, Obstacles, barrier_of, mean_depth, scan_samples
 from jaxnbv.scanning.scanner import far_from_scene
@@ -236,7 +238,7 @@ class Planner(eqx.Module):
 
     @own_settings()
     @jax.debug_nans(False)
-    @eqx.filter_jit
+    @program
     def values_at(self, inputs: StepInputs, poses: Pose) -> Float[Array, " poses"]:
         """Values that the search maximises, with the cost of going there, at poses (n,) of the scene.
 
@@ -246,7 +248,7 @@ class Planner(eqx.Module):
 
     @own_settings()
     @jax.debug_nans(False)
-    @eqx.filter_jit
+    @program
     def expected_depth(self, surfaces: GridSurface, pose: Pose) -> Float[Array, "h w"]:
         """Expected depth image from a pose, in scene units: `mean_depth` over the samples."""
         scans = scan_samples(surfaces, self.camera, pose[None], barrier_of(self.obstacles, self.camera, pose[None]))
@@ -282,7 +284,7 @@ class Planner(eqx.Module):
                 self.sampler.carving.check_inside(scan, self.sampler.grid)
 
 
-@eqx.filter_jit
+@program
 def _propose(search: Search, problem: Problem, key: PRNGKeyArray) -> Proposal:
     return search.propose(problem, key)
 
@@ -295,9 +297,9 @@ def _checked_proposal(planner: Planner, problem: Problem, proposal: Proposal) ->
     """
     if is_traced(proposal):
         return proposal
-    value, search = proposal.value, planner.search
-    is_number = not bool(jnp.isnan(value))
-    if not is_number or (search.uses_samples and bool(value == jnp.inf)):
+    value, search = float(proposal.value), planner.search
+    is_number = not math.isnan(value)
+    if not is_number or (search.uses_samples and value == math.inf):
         _check_parts(planner, problem, proposal)
         kind = f"acquisition {type(problem.acquisition).__name__}" if search.uses_samples else type(search).__name__
         raise InputError(
@@ -305,7 +307,7 @@ def _checked_proposal(planner: Planner, problem: Problem, proposal: Proposal) ->
             "finite for every scan, also for one that sees nothing; a gradient search needs finite derivatives too"
         )
     require(
-        bool(value > -jnp.inf),
+        value > -math.inf,
         f"all {proposal.values.shape[0]} candidates have been visited, or no camera may stand there: give the search "
         "more candidates",
     )

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 
-import equinox as eqx
 import trimesh
 from jaxtyping import Array, Float, PRNGKeyArray
 
@@ -18,6 +17,7 @@ from jaxnbv.planning.episode import Episode, read_views
 from jaxnbv.planning.loop import STAGES, Loop, Step
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.stopping import StopRule
+from jaxnbv.programs import program
 from jaxnbv.progress import progress_bar
 from jaxnbv.scanning import Noise, Obstacles, SensorNoise, Surface, as_surface, barrier_of, scan
 from jaxnbv.scanning.sdf import SignedDistance
@@ -120,4 +120,4 @@ def _noisy_scan(
     return noise(scan(scene, camera, pose, barrier), key, camera, pose)
 
 
-_noisy_scan_in_jit, _barrier = eqx.filter_jit(_noisy_scan), eqx.filter_jit(barrier_of)
+_noisy_scan_in_jit, _barrier = program(_noisy_scan), program(barrier_of)

@@ -19,6 +19,7 @@ from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.tensor_grid import on_tensor_grid
 from jaxnbv.geometry.volume import Box, Volume
+from jaxnbv.programs import program
 from jaxnbv.scanning.grid import Grid
 
 # Share of points that may lie outside the volume. Noise moves fewer points of a face two voxels out of the volume.
@@ -78,7 +79,7 @@ class Carving(eqx.Module):
         depth = jnp.where(scan.mask, along, jnp.where(scan.missed, limit, 0.0)).reshape(camera.height, camera.width)
         return _crossed(grid, depth, camera, pose, self.margin_voxels * grid.spacing)
 
-    @eqx.filter_jit
+    @program
     def outside(self, grid: Grid) -> Bool[Array, "g g g"]:
         """Whether each node is more than two margins outside the volume."""
         axis = jnp.asarray(grid.axis, jnp.result_type(float))
@@ -94,7 +95,7 @@ class Carving(eqx.Module):
     def _beyond_volume(self, grid: Grid) -> float:
         return 2.0 * self.margin_voxels * grid.spacing
 
-    @eqx.filter_jit
+    @program
     def inside(self, grid: Grid) -> Bool[Array, "g g g"]:
         """Whether each node is inside the volume."""
         return on_tensor_grid(self.volume, jnp.asarray(grid.axis, jnp.result_type(float))) < 0
@@ -132,7 +133,7 @@ def carve(values: Float[Array, "*s g g g"], empty: Bool[Array, "g g g"]) -> Floa
     return jnp.where(empty, 2.0 * magnitude, values)
 
 
-@eqx.filter_jit
+@program
 def _beyond(volume: Volume, cloud: PointCloud, limit: float) -> tuple[Int[Array, ""], Float[Array, ""]]:
     """The number of points farther than the limit outside the volume, and the distance of the farthest point."""
     # All rows, so that clouds with different counts share a compilation.

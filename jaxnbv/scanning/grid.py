@@ -15,6 +15,7 @@ from jaxnbv.checks import AnyArray, as_floats, check_fields, is_traced, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
+from jaxnbv.programs import program
 from jaxnbv.scanning import tracing
 from jaxnbv.scanning.scanner import Hits, Surface, scan
 from jaxnbv.sharding import on_cpu, shared_map
@@ -114,7 +115,7 @@ class GridSurface(Surface):
         """The surface without the parts in these cells: rays that hit them miss."""
         return dataclasses.replace(self, is_void=cells if self.is_void is None else self.is_void | cells)
 
-    @eqx.filter_jit
+    @program
     def trace(self, origins: Float[AnyArray, "rays 3"], directions: Float[AnyArray, "rays 3"]) -> Hits:
         """First zeros along the rays inside the box; see `Surface.trace`.
 
@@ -149,7 +150,7 @@ class GridSurface(Surface):
         return Hits(jnp.stack(hits, axis=-1), jnp.stack([n * scale for n in normals], axis=-1), mask)
 
 
-@eqx.filter_jit
+@program
 def scan_samples(
     surfaces: GridSurface, camera: Camera, poses: Pose, barrier: Float[Array, "poses rays"] | None = None
 ) -> PointCloud:
@@ -166,7 +167,7 @@ def samples_at_once(camera: Camera, poses: Pose) -> int:
 
 
 @jax.debug_nans(False)
-@eqx.filter_jit
+@program
 def mean_depth(scans: PointCloud, pose: Pose) -> Float[Array, " rays"]:
     """Mean depth along the camera's axis over the samples that a ray hits (scene units); NaN if most miss.
 

@@ -19,6 +19,7 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.pose_list import PoseList
+from jaxnbv.programs import program
 from jaxnbv.scanning.grid import Grid, GridSurface
 from jaxnbv.scanning.scanner import Surface, pixel_area, scan
 from jaxnbv.sharding import shared_map
@@ -57,7 +58,7 @@ class Looks(eqx.Module):
         """The largest value of `distance`, in scene units."""
         return _REACH * self.grid.spacing
 
-    @eqx.filter_jit
+    @program
     def with_points(self, cloud: PointCloud, radii: Float[Array, " n"] | float = 0.0) -> "Looks":
         """A copy with the points of a cloud added as hits.
 
@@ -108,7 +109,7 @@ class Looks(eqx.Module):
         places = list(jnp.moveaxis((x + self.grid.half_extent) / self.grid.spacing, -1, 0))
         return jax.scipy.ndimage.map_coordinates(self.distance, places, order=1, mode="nearest")
 
-    @eqx.filter_jit
+    @program
     def measurable(self, surfaces: GridSurface, poses: PoseList) -> GridSurface:
         """The sampled surfaces without the cells that a view should have measured and did not.
 

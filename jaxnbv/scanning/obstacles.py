@@ -16,6 +16,7 @@ from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.neighbours import nearest_squared_distance
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.tensor_grid import on_tensor_grid
+from jaxnbv.programs import program
 from jaxnbv.scanning.grid import Grid
 from jaxnbv.scanning.sdf import Rotated, SignedDistance
 from jaxnbv.scanning.sphere_tracing import SDFSurface
@@ -86,13 +87,14 @@ class Obstacles(eqx.Module):
         distance = jnp.linalg.norm(hits.points - origins.reshape(-1, 3), axis=-1)
         return jnp.where(hits.mask, distance, jnp.inf).reshape(origins.shape[:-1])
 
+    @program
     def remove_points(self, scan: PointCloud) -> PointCloud:
         """The scan without the points that belong to solids. In a sensor's image their rays become missed."""
         own = scan.mask & (self.distance(scan.points) < self.margin)
         missed = None if scan.missed is None else scan.missed | own
         return dataclasses.replace(scan.only(~own), missed=missed)
 
-    @eqx.filter_jit
+    @program
     def within(self, grid: Grid) -> Bool[Array, "g g g"]:
         """Whether each node of a grid lies inside a solid."""
         axis = jnp.asarray(grid.axis, jnp.result_type(float))

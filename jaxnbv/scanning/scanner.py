@@ -18,6 +18,7 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
+from jaxnbv.programs import program
 
 # In scene units: forty times the longest side of an object.
 _FAR_OFF = 100.0
@@ -227,7 +228,7 @@ def scan(
     return cloud
 
 
-@eqx.filter_jit
+@program
 def _returns(
     hits: Hits,
     origins: Float[Array, "*batch rays 3"],

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnbv.checks import AnyArray, check_fields, require
+from jaxnbv.programs import program
 from jaxnbv.scanning.scanner import Hits, Surface, implicit_depth
 from jaxnbv.scanning.sdf import SignedDistance
 
@@ -60,7 +61,7 @@ class SDFSurface(Surface):
     def part_labels(self, points: Float[Array, "n 3"]) -> Int[Array, " n"] | None:
         return self.sdf.part_labels(points)
 
-    @eqx.filter_jit
+    @program
     def trace(self, origins: Float[AnyArray, "rays 3"], directions: Float[AnyArray, "rays 3"]) -> Hits:
         origins, directions = jnp.asarray(origins), jnp.asarray(directions)
         along = _Along(self.sdf, origins, directions)

@@ -3,13 +3,13 @@
 import math
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
+from jaxnbv.programs import program
 from jaxnbv.scanning import tracing
 from jaxnbv.scanning.grid import GridSurface
 from jaxnbv.scanning.metrics import GRAZING
@@ -31,7 +31,7 @@ class SurfacePoints(NamedTuple):
     areas: Float[Array, " n"]
 
 
-@eqx.filter_jit
+@program
 def spread_points(surface: GridSurface, count: int) -> SurfacePoints:
     """Points where edges of the grid cross a surface, evenly spread over these edges.
 

@@ -25,6 +25,7 @@ from jaxnbv.geometry.pose import Pose
 from jaxnbv.planning.loop import Sensor, Step
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.simulate import observe_scene
+from jaxnbv.programs import program
 from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning import SensorNoise
 from jaxnbv.scanning.sdf import SignedDistance
@@ -259,6 +260,6 @@ class IdentificationStudy(Study):
         return Tiles(caption, tile, lambda axes: axes.imshow(still_of(true, eye, pixels).image), scale=scale)
 
 
-@eqx.filter_jit
+@program
 def _distances(placement: Placement, solid: SignedDistance, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
     return placement.distance(solid, points)

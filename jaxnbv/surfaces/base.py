@@ -17,6 +17,7 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.tensor_grid import on_tensor_grid
 from jaxnbv.observations import Observations
+from jaxnbv.programs import program
 
 HALF_WIDTH = 0.5 * math.pi
 """Scattered points must lie in [-HALF_WIDTH, HALF_WIDTH]^3, the cube that the paper scales a scene into."""
@@ -135,7 +136,7 @@ class SurfacePosterior(eqx.Module):
         return jnp.mean(self._kept()(x) < self.level, axis=0)
 
     @on_grid_of_torus
-    @eqx.filter_jit
+    @program
     def mean_on_grid(self, axis: Float[AnyArray, " g"]) -> Float[Array, "g g g"]:
         """E f on the tensor grid axis x axis x axis (scene coordinates)."""
         if self.has_closed_forms:

@@ -9,13 +9,13 @@ Symbols are those of `jaxnbv.surfaces.spsr`.
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxnbv.checks import AnyArray
 from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.programs import program
 from jaxnbv.sharding import shared_map
 from jaxnbv.surfaces.base import on_torus
 from jaxnbv.surfaces.covariance import (
@@ -68,14 +68,14 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
         return self.spectrum.shape[-1] - 1
 
     @on_torus
-    @eqx.filter_jit
+    @program
     def variance(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
         """Var f(x) at points in scene coordinates: the prior variance minus the part that the data explain."""
         x = jnp.asarray(x, dtype=self.weights.dtype)
         return jnp.maximum(function_variance(self.spectrum) - self.solver.explained_variance(x), 0.0)
 
     @on_torus
-    @eqx.filter_jit
+    @program
     def covariance(self, x: Float[AnyArray, "n 3"], y: Float[AnyArray, "m 3"]) -> Float[Array, "n m"]:
         """Cov(f(x), f(y)) between points in scene coordinates, in one batch."""
         x, y = (jnp.asarray(points, dtype=self.weights.dtype) for points in (x, y))
@@ -147,7 +147,7 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
         return shared_map(update, (coefficients, weights), transform, self.spectrum)
 
 
-@eqx.filter_jit
+@program
 def given_normals(cloud: PointCloud, spectrum: Spectra, noise: Scalar) -> GeometricSPSRPosterior:
     """The posterior p(f | D), with a solver that suits the cloud's capacity."""
     # The contents of unfilled rows, which may be NaN, must not reach the products.
@@ -176,7 +176,7 @@ def mean_at_data(
     return jnp.sum(jnp.where(cloud.mask, at_data, 0.0)) / jnp.sum(cloud.mask)
 
 
-@eqx.filter_jit
+@program
 def _level_slope(posterior: GeometricSPSRPosterior) -> Float[Array, "n 3"]:
     """Derivative of the level with respect to n: A^-1 times the derivative with respect to A^-1 n."""
     cloud, spectrum = posterior.cloud, posterior.spectrum

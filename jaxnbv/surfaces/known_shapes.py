@@ -25,6 +25,7 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.volume import Box
 from jaxnbv.observations import Observations, as_observations
+from jaxnbv.programs import program
 from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.sharding import shared_map
 from jaxnbv.surfaces.base import Fields, SurfaceModel, SurfacePosterior, sampling_method
@@ -127,7 +128,7 @@ class KnownShapes(SurfaceModel):
         )
 
 
-@eqx.filter_jit
+@program
 def _weights(fits: Hypotheses, inverse_temperature: float, misfit_of_none: float) -> Float[Array, " h_and_none"]:
     misfit = jnp.append(fits.misfit, misfit_of_none)
     return jax.nn.softmax(-inverse_temperature * misfit, where=jnp.append(fits.is_mode, True))
@@ -200,7 +201,7 @@ class KnownShapesPosterior(SurfacePosterior):
         return _sample(self, key, num_samples)
 
 
-@eqx.filter_jit
+@program
 def _sample(posterior: KnownShapesPosterior, key: PRNGKeyArray, num_samples: int) -> "MixtureFields":
     _, residual_key, unknown_key = jax.random.split(key, 3)
     fits, bank = posterior.found, posterior.model.bank
@@ -220,7 +221,7 @@ def _sample(posterior: KnownShapesPosterior, key: PRNGKeyArray, num_samples: int
     return MixtureFields(about_shapes, unknown, posterior.unknown.level, is_none)
 
 
-@eqx.filter_jit
+@program
 def _drawn(posterior: KnownShapesPosterior, key: PRNGKeyArray, num_samples: int) -> Int[Array, " s"]:
     """Index of each sample's hypothesis; the last index is "none of these"."""
     shape_key, order_key = jax.random.split(jax.random.split(key, 3)[0])

@@ -21,7 +21,6 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,6 +29,7 @@ from jaxtyping import Array, Bool, Float
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.volume import Box, ray_interval
 from jaxnbv.observations import Observations
+from jaxnbv.programs import program
 from jaxnbv.scanning import Grid
 from jaxnbv.surfaces.registration import Hypotheses
 from jaxnbv.surfaces.shape_bank import ShapeBank
@@ -73,7 +73,7 @@ class Rays(NamedTuple):
     tau: Float[Array, ""]
 
     @classmethod
-    @eqx.filter_jit
+    @program
     def of(cls, observations: Observations, box: Box) -> "Rays | None":
         """The rays that enter a box; None if the observations keep no looks."""
         looks, poses = observations.looks, observations.poses
@@ -134,7 +134,7 @@ def _noise_of(
     return jnp.nan_to_num(_BY_QUARTILE / math.sqrt(20.0) * quartile)
 
 
-@eqx.filter_jit
+@program
 def evidence(bank: ShapeBank, hypotheses: Hypotheses, rays: Rays) -> tuple[Float[Array, " h"], Float[Array, ""]]:
     """L of each hypothesis, and L_0 of "none of these"."""
     points = rays.origins + jnp.where(rays.is_object, rays.sight, 0.0)[:, None] * rays.directions

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.volume import Box
 from jaxnbv.observations import Observations
+from jaxnbv.programs import program
 from jaxnbv.scanning import Grid, GridSurface
 from jaxnbv.surfaces.part_evidence import LEAST_TAU, Rays, evidence
 from jaxnbv.surfaces.part_search import nothing_before, search_parts
@@ -96,7 +97,7 @@ def identify(
     return _weighted(bank, search_parts(bank, poses, box, seen, rays, previous, _NUM_STARTS), rays)
 
 
-@eqx.filter_jit
+@program
 def _weighted(bank: ShapeBank, placed: Hypotheses, rays: Rays | None) -> PartHypotheses:
     if rays is None:
         misfit, misfit_of_none = _NUM_RAYS * placed.misfit, jnp.asarray(_NUM_RAYS * _NONE_MISFIT)
@@ -111,7 +112,7 @@ def _weighted(bank: ShapeBank, placed: Hypotheses, rays: Rays | None) -> PartHyp
     return PartHypotheses(bank, placed, jnp.append(weights[:-1][order], weights[-1]), tau)
 
 
-@eqx.filter_jit
+@program
 def _on_grid(hypotheses: PartHypotheses, grid: Grid, count: int) -> GridSurface:
     first = jax.tree.map(lambda rows: rows[:count], hypotheses.placed)
     solids = hypotheses.bank.shape(first.shape).solid

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.observations import Observations
+from jaxnbv.programs import program
 from jaxnbv.surfaces.part_hypotheses import PartHypotheses
 from jaxnbv.surfaces.part_search import SAME
 from jaxnbv.surfaces.placement import Placement
@@ -76,7 +77,7 @@ def surface_error(hypotheses: PartHypotheses, observations: Observations) -> flo
     return float(np.sqrt(by_points + by_others))
 
 
-@eqx.filter_jit
+@program
 def distances_to(
     hypotheses: PartHypotheses, points: Float[Array, "p 3"]
 ) -> tuple[Float[Array, "h p"], Float[Array, "h p 3"]]:
@@ -110,7 +111,7 @@ def symmetries(shape: Shape) -> Float[np.ndarray, "n 3 3"]:
     return both[np.sort(first)]
 
 
-@eqx.filter_jit
+@program
 def _largest_change(shape: Shape, turns: Float[Array, "n 3 3"], probes: Float[Array, "p 3"]) -> Float[Array, " n"]:
     before = shape.solid(probes)
 

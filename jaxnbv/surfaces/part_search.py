@@ -9,13 +9,13 @@ part is also tried in the placements that its look-alikes reached. The time grow
 import dataclasses
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxnbv.geometry.volume import Box
+from jaxnbv.programs import program
 from jaxnbv.surfaces.part_evidence import Rays, evidence
 from jaxnbv.surfaces.placement import Placement, ShapePoses
 from jaxnbv.surfaces.registration import Hypotheses, Prior, Seen, first_of_each, judged, refined, tried, turned_alike
@@ -43,7 +43,7 @@ def nothing_before(dtype: Any) -> Hypotheses:
     return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (NUM_HYPOTHESES, *leaf.shape)), one)
 
 
-@eqx.filter_jit
+@program
 def search_parts(
     bank: ShapeBank, poses: ShapePoses, box: Box, seen: Seen, rays: Rays | None, before: Hypotheses, num_starts: int
 ) -> Hypotheses:

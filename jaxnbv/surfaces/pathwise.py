@@ -22,6 +22,7 @@ from jax.scipy.stats import norm
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from jaxnbv.checks import AnyArray, as_floats, check_key, checked, is_traced, require
+from jaxnbv.programs import program
 from jaxnbv.surfaces.base import Fields, SurfacePosterior, on_grid_of_torus, on_torus, sampling_method
 from jaxnbv.surfaces.trigonometric import TrigonometricFields
 
@@ -74,12 +75,12 @@ class TrigonometricPosterior(SurfacePosterior):
         return TrigonometricFields(self.mean_coefficients[None])
 
     @on_torus
-    @eqx.filter_jit
+    @program
     def mean(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
         return self.mean_field(x)[0]
 
     @on_grid_of_torus
-    @eqx.filter_jit
+    @program
     def mean_on_grid(self, axis: Float[AnyArray, " g"]) -> Float[Array, "g g g"]:
         return self.mean_field.on_grid(axis)[0]
 
@@ -87,7 +88,7 @@ class TrigonometricPosterior(SurfacePosterior):
     def variance(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]: ...
 
     @on_torus
-    @eqx.filter_jit
+    @program
     def probability_inside(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
         """P(f(x) < level) = Phi((level - E f(x)) / sqrt(Var f(x))) at points in scene coordinates.
 
@@ -188,7 +189,7 @@ def filled(points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Float[Array,
 # Samples about zero and about means run the same two programs, so that they are equal to the last digit.
 
 
-@eqx.filter_jit
+@program
 def _at_data(means: Fields, points: DataPoints) -> MeansAtData:
     dtype, count = points.gradients.dtype, len(points.values)
     values = means(points.values)
@@ -199,7 +200,7 @@ def _at_data(means: Fields, points: DataPoints) -> MeansAtData:
     return MeansAtData(means.gradient(points.gradients).astype(dtype), values.astype(dtype))
 
 
-@eqx.filter_jit
+@program
 def _sampled(
     posterior: TrigonometricPosterior, key: PRNGKeyArray, means: MeansAtData, scale: Float[Array, "*s"] | None
 ) -> Float[Array, "s a a a"]:

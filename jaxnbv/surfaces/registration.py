@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxnbv.geometry.cloud import farthest_point_subsample
 from jaxnbv.geometry.volume import Box
 from jaxnbv.observations import Observations
+from jaxnbv.programs import program
 from jaxnbv.surfaces.placement import Placement, ShapePoses
 from jaxnbv.surfaces.shape_bank import Shape, ShapeBank, values_and_gradients
 
@@ -152,7 +153,7 @@ class Prior(NamedTuple):
 _PRECISION = _PRIOR * np.array([0.0] * 3 + [_SHIFT**-2] * 3 + [_STRETCH**-2 / 3.0] * 3)
 
 
-@eqx.filter_jit
+@program
 def register(bank: ShapeBank, prior: Prior, seen: Seen, num_starts: int) -> Hypotheses:
     """The shapes and placements that fit the scan best.
 

@@ -24,6 +24,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from jaxnbv.checks import AnyArray, check_fields, is_traced, require, shown
 from jaxnbv.geometry.cloud import PointCloud, some_rows
 from jaxnbv.observations import Observations, as_observations
+from jaxnbv.programs import program
 from jaxnbv.sharding import shared_map
 from jaxnbv.surfaces.base import SurfaceModel, on_torus
 from jaxnbv.surfaces.covariance import function_covariance, function_variance, mode_variance
@@ -102,7 +103,7 @@ class ScreenedSPSR(SurfaceModel):
         return posterior
 
 
-@eqx.filter_jit
+@program
 def _condition(
     model: ScreenedSPSR, base: GeometricSPSRPosterior, observations: Observations
 ) -> "ScreenedSPSRPosterior":
@@ -173,7 +174,7 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
     weights: Float[Array, " m"]
 
     @on_torus
-    @eqx.filter_jit
+    @program
     def variance(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
         x = jnp.asarray(x, dtype=self.weights.dtype)
         spectrum = self.model.base.spectrum

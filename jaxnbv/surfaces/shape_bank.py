@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int, UInt8
 from jaxnbv.checks import InputError, check_type, checked, require, shown
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import fibonacci_sphere
+from jaxnbv.programs import program
 from jaxnbv.scanning.sdf import Scaled, SignedDistance
 from jaxnbv.surfaces.look_alikes import warn_of_look_alikes
 from jaxnbv.surfaces.mesh_shapes import listed, mesh_paths, shapes_of_meshes
@@ -227,7 +228,7 @@ def encoded(names: Sequence[str]) -> UInt8[Array, "k c"]:
     return jnp.asarray(np.frombuffer(b"".join(rows), np.uint8).reshape(-1, _LONGEST_NAME))
 
 
-@eqx.filter_jit
+@program
 def _extremes(solids: SignedDistance) -> Float[Array, "k p 3"]:
     """Points on each solid's surface: points of a large sphere around it, moved along the gradient."""
     start = fibonacci_sphere(NUM_EXTREMES, _FAR)

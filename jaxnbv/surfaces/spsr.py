@@ -26,6 +26,7 @@ from scipy.spatial import cKDTree
 from jaxnbv.checks import as_floats, check_type, is_traced, own_settings, require
 from jaxnbv.geometry.cloud import PointCloud, check_oriented
 from jaxnbv.observations import Observations, as_observations
+from jaxnbv.programs import program
 from jaxnbv.surfaces.base import HALF_WIDTH, SurfaceModel
 from jaxnbv.surfaces.covariance import Scalar, Spectra, circle_spectrum
 from jaxnbv.surfaces.given_normals import GeometricSPSRPosterior, given_normals
@@ -148,7 +149,7 @@ class GeometricSPSR(SurfaceModel):
         return posterior
 
 
-@eqx.filter_jit
+@program
 def _kept_variance(model: GeometricSPSR) -> Float[Array, ""]:
     kept = jnp.sum(jax.vmap(basis_variance)(jnp.atleast_2d(model.spectrum))[:, model.truncation :], axis=1)
     return jnp.sum(kept**3) / jnp.sum(model.variance**3)

@@ -13,6 +13,7 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.neighbours import DistanceField, nearest_squared_distance, spacing
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.pose_list import PoseList
+from jaxnbv.programs import program
 from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning import GridSurface, Looks, pixel_area
 from jaxnbv.scanning.looks import STEEP
@@ -128,7 +129,7 @@ def newness_of(acquisition: Acquisition) -> NewSurface:
     return acquisition if isinstance(acquisition, NewSurface) else NewSurface()
 
 
-@eqx.filter_jit
+@program
 def seen_share(
     unseen: Unseen,
     surfaces: GridSurface,

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxnbv.checks import check_fields, functions_of_users, require, returned
 from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.programs import program
 from jaxnbv.scanning import Surface
 from jaxnbv.utility import Answer, Quantity, Utility, default_batch_size, plain_function
 
@@ -154,12 +155,12 @@ class PartAnswer(Answer):
     target: float = 60.0
 
 
-@eqx.filter_jit
+@program
 def _probabilities(segmenter: Segmenter, cloud: PointCloud) -> Any:
     return returned(segmenter(cloud), "the segmenter's answer", 2, "give probabilities (points, parts)")
 
 
-@eqx.filter_jit
+@program
 def _counts(segmenter: Segmenter, cloud: PointCloud) -> Int[Array, " parts"]:
     return part_counts(_probabilities(segmenter, cloud))
 

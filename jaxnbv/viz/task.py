@@ -5,7 +5,6 @@ import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import trimesh
@@ -19,6 +18,7 @@ from jaxnbv.planning.episode import Episode
 from jaxnbv.planning.loop import View, view_keys
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.stopping import Sure
+from jaxnbv.programs import program
 from jaxnbv.scanning import Surface, pixel_area
 from jaxnbv.scanning.metrics import GRAZING, coverage, true_mesh
 from jaxnbv.tasks.coverage import NewSurface, newness_of
@@ -121,7 +121,7 @@ def seen_after(episode: Episode, truth: Float[AnyArray, "n 3"] | None) -> list[C
     return [CoverageAnswer(("of surface seen",), np.array([area]), unit=unit) for area in areas]
 
 
-@eqx.filter_jit
+@program
 def _new_area(of: NewSurface, before: Observations | None, view: ImaginedView) -> Float[Array, ""]:
     area = pixel_area(view.scan, view.camera, view.pose, GRAZING)
     return jnp.sum(area if before is None else area * of.context(inputs_of(before))(view.scan.points))

@@ -36,7 +36,7 @@ def test_the_image_is_of_a_ball_on_a_table():
 def sizes():
     """How many programs were compiled of each function that takes long to compile."""
     functions = planner_module._propose, sampler_module._sample, depth_image._oriented
-    return [function._cached._cache_size() for function in functions]
+    return [function._jitted._cached._cache_size() for function in functions]
 
 
 @pytest.fixture(scope="module")

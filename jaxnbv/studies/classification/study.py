@@ -20,6 +20,7 @@ from jaxnbv.geometry.pose import Pose
 from jaxnbv.networks import CloudClassifier, load_checkpoint, network_scale, pretrained_classifier
 from jaxnbv.planning.loop import Sensor, Step
 from jaxnbv.planning.planner import Planner
+from jaxnbv.programs import program
 from jaxnbv.readers import MeshFile, class_meshes
 from jaxnbv.scanning import Grid, SensorNoise, scan
 from jaxnbv.search import CandidateSearch, Problem, Proposal, Search, TieBreakSearch
@@ -299,12 +300,12 @@ class ClassificationStudy(Study):
         return Tiles(f"{framing}Beneath: prediction; true: {names[record['label']]}. All methods share view 1.", tile)
 
 
-@eqx.filter_jit
+@program
 def _noisy(scans: PointCloud, keys: Key[Array, " candidates"]) -> PointCloud:
     return jax.vmap(SensorNoise())(scans, keys)
 
 
-@eqx.filter_jit
+@program
 def _classify(classifier: Classifier, cloud: PointCloud) -> Float[Array, " classes"]:
     """Log probabilities of the classes, compiled."""
     return classifier(cloud)

@@ -19,6 +19,7 @@ from jaxnbv.geometry.cloud import PointCloud, farthest_point_subsample
 from jaxnbv.networks import CloudSegmenter
 from jaxnbv.planning.loop import Step
 from jaxnbv.planning.planner import Planner
+from jaxnbv.programs import program
 from jaxnbv.scanning import Grid, MeshParts, TriangleMesh
 from jaxnbv.scanning.metrics import true_mesh
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
@@ -212,6 +213,6 @@ class PartDiscoveryStudy(Study):
         return Tiles(caption, tile, lambda axes: draw_on(axes, still, points, colours[labels_of_points]), marks=marks)
 
 
-@eqx.filter_jit
+@program
 def _count(segmenter: PartSegmenter, cloud: PointCloud) -> Int[Array, " parts"]:
     return part_counts(segmenter(cloud))

@@ -13,6 +13,7 @@ from jaxnbv.checks import AnyArray, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
+from jaxnbv.programs import program
 from jaxnbv.scanning import SDFSurface, Surface, TriangleMesh, scan
 from jaxnbv.scanning.sdf import SignedDistance, least_of_last
 from jaxnbv.scanning.sdf.sampled import distance_to_triangles
@@ -106,7 +107,7 @@ def _scan_telling(
     return jnp.sum(thing.on_cue(scans.points) & scans.mask, axis=-1), scans
 
 
-_compiled = eqx.filter_jit(_scan_telling)
+_compiled = program(_scan_telling)
 
 
 def hidden_view(

@@ -6,12 +6,12 @@ Lengths are scene units. No part reaches beyond 1.35 from the origin along an ax
 import functools
 from collections.abc import Callable, Sequence
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxnbv.geometry.frame import Frame
+from jaxnbv.programs import program
 from jaxnbv.scanning import Grid, TriangleMesh
 from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.scanning.sdf import Cuboid, Cylinder, Difference, Sampled, SignedDistance, Translated, Union
@@ -210,6 +210,6 @@ def _nodes(grid: Grid) -> Float[Array, "g g g 3"]:
 
 
 # Solids of one set share a compilation.
-@eqx.filter_jit
+@program
 def _values(solid: SignedDistance, nodes: Float[Array, "*n 3"]) -> Float[Array, "*n"]:
     return solid(nodes)

@@ -1,0 +1,178 @@
+"""Programs that are kept: a later process neither traces nor compiles them, and gets the same numbers."""
+
+import os
+import subprocess
+import sys
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxnbv import programs
+from jaxnbv.compiled import PROGRAMS
+from jaxnbv.programs import program
+from jaxnbv.scanning import sdf
+
+# One proposal, with what it counts: programs that were compiled, and functions of the package that were traced.
+SCRIPT = """
+import sys
+import jax
+import jaxnbv as nbv
+from jaxnbv.scanning import tracing
+
+compiled, traced = [], []
+jax.monitoring.register_event_listener(lambda event, **_: compiled.append(event.rpartition("/")[2]))
+march = tracing.march
+tracing.march = lambda *args: traced.append("march") or march(*args)
+nbv.keep_compiled(sys.argv[1])
+surface = nbv.SDFSurface(nbv.sdf.Sphere(0.8))
+camera = nbv.Camera(height=8, width=8)
+search = nbv.DiscreteSearch(6)
+planner = nbv.Planner(nbv.Coverage(), search, camera, nbv.SurfaceSampler(num_samples=2, grid=nbv.Grid(24)), capacity=64)
+pose = search.poses_around()[0]
+observations = planner.init(pose, nbv.scan(surface, camera, pose), camera)
+proposal = planner.propose(observations, jax.random.key(0))
+print(proposal.values.tolist(), len(traced), compiled.count("cache_misses"), sep=";")
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setenv(PROGRAMS, str(tmp_path))
+    return tmp_path
+
+
+def counted(function):
+    """A program of a function of the package, and the arguments that it was traced with."""
+    calls = []
+
+    def counting(*args, **kwargs):
+        calls.append(args)
+        return function(*args, **kwargs)
+
+    counting.__module__, counting.__name__, counting.__qualname__ = "jaxnbv.of_a_test", "counting", "counting"
+    return program(counting), calls
+
+
+def propose(folder):
+    environment = {
+        name: value for name, value in os.environ.items() if not name.startswith("JAX_") and name != "XLA_FLAGS"
+    }
+    result = subprocess.run(
+        [sys.executable, "-W", "error", "-c", SCRIPT, str(folder)], env=environment, capture_output=True, text=True
+    )
+    assert result.returncode == 0, result.stderr
+    values, num_traced, num_compiled = result.stdout.split(";")
+    return values, int(num_traced), int(num_compiled)
+
+
+def test_a_later_process_traces_and_compiles_nothing(tmp_path):
+    values, num_traced, num_compiled = propose(tmp_path)
+    assert num_traced > 0
+    assert num_compiled > 0
+    assert propose(tmp_path) == (values, 0, 0)
+
+
+class Line(eqx.Module):
+    """Of the tests, not of the package."""
+
+    slope: jax.Array
+
+    def __call__(self, x):
+        return self.slope * x
+
+
+def test_numbers_and_structure_are_those_of_filter_jit(folder):
+    def function(solid, x, power, *, label):
+        return {"distance": solid(x) ** power, "solid": solid, "label": label, "none": None}
+
+    ball, x = sdf.Sphere(0.5), np.linspace(-1, 1, 12, dtype=np.float32).reshape(4, 3)
+    expected = eqx.filter_jit(function)(ball, x, 2, label="ball")
+    for _ in range(2):
+        # The second is read.
+        kept, calls = counted(function)
+        result = kept(ball, x, 2, label="ball")
+        assert eqx.tree_equal(result, expected, typematch=True)
+    assert len(calls) == 0
+
+
+def test_another_kind_of_argument_is_another_program(folder):
+    kept, calls = counted(lambda x, power: x**power)
+    kept(jnp.ones(3), 2)
+    for x, power in ((jnp.ones(4), 2), (jnp.ones(3), 3), (jnp.ones(3), 2.0), (jnp.ones(3, jnp.int32), 2), (1.0, 2)):
+        before = len(calls)
+        np.testing.assert_array_equal(kept(x, power), x**power)
+        assert len(calls) == before + 1
+    kept(jnp.zeros(3), 2)
+    assert len(calls) == 6
+
+
+def test_settings_are_part_of_a_program(folder):
+    kept, _ = counted(lambda x: x + jnp.asarray(0.1))
+    assert kept(jnp.ones(2)).dtype == jnp.float32
+    with jax.enable_x64(True):
+        assert kept(jnp.ones(2)).dtype == jnp.float64
+    with jax.debug_nans(True), pytest.raises(FloatingPointError):
+        counted(jnp.log)[0](-jnp.ones(2))
+
+
+def test_code_of_others_is_not_kept(folder):
+    """The user may change it, and a kept program would stay as it was."""
+    kept, _ = counted(lambda line, x: line(x))
+    np.testing.assert_array_equal(kept(Line(jnp.asarray(2.0)), jnp.ones(2)), [2.0, 2.0])
+    np.testing.assert_array_equal(kept(lambda x: -x, jnp.ones(2)), [-1.0, -1.0])
+    assert list(folder.iterdir()) == []
+
+
+def test_what_calls_back_is_not_kept(folder):
+    def function(x):
+        return jax.pure_callback(lambda y: np.asarray(y) + 1, jax.ShapeDtypeStruct((2,), jnp.float32), x)
+
+    kept, _ = counted(function)
+    np.testing.assert_array_equal(kept(jnp.ones(2)), [2.0, 2.0])
+    assert list(folder.iterdir()) == []
+
+
+def test_transformations_go_through(folder):
+    kept, _ = counted(lambda x: jnp.sum(x**2))
+    x = jnp.arange(3.0)
+    np.testing.assert_array_equal(jax.grad(kept)(x), 2 * x)
+    np.testing.assert_array_equal(jax.vmap(kept)(jnp.stack([x, x])), [5.0, 5.0])
+    assert list(folder.iterdir()) == []
+
+
+def test_a_damaged_file_is_made_again(folder):
+    counted(lambda x: x + 1)[0](jnp.ones(2))
+    files = list(folder.iterdir())
+    assert len(files) == 2
+    for file in files:
+        file.write_bytes(file.read_bytes()[:-3])
+    kept, calls = counted(lambda x: x + 1)
+    np.testing.assert_array_equal(kept(jnp.ones(2)), [2.0, 2.0])
+    assert len(calls) == 1
+    kept, calls = counted(lambda x: x + 1)
+    np.testing.assert_array_equal(kept(jnp.ones(2)), [2.0, 2.0])
+    assert len(calls) == 0
+
+
+def test_after_an_edit_the_same_code_is_not_compiled_again(folder, monkeypatch):
+    counted(lambda x: x + 1)[0](jnp.ones(2))
+    monkeypatch.setattr(programs, "_source", lambda: "edited")
+    monkeypatch.setattr(programs, "_without_cache", lambda lowered: pytest.fail("compiled"))
+    kept, calls = counted(lambda x: x + 1)
+    np.testing.assert_array_equal(kept(jnp.ones(2)), [2.0, 2.0])
+    assert len(calls) == 1
+
+
+def test_programs_call_lapack_in_a_process_that_never_lowered_it(folder):
+    """JAX finds LAPACK's functions while it lowers."""
+    script = (
+        "import jax.numpy as jnp; from jaxnbv.programs import program\n"
+        "def f(x): return jnp.linalg.eigh(x)[0]\n"
+        "f.__module__ = 'jaxnbv.of_a_test'\nprint(program(f)(jnp.eye(3) * 2.0))"
+    )
+    for _ in range(2):
+        result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+        assert result.stdout.split() == ["[2.", "2.", "2.]"], result.stderr
