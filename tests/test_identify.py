@@ -109,7 +109,9 @@ def test_a_pose_is_told_in_the_unit_of_the_world():
     pose = ObjectPose("rod", np.eye(4), np.diag(deviations**2), np.eye(4)[None])
     assert "least certain axes: 4 mm, 3 degrees.\nNo other pose is as right." in told(pose, "m")
     round_one = dataclasses.replace(pose, alternatives=np.tile(np.eye(4), (72, 1, 1)))
-    assert "least certain axes: 0.004 world units, 3 degrees.\n72 poses are equally right" in told(round_one, "world units")
+    assert "least certain axes: 0.004 world units, 3 degrees.\n72 poses are equally right" in told(
+        round_one, "world units"
+    )
 
 
 def test_a_cloud_is_no_recording(parts, tmp_path):

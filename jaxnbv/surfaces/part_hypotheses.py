@@ -28,7 +28,7 @@ class PartHypotheses(eqx.Module):
     """Parts of a bank, each with a placement, the most likely first.
 
     - `bank`: the parts at true size, in scene units.
-    - `placed`: part and placement of each hypothesis. A part may have several placements; equal surfaces occur once.
+    - `placed`: part and placement of each hypothesis. A part may have several; equal surfaces occur once.
     - `weights`: probability of each hypothesis, and last of "none of these".
     - `tau`: scale of the distance between measured points and the surface, in scene units, see `part_evidence`.
     """
