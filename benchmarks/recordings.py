@@ -25,7 +25,7 @@ from jaxnbv.geometry.pose import fibonacci_sphere
 from jaxnbv.planning.loop import Loop
 from jaxnbv.readers.recorded import RecordedFrames
 from jaxnbv.scanning import TriangleMesh
-from jaxnbv.scanning.sensors import Setting, fitted
+from jaxnbv.scanning.sensors import Setting, fit_distance
 from jaxnbv.studies.engine.results import interval
 from jaxnbv.studies.recorded import NEW_AREA, ORACLE, RecordedStudy
 
@@ -70,7 +70,7 @@ def of_mesh(file: Path, folder: Path, above: bool) -> Recorded:
         return recorded
     if above:
         mesh = _on_table(mesh, -0.5 * extents[1])
-    radius = fitted(Setting(_CAMERA, 1.0, 1), float(np.linalg.norm(extents)) / 2.0).radius
+    radius = fit_distance(Setting(_CAMERA, 1.0, 1), float(np.linalg.norm(extents)) / 2.0).radius
     count, lowest = (_ABOVE, math.radians(10.0)) if above else (_AROUND, -math.pi / 2)
     poses = nbv.look_at(fibonacci_sphere(count, radius, lowest))
     noise = nbv.DepthNoise(_NOISE, scale=frame.scale)

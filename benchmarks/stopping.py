@@ -28,7 +28,7 @@ from jaxnbv.planning.episode import Episode
 from jaxnbv.planning.loop import view_keys
 from jaxnbv.planning.stopping import Covered, Found, StopContext, Sure
 from jaxnbv.scanning import GridSurface
-from jaxnbv.scanning.visibility import sees, spread_points
+from jaxnbv.scanning.visibility import is_visible, spread_points
 from jaxnbv.storage.files import write_text
 from jaxnbv.studies.engine.results import interval
 from jaxnbv.studies.scenes import Framing, Split, hidden_view, part_scene, pyramid_scene
@@ -105,7 +105,7 @@ def truly_shown(solid, planner: nbv.Planner, episode: Episode) -> tuple[np.ndarr
     points = spread_points(surface, 20_000)
     poses = jax.tree.map(lambda *rows: jnp.stack(rows), *(view.pose for view in episode.views))
     views, candidates = (
-        np.asarray(sees(surface, planner.camera, given, points, grid.spacing))
+        np.asarray(is_visible(surface, planner.camera, given, points, grid.spacing))
         for given in (poses, planner.search.poses_around())
     )
     any_shown = candidates.any(axis=0)

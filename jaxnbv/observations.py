@@ -66,7 +66,7 @@ class Observations(eqx.Module):
         - `camera`: the camera along whose rays `looks` stores how far each view saw.
         """
         empty = None if grid is None else jnp.zeros((grid.resolution,) * 3, bool)
-        looks = None if grid is None else Looks.none(grid, camera, max_views).with_points(cloud)
+        looks = None if grid is None else Looks.empty(grid, camera, max_views).with_points(cloud)
         return cls(cloud, PoseList.empty(max_views), grid, looks, empty, obstacle_nodes)
 
     @property

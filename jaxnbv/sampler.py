@@ -28,7 +28,7 @@ from jaxnbv.observations import Observations, as_observations
 from jaxnbv.programs import program
 from jaxnbv.scanning import Carving, Grid, GridSurface, TriangleMesh, carve
 from jaxnbv.scanning.grid import touched_cells
-from jaxnbv.scanning.mesh import held_pieces, level_triangles
+from jaxnbv.scanning.mesh import level_triangles, supported_pieces
 from jaxnbv.surfaces import (
     GeometricSPSR,
     KnownShapes,
@@ -264,7 +264,7 @@ class SurfaceSampler(eqx.Module):
                 "cloud"
             )
         points, _ = self.adapt(observations).cloud.to_numpy()
-        vertices, faces, dropped = held_pieces(*triangles[:2], points, self.grid.spacing)
+        vertices, faces, dropped = supported_pieces(*triangles[:2], points, self.grid.spacing)
         if dropped:
             warnings.warn(
                 f"left out {dropped} piece{'s' * (dropped > 1)} of the mesh with hardly any points of the cloud",
@@ -305,4 +305,4 @@ def _sample(
     if sampler.carving is None:
         return surfaces
     # The cut that a volume makes through an object that continues beyond it is no surface.
-    return surfaces.void(touched_cells((values <= 0) & sampler.carving.outside(sampler.grid)))
+    return surfaces.without_cells(touched_cells((values <= 0) & sampler.carving.outside(sampler.grid)))

@@ -16,7 +16,7 @@ from tqdm import tqdm
 import jaxnbv as nbv
 from jaxnbv.scanning import SDFSurface, Surface
 from jaxnbv.scanning.metrics import truth_points
-from jaxnbv.scanning.sensors import USUAL_SETTING, fitted
+from jaxnbv.scanning.sensors import USUAL_SETTING, fit_distance
 from jaxnbv.search import SphereCandidates
 from jaxnbv.studies.scenes import Split, demo_object, household_scene, part_scene, truck_scene
 from jaxnbv.viz.choice import draw_acquisition
@@ -47,7 +47,7 @@ def objects() -> dict[str, Surface]:
 def episode_of(surface: Surface, views: int) -> nbv.Episode:
     """Views of an object that fits the image."""
     points = truth_points(surface, jax.random.key(0))
-    setting = fitted(USUAL_SETTING, float(np.linalg.norm(points, axis=1).max()))
+    setting = fit_distance(USUAL_SETTING, float(np.linalg.norm(points, axis=1).max()))
     camera = setting.camera.resized(RAYS, RAYS)
     search = nbv.DiscreteSearch(SphereCandidates(CANDIDATES, setting.radius))
     sampler = nbv.SurfaceSampler(grid=nbv.Grid(72), num_samples=8)

@@ -56,11 +56,11 @@ def run(options: RunOptions, **of_tasks: Any) -> None:
     from jaxnbv.cli.play import USUAL, first_pose, play
     from jaxnbv.cli.tasks.base import Subject
     from jaxnbv.scanning import load_mesh
-    from jaxnbv.scanning.sensors import fitted
+    from jaxnbv.scanning.sensors import fit_distance
 
     surface, setting = load_mesh(options.mesh, options.up), task.setting()
     if not options.paper:
-        setting = fitted(setting, surface.bounding_radius)
+        setting = fit_distance(setting, surface.bounding_radius)
     usual = usual_first(None if options.paper else setting.radius)
     first = usual if options.first is None else first_pose(options.first, surface)
     acquisition = task.acquisition(surface, setting.camera, first)

@@ -180,9 +180,9 @@ class PointCloud(eqx.Module):
         return np.asarray(self.points)[mask], np.asarray(self.normals)[mask]
 
     @own_settings()
-    def only(self, kept: Bool[Array, "*batch n"]) -> "PointCloud":
-        """The cloud with only the rows where `kept` is True. `missed` and `sight` stay as they are."""
-        mask = self.mask & kept
+    def only(self, mask: Bool[Array, "*batch n"]) -> "PointCloud":
+        """The cloud with only the rows where `mask` is True. `missed` and `sight` stay as they are."""
+        mask = self.mask & mask
         points, normals = (jnp.where(mask[..., None], rows, 0.0) for rows in (self.points, self.normals))
         return PointCloud(points, normals, mask, self.missed, self.sight)
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Real
 
 from jaxnbv.checks import AnyArray, as_floats, as_numbers, is_traced, require
 from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.distortion import undistorted
+from jaxnbv.geometry.distortion import undistort_image
 from jaxnbv.geometry.gaps import block_samples, gap_of
 from jaxnbv.geometry.plane_fit import fitted_planes
 from jaxnbv.geometry.pose import Pose
@@ -58,7 +58,7 @@ def points_of_depth(
     if camera.distortion:
         place = camera.pixel_directions().reshape(*shape, 3)[..., :2]
         matrix = jnp.asarray(camera.intrinsics, depth.dtype)
-        depth, missed = undistorted(depth, jnp.asarray(missed), place, matrix, camera.distortion)
+        depth, missed = undistort_image(depth, jnp.asarray(missed), place, matrix, camera.distortion)
     gap = 1 if is_traced(depth) else gap_of(np.isfinite(depth) & (np.asarray(depth) > 0))
     # The rounding is an array, so that a program compiled for one unit runs for any.
     image = depth, jnp.asarray(missed), camera, pose, stride, jnp.asarray(rounding, depth.dtype), box, gap

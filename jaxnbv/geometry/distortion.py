@@ -21,7 +21,7 @@ _ALIKE, _STEEPEST = 0.01, 4.0
 _ITERATIONS = 25
 
 
-def distorted(
+def distort_points(
     x: Float[AnyArray, "*n"], y: Float[AnyArray, "*n"], coefficients: tuple[float, ...]
 ) -> tuple[Float[AnyArray, "*n"], Float[AnyArray, "*n"]]:
     """Distorted coordinates in the plane Z = 1 of points (x, y) of this plane."""
@@ -33,16 +33,16 @@ def distorted(
     return across, down
 
 
-def straightened(
+def undistort_points(
     x: Float[np.ndarray, "*n"], y: Float[np.ndarray, "*n"], coefficients: tuple[float, ...]
 ) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
-    """Undistorted coordinates in the plane Z = 1 of distorted points (x, y): the inverse of `distorted`.
+    """Undistorted coordinates in the plane Z = 1 of distorted points (x, y): the inverse of `distort_points`.
 
     By fixed-point iteration as in OpenCV.
     """
     across, down = x, y
     for _ in range(_ITERATIONS):
-        moved = distorted(across, down, coefficients)
+        moved = distort_points(across, down, coefficients)
         across, down = across + x - np.asarray(moved[0]), down + y - np.asarray(moved[1])
     return across, down
 
@@ -51,7 +51,7 @@ def pixels_of(
     place: Float[AnyArray, "*n 2"], matrix: Float[AnyArray, "3 3"], coefficients: tuple[float, ...]
 ) -> tuple[Float[AnyArray, "*n"], Float[AnyArray, "*n"]]:
     """Column and row, in pixels, at which each point of the plane Z = 1 appears through the lens."""
-    across, down = distorted(place[..., 0], place[..., 1], coefficients)
+    across, down = distort_points(place[..., 0], place[..., 1], coefficients)
     return across * matrix[0, 0] + matrix[0, 2], down * matrix[1, 1] + matrix[1, 2]
 
 
@@ -69,7 +69,7 @@ def check_distortion(coefficients: tuple[float, ...], radius: float) -> None:
         f"the distortion is {coefficients}: give OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]], or () for none",
     )
     radial = (*coefficients[:2], 0.0, 0.0, *coefficients[4:])
-    moved, _ = distorted(np.linspace(0.0, radius, 100), np.zeros(100), radial)
+    moved, _ = distort_points(np.linspace(0.0, radius, 100), np.zeros(100), radial)
     require(
         bool((np.diff(np.asarray(moved)) > 0).all()),
         f"the distortion {coefficients} folds the image: give OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]] in this "
@@ -78,7 +78,7 @@ def check_distortion(coefficients: tuple[float, ...], radius: float) -> None:
 
 
 @program
-def undistorted(
+def undistort_image(
     depth: Float[Array, "h w"],
     missed: Bool[Array, "h w"],
     place: Float[Array, "h w 2"],

@@ -81,7 +81,7 @@ class Frame(eqx.Module):
         return np.array(_UP[self.up], np.float64)
 
     @own_settings()
-    def to_scene(self, thing):
+    def to_scene(self, value):
         """Points (..., 3), a `PointCloud`, a `Pose`, a `Box` or a `Camera`'s range, from world to scene.
 
         Clouds and poses have JAX's floating-point type. For coordinates far from the world's origin, such as a map's,
@@ -89,16 +89,16 @@ class Frame(eqx.Module):
 
         **Raises:** `ValueError` for a cloud or a pose whose coordinates are rounded by more than 1e-4 scene units.
         """
-        if isinstance(thing, PointCloud | Pose) and not is_traced(thing):
-            self._check_precision(thing.points if isinstance(thing, PointCloud) else thing.position)
+        if isinstance(value, PointCloud | Pose) and not is_traced(value):
+            self._check_precision(value.points if isinstance(value, PointCloud) else value.position)
         center = np.asarray(self.center)
-        return _apply(thing, lambda points: self._turned(points - center) * self.scale, self._turned, self.scale)
+        return _apply(value, lambda points: self._turned(points - center) * self.scale, self._turned, self.scale)
 
     @own_settings()
-    def to_world(self, thing):
+    def to_world(self, value):
         """The inverse of `to_scene`, for the same types."""
         center = np.asarray(self.center)
-        return _apply(thing, lambda points: self._back(points / self.scale) + center, self._back, 1.0 / self.scale)
+        return _apply(value, lambda points: self._back(points / self.scale) + center, self._back, 1.0 / self.scale)
 
     def _turned(self, vectors):
         return vectors if self.up == "y" else vectors @ self.rotation.T.astype(vectors.dtype)
@@ -117,23 +117,23 @@ class Frame(eqx.Module):
         )
 
 
-def _apply(thing, place, turn, scale: float):
-    """The thing with `place` applied to its points, `turn` to its directions, and its lengths scaled."""
-    if isinstance(thing, PointCloud):
-        points = jnp.where(thing.mask[..., None], place(thing.points), 0.0).astype(thing.points.dtype)
-        sight = None if thing.sight is None else scale * thing.sight
-        return dataclasses.replace(thing, points=points, normals=turn(thing.normals), sight=sight)
-    if isinstance(thing, Pose):
-        rotation = jnp.swapaxes(turn(jnp.swapaxes(thing.rotation, -1, -2)), -1, -2)
-        return Pose(rotation, place(thing.position).astype(thing.position.dtype))
-    if isinstance(thing, Box):
-        corners = place(np.array([thing.low, thing.high]))
+def _apply(value, place, turn, scale: float):
+    """The value with `place` applied to its points, `turn` to its directions, and its lengths scaled."""
+    if isinstance(value, PointCloud):
+        points = jnp.where(value.mask[..., None], place(value.points), 0.0).astype(value.points.dtype)
+        sight = None if value.sight is None else scale * value.sight
+        return dataclasses.replace(value, points=points, normals=turn(value.normals), sight=sight)
+    if isinstance(value, Pose):
+        rotation = jnp.swapaxes(turn(jnp.swapaxes(value.rotation, -1, -2)), -1, -2)
+        return Pose(rotation, place(value.position).astype(value.position.dtype))
+    if isinstance(value, Box):
+        corners = place(np.array([value.low, value.high]))
         return Box(corners.min(axis=0), corners.max(axis=0))
-    if isinstance(thing, Camera):
-        farthest = None if thing.farthest is None else scale * thing.farthest
-        return dataclasses.replace(thing, nearest=scale * thing.nearest, farthest=farthest)
-    if isinstance(thing, Array) and is_traced(thing):
-        return place(thing)
-    array = as_numbers(thing, "the points", None)
-    require(array.shape[-1:] == (3,), f"the points are {shown(thing)}: give an array (..., 3), a cloud or a pose")
+    if isinstance(value, Camera):
+        farthest = None if value.farthest is None else scale * value.farthest
+        return dataclasses.replace(value, nearest=scale * value.nearest, farthest=farthest)
+    if isinstance(value, Array) and is_traced(value):
+        return place(value)
+    array = as_numbers(value, "the points", None)
+    require(array.shape[-1:] == (3,), f"the points are {shown(value)}: give an array (..., 3), a cloud or a pose")
     return place(array)

@@ -24,14 +24,14 @@ class PoseList(eqx.Module):
     count: Int[Array, ""]
 
     @classmethod
-    def empty(cls, room: int) -> "PoseList":
-        """An empty list with capacity `room`."""
+    def empty(cls, capacity: int) -> "PoseList":
+        """An empty list with capacity `capacity`."""
         dtype = jnp.result_type(float)
-        rows = Pose(np.tile(np.eye(3, dtype=dtype), (room, 1, 1)), np.zeros((room, 3), dtype))
+        rows = Pose(np.tile(np.eye(3, dtype=dtype), (capacity, 1, 1)), np.zeros((capacity, 3), dtype))
         return cls(rows, jnp.asarray(0, jnp.int32))
 
     @property
-    def room(self) -> int:
+    def capacity(self) -> int:
         """The capacity: the number of poses that fit."""
         return self.rows.position.shape[0]
 
@@ -43,9 +43,9 @@ class PoseList(eqx.Module):
     def append(self, pose: Pose) -> "PoseList":
         """A list with one more pose; a full list stays as it is."""
         rows = jax.tree.map(lambda rows, row: rows.at[self.count].set(row), self.rows, pose)
-        return dataclasses.replace(self, rows=rows, count=jnp.minimum(self.count + 1, self.room))
+        return dataclasses.replace(self, rows=rows, count=jnp.minimum(self.count + 1, self.capacity))
 
-    def holds(self, poses: Pose) -> Bool[Array, " poses"]:
+    def contains(self, poses: Pose) -> Bool[Array, " poses"]:
         """Whether each of a batch of poses equals one of the list, to 1e-3 in position and viewing direction."""
         return jnp.any(is_same_view(poses[:, None], self.rows[None]) & self.is_filled, axis=1)
 
@@ -55,9 +55,9 @@ class PoseList(eqx.Module):
         return jnp.min(jnp.where(self.is_filled, distance, jnp.inf), axis=1)
 
     @property
-    def is_filled(self) -> Bool[Array, " room"]:
+    def is_filled(self) -> Bool[Array, " capacity"]:
         """Whether each row holds a pose of the list."""
-        return jnp.arange(self.room) < self.count
+        return jnp.arange(self.capacity) < self.count
 
 
 def is_same_view(poses: Pose, others: Pose) -> Bool[Array, "*batch"]:

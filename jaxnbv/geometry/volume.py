@@ -63,7 +63,7 @@ class Box(eqx.Module):
         """
         return Box(self.low - np.array([by, 0.0, by]), self.high + by)
 
-    def passed(self, points: Float[np.ndarray, "n 3"], by: float) -> dict[str, float]:
+    def shares_beyond(self, points: Float[np.ndarray, "n 3"], by: float) -> dict[str, float]:
         """The share of points that lie more than a length beyond each face, by its name such as "+x"."""
         if len(points) == 0:
             return {}

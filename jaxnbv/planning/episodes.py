@@ -17,7 +17,7 @@ from jaxnbv.geometry.pose import Pose
 from jaxnbv.planning.episode_program import answers_by_parts, run
 from jaxnbv.planning.planner import Planner
 from jaxnbv.scanning import Noise, SensorNoise, Surface
-from jaxnbv.scanning.scanner import far_from_scene
+from jaxnbv.scanning.scanner import distance_problem
 from jaxnbv.scanning.scene_batch import scene_batch
 from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.sharding import on_cpu, share_of
@@ -104,7 +104,7 @@ def _batch_of_poses(first: Pose, count: int) -> Pose:
         batch in ((), (count,)),
         f"the first pose is a batch {batch} of poses for {count} keys: give one pose, or one for each key",
     )
-    problem = far_from_scene(first)
+    problem = distance_problem(first)
     require(problem is None, f"the first pose is not of the scene: {problem}")
     return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape[len(batch) :])), first)
 

@@ -12,7 +12,7 @@ from jaxnbv.checks import AnyArray, as_numbers, require, shown
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.depth_image import without_sentinels
-from jaxnbv.geometry.distortion import pixels_of, straightened
+from jaxnbv.geometry.distortion import pixels_of, undistort_points
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
 
@@ -63,7 +63,9 @@ class Image(NamedTuple):
         depth = np.where(np.isfinite(self.depth), self.scale * np.asarray(self.depth, np.float64), 0.0)
         ahead = np.asarray(camera.pixel_directions(), np.float64).reshape(*depth.shape, 3)
         if camera.distortion:
-            ahead = np.stack([*straightened(ahead[..., 0], ahead[..., 1], camera.distortion), ahead[..., 2]], axis=-1)
+            ahead = np.stack(
+                [*undistort_points(ahead[..., 0], ahead[..., 1], camera.distortion), ahead[..., 2]], axis=-1
+            )
         local = depth[..., None] * ahead
         return local @ np.asarray(pose.rotation, np.float64).T + np.asarray(pose.position, np.float64)
 

@@ -31,7 +31,7 @@ from jaxnbv.planning.travel import ValuePerCost, total_cost
 from jaxnbv.programs import program
 from jaxnbv.sampler import StepInputs, SurfaceSampler
 from jaxnbv.scanning import Grid, GridSurface, Obstacles, barrier_of, mean_depth, scan_samples
-from jaxnbv.scanning.scanner import far_from_scene
+from jaxnbv.scanning.scanner import distance_problem
 from jaxnbv.search import DiscreteSearch, Problem, Proposal, Search
 from jaxnbv.surfaces import FreeRotation, ShapeBank, ShapePoses
 from jaxnbv.surfaces.base import HALF_WIDTH
@@ -166,11 +166,11 @@ class Planner(eqx.Module):
         check_type(pose, Pose, "the pose")
         self._check(pose, scan, camera, first=False)
         if not is_traced(observations.num_views):
-            views, room = int(observations.num_views), observations.poses.room
+            views, capacity = int(observations.num_views), observations.poses.capacity
             require(
-                views < room,
+                views < capacity,
                 f"the observations hold {views} views and have room for no more: make them with a planner of "
-                f"Planner(max_views=...) greater than {room}",
+                f"Planner(max_views=...) greater than {capacity}",
             )
         after = self._with_view(self.sampler.adapt(observations), pose, scan, camera).add_points(scan)
         # An acquisition about known parts uses no samples on the grid.
@@ -220,7 +220,7 @@ class Planner(eqx.Module):
         looks, surfaces = inputs.observations.looks, inputs.surfaces
         if looks is None or surfaces is None or not self.acquisition.measurable_only:
             return inputs
-        return dataclasses.replace(inputs, surfaces=looks.measurable(surfaces, inputs.observations.poses))
+        return dataclasses.replace(inputs, surfaces=looks.without_unmeasured(surfaces, inputs.observations.poses))
 
     @own_settings()
     def choose(self, inputs: StepInputs, key: PRNGKeyArray, pending: PoseList | None = None) -> Proposal:
@@ -270,7 +270,7 @@ class Planner(eqx.Module):
             return
         # Under jit, arrays that are not traced still have values.
         with jax.ensure_compile_time_eval():
-            problem = None if pose is None else far_from_scene(pose)
+            problem = None if pose is None else distance_problem(pose)
             require(problem is None, f"the pose is not of the scene: {problem}")
             if first or bool(scan.mask.any()):
                 name = "the first scan" if first else "the scan"

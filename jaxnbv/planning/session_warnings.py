@@ -25,7 +25,7 @@ def warn_of_cut(box: Box, points: Float[np.ndarray, "n 3"], voxel: float, faces:
     - `voxel`: side of a cell of the planner's grid, in world units.
     - `faces`: faces with an earlier warning, which is not repeated.
     """
-    shares = {face: share for face, share in box.passed(points, 0.5 * voxel).items() if share >= _STRAY}
+    shares = {face: share for face, share in box.shares_beyond(points, 0.5 * voxel).items() if share >= _STRAY}
     for face in sorted(shares.keys() - faces):
         warnings.warn(
             f"the object seems to go on beyond the box at {face}: {100 * shares[face]:.0f} % of the points lie within "

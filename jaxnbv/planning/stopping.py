@@ -265,7 +265,7 @@ def expected_coverage(context: StopContext, new: NewSurface) -> float:
     """
     planner, observations, surfaces = context.planner, context.observations, context.surfaces()
     if observations.looks is not None and not planner.acquisition.measurable_only:
-        surfaces = observations.looks.measurable(surfaces, observations.poses)
+        surfaces = observations.looks.without_unmeasured(surfaces, observations.poses)
     poses = planner.search.poses_around()
     barrier = barrier_of(planner.obstacles, planner.camera, poses)
     unseen = context_of(new, observations)

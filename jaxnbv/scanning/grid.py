@@ -111,7 +111,7 @@ class GridSurface(Surface):
             require(bool(finite), "the values on the grid, or the level, are not finite")
         return cls(relative, distances, grid)
 
-    def void(self, cells: Bool[Array, "*s m m m"]) -> "GridSurface":
+    def without_cells(self, cells: Bool[Array, "*s m m m"]) -> "GridSurface":
         """The surface without the parts in these cells: rays that hit them miss."""
         return dataclasses.replace(self, is_void=cells if self.is_void is None else self.is_void | cells)
 

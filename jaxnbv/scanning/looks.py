@@ -47,7 +47,7 @@ class Looks(eqx.Module):
     grid: Grid
 
     @classmethod
-    def none(cls, grid: Grid, camera: Camera, max_views: int) -> "Looks":
+    def empty(cls, grid: Grid, camera: Camera, max_views: int) -> "Looks":
         """The `Looks` before the first view, with rays of every few rows and columns of the sensor."""
         camera = camera.strided(math.ceil(math.sqrt(camera.num_rays / _RAYS)))
         far = jnp.full((grid.resolution,) * 3, _REACH * grid.spacing, jnp.result_type(float))
@@ -110,17 +110,17 @@ class Looks(eqx.Module):
         return jax.scipy.ndimage.map_coordinates(self.distance, places, order=1, mode="nearest")
 
     @program
-    def measurable(self, surfaces: GridSurface, poses: PoseList) -> GridSurface:
+    def without_unmeasured(self, surfaces: GridSurface, poses: PoseList) -> GridSurface:
         """The sampled surfaces without the cells that a view should have measured and did not.
 
-        These are the cells of `cells_in_vain` for all views, and the cells next to them.
+        These are the cells of `unmeasured_cells` for all views, and the cells next to them.
 
         - `surfaces`: a batch along a leading axis.
         - `poses`: the poses of the views.
         """
-        return surfaces.void(shared_map(_looked_at_in_vain, surfaces, self, poses))
+        return surfaces.without_cells(shared_map(_unmeasured_by_any, surfaces, self, poses))
 
-    def cells_in_vain(self, surface: Surface, index: Int[Array, ""] | int, pose: Pose) -> Int[Array, "rays 3"]:
+    def unmeasured_cells(self, surface: Surface, index: Int[Array, ""] | int, pose: Pose) -> Int[Array, "rays 3"]:
         """The cell of each ray's hit on a surface, if the view should have measured it and did not.
 
         That is, the view saw as far as the surface, which faces it, but no measured hit lies within a spacing. Other
@@ -136,19 +136,19 @@ class Looks(eqx.Module):
         cosine, sight = -jnp.sum(offset * hits.normals, axis=-1) / distance, self.sight[index]
         # Steep surface may return nothing. But a ray that hit something deeper has passed through it.
         passed = jnp.isfinite(sight) & ((sight - distance) * cosine > spacing)
-        in_vain = hits.mask & (passed | (cosine >= STEEP) & (distance <= sight + spacing))
-        in_vain &= self(hits.points) > spacing
-        return jnp.where(in_vain[:, None], self.grid.cell_of(hits.points), self.grid.resolution)
+        is_unmeasured = hits.mask & (passed | (cosine >= STEEP) & (distance <= sight + spacing))
+        is_unmeasured &= self(hits.points) > spacing
+        return jnp.where(is_unmeasured[:, None], self.grid.cell_of(hits.points), self.grid.resolution)
 
 
-def _looked_at_in_vain(surface: GridSurface, looks: Looks, poses: PoseList) -> Bool[Array, "m m m"]:
-    def look(index, in_vain):
-        cells = looks.cells_in_vain(surface, index, jax.tree.map(lambda rows: rows[index], poses.rows))
-        return in_vain.at[tuple(cells.T)].set(True, mode="drop")
+def _unmeasured_by_any(surface: GridSurface, looks: Looks, poses: PoseList) -> Bool[Array, "m m m"]:
+    def look(index, is_unmeasured):
+        cells = looks.unmeasured_cells(surface, index, jax.tree.map(lambda rows: rows[index], poses.rows))
+        return is_unmeasured.at[tuple(cells.T)].set(True, mode="drop")
 
-    in_vain = jax.lax.fori_loop(0, poses.count, look, jnp.zeros(surface.distance.shape, bool))
+    is_unmeasured = jax.lax.fori_loop(0, poses.count, look, jnp.zeros(surface.distance.shape, bool))
     # Include neighbouring cells, since rays are farther apart than cells.
     for axis in range(3):
         window = tuple(3 if own == axis else 1 for own in range(3))
-        in_vain = jax.lax.reduce_window(in_vain, False, jax.lax.bitwise_or, window, (1, 1, 1), "SAME")
-    return in_vain
+        is_unmeasured = jax.lax.reduce_window(is_unmeasured, False, jax.lax.bitwise_or, window, (1, 1, 1), "SAME")
+    return is_unmeasured

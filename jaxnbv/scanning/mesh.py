@@ -181,7 +181,7 @@ def level_triangles(
     return vertices - grid.half_extent, faces, -normals / lengths
 
 
-def held_pieces(
+def supported_pieces(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], points: Float[np.ndarray, "n 3"], size: float
 ) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "k 3"], int]:
     """Vertices and faces of connected pieces with at least four points, and the number of other pieces.

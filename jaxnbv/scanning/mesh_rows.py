@@ -54,7 +54,7 @@ def read_obj(content: bytes) -> dict[str, Triangles]:
             # Negative numbers count back from the last vertex so far.
             rows = [corner - 1 if corner > 0 else len(vertices) + corner if corner else -1 for corner in corners]
             polygons.setdefault(material, []).append(rows)
-    places = numbers_of(vertices)
+    places = as_array(vertices)
     parts = {name: triangles_of(group) for name, group in polygons.items()}
     if len(parts) > 1:
         return {name: _used(places, faces) for name, faces in parts.items()}
@@ -84,7 +84,7 @@ def read_off(content: bytes) -> Triangles:
         proper = row[0] == str(len(words)) and all(word.isdigit() for word in words)
         require(proper, f"has a face {' '.join(row)!r}, which is not a number of corners and their vertices")
         corners.append([int(word) for word in words])
-    return numbers_of([row[:3] for row in points]), triangles_of(corners)
+    return as_array([row[:3] for row in points]), triangles_of(corners)
 
 
 def triangles_of(polygons: Sequence[Sequence[int]] | Sequence[np.ndarray] | np.ndarray) -> Int[np.ndarray, "f 3"]:
@@ -108,7 +108,7 @@ def _used(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> 
     return vertices[rows], faces.reshape(-1, 3)
 
 
-def numbers_of(rows: list[list[str]]) -> Float[np.ndarray, "n k"]:
+def as_array(rows: list[list[str]]) -> Float[np.ndarray, "n k"]:
     """Rows of words as an array of numbers.
 
     **Raises:** `ValueError` for rows that differ in length or are not numbers.

@@ -40,12 +40,12 @@ def coverage(views: Iterable[Any], truth: Float[AnyArray, "n 3"], size: float = 
     is_covered = np.zeros(len(truth), bool)
     shares = []
     for view in views:
-        is_covered |= shows(view.scan, view.camera, view.pose, truth, size)
+        is_covered |= is_shown(view.scan, view.camera, view.pose, truth, size)
         shares.append(float(is_covered.mean()))
     return shares
 
 
-def shows(
+def is_shown(
     scan: PointCloud, camera: Camera, pose: Pose, truth: Float[np.ndarray, "n 3"], size: float
 ) -> Bool[np.ndarray, " n"]:
     """Whether a scan shows each point of the true surface.

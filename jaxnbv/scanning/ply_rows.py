@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Int
 
 from jaxnbv.checks import require
-from jaxnbv.scanning.mesh_rows import Triangles, cut_short, numbers_of, triangles_of
+from jaxnbv.scanning.mesh_rows import Triangles, as_array, cut_short, triangles_of
 
 _TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
 _TYPES |= {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"}
@@ -28,7 +28,7 @@ def read_ply(content: bytes) -> Triangles:
     encoding, elements = _header(head.group().decode("latin1") if head else "")
     body = content[head.end() if head else 0 :]
     if encoding == "ascii":
-        body = numbers_of([body.decode("latin1").split()]).astype("<f8").tobytes()
+        body = as_array([body.decode("latin1").split()]).astype("<f8").tobytes()
     columns: dict[str, dict[str, Any]] = {}
     start = 0
     for name, (count, properties) in elements.items():

@@ -161,7 +161,7 @@ class DepthNoise(eqx.Module):
         return cls(0.08 / pixels_times_metres, 1 / 32 / pixels_times_metres, scale)
 
     @checked
-    def measured(self, depth: Float[Array, " n"], key: PRNGKeyArray) -> Float[Array, " n"]:
+    def apply(self, depth: Float[Array, " n"], key: PRNGKeyArray) -> Float[Array, " n"]:
         """Noisy depths for exact ones, in scene units. In both, zero stands for no depth."""
         has_depth = depth > 0
         inverse = jnp.where(has_depth, self.scale / jnp.where(has_depth, depth, 1.0), 0.0)
@@ -184,7 +184,7 @@ class DepthNoise(eqx.Module):
             "took it",
         )
         depth = jnp.matmul(scan.points - pose.position, pose.forward, precision="highest")
-        depth = self.measured(jnp.where(scan.mask, depth, 0.0), key)
+        depth = self.apply(jnp.where(scan.mask, depth, 0.0), key)
         missed = jnp.zeros_like(scan.mask) if scan.missed is None else scan.missed
         image = jnp.where(missed, jnp.inf, depth).reshape(camera.height, camera.width)
         return PointCloud.from_depth(image, camera, pose)
@@ -194,7 +194,7 @@ Noise: TypeAlias = SensorNoise | DepthNoise
 """Sensor noise: a function of a scan without noise, a key, the camera and the pose that returns the noisy scan."""
 
 
-def far_from_scene(pose: Pose) -> str | None:
+def distance_problem(pose: Pose) -> str | None:
     """A message if a pose is too far from the scene to be meant, else None. Poses must not be traced."""
     distance = float(np.linalg.norm(np.asarray(pose.position), axis=-1).max(initial=0.0))
     if distance <= _FAR_OFF:
@@ -223,7 +223,7 @@ def scan(
     origins, directions = camera.rays(pose)
     hits = surface.trace(origins.reshape(-1, 3), directions.reshape(-1, 3))
     cloud = _returns(hits, origins, directions, camera, pose, barrier)
-    if not is_traced(pose, cloud) and (problem := far_from_scene(pose)) and not bool(cloud.mask.any()):
+    if not is_traced(pose, cloud) and (problem := distance_problem(pose)) and not bool(cloud.mask.any()):
         warnings.warn(f"the scan sees nothing: {problem}", stacklevel=3)
     return cloud
 

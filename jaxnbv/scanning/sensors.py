@@ -21,7 +21,7 @@ USUAL_SETTING = Setting(Camera(), 2.5, 120)
 SENSOR_RADIUS = USUAL_SETTING.radius
 
 
-def fitted(setting: Setting, bounding_radius: float) -> Setting:
+def fit_distance(setting: Setting, bounding_radius: float) -> Setting:
     """The setting at a distance from which its square image shows the whole object from all sides.
 
     There is 5 % to spare:

@@ -112,7 +112,7 @@ def first_zero(field: Field, u: Triple, du: Triple) -> tuple[Float[Array, " n"],
     t is differentiable in values and rays. Slopes are kept away from zero for grazing rays (`implicit_depth`). If there
     is no zero, t and its derivatives are zero.
     """
-    t, mask, cell = _found_zero(*jax.lax.stop_gradient((field, u, du)))
+    t, mask, cell = _traced_zero(*jax.lax.stop_gradient((field, u, du)))
     along = _InCell(field, u, du, cell)
     return implicit_depth(along, t, mask, jax.lax.stop_gradient(along.grazing)), mask
 
@@ -130,11 +130,11 @@ def _first_zero(field: Field, u: Triple, du: Triple):
     return jnp.where(mask, start + rays.t + root * width, 0.0), mask, cell
 
 
-_found_zero = jax.custom_batching.custom_vmap(_first_zero)
+_traced_zero = jax.custom_batching.custom_vmap(_first_zero)
 
 
-@_found_zero.def_vmap
-def _found_zero_batched(size: int, batched, field: Field, u: list[Array], du: list[Array]):
+@_traced_zero.def_vmap
+def _traced_zero_batched(size: int, batched, field: Field, u: list[Array], du: list[Array]):
     """Joins batches of rays through one field into one batch, which is faster than a batch of marches."""
     u, du = jax.tree.map(
         lambda x, has: x if has else jnp.broadcast_to(x, (size, *x.shape)), (u, du), tuple(batched[1:])
@@ -144,7 +144,7 @@ def _found_zero_batched(size: int, batched, field: Field, u: list[Array], du: li
         zeros = jax.vmap(_first_zero, in_axes=(axes, 0, 0))(field, u, du)
     else:
         flat = jax.tree.map(lambda x: x.reshape(-1), (u, du))
-        zeros = jax.tree.map(lambda x: x.reshape(size, -1), _found_zero(field, *flat))
+        zeros = jax.tree.map(lambda x: x.reshape(size, -1), _traced_zero(field, *flat))
     return zeros, jax.tree.map(lambda _: True, zeros)
 
 

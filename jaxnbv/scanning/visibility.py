@@ -65,7 +65,7 @@ def spread_points(surface: GridSurface, count: int) -> SurfacePoints:
     return SurfacePoints(grid.spacing * place - grid.half_extent, normals, areas)
 
 
-def sees(
+def is_visible(
     surface: Surface,
     camera: Camera,
     poses: Pose,

@@ -109,9 +109,9 @@ class Problem(eqx.Module):
 
     def is_excluded(self, poses: Pose) -> Bool[Array, " poses"]:
         """Mask of the poses that were visited or proposed before, or violate the clearance."""
-        excluded = self.observations.poses.holds(poses)
+        excluded = self.observations.poses.contains(poses)
         if self.pending is not None:
-            excluded |= self.pending.holds(poses)
+            excluded |= self.pending.contains(poses)
         return excluded | (self.violation(poses) > 0)
 
     def violation(self, poses: Pose) -> Float[Array, " poses"]:

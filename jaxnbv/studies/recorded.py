@@ -101,7 +101,7 @@ class MostNewVoxels(Baseline):
 
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
         """The number of new voxels of each candidate. The key is not used."""
-        is_shown = jnp.any(self.shown & problem.observations.poses.holds(candidates)[:, None], axis=0)
+        is_shown = jnp.any(self.shown & problem.observations.poses.contains(candidates)[:, None], axis=0)
         gain = jnp.sum(self.shown & ~is_shown, axis=1)
         return gain.astype(candidates.position.dtype)
 

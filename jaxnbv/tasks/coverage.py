@@ -17,7 +17,7 @@ from jaxnbv.programs import program
 from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning import GridSurface, Looks, pixel_area
 from jaxnbv.scanning.looks import STEEP
-from jaxnbv.scanning.visibility import sees, spread_points
+from jaxnbv.scanning.visibility import is_visible, spread_points
 from jaxnbv.sharding import on_cpu, shared_map
 from jaxnbv.utility import Quantity
 
@@ -162,9 +162,9 @@ def _areas_shown(
     """Two areas of one sample: visible from the poses and already seen, and visible from the poses."""
     points = spread_points(surface, _POINTS)
     tolerance = surface.grid.spacing
-    is_visible = jnp.any(sees(surface, camera, poses, points, tolerance, barrier), axis=0)
+    is_shown = jnp.any(is_visible(surface, camera, poses, points, tolerance, barrier), axis=0)
     is_seen = unseen(points.points) <= 0
     if isinstance(unseen.seen, Looks):
-        own = sees(surface, unseen.seen.camera, views.rows, points, tolerance)
+        own = is_visible(surface, unseen.seen.camera, views.rows, points, tolerance)
         is_seen &= jnp.any(own & views.is_filled[:, None], axis=0)
-    return jnp.stack([jnp.sum(points.areas, where=is_seen & is_visible), jnp.sum(points.areas, where=is_visible)])
+    return jnp.stack([jnp.sum(points.areas, where=is_seen & is_shown), jnp.sum(points.areas, where=is_shown)])

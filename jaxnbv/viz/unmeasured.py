@@ -40,7 +40,7 @@ def unmeasured(surface: trimesh.Trimesh, observations: Observations, carving: Ca
     times = np.zeros((looks.grid.resolution + 1,) * 3, int)
     for index in range(count):
         in_vain = np.zeros(times.shape, bool)
-        seen = np.asarray(looks.cells_in_vain(mesh, index, observations.poses.rows[index]))
+        seen = np.asarray(looks.unmeasured_cells(mesh, index, observations.poses.rows[index]))
         in_vain[tuple(seen[(seen < looks.grid.resolution).all(axis=1)].T)] = True
         # Rays are farther apart than cells.
         times += binary_dilation(in_vain, np.ones((3, 3, 3)))

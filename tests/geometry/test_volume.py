@@ -66,9 +66,9 @@ def test_boundary_points_lie_on_the_boundary_all_around(name):
 def test_the_share_of_points_beyond_each_face():
     box = nbv.Box((0.0, 0.0, 0.0), (1.0, 2.0, 3.0))
     points = np.array([[1.2, 1.0, 1.0], [1.05, 1.0, 3.3], [0.5, -0.2, 1.0], [0.5, 1.0, 1.0]])
-    found = box.passed(points, 0.1)
+    found = box.shares_beyond(points, 0.1)
     assert found == {"-x": 0.0, "+x": 0.25, "-y": 0.25, "+y": 0.0, "-z": 0.0, "+z": 0.25}
-    assert box.passed(points[:0], 0.1) == {}
+    assert box.shares_beyond(points[:0], 0.1) == {}
 
 
 def test_a_program_runs_for_any_box():

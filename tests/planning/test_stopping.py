@@ -165,7 +165,7 @@ def test_what_no_sensor_can_measure_need_not_be_covered():
     surfaces = balls(fine, [0.8, 1.1])
     known = dataclasses.replace(after(planner, observations.cloud, surfaces=surfaces), observations=observations)
     assert expected_coverage(known, NewSurface()) < 0.45
-    measurable = observations.looks.measurable(surfaces, observations.poses)
+    measurable = observations.looks.without_unmeasured(surfaces, observations.poses)
     covered = expected_coverage(dataclasses.replace(known, surfaces=lambda: measurable), NewSurface())
     # What of the larger ball is steep to both views may still be there, but for what lies a cell from what is not.
     drawn = np.random.default_rng(2).normal(size=(50_000, 3))

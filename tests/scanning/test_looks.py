@@ -23,7 +23,7 @@ def cloud_of(points, capacity):
 
 
 def nothing(camera=CAMERA):
-    return Looks.none(GRID, camera, 3)
+    return Looks.empty(GRID, camera, 3)
 
 
 def distances(points):
@@ -74,7 +74,7 @@ def test_what_a_view_measured_stays_and_what_it_looked_at_in_vain_goes():
     more; from the other side, where nobody looked, it can."""
     surfaces = sampled(0.6, 0.8)
     looks, poses = after(POSE, scan(nbv.SDFSurface(BALL), CAMERA, POSE))
-    found = looks.measurable(surfaces, poses)
+    found = looks.without_unmeasured(surfaces, poses)
     behind = nbv.look_at(-POSE.position)
     assert shown(found, POSE) == shown(surfaces, POSE)
     assert shown(found, behind) == shown(surfaces, behind)
@@ -88,7 +88,7 @@ def test_only_as_far_as_a_view_saw_it_looked(sight, share):
     """Without a single return: to the end, to something before the ball, or not at all."""
     surfaces = sampled(0.6)
     looks, poses = after(POSE, dataclasses.replace(EMPTY, sight=jnp.full(600, sight)))
-    count = shown(looks.measurable(surfaces, poses), POSE)
+    count = shown(looks.without_unmeasured(surfaces, poses), POSE)
     assert count == shown(surfaces, POSE) if share == 1.0 else count < share * shown(surfaces, POSE)
 
 
@@ -98,12 +98,12 @@ def test_a_ray_that_met_something_deeper_has_passed_however_steep_the_surface():
     surfaces, left = sampled(0.6), []
     for sight in (np.inf, 4.0):
         looks, poses = after(POSE, dataclasses.replace(EMPTY, sight=jnp.full(600, sight)))
-        left.append(shown(looks.measurable(surfaces, poses), POSE))
+        left.append(shown(looks.without_unmeasured(surfaces, poses), POSE))
     assert left[1] < 0.5 * left[0]
 
 
 def test_of_a_sensor_of_many_rays_every_few_are_kept():
-    looks = Looks.none(GRID, nbv.Camera(height=480, width=640), 2)
+    looks = Looks.empty(GRID, nbv.Camera(height=480, width=640), 2)
     assert 2_000 < looks.camera.num_rays <= 5_000
     assert looks.sight.shape == (2, looks.camera.num_rays)
 
@@ -112,7 +112,7 @@ def test_behind_an_obstacle_nothing_was_looked_at():
     surfaces = sampled(0.6)
     silent = dataclasses.replace(EMPTY, sight=jnp.full(600, jnp.inf))
     looks, poses = after(POSE, silent, barrier=jnp.full(600, 1.0))
-    assert shown(looks.measurable(surfaces, poses), POSE) == shown(surfaces, POSE)
+    assert shown(looks.without_unmeasured(surfaces, poses), POSE) == shown(surfaces, POSE)
 
 
 def test_the_sight_of_a_finer_sensor_is_that_of_the_pixel_about_each_ray():

@@ -13,7 +13,7 @@ import trimesh
 
 import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Sphere
-from jaxnbv.scanning.sensors import USUAL_SETTING, fitted
+from jaxnbv.scanning.sensors import USUAL_SETTING, fit_distance
 from jaxnbv.studies.sensors import HEAT_SETTING, PART_SETTING
 
 ICOSPHERE = trimesh.creation.icosphere(4)
@@ -128,7 +128,7 @@ def seen_share(setting, reach):
 
 @pytest.mark.parametrize("setting", [USUAL_SETTING, PART_SETTING, HEAT_SETTING])
 def test_all_of_an_object_is_seen_from_everywhere_and_hardly_more(setting):
-    found = fitted(setting, 1.7)
+    found = fit_distance(setting, 1.7)
     assert seen_share(found, 1.7) == 1.0
     assert seen_share(found, 1.7 * 1.06) < 1.0
     assert found._replace(radius=setting.radius) == setting
@@ -136,7 +136,7 @@ def test_all_of_an_object_is_seen_from_everywhere_and_hardly_more(setting):
 
 def test_from_further_away_the_same_ball_stands_under_the_angle_of_the_sine():
     """A ray along the silhouette touches the ball: its angle with the axis is arcsin(reach / radius)."""
-    found = fitted(USUAL_SETTING, 1.0)
+    found = fit_distance(USUAL_SETTING, 1.0)
     edge = nbv.look_at((0.0, 0.0, found.radius))
     a = 0.5 * found.camera.fov
     direction = np.asarray(edge.rotation) @ [math.sin(a), 0.0, math.cos(a)]
@@ -158,7 +158,7 @@ COUNT = 20_000
 )
 def test_noise_and_steps_grow_with_the_square_of_the_depth(noise, at_a_metre, step):
     for depth in (0.7, 2.0, 4.0):
-        found = np.asarray(noise.measured(jnp.full(COUNT, depth), KEY), np.float64)
+        found = np.asarray(noise.apply(jnp.full(COUNT, depth), KEY), np.float64)
         # Rounding adds a twelfth of its square. The deviation of so many has a standard error of 0.5 %, its mean of
         # 0.7 % of the deviation; 1/z is not linear, which adds (deviation / z)^2 of z to the mean.
         spread = depth**2 * np.hypot(at_a_metre, step / np.sqrt(12.0))
@@ -170,8 +170,8 @@ def test_noise_and_steps_grow_with_the_square_of_the_depth(noise, at_a_metre, st
 
 def test_scene_units_scale_it_and_nothing_stays_nothing():
     depth = jnp.array([0.0, 1.0, 2.0, 3.0])
-    metres = nbv.DepthNoise.kinect_v1().measured(depth, KEY)
-    scene = nbv.DepthNoise.kinect_v1(scale=5.0).measured(5.0 * depth, KEY)
+    metres = nbv.DepthNoise.kinect_v1().apply(depth, KEY)
+    scene = nbv.DepthNoise.kinect_v1(scale=5.0).apply(5.0 * depth, KEY)
     np.testing.assert_allclose(scene, 5.0 * metres, rtol=1e-5)
     assert metres[0] == 0.0
 

@@ -10,7 +10,7 @@ import pytest
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import look_at
 from jaxnbv.scanning import Grid, GridSurface
-from jaxnbv.scanning.visibility import SurfacePoints, sees, spread_points
+from jaxnbv.scanning.visibility import SurfacePoints, is_visible, spread_points
 
 GRID = Grid(48, 1.5)
 NODES = np.stack(np.meshgrid(*3 * [GRID.axis], indexing="ij"), axis=-1)
@@ -55,7 +55,7 @@ def test_a_surface_without_points_has_no_area():
 
 
 def seen_of(surface, poses, points, **limits):
-    return np.asarray(sees(surface, dataclasses.replace(CAMERA, **limits), poses, points, GRID.spacing))
+    return np.asarray(is_visible(surface, dataclasses.replace(CAMERA, **limits), poses, points, GRID.spacing))
 
 
 def test_a_pose_sees_what_faces_it_and_nothing_hides():
@@ -112,8 +112,10 @@ def test_what_is_behind_an_obstacle_is_not_seen():
     surface, poses = surface_of(ball((0.0, 0.0, 0.0), 0.9)), look_at([(0.0, 0.0, 3.2), (3.2, 0.0, 0.0)])
     points = spread_points(surface, 1000)
     wall = jnp.where(jnp.arange(CAMERA.num_rays) < CAMERA.num_rays // 2, 1.0, jnp.inf)
-    free = np.asarray(sees(surface, CAMERA, poses, points, GRID.spacing))
-    behind = np.asarray(sees(surface, CAMERA, poses, points, GRID.spacing, jnp.stack([wall, jnp.full_like(wall, 9.0)])))
+    free = np.asarray(is_visible(surface, CAMERA, poses, points, GRID.spacing))
+    behind = np.asarray(
+        is_visible(surface, CAMERA, poses, points, GRID.spacing, jnp.stack([wall, jnp.full_like(wall, 9.0)]))
+    )
     height = np.asarray(points.points)[:, 1]
     np.testing.assert_array_equal(behind[0], free[0] & (height < 0))
     np.testing.assert_array_equal(behind[1], free[1])
@@ -124,7 +126,7 @@ def test_no_ray_sees_what_is_void():
     half = np.zeros(3 * [GRID.resolution - 1], bool)
     half[: GRID.resolution // 2] = True
     points = spread_points(surface, 1000)
-    free, left = (seen_of(each, pose, points)[0] for each in (surface, surface.void(jnp.asarray(half))))
+    free, left = (seen_of(each, pose, points)[0] for each in (surface, surface.without_cells(jnp.asarray(half))))
     away = np.abs(np.asarray(points.points)[:, 0]) > GRID.spacing
     np.testing.assert_array_equal(left[away], (free & (np.asarray(points.points)[:, 0] > 0))[away])
 
