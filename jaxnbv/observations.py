@@ -41,7 +41,7 @@ class Observations(eqx.Module):
     - `looks`: the measured surface, and how far each view saw.
     - `empty_nodes`: mask of the nodes that some scan showed to be empty.
     - `obstacle_nodes`: mask of the nodes inside known obstacles, where the object cannot be.
-    - `hypotheses`: the state that a model carries from view to view, see `SurfaceModel.observed`; None without one.
+    - `hypotheses`: the state that a model carries from view to view, see `SurfaceModel.add_state`; None without one.
     """
 
     cloud: PointCloud

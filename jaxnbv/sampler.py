@@ -30,12 +30,12 @@ from jaxnbv.scanning import Carving, Grid, GridSurface, TriangleMesh, carve
 from jaxnbv.scanning.grid import touched_cells
 from jaxnbv.scanning.mesh import level_triangles, supported_pieces
 from jaxnbv.surfaces import (
+    EmptySpace,
     GeometricSPSR,
     KnownShapes,
     OnSurface,
     OutsideBoundary,
     ScreenedSPSR,
-    SeenEmpty,
     ShapeBank,
     ShapePoses,
     SurfaceModel,
@@ -109,7 +109,7 @@ class SurfaceSampler(eqx.Module):
         - `quick`: use fewer frequencies.
         - `volume`: by default the cube of the longest side about the origin. A volume given here may cut the object.
         - `solid`: set this for a body that is nowhere thin, such as the pyramid. Its hidden side is as large as the
-          visible one, so space next to empty space need not be empty: `SeenEmpty` is left out.
+          visible one, so space next to empty space need not be empty: `EmptySpace` is left out.
 
         **Raises:** `ValueError` for another name, or a longest side that is not positive.
         """
@@ -123,7 +123,7 @@ class SurfaceSampler(eqx.Module):
         # Shorter scales need more frequencies, but time and memory grow with their cube.
         truncation = min(round((20 if quick else usual.base.truncation) / scale), 30 if quick else 48)
         base = GeometricSPSR(lengthscales, usual.base.variance, truncation)
-        values = (OutsideBoundary(volume, room=room), OnSurface(), *(() if solid else (SeenEmpty(),)))
+        values = (OutsideBoundary(volume, room=room), OnSurface(), *(() if solid else (EmptySpace(),)))
         return cls(ScreenedSPSR(base, values, offset=scale * usual.offset), carving=Carving(volume))
 
     @own_settings()
@@ -144,7 +144,9 @@ class SurfaceSampler(eqx.Module):
     @property
     def without_bank(self) -> "SurfaceSampler":
         """A copy without a bank: its prior is the model that `KnownShapes` uses for "none of these"."""
-        return dataclasses.replace(self, model=self.model.unknown) if isinstance(self.model, KnownShapes) else self
+        return (
+            dataclasses.replace(self, model=self.model.model_of_none) if isinstance(self.model, KnownShapes) else self
+        )
 
     @own_settings()
     def within(self, volume: Box) -> "SurfaceSampler":

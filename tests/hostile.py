@@ -112,7 +112,7 @@ CALLS = {
     nbv.RandomView: {"candidates": 6},
     nbv.SDFSurface: {"sdf": BALL, "bounding_radius": 2.0},
     nbv.ScreenedSPSR: {"base": MODEL, "values": (nbv.surfaces.OnSurface(),), "level_deviation": 0.5, "offset": 0.1},
-    nbv.surfaces.SeenEmpty: {"num_points": 10, "value": 2.0, "noise": 1.0},
+    nbv.surfaces.EmptySpace: {"num_points": 10, "value": 2.0, "noise": 1.0},
     nbv.SensorNoise: {"points": 0.01, "normals": 0.01},
     nbv.AcquisitionList: {"members": (nbv.Coverage(),)},
     nbv.SoftPartCount: {"segmenter": number_of_points, "target": 60.0},

@@ -145,7 +145,7 @@ SURFACES = [
     (lambda: nbv.ScreenedSPSR(level_deviation=0.0), "level_deviation is 0.0"),
     (lambda: nbv.ScreenedSPSR(offset=-1.0), "offset is -1.0"),
     (lambda: nbv.surfaces.OnSurface(0), "number of values is 0"),
-    (lambda: nbv.surfaces.SeenEmpty(noise=-1.0), "noise of the values is -1.0"),
+    (lambda: nbv.surfaces.EmptySpace(noise=-1.0), "noise of the values is -1.0"),
     (lambda: nbv.surfaces.OutsideBoundary(nbv.Box.cube(4.0)), "coordinate of 2"),
     (lambda: nbv.surfaces.OutsideBoundary(nbv.Box((1.0, 1.0, 1.0), (1.2, 1.2, 1.2))), "must enclose the origin"),
     (lambda: nbv.surfaces.FreeRotation(scale=(0.0, 1.0)), "the scales are"),

@@ -41,7 +41,7 @@ def test_lengths_are_in_proportion_to_the_object():
 
 def test_of_a_solid_body_nothing_follows_from_what_was_seen_empty():
     kinds = [[type(one).__name__ for one in preset("screened", solid=solid).model.values] for solid in (False, True)]
-    assert kinds == [["OutsideBoundary", "OnSurface", "SeenEmpty"], ["OutsideBoundary", "OnSurface"]]
+    assert kinds == [["OutsideBoundary", "OnSurface", "EmptySpace"], ["OutsideBoundary", "OnSurface"]]
 
 
 def test_quick_surfaces_have_fewer_frequencies():

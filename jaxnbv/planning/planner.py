@@ -146,7 +146,7 @@ class Planner(eqx.Module):
             self.sampler.model.check(observations.cloud)
         if pose is not None:
             observations = self._with_view(observations, pose, scan, camera)
-        return self.sampler.model.observed(observations)
+        return self.sampler.model.add_state(observations)
 
     @own_settings()
     def observe(
@@ -176,7 +176,7 @@ class Planner(eqx.Module):
         # An acquisition about known parts uses no samples on the grid.
         if self.search.uses_samples and not self.acquisition.needs_hypotheses and not is_traced(after):
             self.sampler.grid.check(after.cloud)
-        return self.sampler.model.observed(after)
+        return self.sampler.model.add_state(after)
 
     def replay(self, views: Iterable[tuple[Pose, PointCloud]], camera: Camera | None = None) -> Iterator[Observations]:
         """Yield the observations after each view: `init` with the first, then `observe`. Raises as these do.

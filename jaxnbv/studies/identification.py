@@ -224,7 +224,7 @@ class IdentificationStudy(Study):
         assert isinstance(hypotheses, PartHypotheses)
         (task, points, diameter), bank = truth, hypotheses.bank
         weights = np.append(np.asarray(hypotheses.shape_weights), hypotheses.weights[-1])
-        named, (part, placement) = int(np.argmax(weights)), hypotheses.likeliest
+        named, (part, placement) = int(np.argmax(weights)), hypotheses.most_likely
         # Parts that the scans so far do not distinguish are tied, whatever their order in the bank.
         is_tied = weights >= _LEVEL * weights.max()
         right = float(is_tied[task.part] / is_tied.sum())
@@ -239,7 +239,7 @@ class IdentificationStudy(Study):
             "fit": fit,
             "placed": right if fit < _RIGHT else 0.0,
             "add_s": float(np.mean(cKDTree(dense).query(points)[0])) / diameter,
-            "likeliest": {"part": part, "rotation": rotation.tolist(), "shift": shift.tolist()},
+            "most_likely": {"part": part, "rotation": rotation.tolist(), "shift": shift.tolist()},
         }
 
     def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
@@ -250,7 +250,7 @@ class IdentificationStudy(Study):
 
         def tile(axes: Axes, method: str, view: int) -> None:
             run = runs[method]
-            at = run["likeliest"][view]
+            at = run["most_likely"][view]
             mesh = task.placed(at["part"], np.asarray(at["rotation"]), np.asarray(at["shift"]))
             axes.imshow(still_of(mesh, eye, pixels, lambda points: tree.query(points)[0], _ERRORS).image)
             say(axes, f"{run['named'][view]}, {run['p_true'][view]:.2f}", right=run["right"][view] == 1)

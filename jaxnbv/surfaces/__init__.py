@@ -22,8 +22,8 @@ from jaxnbv.surfaces.shipped_banks import bank_poses as bank_poses
 from jaxnbv.surfaces.shipped_banks import shape_bank as shape_bank
 from jaxnbv.surfaces.spsr import GeometricSPSR as GeometricSPSR
 from jaxnbv.surfaces.trigonometric import TrigonometricFields as TrigonometricFields
+from jaxnbv.surfaces.values import EmptySpace as EmptySpace
 from jaxnbv.surfaces.values import OnSurface as OnSurface
 from jaxnbv.surfaces.values import OutsideBoundary as OutsideBoundary
-from jaxnbv.surfaces.values import SeenEmpty as SeenEmpty
 from jaxnbv.surfaces.values import ValueRows as ValueRows
 from jaxnbv.surfaces.values import ValueSource as ValueSource

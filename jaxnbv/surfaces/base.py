@@ -158,7 +158,7 @@ class SurfaceModel(eqx.Module):
         implementation converts a cloud alone by `as_observations`.
         """
 
-    def observed(self, observations: Observations) -> Observations:
+    def add_state(self, observations: Observations) -> Observations:
         """Add the state that the model carries from view to view. Called after each view."""
         return observations
 
@@ -168,7 +168,7 @@ class SurfaceModel(eqx.Module):
 
     @property
     def carries_hypotheses(self) -> bool:
-        """Whether `observed` keeps hypotheses about the identity of a known part, see `PartHypotheses`."""
+        """Whether `add_state` keeps hypotheses about the identity of a known part, see `PartHypotheses`."""
         return False
 
     def check(self, cloud: PointCloud) -> None:

@@ -25,7 +25,7 @@ from jaxnbv.surfaces.covariance import (
     function_variance,
     mode_variance,
 )
-from jaxnbv.surfaces.pathwise import DataPoints, MeansAtData, TrigonometricPosterior, filled
+from jaxnbv.surfaces.pathwise import DataPoints, MeansAtData, TrigonometricPosterior, fill_rows
 from jaxnbv.surfaces.solver import Solver, solver_of
 from jaxnbv.surfaces.trigonometric import NonuniformTransform, solve_poisson
 
@@ -90,7 +90,7 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
 
     def data_points(self) -> DataPoints:
         """The points of the cloud, for gradients and for values."""
-        points = filled(self.cloud.points, self.cloud.mask)
+        points = fill_rows(self.cloud.points, self.cloud.mask)
         return DataPoints(points, points)
 
     def level_about(self, means: MeansAtData) -> Float[Array, " s"]:

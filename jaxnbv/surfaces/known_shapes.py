@@ -31,7 +31,7 @@ from jaxnbv.sharding import shared_map
 from jaxnbv.surfaces.base import Fields, SurfaceModel, SurfacePosterior, sampling_method
 from jaxnbv.surfaces.part_hypotheses import NONE, PartHypotheses, identify
 from jaxnbv.surfaces.placement import FreeRotation, Placement, ShapePoses
-from jaxnbv.surfaces.registration import Hypotheses, Prior, Seen, register
+from jaxnbv.surfaces.registration import FitTargets, Hypotheses, Prior, register
 from jaxnbv.surfaces.screened import ScreenedSPSR, ScreenedSPSRPosterior
 from jaxnbv.surfaces.shape_bank import ShapeBank
 from jaxnbv.surfaces.spsr import GeometricSPSR
@@ -58,7 +58,7 @@ class KnownShapes(SurfaceModel):
     - `residual`: the short-ranged model of the difference between the object and the shape, near the scan.
     - `poses`: the possible placements of shapes in the scene.
     - `box`: a tight box around the object.
-    - `unknown`: the model for an object that is none of the shapes. With an empty bank this is the whole model.
+    - `model_of_none`: the model for an object that is none of the shapes. With an empty bank this is the whole model.
     - `num_starts`: number of placements tried, over all shapes.
     - `noise_scale`: rho, which scales the residual's standard deviation. At 1 the prior's deviation in unseen places
       breaks thin parts and leaves pieces floating around them.
@@ -72,7 +72,7 @@ class KnownShapes(SurfaceModel):
     residual: ScreenedSPSR = eqx.field(default_factory=short_ranged)
     poses: ShapePoses = FreeRotation()
     box: Box = Box()
-    unknown: SurfaceModel = eqx.field(default_factory=ScreenedSPSR)
+    model_of_none: SurfaceModel = eqx.field(default_factory=ScreenedSPSR)
     num_starts: int = eqx.field(static=True, default=4096)
     noise_scale: float = eqx.field(static=True, default=0.1)
     inverse_temperature: float = eqx.field(static=True, default=20.0)
@@ -85,7 +85,7 @@ class KnownShapes(SurfaceModel):
             require(0 <= value < math.inf, f"the {name} is {value}; it must be finite and not negative")
 
     def check(self, cloud: PointCloud) -> None:
-        self.unknown.check(cloud)
+        self.model_of_none.check(cloud)
 
     @property
     def carries_hypotheses(self) -> bool:
@@ -95,36 +95,36 @@ class KnownShapes(SurfaceModel):
     def in_scene(self, frame: Frame) -> "KnownShapes":
         return dataclasses.replace(self, bank=self.bank.in_scene(frame))
 
-    def observed(self, observations: Observations) -> Observations:
+    def add_state(self, observations: Observations) -> Observations:
         """Add the `PartHypotheses` of parts at true size; no change for a bank of categories."""
         if not self.carries_hypotheses:
             return observations
-        before = observations.hypotheses
-        assert before is None or isinstance(before, PartHypotheses)
+        previous = observations.hypotheses
+        assert previous is None or isinstance(previous, PartHypotheses)
         return dataclasses.replace(
-            observations, hypotheses=identify(self.bank, self.poses, self.box, observations, before)
+            observations, hypotheses=identify(self.bank, self.poses, self.box, observations, previous)
         )
 
     def condition(self, observations: Observations | PointCloud) -> SurfacePosterior:
         """The posterior p(f | observations), with the shapes registered to the cloud and to empty space.
 
-        **Raises:** `ValueError` as the `condition` of `residual` and `unknown` does.
+        **Raises:** `ValueError` as the `condition` of `residual` and `model_of_none` does.
         """
         observations = as_observations(observations)
-        unknown = self.unknown.condition(observations)
+        of_none = self.model_of_none.condition(observations)
         if self.bank.solids is None:
-            return unknown
+            return of_none
         if self.carries_hypotheses:
             hypotheses = (
-                self.observed(observations).hypotheses if observations.hypotheses is None else observations.hypotheses
+                self.add_state(observations).hypotheses if observations.hypotheses is None else observations.hypotheses
             )
             assert isinstance(hypotheses, PartHypotheses)
             fits, weights = hypotheses.placed, hypotheses.weights
         else:
-            fits = register(self.bank, Prior(self.poses, self.box), Seen.of(observations), self.num_starts)
+            fits = register(self.bank, Prior(self.poses, self.box), FitTargets.of(observations), self.num_starts)
             weights = _weights(fits, self.inverse_temperature, self.misfit_of_none)
         return KnownShapesPosterior(
-            jnp.zeros_like(unknown.level), self, fits, weights, self.residual.condition(observations), unknown
+            jnp.zeros_like(of_none.level), self, fits, weights, self.residual.condition(observations), of_none
         )
 
 
@@ -150,31 +150,31 @@ class KnownShapesPosterior(SurfacePosterior):
     """The posterior p(f | D) under `KnownShapes`.
 
     - `level`: zero.
-    - `found`: the registered shapes.
+    - `fits`: the registered shapes.
     - `weights`: weight of each of them, and last of "none of these".
     - `residual`: p(g | D), which gives the samples about the shapes.
-    - `unknown`: p(f | D, none of the shapes).
+    - `of_none`: p(f | D, none of the shapes).
     """
 
     level: Float[Array, ""]
     model: KnownShapes
-    found: Hypotheses
+    fits: Hypotheses
     weights: Float[Array, " h_and_none"]
     residual: ScreenedSPSRPosterior
-    unknown: SurfacePosterior
+    of_none: SurfacePosterior
 
     @property
     def hypotheses(self) -> list[Hypothesis]:
         """The hypotheses, including "none of these", most likely first."""
         # One transfer to the host, not one per row.
-        fits, weights = jax.tree.map(np.asarray, self.found), np.asarray(self.weights)
+        fits, weights = jax.tree.map(np.asarray, self.fits), np.asarray(self.weights)
         names = self.model.bank.names
         of_shapes = [
             Hypothesis(
                 names[fits.shape[row]],
                 float(weights[row]),
                 float(fits.misfit[row]),
-                jax.tree.map(lambda rows, row=row: rows[row], self.found.placement),
+                jax.tree.map(lambda rows, row=row: rows[row], self.fits.placement),
             )
             for row in np.flatnonzero(fits.is_mode)
         ]
@@ -192,7 +192,7 @@ class KnownShapesPosterior(SurfacePosterior):
     def names_of_samples(self, key: PRNGKeyArray, num_samples: int) -> list[str]:
         """Name of the shape behind each sample of `sample` with the same key."""
         of_bank = self.model.bank.names
-        names = [*(of_bank[index] for index in np.asarray(self.found.shape)), NONE]
+        names = [*(of_bank[index] for index in np.asarray(self.fits.shape)), NONE]
         return [names[index] for index in np.asarray(_drawn(self, key, num_samples))]
 
     @sampling_method
@@ -203,8 +203,8 @@ class KnownShapesPosterior(SurfacePosterior):
 
 @program
 def _sample(posterior: KnownShapesPosterior, key: PRNGKeyArray, num_samples: int) -> "MixtureFields":
-    _, residual_key, unknown_key = jax.random.split(key, 3)
-    fits, bank = posterior.found, posterior.model.bank
+    _, residual_key, none_key = jax.random.split(key, 3)
+    fits, bank = posterior.fits, posterior.model.bank
     index = _drawn(posterior, key, num_samples)
     is_none = index == len(fits.shape)
     row = jnp.where(is_none, 0, index)
@@ -214,11 +214,11 @@ def _sample(posterior: KnownShapesPosterior, key: PRNGKeyArray, num_samples: int
     about_shapes = posterior.residual.sample_about(means, residual_key, posterior.model.noise_scale)
 
     def draw():
-        return posterior.unknown.sample(unknown_key, num_samples)
+        return posterior.of_none.sample(none_key, num_samples)
 
     nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), eqx.filter_eval_shape(draw))
-    unknown = jax.lax.cond(jnp.any(is_none), draw, lambda: nothing)
-    return MixtureFields(about_shapes, unknown, posterior.unknown.level, is_none)
+    of_none = jax.lax.cond(jnp.any(is_none), draw, lambda: nothing)
+    return MixtureFields(about_shapes, of_none, posterior.of_none.level, is_none)
 
 
 @program
@@ -267,15 +267,15 @@ class PlacedShapes(Fields):
 class MixtureFields(Fields):
     """Samples that come from one of two batches.
 
-    - `known`, `unknown`: the two batches, of the same size.
-    - `level`: the level of `unknown`, which is subtracted from its values.
-    - `is_unknown`: whether each sample comes from `unknown`.
+    - `of_shapes`, `of_none`: the two batches, of the same size.
+    - `level`: the level of `of_none`, which is subtracted from its values.
+    - `is_none`: whether each sample comes from `of_none`.
     """
 
-    known: Fields
-    unknown: Fields
+    of_shapes: Fields
+    of_none: Fields
     level: Float[Array, ""]
-    is_unknown: Bool[Array, " s"]
+    is_none: Bool[Array, " s"]
 
     def __call__(self, x: Float[AnyArray, "n 3"]) -> Float[Array, "s n"]:
         return self._merged(lambda fields: fields(x))
@@ -287,10 +287,10 @@ class MixtureFields(Fields):
         return self._merged(lambda fields: fields.on_grid(axis))
 
     def _merged(self, evaluate: Any, relative: bool = True) -> Array:
-        shape = jax.eval_shape(lambda: evaluate(self.known))
+        shape = jax.eval_shape(lambda: evaluate(self.of_shapes))
         zero = jnp.zeros(shape.shape, shape.dtype)
         # A batch that gives no sample is not evaluated.
-        of_known = jax.lax.cond(jnp.all(self.is_unknown), lambda: zero, lambda: evaluate(self.known))
-        of_unknown = jax.lax.cond(jnp.any(self.is_unknown), lambda: evaluate(self.unknown), lambda: zero)
-        is_unknown = self.is_unknown.reshape(-1, *(1,) * (zero.ndim - 1))
-        return jnp.where(is_unknown, of_unknown - self.level if relative else of_unknown, of_known)
+        from_shapes = jax.lax.cond(jnp.all(self.is_none), lambda: zero, lambda: evaluate(self.of_shapes))
+        from_none = jax.lax.cond(jnp.any(self.is_none), lambda: evaluate(self.of_none), lambda: zero)
+        is_none = self.is_none.reshape(-1, *(1,) * (zero.ndim - 1))
+        return jnp.where(is_none, from_none - self.level if relative else from_none, from_shapes)

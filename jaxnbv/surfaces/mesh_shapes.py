@@ -29,7 +29,7 @@ _ARRAYS = ("values", "low", "spacing", "padding", "extremes", "from_mesh")
 _T = TypeVar("_T")
 
 
-def listed(values: Sequence[_T], name: str) -> tuple[_T, ...]:
+def as_tuple(values: Sequence[_T], name: str) -> tuple[_T, ...]:
     """The values as a tuple.
 
     **Raises:** `ValueError` for values that are not iterable.
@@ -54,7 +54,7 @@ def mesh_paths(meshes: str | Path | Sequence[str | Path | trimesh.Trimesh]) -> l
         meshes = [path for path in sorted(folder.rglob("*")) if path.suffix[1:].lower() in formats and path.is_file()]
         ends = ", ".join(sorted(formats))
         require(len(meshes) > 0, f"the folder {folder} holds no mesh: its files must end in {ends}")
-    items = listed(meshes, "the meshes")
+    items = as_tuple(meshes, "the meshes")
     require(len(items) > 0, "no meshes are named: give their files, or a folder")
     for path in items:
         check_type(path, str | Path | trimesh.Trimesh, "a mesh")

@@ -12,9 +12,9 @@ from jaxnbv.observations import Observations
 from jaxnbv.programs import program
 from jaxnbv.scanning import Grid, GridSurface
 from jaxnbv.surfaces.part_evidence import LEAST_TAU, Rays, evidence
-from jaxnbv.surfaces.part_search import nothing_before, search_parts
+from jaxnbv.surfaces.part_search import placeholder_hypotheses, search_parts
 from jaxnbv.surfaces.placement import Placement, ShapePoses
-from jaxnbv.surfaces.registration import NUM_POINTS, Hypotheses, Seen
+from jaxnbv.surfaces.registration import NUM_POINTS, FitTargets, Hypotheses
 from jaxnbv.surfaces.shape_bank import ShapeBank
 
 NONE = "none of these"
@@ -63,7 +63,7 @@ class PartHypotheses(eqx.Module):
         return dict(sorted(listed.items(), key=lambda item: -item[1]))
 
     @property
-    def likeliest(self) -> tuple[int, Placement]:
+    def most_likely(self) -> tuple[int, Placement]:
         """Index in the bank of the most likely part, and its most likely placement."""
         shapes, weights = np.asarray(self.placed.shape), np.asarray(self.weights)[:-1]
         part = int(np.argmax(np.bincount(shapes, weights, len(self.bank))))
@@ -82,19 +82,19 @@ def hypotheses_of(observations: Observations) -> PartHypotheses:
 
 
 def identify(
-    bank: ShapeBank, poses: ShapePoses, box: Box, observations: Observations, before: PartHypotheses | None
+    bank: ShapeBank, poses: ShapePoses, box: Box, observations: Observations, previous: PartHypotheses | None
 ) -> PartHypotheses:
     """The hypotheses given the observations.
 
     - `bank`: the parts at true size, in scene units.
     - `poses`: the possible placements of the parts.
     - `box`: a box around the object.
-    - `before`: the hypotheses of the previous view, which are kept while they fit.
+    - `previous`: the hypotheses of the previous view, which are kept while they fit.
     """
-    seen = Seen.of(observations)
-    previous = nothing_before(seen.points.dtype) if before is None else before.placed
+    targets = FitTargets.of(observations)
+    placed = placeholder_hypotheses(targets.points.dtype) if previous is None else previous.placed
     rays = Rays.of(observations, box)
-    return _weighted(bank, search_parts(bank, poses, box, seen, rays, previous, _NUM_STARTS), rays)
+    return _weighted(bank, search_parts(bank, poses, box, targets, rays, placed, _NUM_STARTS), rays)
 
 
 @program

@@ -13,7 +13,7 @@ from jaxnbv.programs import program
 from jaxnbv.surfaces.part_hypotheses import PartHypotheses
 from jaxnbv.surfaces.part_search import SAME
 from jaxnbv.surfaces.placement import Placement
-from jaxnbv.surfaces.registration import Seen
+from jaxnbv.surfaces.registration import FitTargets
 from jaxnbv.surfaces.shape_bank import Shape, values_and_gradients
 
 _NUM_PROBES = 4096
@@ -45,7 +45,7 @@ class ObjectPose(eqx.Module):
 
 def object_pose(hypotheses: PartHypotheses, observations: Observations, frame: Frame) -> ObjectPose:
     """The pose of the most likely part, in the world of a frame."""
-    part, placement = hypotheses.likeliest
+    part, placement = hypotheses.most_likely
     bank = hypotheses.bank
     shape = bank.shape(jnp.asarray(part))
     from_mesh = np.eye(4) if bank.from_mesh is None else np.asarray(bank.from_mesh[part], np.float64)
@@ -53,7 +53,7 @@ def object_pose(hypotheses: PartHypotheses, observations: Observations, frame: F
     to_world = np.linalg.inv(_matrix(frame.scale * frame.rotation, -frame.scale * frame.rotation @ frame.center))
     turns = symmetries(shape)
     matrices = np.stack([_rigid(to_world @ to_scene @ _matrix(turn, np.zeros(3)) @ from_mesh) for turn in turns])
-    covariance = _covariance(shape, placement, Seen.of(observations))
+    covariance = _covariance(shape, placement, FitTargets.of(observations))
     back = np.kron(np.eye(2), frame.rotation.T) * np.repeat([1.0, 1.0 / frame.scale], 3)[:, None]
     return ObjectPose(bank.names[part], matrices[0], back @ covariance @ back.T, matrices)
 
@@ -63,9 +63,9 @@ def surface_error(hypotheses: PartHypotheses, observations: Observations) -> flo
 
     It includes the errors of the points and the differences from the other hypotheses.
     """
-    part, placement = hypotheses.likeliest
+    part, placement = hypotheses.most_likely
     shape = hypotheses.bank.shape(jnp.asarray(part))
-    covariance = _covariance(shape, placement, Seen.of(observations))
+    covariance = _covariance(shape, placement, FitTargets.of(observations))
     points = np.asarray(placement.rotation) @ np.asarray(shape.extremes).T + np.asarray(placement.shift)[:, None]
     off, gradient = (
         np.asarray(rows, np.float64) for rows in distances_to(hypotheses, jnp.asarray(points.T, jnp.float32))
@@ -121,16 +121,16 @@ def _largest_change(shape: Shape, turns: Float[Array, "n 3 3"], probes: Float[Ar
     return jax.lax.map(change, turns)
 
 
-def _covariance(shape: Shape, placement: Placement, seen: Seen) -> Float[np.ndarray, "6 6"]:
+def _covariance(shape: Shape, placement: Placement, targets: FitTargets) -> Float[np.ndarray, "6 6"]:
     """Covariance of a turn about the part's centre and of its shift, in the scene.
 
     It is the inverse of J^T J / s^2 plus a broad prior, with J the derivative of the points' distances and s their
     error.
     """
-    distance, gradient = values_and_gradients(lambda x: placement.distance(shape.solid, x), seen.points)
-    mask = np.asarray(seen.mask)
+    distance, gradient = values_and_gradients(lambda x: placement.distance(shape.solid, x), targets.points)
+    mask = np.asarray(targets.mask)
     distance, gradient = np.asarray(distance, np.float64)[mask], np.asarray(gradient, np.float64)[mask]
-    away = np.asarray(seen.points, np.float64)[mask] - np.asarray(placement.shift, np.float64)
+    away = np.asarray(targets.points, np.float64)[mask] - np.asarray(placement.shift, np.float64)
     rows = np.concatenate([np.cross(gradient, away), -gradient], axis=1)
     error = max(_LEAST_ERROR, _BY_MEDIAN * float(np.median(np.abs(distance)))) if len(distance) else 1.0
     unknown = np.repeat([_UNKNOWN_TURN**-2, _UNKNOWN_SHIFT**-2], 3)

@@ -18,7 +18,16 @@ from jaxnbv.geometry.volume import Box
 from jaxnbv.programs import program
 from jaxnbv.surfaces.part_evidence import Rays, evidence
 from jaxnbv.surfaces.placement import Placement, ShapePoses
-from jaxnbv.surfaces.registration import Hypotheses, Prior, Seen, first_of_each, judged, refined, tried, turned_alike
+from jaxnbv.surfaces.registration import (
+    FitTargets,
+    Hypotheses,
+    Prior,
+    evaluate,
+    first_of_each,
+    reevaluate,
+    refine,
+    turned_alike,
+)
 from jaxnbv.surfaces.shape_bank import ShapeBank
 
 NUM_HYPOTHESES = 32
@@ -36,7 +45,7 @@ _ROOM, SAME = 0.2, 0.03
 _NUM_PROBES, _FEW_RAYS = 4096, 1024
 
 
-def nothing_before(dtype: Any) -> Hypotheses:
+def placeholder_hypotheses(dtype: Any) -> Hypotheses:
     """Placeholder hypotheses for the first view: the first part unmoved, a harmless extra start."""
     still = Placement(jnp.eye(3, dtype=dtype), jnp.zeros(3, dtype), jnp.ones(3, dtype))
     one = Hypotheses(jnp.zeros((), int), still, jnp.asarray(jnp.inf, dtype), jnp.asarray(False))
@@ -45,7 +54,13 @@ def nothing_before(dtype: Any) -> Hypotheses:
 
 @program
 def search_parts(
-    bank: ShapeBank, poses: ShapePoses, box: Box, seen: Seen, rays: Rays | None, before: Hypotheses, num_starts: int
+    bank: ShapeBank,
+    poses: ShapePoses,
+    box: Box,
+    targets: FitTargets,
+    rays: Rays | None,
+    previous: Hypotheses,
+    num_starts: int,
 ) -> Hypotheses:
     """The 32 placed parts of smallest misfit, best first.
 
@@ -54,25 +69,25 @@ def search_parts(
 
     - `bank`: parts at true size, in scene units.
     - `box`: a box around the object.
-    - `before`: the hypotheses of the previous view, which are refined and kept while they fit.
+    - `previous`: the hypotheses of the previous view, which are refined and kept while they fit.
     - `num_starts`: number of placements tried for each part.
     """
     prior = Prior(poses, box, is_true_size=True)
-    few, some = seen.first(_COARSE[1]), seen.first(_FINE[1])
-    starts = _of_each(tried(bank, prior, _starts(bank, prior, seen, num_starts), few), len(bank))
+    few, some = targets.first(_COARSE[1]), targets.first(_FINE[1])
+    starts = _of_each(evaluate(bank, prior, _starts(bank, prior, targets, num_starts), few), len(bank))
     best = jax.vmap(lambda own: own.best(_COARSE[0]))(starts)
-    coarse = refined(bank, prior, _flat(best), few, _COARSE[2])
+    coarse = refine(bank, prior, _flat(best), few, _COARSE[2])
     fine = _flat(jax.vmap(lambda own: _apart(own, _FINE[0]))(_of_each(coarse, len(bank))))
-    fine = refined(bank, prior, jax.tree.map(lambda *rows: jnp.concatenate(rows), fine, before), some, _FINE[2])
+    fine = refine(bank, prior, jax.tree.map(lambda *rows: jnp.concatenate(rows), fine, previous), some, _FINE[2])
     everywhere = jax.tree.map(lambda rows: jnp.stack(len(bank) * [rows]), _apart(fine, _SHARED).placement)
-    exchanged = _of_each(judged(bank, prior, tried(bank, prior, everywhere, some), some), len(bank))
+    exchanged = _of_each(reevaluate(bank, prior, evaluate(bank, prior, everywhere, some), some), len(bank))
     own = jax.tree.map(lambda rows: rows[:-NUM_HYPOTHESES], fine)
     kept = jax.tree.map(lambda rows: rows[-NUM_HYPOTHESES:], fine)
     both = jax.tree.map(lambda *rows: jnp.concatenate(rows, axis=1), _of_each(own, len(bank)), exchanged)
     both = jax.vmap(lambda each: _apart(each, _FINE[0]))(both)
-    last = refined(bank, prior, jax.tree.map(lambda *rows: jnp.concatenate(rows), _flat(both), kept), some, _LAST)
+    last = refine(bank, prior, jax.tree.map(lambda *rows: jnp.concatenate(rows), _flat(both), kept), some, _LAST)
     if rays is None:
-        last = judged(bank, prior, last, seen)
+        last = reevaluate(bank, prior, last, targets)
     else:
         last = dataclasses.replace(last, misfit=evidence(bank, last, rays.first(_FEW_RAYS))[0])
     return _distinct(bank, box, last.best(2 * NUM_HYPOTHESES)).best(NUM_HYPOTHESES)
@@ -102,14 +117,14 @@ def _apart(hypotheses: Hypotheses, count: int) -> Hypotheses:
     return dataclasses.replace(ordered, misfit=jnp.where(modes, ordered.misfit, jnp.inf)).best(count)
 
 
-def _starts(bank: ShapeBank, prior: Prior, seen: Seen, num_starts: int) -> Placement:
+def _starts(bank: ShapeBank, prior: Prior, targets: FitTargets, num_starts: int) -> Placement:
     """Placements of each shape along a second axis: rotations, each at a few positions.
 
     The shape spans the scan at each of them. If the whole object was in view, there is one such position across the
     line of sight, and along it one with the scan on the shape's front. If a view shows a patch, positions are spread
     over all that contain the patch.
     """
-    dtype = seen.points.dtype
+    dtype = targets.points.dtype
     rotations = jnp.asarray(prior.poses.rotations_of(len(bank), max(1, num_starts // _PLACES)), dtype)
     count = rotations.shape[1]
     # A low-discrepancy sequence (Roberts 2018). The first position is the middle, with the scan on the front.
@@ -118,10 +133,10 @@ def _starts(bank: ShapeBank, prior: Prior, seen: Seen, num_starts: int) -> Place
     middle = np.tile([[[0.5, 0.5, 1.0]]], (1, count, 1))
     shares = jnp.asarray(np.concatenate([middle, spread.reshape(_PLACES - 1, count, 3)]), dtype)
 
-    axes = _axes_of_sight(seen)
-    along = jnp.matmul(seen.points, axes.T, precision="highest")
-    least = jnp.min(jnp.where(seen.mask[:, None], along, jnp.inf), axis=0)
-    most = jnp.max(jnp.where(seen.mask[:, None], along, -jnp.inf), axis=0)
+    axes = _axes_of_sight(targets)
+    along = jnp.matmul(targets.points, axes.T, precision="highest")
+    least = jnp.min(jnp.where(targets.mask[:, None], along, jnp.inf), axis=0)
+    most = jnp.max(jnp.where(targets.mask[:, None], along, -jnp.inf), axis=0)
     low, high = jnp.asarray(prior.box.low, dtype) - _ROOM, jnp.asarray(prior.box.high, dtype) + _ROOM
 
     def place(shape, rotation, share):
@@ -143,9 +158,9 @@ def _starts(bank: ShapeBank, prior: Prior, seen: Seen, num_starts: int) -> Place
     return jax.vmap(of_shape)(bank.shapes, each)
 
 
-def _axes_of_sight(seen: Seen) -> Float[Array, "3 3"]:
+def _axes_of_sight(targets: FitTargets) -> Float[Array, "3 3"]:
     """Two directions across the line of sight, and the direction to the sensor: the mean of the normals."""
-    mean = jnp.sum(jnp.where(seen.mask[:, None], seen.normals, 0.0), axis=0)
+    mean = jnp.sum(jnp.where(targets.mask[:, None], targets.normals, 0.0), axis=0)
     length = jnp.linalg.norm(mean)
     ahead = jnp.where(length > 0, mean / jnp.where(length > 0, length, 1.0), jnp.eye(3, dtype=mean.dtype)[2])
     aside = jnp.cross(ahead, jnp.eye(3, dtype=mean.dtype)[jnp.argmin(jnp.abs(ahead))])

@@ -177,7 +177,7 @@ class _Zeros(Fields):
         return jnp.zeros((self.count, *x.shape), jnp.asarray(x).dtype)
 
 
-def filled(points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Float[Array, "n 3"]:
+def fill_rows(points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Float[Array, "n 3"]:
     """The points with the first filled row copied into all unfilled rows.
 
     Unfilled rows are zero. A mean function may have no gradient there, and its derivatives would then not be finite,

@@ -42,7 +42,7 @@ _DAMPING = 1e-3
 _LARGEST_STEP = 0.3
 
 
-class Seen(NamedTuple):
+class FitTargets(NamedTuple):
     """Data that shapes are fitted to: points with normals, and empty points, in scene coordinates.
 
     The first rows of each are spread as evenly as all rows.
@@ -55,15 +55,15 @@ class Seen(NamedTuple):
     is_empty: Bool[Array, " m"]
 
     @classmethod
-    def of(cls, observations: Observations) -> "Seen":
+    def of(cls, observations: Observations) -> "FitTargets":
         """Points of the cloud by farthest point sampling, and random nodes that are empty or inside obstacles."""
         cloud = farthest_point_subsample(observations.cloud, NUM_POINTS)
         empty, is_empty = _some_empty(observations)
         return cls(cloud.points, cloud.normals, cloud.mask, empty.astype(cloud.points.dtype), is_empty)
 
-    def first(self, count: int) -> "Seen":
+    def first(self, count: int) -> "FitTargets":
         """The first `count` rows of each."""
-        return Seen(*(rows[:count] for rows in self))
+        return FitTargets(*(rows[:count] for rows in self))
 
 
 def _some_empty(observations: Observations) -> tuple[Float[Array, "m 3"], Bool[Array, " m"]]:
@@ -154,25 +154,25 @@ _PRECISION = _PRIOR * np.array([0.0] * 3 + [_SHIFT**-2] * 3 + [_STRETCH**-2 / 3.
 
 
 @program
-def register(bank: ShapeBank, prior: Prior, seen: Seen, num_starts: int) -> Hypotheses:
+def register(bank: ShapeBank, prior: Prior, targets: FitTargets, num_starts: int) -> Hypotheses:
     """The shapes and placements that fit the scan best.
 
     All shapes are tried in many rotations. Then all shapes are tried in the placements of the best.
     """
-    few, some = seen.first(_COARSE[1]), seen.first(_FINE[1])
+    few, some = targets.first(_COARSE[1]), targets.first(_FINE[1])
     turned = _turned(bank, prior, few, num_starts)
-    coarse = refined(bank, prior, turned.best(_COARSE[0]), few, _COARSE[2])
-    fine = refined(bank, prior, coarse.best(_FINE[0]), some, _FINE[2])
+    coarse = refine(bank, prior, turned.best(_COARSE[0]), few, _COARSE[2])
+    fine = refine(bank, prior, coarse.best(_FINE[0]), some, _FINE[2])
     others = _exchanged(bank, prior, fine, few).best(_LAST[0])
     both = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), fine, others)
-    last = refined(bank, prior, both.best(_LAST[0]), some, _LAST[2])
-    fits = judged(bank, prior, last, seen).best(_LAST[0])
+    last = refine(bank, prior, both.best(_LAST[0]), some, _LAST[2])
+    fits = reevaluate(bank, prior, last, targets).best(_LAST[0])
     return dataclasses.replace(fits, is_mode=_modes(fits.shape, fits.placement.rotation))
 
 
-def _turned(bank: ShapeBank, prior: Prior, seen: Seen, num_starts: int) -> Hypotheses:
+def _turned(bank: ShapeBank, prior: Prior, targets: FitTargets, num_starts: int) -> Hypotheses:
     """All shapes in several rotations each, filling the box."""
-    all_of_them = jnp.asarray(prior.poses.rotations(num_starts), seen.points.dtype)
+    all_of_them = jnp.asarray(prior.poses.rotations(num_starts), targets.points.dtype)
     count = max(1, min(len(all_of_them), num_starts // len(bank)))
     # Each shape has rotations of its own, evenly spread, so that together the shapes leave no gaps.
     offsets = np.random.default_rng(0).permutation(len(bank)) / len(bank)
@@ -182,10 +182,10 @@ def _turned(bank: ShapeBank, prior: Prior, seen: Seen, num_starts: int) -> Hypot
         return jax.vmap(lambda one: prior.filling(shape, one))(rotations)
 
     starts = jax.vmap(of_shape)(bank.shapes, all_of_them[places.astype(int)])
-    return tried(bank, prior, starts, seen)
+    return evaluate(bank, prior, starts, targets)
 
 
-def _exchanged(bank: ShapeBank, prior: Prior, first: Hypotheses, seen: Seen) -> Hypotheses:
+def _exchanged(bank: ShapeBank, prior: Prior, first: Hypotheses, targets: FitTargets) -> Hypotheses:
     """All shapes in the placements of a few of the best hypotheses with different rotations.
 
     Each shape departs from filling the box by as much as that hypothesis does.
@@ -199,16 +199,16 @@ def _exchanged(bank: ShapeBank, prior: Prior, first: Hypotheses, seen: Seen) -> 
     def of_shape(shape):
         return jax.vmap(lambda one, step: prior.filling(shape, one.rotation).moved(step))(where, step)
 
-    return tried(bank, prior, jax.vmap(of_shape)(bank.shapes), seen)
+    return evaluate(bank, prior, jax.vmap(of_shape)(bank.shapes), targets)
 
 
-def tried(bank: ShapeBank, prior: Prior, placements: Placement, seen: Seen) -> Hypotheses:
+def evaluate(bank: ShapeBank, prior: Prior, placements: Placement, targets: FitTargets) -> Hypotheses:
     """Compute the misfit of each shape at its own placements, which lie along a second axis."""
     num_shapes, count = placements.scale.shape[:2]
 
     def of_shape(one):
         shape, where = one
-        return jax.vmap(lambda placement: _misfit(shape, prior, placement, seen, _FIRST_TAU))(where)
+        return jax.vmap(lambda placement: _misfit(shape, prior, placement, targets, _FIRST_TAU))(where)
 
     misfit = jax.lax.map(of_shape, (bank.shapes, placements), batch_size=max(1, _AT_ONCE // count))
     flat = jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), placements)
@@ -216,36 +216,36 @@ def tried(bank: ShapeBank, prior: Prior, placements: Placement, seen: Seen) -> H
     return Hypotheses(shape, flat, misfit.reshape(-1), jnp.ones(len(shape), bool))
 
 
-def refined(bank: ShapeBank, prior: Prior, starts: Hypotheses, seen: Seen, num_steps: int) -> Hypotheses:
+def refine(bank: ShapeBank, prior: Prior, starts: Hypotheses, targets: FitTargets, num_steps: int) -> Hypotheses:
     """Refine each start by Gauss-Newton steps with falling tau.
 
     The result is the iterate of smallest E at the last tau.
     """
     taus = jnp.append(jnp.geomspace(_FIRST_TAU, _LAST_TAU, num_steps), _LAST_TAU)
-    basis = jnp.asarray(prior.steps, seen.points.dtype)
+    basis = jnp.asarray(prior.steps, targets.points.dtype)
 
-    def refine(start):
+    def refine_one(start):
         shape = bank.shape(start.shape)
 
         def advance(state, tau):
             current, best, least = state
-            step, misfit = _newton_step(shape, prior, current, seen, tau, basis)
+            step, misfit = _newton_step(shape, prior, current, targets, tau, basis)
             best = jax.tree.map(lambda a, b: jnp.where(misfit < least, a, b), current, best)
             # The result of the last step is not evaluated, and is dropped.
             return (prior.within(shape, current.moved(step)), best, jnp.minimum(misfit, least)), None
 
-        state = start.placement, start.placement, jnp.asarray(jnp.inf, seen.points.dtype)
+        state = start.placement, start.placement, jnp.asarray(jnp.inf, targets.points.dtype)
         (_, best, least), _ = jax.lax.scan(advance, state, taus)
         return Hypotheses(start.shape, best, least, start.is_mode)
 
-    return jax.lax.map(refine, starts, batch_size=_AT_ONCE)
+    return jax.lax.map(refine_one, starts, batch_size=_AT_ONCE)
 
 
-def judged(bank: ShapeBank, prior: Prior, hypotheses: Hypotheses, seen: Seen) -> Hypotheses:
-    """The hypotheses with E recomputed from all rows of `seen`, at the last tau."""
+def reevaluate(bank: ShapeBank, prior: Prior, hypotheses: Hypotheses, targets: FitTargets) -> Hypotheses:
+    """The hypotheses with E recomputed from all rows of `targets`, at the last tau."""
 
     def judge(one):
-        return _misfit(bank.shape(one.shape), prior, one.placement, seen, _LAST_TAU)
+        return _misfit(bank.shape(one.shape), prior, one.placement, targets, _LAST_TAU)
 
     return dataclasses.replace(hypotheses, misfit=jax.lax.map(judge, hypotheses, batch_size=_AT_ONCE))
 
@@ -255,12 +255,12 @@ def _mean(values: Float[Array, " n"], mask: Bool[Array, " n"]) -> Float[Array, "
 
 
 def _misfit(
-    shape: Shape, prior: Prior, placement: Placement, seen: Seen, tau: Float[Array, ""] | float
+    shape: Shape, prior: Prior, placement: Placement, targets: FitTargets, tau: Float[Array, ""] | float
 ) -> Float[Array, ""]:
     """E of a placement, with n_j . grad d from `jax.jvp`."""
-    distance, slope = jax.jvp(lambda x: placement.distance(shape.solid, x), (seen.points,), (seen.normals,))
-    empty = placement.distance(shape.solid, seen.empty)
-    return _summed(distance, slope, empty, prior.deviation(shape, placement), seen, tau)
+    distance, slope = jax.jvp(lambda x: placement.distance(shape.solid, x), (targets.points,), (targets.normals,))
+    empty = placement.distance(shape.solid, targets.empty)
+    return _summed(distance, slope, empty, prior.deviation(shape, placement), targets, tau)
 
 
 def _summed(
@@ -268,20 +268,20 @@ def _summed(
     slope: Float[Array, " n"],
     empty: Float[Array, " m"],
     deviation: Float[Array, "9"],
-    seen: Seen,
+    targets: FitTargets,
     tau: Float[Array, ""] | float,
 ) -> Float[Array, ""]:
     of_data = jnp.log1p(distance**2 / (2.0 * tau**2)) + 0.5 * (1.0 - jnp.clip(slope, -1.0, 1.0))
     of_empty = jnp.log1p(jnp.minimum(empty + _MARGIN, 0.0) ** 2 / tau**2)
     of_prior = 0.5 * jnp.sum(jnp.asarray(_PRECISION, deviation.dtype) * deviation**2)
-    return _mean(of_data, seen.mask) + 2.0 * _mean(of_empty, seen.is_empty) + of_prior
+    return _mean(of_data, targets.mask) + 2.0 * _mean(of_empty, targets.is_empty) + of_prior
 
 
 def _newton_step(
     shape: Shape,
     prior: Prior,
     placement: Placement,
-    seen: Seen,
+    targets: FitTargets,
     tau: Float[Array, ""],
     basis: Float[Array, "9 k"],
 ) -> tuple[Float[Array, "9"], Float[Array, ""]]:
@@ -289,9 +289,9 @@ def _newton_step(
 
     Normals enter the step as (n - grad d)^2 / 4.
     """
-    points = jnp.concatenate([seen.points, seen.empty])
+    points = jnp.concatenate([targets.points, targets.empty])
     distance, gradient = values_and_gradients(lambda x: placement.distance(shape.solid, x), points)
-    count = len(seen.points)
+    count = len(targets.points)
     # Derivatives of the distance at a fixed point of the scene, as the shape is turned about t, shifted and scaled.
     away = points - placement.shift
     own = jnp.matmul(away, placement.rotation, precision="highest")
@@ -300,8 +300,8 @@ def _newton_step(
     rows = jnp.concatenate([jnp.cross(gradient, away), -gradient, by_scale], axis=1)
     rows = jnp.matmul(rows, basis, precision="highest")
 
-    of_data = jnp.where(seen.mask, 1.0, 0.0) / jnp.maximum(jnp.sum(seen.mask), 1)
-    of_empty = jnp.where(seen.is_empty, 4.0, 0.0) / jnp.maximum(jnp.sum(seen.is_empty), 1)
+    of_data = jnp.where(targets.mask, 1.0, 0.0) / jnp.maximum(jnp.sum(targets.mask), 1)
+    of_empty = jnp.where(targets.is_empty, 4.0, 0.0) / jnp.maximum(jnp.sum(targets.is_empty), 1)
     within = jnp.minimum(distance[count:] + _MARGIN, 0.0)
     residuals = jnp.concatenate([distance[:count], within])
     weights = jnp.concatenate(
@@ -319,13 +319,13 @@ def _newton_step(
     normal = normal + 0.5 * jnp.einsum("n,ndk,ndl->kl", of_data, turning, turning, precision="highest")
     normal = normal + jnp.matmul(basis.T, precision[:, None] * basis, precision="highest")
     slope = jnp.einsum("n,n,nk->k", weights, residuals, rows, precision="highest")
-    slope = slope - 0.5 * jnp.einsum("n,nd,ndk->k", of_data, seen.normals - unit, turning, precision="highest")
+    slope = slope - 0.5 * jnp.einsum("n,nd,ndk->k", of_data, targets.normals - unit, turning, precision="highest")
     slope = slope + jnp.matmul(basis.T, precision * deviation, precision="highest")
 
     normal = normal + _DAMPING * jnp.trace(normal) * jnp.eye(len(normal), dtype=normal.dtype)
     step = jnp.matmul(basis, jnp.linalg.solve(normal, -slope), precision="highest")
-    along = jnp.sum(seen.normals * gradient[:count], axis=1)
-    misfit = _summed(distance[:count], along, distance[count:], deviation, seen, _LAST_TAU)
+    along = jnp.sum(targets.normals * gradient[:count], axis=1)
+    misfit = _summed(distance[:count], along, distance[count:], deviation, targets, _LAST_TAU)
     return step * jnp.minimum(1.0, _LARGEST_STEP / jnp.maximum(jnp.max(jnp.abs(step)), 1e-9)), misfit
 
 

@@ -68,16 +68,16 @@ class _Equations(NamedTuple):
     """Normal equations of a step for each motion.
 
     - `gaps`: distances of the points from the surface.
-    - `alike`: agreement of the normals, from 0 to 1.
+    - `agreement`: agreement of the normals, from 0 to 1.
     """
 
     matrix: Float[np.ndarray, "s 6 6"]
     vector: Float[np.ndarray, "s 6"]
     gaps: Float[np.ndarray, "s n"]
-    alike: Float[np.ndarray, "s n"]
+    agreement: Float[np.ndarray, "s n"]
 
     def fit(self, scale: float) -> Float[np.ndarray, " s"]:
-        return np.mean(self.alike / (1.0 + (self.gaps / scale) ** 2), axis=1)
+        return np.mean(self.agreement / (1.0 + (self.gaps / scale) ** 2), axis=1)
 
 
 class _Stage(NamedTuple):
@@ -93,15 +93,15 @@ class _Stage(NamedTuple):
         arms = np.einsum("nj,sij->sni", self.points, motions.turns)
         places = arms + motions.shifts[:, None]
         feet, outer = (rows.reshape(places.shape) for rows in self.nearest(places.reshape(-1, 3)))
-        alike = np.sum(np.einsum("nj,sij->sni", self.normals, motions.turns) * outer, axis=-1)
-        alike = np.clip(alike if self.is_solid else np.abs(alike), 0.0, 1.0)
+        agreement = np.sum(np.einsum("nj,sij->sni", self.normals, motions.turns) * outer, axis=-1)
+        agreement = np.clip(agreement if self.is_solid else np.abs(agreement), 0.0, 1.0)
         gaps = np.linalg.norm(places - feet, axis=-1)
         scales = np.median(gaps, axis=1, keepdims=True) * _MEDIANS if scale is None else np.asarray(scale)
-        weight = alike / (1.0 + (gaps / np.maximum(scales, _LEAST)) ** 2)
+        weight = agreement / (1.0 + (gaps / np.maximum(scales, _LEAST)) ** 2)
         rows = np.concatenate([np.cross(arms, outer), outer], axis=-1)
         matrix = np.einsum("sni,snj->sij", weight[..., None] * rows, rows, optimize=True)
         vector = np.einsum("sn,sni->si", weight * np.sum((places - feet) * outer, axis=-1), rows)
-        return _Equations(matrix, vector, gaps, alike)
+        return _Equations(matrix, vector, gaps, agreement)
 
     def aligned(self, motions: _Motions, scales: Sequence[float | None] | np.ndarray) -> _Motions:
         """The motions after a damped step at each scale."""
@@ -136,7 +136,7 @@ class _Stage(NamedTuple):
         return _Motions(screws[:, :3, :3] @ motion.turns, screws[:, :3, 3] + motion.shifts)
 
 
-def outward(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, bool]:
+def orient_outward(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, bool]:
     """Clean a mesh and wind its faces outward, and return whether it has an inside.
 
     Duplicate vertices and faces of zero area are removed. Winding numbers on both sides of the surface distinguish a
@@ -167,7 +167,7 @@ def register_scan(
 ) -> Registration:
     """Find the motion that registers points with outward normals to a mesh.
 
-    - `mesh`, `is_solid`: the results of `outward`. The normals of a sheet may point to either side.
+    - `mesh`, `is_solid`: the results of `orient_outward`. The normals of a sheet may point to either side.
     - `start`: motion from the scan to the mesh to start from; without it, the search is over all motions.
     """
     unit, center, middle = mesh.scale, points.mean(axis=0), mesh.bounds.mean(axis=0)

@@ -30,11 +30,11 @@ from jaxnbv.surfaces.base import SurfaceModel, on_torus
 from jaxnbv.surfaces.covariance import function_covariance, function_variance, mode_variance
 from jaxnbv.surfaces.factor import CholeskyFactor
 from jaxnbv.surfaces.given_normals import GeometricSPSRPosterior, NormalDraws
-from jaxnbv.surfaces.pathwise import DataPoints, MeansAtData, TrigonometricPosterior, filled
+from jaxnbv.surfaces.pathwise import DataPoints, MeansAtData, TrigonometricPosterior, fill_rows
 from jaxnbv.surfaces.solver import MOST_FACTORISED, points_at_once
 from jaxnbv.surfaces.spsr import GeometricSPSR
 from jaxnbv.surfaces.trigonometric import NonuniformTransform, inverse_laplacian, solve_poisson
-from jaxnbv.surfaces.values import OnSurface, OutsideBoundary, SeenEmpty, ValueRows, ValueSource, joined
+from jaxnbv.surfaces.values import EmptySpace, OnSurface, OutsideBoundary, ValueRows, ValueSource, concatenate_rows
 
 _JUMP_POINTS = 256
 
@@ -58,7 +58,7 @@ class ScreenedSPSR(SurfaceModel):
     """
 
     base: GeometricSPSR = eqx.field(default_factory=lambda: GeometricSPSR((0.01, 0.06), (0.2, 0.25), truncation=32))
-    values: tuple[ValueSource, ...] = eqx.field(default_factory=lambda: (OutsideBoundary(), OnSurface(), SeenEmpty()))
+    values: tuple[ValueSource, ...] = eqx.field(default_factory=lambda: (OutsideBoundary(), OnSurface(), EmptySpace()))
     level_deviation: float = eqx.field(static=True, default=0.5)
     offset: float = eqx.field(static=True, default=0.1)
 
@@ -109,7 +109,7 @@ def _condition(
 ) -> "ScreenedSPSRPosterior":
     # The contents of unfilled rows must not reach the products.
     observations = eqx.tree_at(lambda e: e.cloud, observations, base.cloud)
-    spectrum, rows = model.base.spectrum, joined(model.values, observations)
+    spectrum, rows = model.base.spectrum, concatenate_rows(model.values, observations)
     half_jump = _half_jump(base, model.offset)
     whitened = jnp.where(rows.mask, base.solver.whitened_cross(rows.points), 0.0)
     explained = jnp.einsum("dnk,dnl->kl", whitened, whitened, precision="highest")
@@ -192,7 +192,7 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
 
     def data_points(self) -> DataPoints:
         """The points of the cloud for gradients, and the points of the value rows for values."""
-        return DataPoints(self.base.data_points().gradients, filled(self.rows.points, self.rows.mask))
+        return DataPoints(self.base.data_points().gradients, fill_rows(self.rows.points, self.rows.mask))
 
     def level_about(self, means: MeansAtData) -> Float[Array, " s"]:
         """Zeros: g is relative to the level, which the values tie to m_s + f."""

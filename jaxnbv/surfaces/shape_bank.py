@@ -18,7 +18,7 @@ from jaxnbv.geometry.pose import fibonacci_sphere
 from jaxnbv.programs import program
 from jaxnbv.scanning.sdf import Scaled, SignedDistance
 from jaxnbv.surfaces.look_alikes import warn_of_look_alikes
-from jaxnbv.surfaces.mesh_shapes import listed, mesh_paths, shapes_of_meshes
+from jaxnbv.surfaces.mesh_shapes import as_tuple, mesh_paths, shapes_of_meshes
 
 NUM_EXTREMES, _FAR, _STRIDES, _ARRIVED = 128, 4.0, 40, 0.01
 _LONGEST_NAME = 64
@@ -80,7 +80,7 @@ class ShapeBank(eqx.Module):
         **Raises:** `ValueError` for entries that are not solids, for solids of several types, or if the number of names
         differs from that of solids.
         """
-        solids = listed(solids, "the bank's solids")
+        solids = as_tuple(solids, "the bank's solids")
         for index, solid in enumerate(solids):
             check_type(solid, SignedDistance, f"solid {index} of the bank")
         names = tuple(map(str, range(len(solids)))) if names is None else _as_names(names)
@@ -190,7 +190,7 @@ class ShapeBank(eqx.Module):
 
         **Raises:** `ValueError` for an index out of range.
         """
-        indices = listed(indices, "the indices")
+        indices = as_tuple(indices, "the indices")
         for index in indices:
             check_type(index, int, "an index of the bank")
             require(0 <= index < len(self), f"the bank has {len(self)} shapes; there is no number {index}")
@@ -216,7 +216,7 @@ def _metres(scale: float | str) -> float:
 
 
 def _as_names(names: Sequence[str]) -> tuple[str, ...]:
-    strings = listed(names, "the names")
+    strings = as_tuple(names, "the names")
     for name in strings:
         check_type(name, str, "a name of a shape")
     return strings

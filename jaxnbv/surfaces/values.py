@@ -153,7 +153,7 @@ class OnSurface(ValueSource):
         return _rows(chosen.points, 0.0, self.noise, chosen.mask)
 
 
-class SeenEmpty(ValueSource):
+class EmptySpace(ValueSource):
     """f(z) - c ~ N(value, s^2) with a positive value, at points z that were seen to be empty.
 
     It says that unseen space next to empty space is likely to be empty too. This holds for thin objects such as
@@ -182,7 +182,7 @@ class SeenEmpty(ValueSource):
         return _rows(points, self.value, self.noise, is_filled)
 
 
-def joined(sources: tuple[ValueSource, ...], observations: Observations) -> ValueRows:
+def concatenate_rows(sources: tuple[ValueSource, ...], observations: Observations) -> ValueRows:
     """Concatenate the rows of all sources, with zeros in unfilled rows.
 
     **Raises:** `ValueError` if a source does not return `ValueRows`.

@@ -21,7 +21,7 @@ from jaxnbv.geometry.pose import rigid_matrices
 from jaxnbv.scanning.mesh import TriangleMesh
 from jaxnbv.scanning.mesh_files import read_nodes
 from jaxnbv.scanning.sdf.sampled import checked_triangles
-from jaxnbv.surfaces.rigid import outward, register_scan
+from jaxnbv.surfaces.rigid import orient_outward, register_scan
 
 # Points sampled from a mesh, fewest points of a cloud, points of the CAD at which coverage is tested.
 _POINTS, _FEWEST, _SAMPLES = 50_000, 10, 20_000
@@ -200,7 +200,7 @@ def deviation(
     **Raises:** `ValueError` for a file that cannot be read, a mesh without faces, a scan of fewer than ten points or
     without measured faces, a pose that is not rigid, units that differ, or if libigl is missing.
     """
-    model, is_solid = outward(_mesh_of(cad))
+    model, is_solid = orient_outward(_mesh_of(cad))
     points, normals, imagined = _points_of(mesh)
     _check_units(_diameter(points), _diameter(model.vertices))
     matrix = _checked_pose(pose)

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Cuboid, SignedDistance, Sphere
 from jaxnbv.surfaces.known_shapes import kind_of, systematic_resampling
-from jaxnbv.surfaces.registration import Prior, Seen, register
+from jaxnbv.surfaces.registration import FitTargets, Prior, register
 
 CAMERA = nbv.Camera(height=40, width=40, fov=1.0)
 QUICK = nbv.ScreenedSPSR(nbv.GeometricSPSR((0.02, 0.06), (0.2, 0.25), truncation=8))
@@ -62,7 +62,7 @@ UPRIGHT = Rotation.from_rotvec([0.0, 1e-6, 0.0])
 
 def model(bank=BANK, **changed):
     """Alike in most tests, which then share what was compiled."""
-    return nbv.surfaces.KnownShapes(bank, RESIDUAL, unknown=QUICK, num_starts=2048, **changed)
+    return nbv.surfaces.KnownShapes(bank, RESIDUAL, model_of_none=QUICK, num_starts=2048, **changed)
 
 
 def observations_of(surface, positions, noise=0.005):
@@ -87,7 +87,7 @@ def planted():
     for seed in range(8):
         rotation, index = Rotation.random(random_state=seed), seed % len(ARMS)
         surface, _, shift = filling(ARMS[index], rotation)
-        seen = Seen.of(observations_of(surface, AROUND))
+        seen = FitTargets.of(observations_of(surface, AROUND))
         found.append(
             (index, rotation, shift, register(BANK, Prior(nbv.surfaces.FreeRotation(), nbv.Box()), seen, 2048))
         )
@@ -119,7 +119,7 @@ def test_modes_of_one_shape_are_far_apart(planted):
 def test_a_symmetric_shape_stands_in_all_the_ways_that_look_alike():
     """A bar that was seen from above: it may be turned by half a turn."""
     bank = nbv.ShapeBank.of([Cuboid([1.2, 0.3, 0.4])])
-    seen = Seen.of(observations_of(nbv.SDFSurface(Cuboid([1.25, 0.31, 0.42])), ((0.5, 3.0, 1.5),)))
+    seen = FitTargets.of(observations_of(nbv.SDFSurface(Cuboid([1.25, 0.31, 0.42])), ((0.5, 3.0, 1.5),)))
     found = register(bank, Prior(nbv.surfaces.Upright(), nbv.Box()), seen, 512)
     angles = np.degrees(
         np.arctan2(np.asarray(found.placement.rotation)[:, 0, 2], np.asarray(found.placement.rotation)[:, 0, 0])
@@ -130,13 +130,13 @@ def test_a_symmetric_shape_stands_in_all_the_ways_that_look_alike():
 
 def test_what_was_seen_empty_is_among_what_shapes_are_fitted_to():
     observations = observations_of(nbv.SDFSurface(Cuboid([0.5, 0.3, 0.4])), AROUND)
-    seen = Seen.of(observations)
+    seen = FitTargets.of(observations)
     assert bool(seen.is_empty.all())
     node = (np.asarray(seen.empty, np.float64) + GRID.half_extent) / GRID.spacing
     np.testing.assert_allclose(node, np.rint(node), atol=1e-4)
     assert np.asarray(observations.empty_nodes)[tuple(np.rint(node).astype(int).T)].all()
     nothing = dataclasses.replace(observations, empty_nodes=None, grid=None)
-    assert not bool(Seen.of(nothing).is_empty.any())
+    assert not bool(FitTargets.of(nothing).is_empty.any())
 
 
 def test_shapes_of_a_kind_differ_by_their_number():
@@ -172,7 +172,7 @@ def test_of_one_exact_shape_samples_are_that_shape_to_the_noise():
     points = jnp.asarray(truth.frame.to_world(truth.sample_points(jax.random.key(1), 400)), jnp.float32)
     posterior = model().condition(observations_of(surface, AROUND[:2]))
     # Held for certain, in the best of the ways that it was found to stand.
-    best = int(np.flatnonzero(np.asarray(posterior.found.shape) == 2)[0])
+    best = int(np.flatnonzero(np.asarray(posterior.fits.shape) == 2)[0])
     certain = jnp.zeros_like(posterior.weights).at[best].set(1.0)
     posterior = eqx.tree_at(lambda p: p.weights, posterior, certain)
     assert posterior.hypotheses[0].name == "arm 0.65"
@@ -187,7 +187,7 @@ def test_of_one_exact_shape_samples_are_that_shape_to_the_noise():
 def test_weights_are_tempered_fits():
     observations = observations_of(filling(0.5, UPRIGHT)[0], AROUND[:1])
     posterior = model(inverse_temperature=7.0, misfit_of_none=0.4).condition(observations)
-    found = posterior.found
+    found = posterior.fits
     energy = np.append(np.where(found.is_mode, np.exp(-7.0 * np.asarray(found.misfit, np.float64)), 0.0), np.exp(-2.8))
     np.testing.assert_allclose(posterior.weights, energy / energy.sum(), rtol=1e-4, atol=1e-7)
     listed = posterior.hypotheses
@@ -212,7 +212,7 @@ def test_the_same_observations_have_the_same_hypotheses_and_nothing_is_compiled_
     sampler = dataclasses.replace(nbv.SurfaceSampler(QUICK, GRID, 3).with_bank(BANK, nbv.surfaces.AsGiven()))
     sampler = dataclasses.replace(sampler, model=dataclasses.replace(sampler.model, residual=RESIDUAL, num_starts=64))
     first, second = observations_of(surface, AROUND[:1]), observations_of(surface, AROUND[:2])
-    assert eqx.tree_equal(sampler.posterior(first).found, sampler.posterior(first).found)
+    assert eqx.tree_equal(sampler.posterior(first).fits, sampler.posterior(first).fits)
     sampler.sample(first, jax.random.key(0))
     compilations.clear()
     sampler.sample(second, jax.random.key(1))

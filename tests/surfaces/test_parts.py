@@ -15,9 +15,9 @@ from jaxnbv.scanning.sdf import Cuboid, Cylinder, Difference, Sphere, Translated
 from jaxnbv.surfaces.part_evidence import Rays, evidence
 from jaxnbv.surfaces.part_hypotheses import NONE, PartHypotheses, identify
 from jaxnbv.surfaces.part_pose import object_pose, surface_error, symmetries
-from jaxnbv.surfaces.part_search import nothing_before, search_parts
+from jaxnbv.surfaces.part_search import placeholder_hypotheses, search_parts
 from jaxnbv.surfaces.placement import FreeRotation, Placement
-from jaxnbv.surfaces.registration import Hypotheses, Seen
+from jaxnbv.surfaces.registration import FitTargets, Hypotheses
 from jaxnbv.surfaces.shape_bank import Shape
 
 CAMERA = nbv.Camera(height=40, width=40, fov=1.0)
@@ -235,9 +235,9 @@ def test_where_one_part_lies_all_that_look_alike_may():
     observations = observations_of(surface, [TURN.apply([0.4, -4.0, 0.9])], sampler)
     true = Placement(jnp.asarray(turn), jnp.zeros(3), jnp.ones(3))
     known = Hypotheses(jnp.asarray(0), true, jnp.asarray(0.0), jnp.asarray(True))
-    before = jax.tree.map(lambda rows, row: rows.at[0].set(row), nothing_before(jnp.float32), known)
-    seen, rays = Seen.of(observations), Rays.of(observations, box)
-    for carried, all_parts in ((before, set(range(5))), (nothing_before(jnp.float32), set())):
+    before = jax.tree.map(lambda rows, row: rows.at[0].set(row), placeholder_hypotheses(jnp.float32), known)
+    seen, rays = FitTargets.of(observations), Rays.of(observations, box)
+    for carried, all_parts in ((before, set(range(5))), (placeholder_hypotheses(jnp.float32), set())):
         found = search_parts(bank, FreeRotation(), box, seen, rays, carried, 4)
         off = (TURN.inv() * Rotation.from_matrix(found.placement.rotation)).magnitude()
         there = np.asarray(found.is_mode) & (off < np.radians(3.0))
@@ -279,7 +279,7 @@ def test_covariance_of_a_ball():
     covariance = object_pose(hypotheses, observations, nbv.Frame()).covariance
     assert np.diag(covariance)[:3] == pytest.approx(np.pi**2 / 3.0, rel=1e-3)
     # Least squares by the normals of the points. Farthest point sampling prefers those that err most.
-    points = np.asarray(Seen.of(observations).points)
+    points = np.asarray(FitTargets.of(observations).points)
     normals = points / np.linalg.norm(points, axis=1, keepdims=True)
     expected = np.linalg.inv(normals.T @ normals / 0.02**2)
     assert np.diag(covariance)[3:] == pytest.approx(np.diag(expected), rel=0.6)

@@ -6,7 +6,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from jaxnbv.scanning.triangle_rays import first_faces
-from jaxnbv.surfaces.rigid import outward, register_scan
+from jaxnbv.surfaces.rigid import orient_outward, register_scan
 
 RNG = np.random.default_rng(0)
 
@@ -57,7 +57,7 @@ def off(mesh, change):
 
 @pytest.mark.parametrize("ahead", [(1, 1, 1), (1, -2, 1), (-1, 0.5, -0.7)])
 def test_a_partial_noisy_scan_is_laid_on_its_part_from_anywhere(ahead):
-    mesh, is_solid = outward(bracket())
+    mesh, is_solid = orient_outward(bracket())
     truth = motion(RNG)
     points, normals = moved(truth, *scanned(mesh, ahead, RNG, noise=0.1))
     result = register_scan(points, normals, mesh, is_solid)
@@ -67,7 +67,7 @@ def test_a_partial_noisy_scan_is_laid_on_its_part_from_anywhere(ahead):
 
 
 def test_a_start_is_refined_and_its_neighbourhood_kept():
-    mesh, is_solid = outward(trimesh.creation.box((60, 40, 30)))
+    mesh, is_solid = orient_outward(trimesh.creation.box((60, 40, 30)))
     points, normals = scanned(mesh, (1, 2, 3), RNG)
     # The box looks the same turned by 180 degrees.
     for truth in (np.eye(4), trimesh.transformations.rotation_matrix(np.pi, (0, 0, 1))):
@@ -77,7 +77,7 @@ def test_a_start_is_refined_and_its_neighbourhood_kept():
 
 
 def test_a_symmetric_part_has_no_rival():
-    mesh, is_solid = outward(trimesh.creation.box((60, 40, 30)))
+    mesh, is_solid = orient_outward(trimesh.creation.box((60, 40, 30)))
     truth = motion(RNG)
     result = register_scan(*moved(truth, *scanned(mesh, (1, 2, 3), RNG, noise=0.05)), mesh, is_solid)
     assert off(mesh, result.matrix @ truth) < 0.05
@@ -85,7 +85,7 @@ def test_a_symmetric_part_has_no_rival():
 
 
 def test_the_flat_of_a_shaft_determines_its_rotation():
-    mesh, is_solid = outward(shaft_with_flat())
+    mesh, is_solid = orient_outward(shaft_with_flat())
     truth = motion(RNG)
     result = register_scan(*moved(truth, *scanned(mesh, (1, 0.4, 0.6), RNG, noise=0.05)), mesh, is_solid)
     # It may be turned end for end about the normal of the flat.
@@ -93,7 +93,7 @@ def test_the_flat_of_a_shaft_determines_its_rotation():
 
 
 def test_a_face_that_can_slide_has_a_rival():
-    mesh, is_solid = outward(bracket())
+    mesh, is_solid = orient_outward(bracket())
     points, normals = scanned(mesh, (0, 0, -1), RNG)
     patch = (points[:, 0] > 15) & (points[:, 0] < 40)
     assert register_scan(points[patch], normals[patch], mesh, is_solid).rival > 1.0
@@ -108,7 +108,7 @@ def test_faces_are_wound_outward_however_they_were_wound():
     soup = trimesh.Trimesh(box.triangles.reshape(-1, 3), np.arange(36).reshape(-1, 3), process=False)
     without_lid = trimesh.Trimesh(box.vertices, box.faces[box.face_normals[:, 2] < 0.5], process=False)
     for cad in (box, inverted, mixed, soup, without_lid):
-        mesh, is_solid = outward(cad)
+        mesh, is_solid = orient_outward(cad)
         assert is_solid
         assert len(mesh.vertices) == 8
         assert np.all(np.sum(mesh.triangles_center * mesh.face_normals, axis=1) > 0)
@@ -117,6 +117,6 @@ def test_faces_are_wound_outward_however_they_were_wound():
 def test_a_sheet_keeps_its_winding():
     sheet = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]], process=False)
     for cad in (sheet, trimesh.Trimesh(sheet.vertices, sheet.faces[:, ::-1], process=False)):
-        mesh, is_solid = outward(cad)
+        mesh, is_solid = orient_outward(cad)
         assert not is_solid
         np.testing.assert_allclose(mesh.face_normals, cad.face_normals)

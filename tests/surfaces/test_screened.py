@@ -109,7 +109,7 @@ def test_what_was_seen_empty_is_likelier_to_be_outside_and_so_is_what_is_near():
     assert beyond.sum() == 8
     model = nbv.ScreenedSPSR(
         nbv.GeometricSPSR((0.03, 0.1), (0.2, 0.4), truncation=8),
-        (nbv.surfaces.OutsideBoundary(num_points=60), nbv.surfaces.SeenEmpty(30)),
+        (nbv.surfaces.OutsideBoundary(num_points=60), nbv.surfaces.EmptySpace(30)),
     )
     nothing = nbv.Observations.start(data, 1, grid)
     seen = eqx.tree_at(lambda e: e.empty_nodes, nothing, jnp.asarray(is_beside | beyond))
@@ -123,12 +123,12 @@ def test_what_was_seen_empty_is_likelier_to_be_outside_and_so_is_what_is_near():
     assert inside(with_bank, beside) < 0.3 * inside(without, beside)
     assert inside(with_bank, near) < 0.5 * inside(without, near)
     assert abs(inside(with_bank, far) - inside(without, far)) < 0.1
-    rows = nbv.surfaces.SeenEmpty(30).rows(seen)
+    rows = nbv.surfaces.EmptySpace(30).rows(seen)
     assert np.asarray(rows.mask).all()
     assert len(np.unique(np.asarray(rows.points), axis=0)) == 30
     assert {tuple(p) for p in np.asarray(rows.points)} <= {tuple(p) for p in np.float32(beside)}
     for observations in (nothing, nbv.as_observations(data)):
-        assert not np.asarray(nbv.surfaces.SeenEmpty(30).rows(observations).mask).any()
+        assert not np.asarray(nbv.surfaces.EmptySpace(30).rows(observations).mask).any()
 
 
 def test_rows_beyond_the_data_are_not_filled():

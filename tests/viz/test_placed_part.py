@@ -44,7 +44,7 @@ class Told(nbv.SurfaceModel):
     hypotheses: PartHypotheses
     carries_hypotheses = True
 
-    def observed(self, observations):
+    def add_state(self, observations):
         return dataclasses.replace(observations, hypotheses=self.hypotheses)
 
     def condition(self, observations):

@@ -28,7 +28,7 @@ def knowing_study():
     plain = small_study()
     bank = nbv.ShapeBank.of([pyramid_scene(Split.TRAIN, index, turned=False) for index in range(5)])
     residual = ScreenedSPSR(GeometricSPSR(0.05, truncation=8), (OnSurface(),))
-    model = KnownShapes(bank, residual, unknown=plain.sampler.model, num_starts=60)
+    model = KnownShapes(bank, residual, model_of_none=plain.sampler.model, num_starts=60)
     return dataclasses.replace(plain, sampler=dataclasses.replace(plain.sampler, model=model))
 
 
