@@ -116,7 +116,8 @@ def of_recording(options: argparse.Namespace) -> None:
             f"off by {degrees:.1f} degrees, {1e3 * length:.0f} mm: views disagree by "
             f"{1e3 * np.nanmedian(alignment.disagreement):.2f} mm, then {1e3 * np.nanmedian(alignment.corrected):.2f}; "
             f"one view scatters by {1e3 * alignment.noise:.2f}; left {turn:.2f} degrees, "
-            f"{1e3 * np.linalg.norm(left[:3, 3]):.2f} mm; {'' if alignment.is_told else 'not '}told; {seconds:.1f} s"
+            f"{1e3 * np.linalg.norm(left[:3, 3]):.2f} mm; "
+            f"{'' if alignment.is_determined else 'un'}determined; {seconds:.1f} s"
         )
 
 

@@ -1,4 +1,4 @@
-"""How many views a rule of stopping saves, and what it costs.
+"""How many views a stop rule saves, and what it costs.
 
     python benchmarks/stopping.py [--task class parts coverage] [--scenes 24] [--out FILE]
 
@@ -26,7 +26,7 @@ from jaxnbv.networks import part_segmenter, pretrained_classifier
 from jaxnbv.networks.categories import CATEGORIES
 from jaxnbv.planning.episode import Episode
 from jaxnbv.planning.loop import view_keys
-from jaxnbv.planning.stopping import Covered, Found, StopContext, Sure
+from jaxnbv.planning.stopping import Covered, PartsFound, StopContext, Sure
 from jaxnbv.scanning import GridSurface
 from jaxnbv.scanning.visibility import is_visible, spread_points
 from jaxnbv.storage.files import write_text
@@ -39,7 +39,7 @@ RULES = {
     "class": {
         f"{'Sure' if again else 'D alone'} {p}": Sure(p, again) for again in (8, 0) for p in (0.8, 0.9, 0.95, 0.99)
     },
-    "parts": {f"Found {points}": Found(points) for points in (20, 40, 60, 100)},
+    "parts": {f"PartsFound {points}": PartsFound(points) for points in (20, 40, 60, 100)},
     "coverage": {f"Covered {share}": Covered(share) for share in (0.6, 0.7, 0.8, 0.9)},
 }
 VIEWS = {"class": 6, "parts": 6, "coverage": 14}

@@ -33,8 +33,8 @@ from .planning.sessions import Sessions as Sessions
 from .planning.simulate import simulate as simulate
 from .planning.stopping import Budget as Budget
 from .planning.stopping import Covered as Covered
-from .planning.stopping import Found as Found
 from .planning.stopping import Identified as Identified
+from .planning.stopping import PartsFound as PartsFound
 from .planning.stopping import Placed as Placed
 from .planning.stopping import StopRule as StopRule
 from .planning.stopping import Sure as Sure

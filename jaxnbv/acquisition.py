@@ -47,7 +47,7 @@ class Acquisition(eqx.Module):
     - `needs_hypotheses`: whether it reads the hypotheses of a model of known parts, and no posterior. The step's only
       sample is then the likeliest part.
     - `gains_once`: whether a second view from the same pose gains nothing. The value at the poses of earlier views is
-      then an error, and counts in which candidates are level with the best (`Proposal.tied_with_best`). A search over
+      then an error, and counts in which candidates are tied with the best (`Proposal.tied_with_best`). A search over
       candidates takes the one of these that is farthest from the cameras so far.
     """
 

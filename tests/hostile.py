@@ -87,7 +87,7 @@ CALLS = {
     nbv.Frame.fit: {"points": DIRECTIONS, "longest_side": 2.5},
     nbv.search.FreePoses: {"radius": 2.5},
     nbv.GeometricSPSR: {"lengthscale": 0.05, "variance": 0.2, "truncation": 6, "noise": 0.01, "nu": 1.5},
-    nbv.GivenPoses: {"given": POSES},
+    nbv.GivenPoses: {"batch": POSES},
     nbv.GradientSearch: {"dof": 2, "space": None, "num_starts": 2, "iterations": 2, "learning_rate": 0.01}
     | {"num_candidates": 6, "solver": None, "candidates": None},
     nbv.Grid: {"resolution": 8, "half_extent": 1.5},

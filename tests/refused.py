@@ -320,7 +320,7 @@ REFUSED = {
         lambda: nbv.simulate(P, BALL, POSE, 2, KEY, progress=False, until="sure"),
         "'sure'",
     ),
-    "parts that are no names": (lambda: nbv.Found(parts=3), "3"),
+    "parts that are no names": (lambda: nbv.PartsFound(parts=3), "3"),
     "a boundary of text": (
         lambda: nbv.surfaces.OutsideBoundary(lambda x: "far"),
         "gives no signed distances of points",

@@ -236,7 +236,7 @@ def test_no_posterior_waits_for_a_rival_or_for_an_earlier_drawing(tmp_path, monk
     held = []
 
     def simulate(*arguments, each=None, **settings):
-        episode = types.SimpleNamespace(stopped=None, views=())
+        episode = types.SimpleNamespace(stop_reason=None, views=())
         if each is None:
             assert Drawings.may_end.wait(300)
             return episode

@@ -27,7 +27,7 @@ def test_a_task_has_a_sensor_and_ends_by_rules_that_exist(name):
 
 @pytest.mark.parametrize("name", STOPS)
 def test_a_rule_is_made_of_a_number(name):
-    assert isinstance(rule([f"{name}=0.5" if name != "found" else "found=5"]), StopRule)
+    assert isinstance(rule([f"{name}=0.5" if name != "parts-found" else "parts-found=5"]), StopRule)
 
 
 @pytest.mark.parametrize("name", SEARCHES)

@@ -47,6 +47,6 @@ def _why(planner: Planner, view: View) -> str:
         best = float(values.max(initial=-np.inf))
         return f"{number(value)}, " + ("no ascent found more" if value <= best else f"by ascent from {number(best)}")
     rank, tied = 1 + int(np.sum(values > value)), view.proposal.num_tied
-    level = f", level with {tied}" if tied else ""
+    ties = f", tied with {tied}" if tied else ""
     stands = "best" if rank == 1 else f"number {rank}"
-    return f"{number(value)}, {stands} of {len(values)} (median {number(float(np.median(values)))}){level}"
+    return f"{number(value)}, {stands} of {len(values)} (median {number(float(np.median(values)))}){ties}"

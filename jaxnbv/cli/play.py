@@ -184,9 +184,9 @@ def play(options: EpisodeOptions, subject: Subject, setting: Setting, sizes: Siz
     rival_episode = None if race is None else race.result()
     if drawing is not None:
         drawing.result()
-    if episode.stopped is not None:
+    if episode.stop_reason is not None:
         views, saved = len(episode.views), options.views - len(episode.views)
-        typer.echo(f"enough   after view {views}: {episode.stopped}. Views saved: {saved} of {options.views}")
+        typer.echo(f"enough   after view {views}: {episode.stop_reason}. Views saved: {saved} of {options.views}")
     if rival_episode is not None:
         words = race_words(rival_episode, episode)
         typer.echo(textwrap.fill(words, 100, initial_indent="race     ", subsequent_indent="         "))

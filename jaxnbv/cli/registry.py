@@ -47,7 +47,7 @@ class Stop(NamedTuple):
 
 STOPS = {
     "sure": Stop("probability of the class", lambda probability: nbv.Sure(probability)),
-    "found": Stop("points of every part", lambda points: nbv.Found(int(points))),
+    "parts-found": Stop("points of every part", lambda points: nbv.PartsFound(int(points))),
     "covered": Stop("share of the visible surface that was seen", lambda share: nbv.Covered(share)),
     "identified": Stop("probability of the part", lambda probability: nbv.Identified(probability)),
     "placed": Stop("root mean square error of the part's surface", lambda length: nbv.Placed(length)),

@@ -63,7 +63,7 @@ class Alignment(eqx.Module):
       the agreement too little.
     - `is_mount`: whether X is the same for all views, an error of the mount.
     - `covariance`: covariance of the mount's turn (a rotation vector, radians) and shift, in the camera's axes.
-    - `is_told`: whether the views determine all of the mount's error. Undetermined components count as zero.
+    - `is_determined`: whether the views determine all of the mount's error. Undetermined components count as zero.
     - `weakest`: the turn and shift, in radians and lengths, that the views determine least.
     - `num_pairs`: number of pairs of views that were compared: each view with up to four of similar direction.
     - `distance`: median distance of points from the cameras.
@@ -76,7 +76,7 @@ class Alignment(eqx.Module):
     corrections: Float[np.ndarray, "views 4 4"]
     is_mount: bool
     covariance: Float[np.ndarray, "6 6"]
-    is_told: bool
+    is_determined: bool
     weakest: Float[np.ndarray, "6"]
     num_pairs: int
     distance: float
@@ -85,7 +85,7 @@ class Alignment(eqx.Module):
     def disagrees(self) -> bool:
         """Whether a view is off by more than three times the noise, and a correction helps or is undetermined."""
         is_off = bool(np.any(self.disagreement > _OFF * self.noise))
-        return is_off and (self.is_corrected or not self.is_told)
+        return is_off and (self.is_corrected or not self.is_determined)
 
     @property
     def is_corrected(self) -> bool:
@@ -159,7 +159,7 @@ def align_views(clouds: Sequence[PointCloud], poses: Sequence[Pose]) -> Alignmen
     matches = _matched(views, pairs, mount, _REACHES[-1] * away)
     _, rows = _linearised(views, matches, mount, is_mount=True)
     values, vectors = np.linalg.eigh((rows.T @ rows).toarray() * np.outer(unit, unit))
-    is_told = bool(values[0] > _TOLD * values[-1])
+    is_determined = bool(values[0] > _TOLD * values[-1])
     corrections, is_mount, left = still, True, off
     after, _ = _compared(views, pairs, mount, away)
     is_off = bool(np.any(off > _OFF * noise))
@@ -181,7 +181,7 @@ def align_views(clouds: Sequence[PointCloud], poses: Sequence[Pose]) -> Alignmen
         corrections,
         is_mount,
         covariance * np.outer(unit, unit),
-        is_told,
+        is_determined,
         unit * vectors[:, 0],
         len(pairs),
         away,

@@ -35,7 +35,7 @@ class Episode(eqx.Module):
 
     - `scene`, `noise`: true surface and sensor noise; None if a real sensor took the views.
     - `first`: pose of the first view.
-    - `stopped`: reason of the stop rule that ended the episode; None if no rule did.
+    - `stop_reason`: reason of the stop rule that ended the episode; None if no rule did.
     - `frame`: frame of the user's world, in which the episode is shown and its cloud is saved.
     """
 
@@ -45,7 +45,7 @@ class Episode(eqx.Module):
     first: Pose
     key: PRNGKeyArray
     views: tuple[View, ...] = ()
-    stopped: str | None = None
+    stop_reason: str | None = None
     frame: Frame = Frame()
 
     @property
@@ -71,7 +71,7 @@ class Episode(eqx.Module):
         require(1 <= views <= len(self.views), f"asked for {views} of {len(self.views)} views; ask for at least one")
         return next(itertools.islice(self.observations(), views - 1, None))
 
-    def found(self) -> Iterator[float | None]:
+    def actual_scores(self) -> Iterator[float | None]:
         """Yield the score of each view's actual scan, given the observations before it.
 
         In scene units; None for the first view. Compare it with the value that the proposal expected.
@@ -104,7 +104,7 @@ class Episode(eqx.Module):
             View(pose, scan, observations.cloud, proposal, camera, observations.hypotheses)
             for (pose, scan, proposal), observations in zip(stored, after, strict=True)
         )
-        return dataclasses.replace(episode, views=views, stopped=_read_end(folder, len(views)))
+        return dataclasses.replace(episode, views=views, stop_reason=_read_end(folder, len(views)))
 
     def save(self, path: str | Path) -> None:
         """Save the episode to a folder (see `jaxnbv.storage` for its files). `simulate` can continue from it.
@@ -125,7 +125,7 @@ class Episode(eqx.Module):
 
     def write_end(self, folder: RunFolder) -> None:
         """Write the reason why the episode ended, and its cloud in world units."""
-        reason = None if self.stopped is None else np.array(self.stopped)
+        reason = None if self.stop_reason is None else np.array(self.stop_reason)
         folder.write("end", 0, reason=reason, views=np.array(len(self.views)))
         folder.write_cloud(self.frame.to_world(self.cloud))
 

@@ -42,7 +42,7 @@ class Intake:
         self.other_ups: tuple[str, ...] = ()
         self.clutter = self._no_clutter()
 
-    def emptied(self) -> "Intake":
+    def without_images(self) -> "Intake":
         """A copy without images, to add them again. It keeps the corrections of the mount's error."""
         intake = copy.copy(self)
         intake.images, intake.clutter = (), self._no_clutter()
@@ -68,7 +68,7 @@ class Intake:
             table = table_under(self.frame.to_scene(whole), self.frame.to_scene(self.box))
             ups = other_ups(whole, self.box, self.frame.up) if table is None else ()
             # Without a table, cameras still keep clear of the points of D.
-            loop = loop.emptied(dataclasses.replace(self.planner, obstacles=table or Obstacles()))
+            loop = loop.without_views(dataclasses.replace(self.planner, obstacles=table or Obstacles()))
         if image.mask is not None:
             cloud = only_where(cloud, image.mask, self.camera, self.stride)
         if image.robot is not None or image.mask is not None:
@@ -79,7 +79,7 @@ class Intake:
         if self.clutter is not None and obstacles is not None:
             self.clutter = self.clutter.with_image(clean, self.camera, pose, self.frame, obstacles)
             loop = loop.with_clutter(self.clutter.solid())
-        self.mount_error.show(clean, index)
+        self.mount_error.add(clean, index)
         self.images, self.table, self.other_ups = (*self.images, image), table, ups
         return loop
 

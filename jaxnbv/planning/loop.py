@@ -133,7 +133,7 @@ class Loop:
         self._first_view_at: float | None = None
         self._next = _StepState()
 
-    def emptied(self, planner: Planner) -> "Loop":
+    def without_views(self, planner: Planner) -> "Loop":
         """A copy without views, to add them again with this planner. The clock keeps running."""
         loop = copy.copy(self)
         loop.planner, loop.views, loop._observations = planner, (), None
@@ -193,7 +193,7 @@ class Loop:
         """
         pose, inputs, seconds = first, None, 0.0
         if self.views:
-            if self.enough() is not None:
+            if self.done() is not None:
                 return None
             pose, seconds = self.propose().pose, self._next.seconds
             inputs = self._next.inputs if self.planner.search.uses_samples else None
@@ -254,7 +254,7 @@ class Loop:
         return self._sampled()
 
     @own_settings()
-    def enough(self) -> str | None:
+    def done(self) -> str | None:
         """The reason to stop, by the stop rule; None to continue.
 
         The rule is evaluated once for each view. If it needs samples or a proposal, `propose` uses the same ones.
@@ -277,8 +277,8 @@ class Loop:
         return self._next.stop
 
     @property
-    def stopped(self) -> str | None:
-        """The reason to stop, if `enough` has found one; otherwise None."""
+    def stop_reason(self) -> str | None:
+        """The reason to stop, if `done` has found one; otherwise None."""
         return self._next.stop
 
     def in_world(self, value: Float[Array, ""]) -> float:

@@ -34,7 +34,7 @@ class MountError:
         self._clouds: list[PointCloud] = []
         self._alignment: Alignment | None = None
 
-    def show(self, image: Image, index: int) -> None:
+    def add(self, image: Image, index: int) -> None:
         """Add the image with this index, without values for "not measured". Repeated calls have no effect."""
         if index == len(self._images):
             self._images.append(image)
@@ -55,7 +55,7 @@ class MountError:
             self._alignment = align_views(self._clouds, poses)
         return self._alignment
 
-    def warns(self) -> bool:
+    def warn_if_off(self) -> bool:
         """Warn if the images disagree, and return whether they do."""
         if len(self._images) < _ENOUGH or not (alignment := self.alignment()).disagrees:
             return False
@@ -76,7 +76,7 @@ class MountError:
             return pose
         return Pose.from_matrix(np.asarray(pose.to_matrix(), np.float64) @ correction)
 
-    def sent(self, poses: Pose) -> Pose:
+    def command_poses(self, poses: Pose) -> Pose:
         """Poses to send the camera to, so that it arrives at poses (n,) despite the mount's error."""
         if np.array_equal(self.mount, np.eye(4)):
             return poses

@@ -52,7 +52,7 @@ def rehearse(intake: Intake, loop: Loop) -> Rehearsal:
             depth = ball_on_a_table(frame.to_scene(intake.camera), pose, frame.to_scene(intake.box)) / frame.scale
             matrix = frame.to_world(pose).to_matrix(intake.convention)
             loop = intake.add(loop, Image.of(depth, matrix, 1.0, None)) or loop
-            loop.enough()
+            loop.done()
             loop.propose()
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)

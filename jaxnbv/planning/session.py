@@ -255,7 +255,7 @@ class Session:
         """
         require(len(self.views) > 0, _NO_IMAGE)
         loop, first = self._loop, self.views[0].pose
-        return Episode(loop.planner, None, None, first, loop.key, loop.views, loop.stopped, self.frame)
+        return Episode(loop.planner, None, None, first, loop.key, loop.views, loop.stop_reason, self.frame)
 
     @own_settings()
     def done(self) -> str | None:
@@ -267,7 +267,7 @@ class Session:
         **Raises:** `ValueError` as `next` does, if the rule needs the next proposal.
         """
         with self._planning():
-            return self._loop.enough()
+            return self._loop.done()
 
     @checked
     def add(
@@ -314,7 +314,7 @@ class Session:
         if self.correct_mount:
             self._correct()
         elif self.correct_mount is not None and not self._warned_of_mount:
-            self._warned_of_mount = self._intake.mount_error.warns()
+            self._warned_of_mount = self._intake.mount_error.warn_if_off()
 
     @own_settings()
     def next(self, seconds: float = math.inf) -> NextView:
@@ -341,7 +341,7 @@ class Session:
                     proposal, refusals = best_reachable(proposal, *arguments)
                     self._loop.settle(proposal)
                 next_view = self._next_of(proposal, refusals)
-                warn_of_little(next_view.value, next_view.standard_error, self._in_vain(proposal))
+                warn_of_little(next_view.value, next_view.standard_error, self._value_at_visited(proposal))
                 if folder is not None:
                     folder.store_proposal(len(self.views), proposal)
                 self._next = next_view
@@ -393,7 +393,7 @@ class Session:
         if not self._intake.mount_error.update():
             return
         images, views = self._intake.images, self.views
-        self._loop, self._intake = self._loop.emptied(self._given_planner), self._intake.emptied()
+        self._loop, self._intake = self._loop.without_views(self._given_planner), self._intake.without_images()
         for image, view in zip(images, views, strict=True):
             if view.proposal is not None:
                 self._loop.resume(view.proposal)
@@ -420,7 +420,7 @@ class Session:
 
     def _matrices(self, poses: Pose) -> Float[np.ndarray, "n 4 4"]:
         """World matrices to send the camera to, so that it arrives at poses (n,) of the scene."""
-        sent = self._intake.mount_error.sent(self.frame.to_world(poses))
+        sent = self._intake.mount_error.command_poses(self.frame.to_world(poses))
         return np.asarray(sent.to_matrix(self.convention), np.float64)
 
     @property
@@ -432,8 +432,8 @@ class Session:
     def _values_at(self, poses: Pose) -> Float[Array, " n"]:
         return self.planner.values_at(self._loop.inputs(), poses)
 
-    def _in_vain(self, proposal: Proposal) -> float:
-        return 0.0 if proposal.in_vain is None else self._loop.in_world(proposal.in_vain)
+    def _value_at_visited(self, proposal: Proposal) -> float:
+        return 0.0 if proposal.value_at_visited is None else self._loop.in_world(proposal.value_at_visited)
 
     def _show(self, stage: str) -> None:
         """Show the stage on the bar, which is created at the first stage."""

@@ -52,9 +52,9 @@ def in_scene(
     - `camera`, `box`: as for `Session`, in world units.
     - `matrices`, `obstacles`: as for `Session`, in world units; None for the planner's own.
     """
-    search = planner.search.above()
+    search = planner.search.upper_half()
     if matrices is not None:
-        search = planner.search.among(frame.to_scene(Pose.from_matrix(matrices, convention)))
+        search = planner.search.over(frame.to_scene(Pose.from_matrix(matrices, convention)))
     sampler = planner.sampler.within(frame.to_scene(box))
     return dataclasses.replace(
         planner,

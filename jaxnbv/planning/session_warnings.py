@@ -77,7 +77,7 @@ def warn_of_mount(alignment: Alignment) -> None:
     if not alignment.is_corrected:
         cause = f"they cannot tell whether the camera's mount is off; {alignment.motion} would"
     elif alignment.is_mount:
-        more = "" if alignment.is_told else f", and {alignment.motion} would tell it better"
+        more = "" if alignment.is_determined else f", and {alignment.motion} would tell it better"
         cause = f"the camera's mount seems {off}{more}; {use}"
     else:
         cause = f"poses seem {off} at most, each in its own way; {use}"
@@ -101,15 +101,15 @@ def warn_of_inside(box: Box, cameras: Float[np.ndarray, "n 3"], candidates: Floa
         )
 
 
-def warn_of_little(value: float, error: float | None, in_vain: float) -> None:
+def warn_of_little(value: float, error: float | None, value_at_visited: float) -> None:
     """Warn of a best view that may be worth nothing: candidates look elsewhere, or all has been seen.
 
-    - `value`, `error`, `in_vain`: value, standard error, and value expected in vain, in world units.
+    - `value`, `error`, `value_at_visited`: value, standard error, and value expected at visited poses, in world units.
     """
     has_error = error is not None and math.isfinite(error)
-    if value <= (3.0 * error if has_error and error is not None else 0.0) + in_vain:
+    if value <= (3.0 * error if has_error and error is not None else 0.0) + value_at_visited:
         spread = f" ± {error:.2g}" if has_error else ""
-        vain = f", while {in_vain:.2g} is expected even at earlier poses" if in_vain > 0 else ""
+        vain = f", while {value_at_visited:.2g} is expected even at earlier poses" if value_at_visited > 0 else ""
         warnings.warn(
             f"the best view is worth {value:.3g}{spread}{vain}: none is sure to show anything new. Stop, or give poses "
             "that look at the box from elsewhere",

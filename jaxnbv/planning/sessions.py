@@ -141,9 +141,9 @@ class Sessions:
             if np.any((corners - np.asarray(pose.position)) @ np.asarray(pose.forward) > 0):
                 session.add(depth, matrix, depth_scale, mask=numbers == number)
         self._next = None
-        self._mount_error.show(image, self._num_images)
+        self._mount_error.add(image, self._num_images)
         self._num_images += 1
-        self._warned_of_mount = self._warned_of_mount or self._mount_error.warns()
+        self._warned_of_mount = self._warned_of_mount or self._mount_error.warn_if_off()
 
     def next(self) -> Float[np.ndarray, "4 4"]:
         """Propose the pose for the next image: a matrix, camera to world.

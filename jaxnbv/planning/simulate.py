@@ -88,8 +88,8 @@ def simulate(
                 # A posterior may be large: free it before the next step computes another.
                 del step
             bar.update(bar.total - bar.n)
-        stopped = loop.stopped if len(loop.views) < views else None
-        episode = dataclasses.replace(episode, views=loop.views, stopped=stopped)
+        reason = loop.stop_reason if len(loop.views) < views else None
+        episode = dataclasses.replace(episode, views=loop.views, stop_reason=reason)
         if store:
             episode.write_end(store)
     return episode

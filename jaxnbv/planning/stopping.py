@@ -2,7 +2,7 @@
 
     rule         its limit is                                             checks the proposed view too
     Sure         a probability                                            no
-    Found        points of each part                                      no
+    PartsFound   points of each part                                      no
     Identified   a probability                                            no
     Placed       a length                                                 no
     Covered      a share of the area that can be seen                     no
@@ -184,7 +184,7 @@ def half_of(cloud: PointCloud, key: PRNGKeyArray) -> PointCloud:
     return cloud.only(jax.random.bernoulli(key, 0.5, cloud.mask.shape))
 
 
-class Found(StopRule):
+class PartsFound(StopRule):
     """Stop once all parts are found.
 
     - `points`: number of points that must be predicted to belong to each part.
@@ -207,13 +207,13 @@ class Found(StopRule):
         utility = acquisition.utility if isinstance(acquisition, ExpectedUtilityImprovement) else None
         if not isinstance(utility, SoftPartCount):
             raise InputError(
-                f"Found is about parts, but {type(acquisition).__name__} has no segmenter: use the utility "
+                f"PartsFound is about parts, but {type(acquisition).__name__} has no segmenter: use the utility "
                 "SoftPartCount, or another rule"
             )
         names = tuple((utility.segmenter.part_names or {}).values())
         require(
             bool(self.parts or names),
-            "the segmenter has no names for its parts: give the parts to find as Found(parts=('part 0', ...))",
+            "the segmenter has no names for its parts: give the parts to find as PartsFound(parts=('part 0', ...))",
         )
         unknown = [name for name in self.parts or () if names and name not in names]
         require(not unknown, f"the segmenter knows no part {unknown[:1]}: give some of {', '.join(names)}")
@@ -221,7 +221,7 @@ class Found(StopRule):
     def after(self, context: StopContext) -> str | None:
         answer = context.planner.acquisition.answer(context.observations.cloud)
         if not isinstance(answer, PartAnswer):
-            raise InputError("the acquisition's answer has no parts: Found needs that of the utility SoftPartCount")
+            raise InputError("the acquisition's answer has no parts: PartsFound needs that of SoftPartCount")
         counts = dict(zip(answer.names, answer.values.tolist(), strict=True))
         names = self.parts or tuple(answer.names[index] for index in answer.asked)
         if any(counts.get(name, 0) < self.points for name in names):

@@ -24,7 +24,7 @@ else:
     AnyCandidates = Candidates
 
 Scores: TypeAlias = Float[Array, "asked samples candidates"]
-"""Scores of each acquisition in `CandidateSearch.asks`, for each posterior sample and candidate."""
+"""Scores of each acquisition in `CandidateSearch.acquisitions`, for each posterior sample and candidate."""
 
 _TIE = 1e-5
 
@@ -51,11 +51,11 @@ class Search(eqx.Module):
         """Poses all around the object, used to compute which surface is visible. By default the paper's."""
         return SphereCandidates().poses()
 
-    def above(self) -> "Search":
+    def upper_half(self) -> "Search":
         """A copy over the upper half of its poses if these are a whole sphere; otherwise the search itself."""
         return self
 
-    def among(self, poses: Pose) -> "Search":
+    def over(self, poses: Pose) -> "Search":
         """A copy that chooses among these poses (n,).
 
         **Raises:** `ValueError` if the search does not choose among poses.
@@ -73,7 +73,7 @@ class Search(eqx.Module):
 class CandidateSearch(Search):
     """Base class of searches over candidates, in two halves: score the candidates, then pick one.
 
-    A study computes the scores of `asks` once for several searches, and lets each of them `pick`.
+    A study computes the scores of `acquisitions` once for several searches, and lets each of them `pick`.
 
     - `candidates`: `SphereCandidates`, `GivenPoses` or others. A number becomes `SphereCandidates`, a batch of poses
       `GivenPoses`.
@@ -85,24 +85,24 @@ class CandidateSearch(Search):
         """The poses of its candidates."""
         return self.candidates.poses()
 
-    def above(self) -> "CandidateSearch":
-        return dataclasses.replace(self, candidates=self.candidates.above())
+    def upper_half(self) -> "CandidateSearch":
+        return dataclasses.replace(self, candidates=self.candidates.upper_half())
 
-    def among(self, poses: Pose) -> "CandidateSearch":
+    def over(self, poses: Pose) -> "CandidateSearch":
         return dataclasses.replace(self, candidates=GivenPoses(poses))
 
-    def asks(self, acquisition: Acquisition) -> tuple[Acquisition, ...]:
+    def acquisitions(self, acquisition: Acquisition) -> tuple[Acquisition, ...]:
         """The acquisitions whose scores `pick` needs; empty for a search that needs none."""
         return (acquisition,)
 
     def score(self, problem: Problem, candidates: Pose) -> Scores:
-        """First half: the scores of the candidates for each acquisition in `asks` and each sample."""
-        acquisitions = self.asks(problem.acquisition)
+        """First half: the scores of the candidates for each acquisition in `acquisitions` and each sample."""
+        acquisitions = self.acquisitions(problem.acquisition)
         if not acquisitions:
             return jnp.zeros((0, 0, self.candidates.count))
         if len(acquisitions) == 1:
             return problem.scores(candidates)[None]
-        return problem.about(AcquisitionList(acquisitions)).scores(candidates)
+        return problem.with_acquisition(AcquisitionList(acquisitions)).scores(candidates)
 
     @abstractmethod
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
@@ -120,7 +120,7 @@ class Baseline(CandidateSearch):
     uses_samples: ClassVar[bool] = False
     uses_cost: ClassVar[bool] = False
 
-    def asks(self, acquisition: Acquisition) -> tuple[Acquisition, ...]:
+    def acquisitions(self, acquisition: Acquisition) -> tuple[Acquisition, ...]:
         """No acquisitions."""
         return ()
 
@@ -164,7 +164,7 @@ def best_or_farthest(problem: Problem, candidates: Pose, scores: Float[Array, "s
     proposal = best_unvisited(problem, candidates, jnp.mean(scores, axis=0), scores=scores)
     if not problem.acquisition.gains_once or problem.cost is not None:
         return proposal
-    proposal = dataclasses.replace(proposal, in_vain=problem.expected_in_vain())
+    proposal = dataclasses.replace(proposal, value_at_visited=problem.value_at_visited())
     visited = problem.observations.poses
     # Without earlier cameras there is no distance: prefer the highest value.
     return preferred(proposal, jnp.where(visited.count > 0, visited.distance(candidates), proposal.values))

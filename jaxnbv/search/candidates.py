@@ -31,7 +31,7 @@ class Candidates(eqx.Module):
     def poses(self) -> Pose:
         """The poses (count,), the same at each call."""
 
-    def above(self) -> "Candidates":
+    def upper_half(self) -> "Candidates":
         """The upper half of a whole sphere; other candidates unchanged."""
         return self
 
@@ -77,7 +77,7 @@ class SphereCandidates(Candidates):
             f"the least elevation is {self.min_elevation} rad; it must lie within [-pi/2, pi/2)",
         )
 
-    def above(self) -> "SphereCandidates":
+    def upper_half(self) -> "SphereCandidates":
         return dataclasses.replace(self, min_elevation=0.0) if self.min_elevation == -0.5 * math.pi else self
 
     def poses(self) -> Pose:
@@ -126,24 +126,24 @@ class Reach(Candidates):
 class GivenPoses(Candidates):
     """Candidates that are given as poses.
 
-    - `given`: the poses.
+    - `batch`: the poses.
 
     **Raises:** `ValueError` unless the poses are a batch (n,) with n >= 1.
     """
 
-    given: Pose
+    batch: Pose
 
     def __check_init__(self):
         check_fields(self)
-        shape = jnp.shape(self.given.position)
+        shape = jnp.shape(self.batch.position)
         require(len(shape) == 2 and shape[0] >= 1, f"the poses have shape {shape[:-1]}; give a batch (n,) of them")
 
     @property
     def count(self) -> int:
-        return self.given.position.shape[0]
+        return self.batch.position.shape[0]
 
     def poses(self) -> Pose:
-        return self.given
+        return self.batch
 
 
 def _check_places(number: int, nearest: float, farthest: float, up: tuple[float, float, float]) -> None:

@@ -46,7 +46,7 @@ class TieBreakSearch(CandidateSearch):
     def __check_init__(self):
         check_fields(self)
 
-    def asks(self, acquisition: Acquisition) -> tuple[Acquisition, ...]:
+    def acquisitions(self, acquisition: Acquisition) -> tuple[Acquisition, ...]:
         """Both acquisitions."""
         return acquisition, self.second
 

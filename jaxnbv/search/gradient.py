@@ -56,7 +56,7 @@ class GradientSearch(Search):
     num_candidates: int = eqx.field(static=True)
     solver: optx.AbstractMinimiser | None
     candidates: Candidates | None
-    turned: ClassVar[bool] = True
+    rotates_candidates: ClassVar[bool] = True
     uses_samples: ClassVar[bool] = True
 
     @checked
@@ -104,10 +104,10 @@ class GradientSearch(Search):
     def poses_around(self) -> Pose:
         return super().poses_around() if self.candidates is None else self.candidates.poses()
 
-    def above(self) -> "GradientSearch":
+    def upper_half(self) -> "GradientSearch":
         if self.candidates is None:
             return self
-        return eqx.tree_at(lambda search: search.candidates, self, self.candidates.above())
+        return eqx.tree_at(lambda search: search.candidates, self, self.candidates.upper_half())
 
     def check(self, acquisition: Acquisition, camera: Camera, capacity: int) -> None:
         """Raise `ValueError` if the acquisition has no gradient, or the camera does not fit the space."""
@@ -120,7 +120,7 @@ class GradientSearch(Search):
         The key rotates the space's candidates.
         """
         if self.candidates is None:
-            candidates = self.space.candidates(self.num_candidates, key if self.turned else None)
+            candidates = self.space.candidates(self.num_candidates, key if self.rotates_candidates else None)
         else:
             candidates = self.candidates.poses()
         scores = problem.scores(candidates)
@@ -188,7 +188,7 @@ class HybridSearch(GradientSearch):
     `DiscreteSearch` of the same number, so the value is never lower than there.
     """
 
-    turned: ClassVar[bool] = False
+    rotates_candidates: ClassVar[bool] = False
 
     def __init__(
         self,

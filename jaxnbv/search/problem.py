@@ -52,7 +52,7 @@ class Problem(eqx.Module):
         context = None if self.inputs.surfaces is None else context_of(self.acquisition, self.inputs)
         return dataclasses.replace(self, context=context)
 
-    def about(self, acquisition: Acquisition) -> "Problem":
+    def with_acquisition(self, acquisition: Acquisition) -> "Problem":
         """A copy with another acquisition."""
         return dataclasses.replace(self, acquisition=acquisition).prepared()
 
@@ -76,7 +76,7 @@ class Problem(eqx.Module):
         """Values of poses, given the cost of going there from the last view."""
         return values if self.cost is None else self.cost(values, self.observations, poses)
 
-    def expected_in_vain(self) -> Float[Array, ""]:
+    def value_at_visited(self) -> Float[Array, ""]:
         """Mean value that the acquisition expects at the visited poses, in its own units and without cost.
 
         If a second view from a pose gains nothing, this value is an error, and may be so at other poses. Zero before

@@ -36,8 +36,8 @@ class Proposal(eqx.Module):
       scored on the same samples. None for a search that does not score all candidates on all samples.
     - `standard_error`: standard error of `value`, a mean over posterior samples. NaN for one sample; None for a search
       without scores.
-    - `in_vain`: mean value expected at visited poses, see `Problem.expected_in_vain`; None unless the acquisition
-      `gains_once`.
+    - `value_at_visited`: mean value expected at visited poses, see `Problem.value_at_visited`; None unless the
+      acquisition `gains_once`.
     """
 
     pose: Pose
@@ -48,7 +48,7 @@ class Proposal(eqx.Module):
     standard_errors: Float[Array, " candidates"] | None = None
     difference_errors: Float[Array, " candidates"] | None = None
     standard_error: Float[Array, ""] | None = None
-    in_vain: Float[Array, ""] | None = None
+    value_at_visited: Float[Array, ""] | None = None
 
     def in_world(self, frame: Frame, length_power: int) -> "Proposal":
         """The proposal with values and errors in world units (powers of length). Poses stay in the scene."""
@@ -61,12 +61,13 @@ class Proposal(eqx.Module):
     def tied_with_best(self, errors: float = 2.0) -> Bool[Array, " candidates"] | None:
         """Mask of the candidates that are tied with the best one (itself included); None without errors.
 
-        A value ties if it differs from the best by at most `errors` standard errors of the difference plus `in_vain`.
+        A value ties if it differs from the best by at most `errors` standard errors of the difference plus
+        `value_at_visited`.
         """
         if self.difference_errors is None:
             return None
-        best, in_vain = jnp.max(self.values), 0.0 if self.in_vain is None else self.in_vain
-        return (self.values == best) | (best - self.values <= errors * self.difference_errors + in_vain)
+        best, bias = jnp.max(self.values), 0.0 if self.value_at_visited is None else self.value_at_visited
+        return (self.values == best) | (best - self.values <= errors * self.difference_errors + bias)
 
     @property
     def num_tied(self) -> int | None:

@@ -46,14 +46,14 @@ def colour_range(values: Float[np.ndarray, "*n"]) -> tuple[float, float]:
 
 
 def has_rings(proposal: Proposal) -> bool:
-    """Whether the candidates that are level with the best are marked: they must be known, and not most of all."""
+    """Whether the candidates that are tied with the best are marked: they must be known, and not most of all."""
     return 0 < (proposal.num_tied or 0) <= len(proposal.values) // 3
 
 
 def marks(*proposals: Proposal) -> list[str]:
     """The marks on some maps that not every map has."""
     visited = any(np.isnan(open_values(proposal)).any() for proposal in proposals)
-    found = ["× visited"] * visited + ["◯ level with the best"] * any(map(has_rings, proposals))
+    found = ["× visited"] * visited + ["◯ tied with the best"] * any(map(has_rings, proposals))
     climbed = any(proposal.trajectories is not None for proposal in proposals)
     return found + ["○ start, ● end of an ascent"] * climbed
 

@@ -122,8 +122,8 @@ def report_data(
     ]
     leading = Sketch(None, None)
     # Only then is what was promised what one view can give.
-    found = episode.found() if planner.acquisition.gains_once else itertools.repeat(None)
-    for index, (next_one, gain) in enumerate(zip(following, found, strict=False)):
+    actual = episode.actual_scores() if planner.acquisition.gains_once else itertools.repeat(None)
+    for index, (next_one, gain) in enumerate(zip(following, actual, strict=False)):
         view, gain = views[index], None if gain is None else float(frame.length_to_world(gain, power))
         words = told(planner.quantity, views[: index + 1], task.amounts[: index + 1], frame, gain)
         if not task.is_coverage:

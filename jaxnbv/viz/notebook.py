@@ -153,7 +153,7 @@ def _(episode: Episode) -> Drawing:
     part = likeliest_part(hypotheses) if isinstance(hypotheses, PartHypotheses) else None
     facts += "" if part is None else f"; {part.caption}"
     drawn = functools.partial(_draw_views, episode, part)
-    return Drawing(drawn, facts + (f"; {episode.stopped}" if episode.stopped else ""))
+    return Drawing(drawn, facts + (f"; {episode.stop_reason}" if episode.stop_reason else ""))
 
 
 def _draw_views(episode: Episode, part: PlacedPart | None, axes: Axes) -> None:

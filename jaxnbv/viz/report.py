@@ -167,7 +167,7 @@ def _settings(episode: Episode, title: str) -> dict[str, str]:
         "Planner": eqx.tree_pformat(episode.planner, width=110),
         "Sensor noise": "that of a real sensor" if episode.noise is None else eqx.tree_pformat(episode.noise),
         "Seed": ", ".join(str(word) for word in describe(episode.key)["data"]),
-        "Ended": episode.stopped or "not by a rule",
+        "Ended": episode.stop_reason or "not by a rule",
         "Versions": ", ".join(f"{name} {version}" for name, version in versions().items()),
         "Written": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
     }

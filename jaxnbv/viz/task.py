@@ -169,8 +169,8 @@ def race_words(rival: Episode, episode: Episode) -> str:
     name, count = search_name(rival).capitalize(), len(rival.views)
     answers = _answers(episode, rival.views)
     views = f"{count} view{'s' * (count > 1)}"
-    text = f"{name} {'needed' if rival.stopped else 'took'} {views} from the same start"
-    if episode.stopped and not rival.stopped:
+    text = f"{name} {'needed' if rival.stop_reason else 'took'} {views} from the same start"
+    if episode.stop_reason and not rival.stop_reason:
         text = f"{name} was not done after {views} from the same start"
     return f"{text} ({words_of(answers[-1]).found})." if answers else f"{text}."
 
@@ -189,5 +189,5 @@ def _sure(episode: Episode, answers: Sequence[Answer]) -> str:
     first, lost = since(settled), lost_again(settled)
     text = f"From view {first} on" if first else f"Not yet after {count} view{'s' * (count > 1)}"
     again = f" At view {lost} it was sure already, but then not." if lost else ""
-    ended = "" if episode.stopped is None else f" It ended by its rule: {episode.stopped}."
+    ended = "" if episode.stop_reason is None else f" It ended by its rule: {episode.stop_reason}."
     return f"{text}.{again} Sure means {words_of(answers[-1]).settled_means}.{ended}"

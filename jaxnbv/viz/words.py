@@ -56,16 +56,16 @@ def _reason(quantity: Quantity, proposal: Proposal, frame: Frame) -> dict[str, s
     climbed = proposal.trajectories is not None and (not others or value > others[0])
     rank = 1 + sum(other > value for other in others)
     how = f"{'the highest' if rank == 1 else f'rank {rank}'} of {len(others)} open candidates"
-    if rank > 1 and proposal.in_vain is not None:
-        how += ", and of those level with the best the farthest from the cameras so far"
+    if rank > 1 and proposal.value_at_visited is not None:
+        how += ", and of those tied with the best the farthest from the cameras so far"
     if climbed and proposal.trajectories is not None:
         starts = len(proposal.trajectories.values)
         how = f"found by gradient ascent from {starts} start{'s' * (starts > 1)}"
     said = {"What it promised": f"Its {quantity.name}, {shown_value(quantity, value, frame)}, was {how}."}
     rest = others if climbed or rank > 1 else others[1:]
     if rest:
-        vain = 0.0 if proposal.in_vain is None else float(proposal.in_vain)
-        level = "two standard errors" + (f" and {number(vain)}, expected where cameras were" if vain > 0 else "")
+        vain = 0.0 if proposal.value_at_visited is None else float(proposal.value_at_visited)
+        level = "two standard errors" + (f" and {number(vain)}, expected even at earlier poses" if vain > 0 else "")
         many = "" if tied is None else f"; {tied or 'no'} other{'s' * (tied != 1)} within {level}"
         other, median = "candidate" if climbed else "other", number(float(np.median(others)))
         said["Beside the others"] = f"Best {other} {number(rest[0])}, median {median}{many}."

@@ -65,7 +65,7 @@ def test_the_error_of_the_mount_is_found(seed, degrees, length):
     clouds, poses = views_of_a_box(len(EYES) * [error], noise=0.0005)
     alignment = align_views(clouds, poses)
     assert alignment.is_mount
-    assert alignment.is_told
+    assert alignment.is_determined
     assert alignment.disagrees
     angle, shift = apart(error, alignment.corrections[0])
     # What is told least is taken for smaller than it is, by a few percent.
@@ -130,7 +130,7 @@ def test_views_that_only_shift_do_not_tell_a_shift_of_the_mount():
     matrices = np.tile(np.eye(4), (4, 1, 1))
     matrices[:, :3, :3], matrices[:, :3, 3] = ahead, np.array(EYES[0]) + 0.03 * np.arange(4)[:, None]
     alignment = align_views(4 * [cloud], [Pose.from_matrix(matrix) for matrix in matrices])
-    assert not alignment.is_told
+    assert not alignment.is_determined
     assert not alignment.is_corrected
     assert np.sqrt(np.diag(alignment.covariance)[3:].max()) > 0.005
     assert "from another side" in alignment.motion or "turned about its optical axis" in alignment.motion
@@ -140,7 +140,7 @@ def test_views_that_share_nothing_tell_nothing():
     clouds, poses = views_of_a_box([np.eye(4)] * 2, eyes=[(0.0, 0.0, 0.7), (0.0, 0.0, -0.7)])
     alignment = align_views(clouds, poses)
     assert np.isnan(alignment.disagreement).all()
-    assert not alignment.is_told
+    assert not alignment.is_determined
     assert not alignment.disagrees
     np.testing.assert_array_equal(alignment.corrections, np.tile(np.eye(4), (2, 1, 1)))
 

@@ -138,7 +138,7 @@ def test_what_views_found_of_a_ball():
     planner = nbv.Planner(nbv.NewSurface(), nbv.DiscreteSearch(poses), camera, sampler, capacity=400, max_views=4)
     scans = [scan(SDFSurface(Sphere(radius)), camera, pose) for pose in poses]
     views = tuple(nbv.View(pose, seen, seen, None, camera) for pose, seen in zip(poses, scans, strict=True))
-    first, other_side, again = Episode(planner, None, None, poses[0], KEY, views).found()
+    first, other_side, again = Episode(planner, None, None, poses[0], KEY, views).actual_scores()
     cap = 2.0 * np.pi * radius**2 * (1.0 - radius / away)
     assert first is None
     assert 0.7 * cap < other_side < cap

@@ -410,7 +410,7 @@ def test_it_is_done_by_its_rule(finished):
     assert session.done() is None
     session.add(shot(FIRST), FIRST, depth_scale=1e-3)
     assert "less than" in session.done()
-    assert session.episode.stopped == session.done()
+    assert session.episode.stop_reason == session.done()
     session = session_of(until=Budget(seconds=1e9))
     session.add(shot(FIRST), FIRST, depth_scale=1e-3)
     assert session.done() is None

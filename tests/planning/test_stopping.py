@@ -19,7 +19,7 @@ from jaxnbv.geometry.pose import fibonacci_sphere, look_at
 from jaxnbv.observations import Observations
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.simulate import simulate
-from jaxnbv.planning.stopping import Budget, Covered, Found, StopContext, Sure, ValueBelow, expected_coverage
+from jaxnbv.planning.stopping import Budget, Covered, PartsFound, StopContext, Sure, ValueBelow, expected_coverage
 from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning import Grid, SDFSurface, SensorNoise, scan
 from jaxnbv.scanning.sdf import Sphere
@@ -100,7 +100,7 @@ def segmenter(counts):
 )
 def test_found_counts_the_points_of_the_parts_that_are_asked_for(parts, points, stops):
     planner = planner_of(ExpectedUtilityImprovement(segmenter((80, 80, 40))))
-    reason = Found(points, parts).after(after(planner, cloud_of(200, 200)))
+    reason = PartsFound(points, parts).after(after(planner, cloud_of(200, 200)))
     assert (reason is not None) == stops
 
 
@@ -230,12 +230,12 @@ def test_an_episode_ends_by_its_rule_and_goes_on_by_another(tmp_path):
     assert 1 < enough < 5
     short = simulate(planner, SCENE, FIRST, 6, KEY, folder=tmp_path, progress=False, until=Sure(0.95, 0))
     assert len(short.views) == enough
-    assert short.stopped.startswith("sure of class 0")
+    assert short.stop_reason.startswith("sure of class 0")
     again = simulate(planner, SCENE, FIRST, 6, KEY, folder=tmp_path, progress=False, until=Sure(0.95, 0))
     assert len(again.views) == enough
     longer = simulate(planner, SCENE, FIRST, 6, KEY, folder=tmp_path, progress=False, until=Budget(seconds=1e6))
     assert len(longer.views) == 6
-    assert longer.stopped is None
+    assert longer.stop_reason is None
     for view, expected in zip(longer.views, whole.views, strict=True):
         np.testing.assert_array_equal(view.scan.points, expected.scan.points)
 
@@ -248,7 +248,7 @@ def test_a_view_of_too_little_value_is_not_taken():
     assert values[1] < limit < values[0]
     short = simulate(planner, SCENE, FIRST, 6, KEY, progress=False, until=ValueBelow(limit))
     assert len(short.views) == 2
-    assert "less than" in short.stopped
+    assert "less than" in short.stop_reason
 
 
 @pytest.mark.parametrize(
@@ -256,15 +256,15 @@ def test_a_view_of_too_little_value_is_not_taken():
     [
         (lambda: Sure(1.0), "probability is 1.0; it must lie within"),
         (lambda: Sure(num_resamplings=-1), "number of resamplings is -1"),
-        (lambda: Found(0), "a part is found by 0 points"),
+        (lambda: PartsFound(0), "a part is found by 0 points"),
         (lambda: Covered(1.5), "share is 1.5"),
         (lambda: Covered(size=0.0), "size is 0.0"),
         (lambda: Budget(), "has no limit: give seconds or cost"),
         (lambda: Budget(seconds=0.0), "must be positive"),
         (lambda: Sure().check(Coverage()), "Sure is about a class, but Coverage has no classifier"),
-        (lambda: Found().check(Coverage()), "Found is about parts, but Coverage has no segmenter"),
+        (lambda: PartsFound().check(Coverage()), "PartsFound is about parts, but Coverage has no segmenter"),
         (
-            lambda: Found().check(ExpectedUtilityImprovement(segmenter((3, 3)))),
+            lambda: PartsFound().check(ExpectedUtilityImprovement(segmenter((3, 3)))),
             "has no names for its parts",
         ),
     ],

@@ -93,9 +93,9 @@ def test_standard_errors_are_those_of_the_scores_sample_by_sample():
 
 @pytest.mark.parametrize("taken", [(), (3,), (3, 8), (0, 3, 8)])
 def test_of_what_is_gained_once_the_farthest_of_those_that_are_level(taken):
-    """Level is within two standard errors and, from the second view on, the mean of what is expected where cameras
+    """A tie is within two standard errors and, from the second view on, the mean of what is expected where cameras
     were."""
-    problem = visit(PROBLEM.about(Once()), *[POSES[index] for index in taken])
+    problem = visit(PROBLEM.with_acquisition(Once()), *[POSES[index] for index in taken])
     scores, is_open = sample_by_sample(PROBLEM), ~np.isin(np.arange(12), taken)
     values = np.where(is_open, scores.mean(axis=0), -np.inf)
     differences = scores[:, [values.argmax()]] - scores
@@ -106,7 +106,7 @@ def test_of_what_is_gained_once_the_farthest_of_those_that_are_level(taken):
     expected = np.argmax(np.where(level & is_open, away, -np.inf)) if taken else values.argmax()
     assert (level & is_open).sum() > 1
     found = propose(SEARCH, problem)
-    assert float(found.in_vain) == pytest.approx(in_vain, rel=1e-4)
+    assert float(found.value_at_visited) == pytest.approx(in_vain, rel=1e-4)
     np.testing.assert_array_equal(found.tied_with_best()[is_open], level[is_open])
     np.testing.assert_array_equal(found.pose.position, found.candidates.position[expected])
     assert float(found.value) == pytest.approx(values[expected], rel=1e-5)
@@ -115,10 +115,10 @@ def test_of_what_is_gained_once_the_farthest_of_those_that_are_level(taken):
 
 def test_of_what_is_gained_once_the_way_there_counts_for_more():
     here, cost = nbv.look_at(jnp.array([0.0, 0.0, 2.5])), nbv.ValuePerCost(nbv.arc_length, fixed=1e-3)
-    problem = dataclasses.replace(visit(PROBLEM.about(Once()), here), cost=cost)
+    problem = dataclasses.replace(visit(PROBLEM.with_acquisition(Once()), here), cost=cost)
     found = propose(SEARCH, problem)
     assert float(found.value) == float(found.values.max())
-    assert found.in_vain is None
+    assert found.value_at_visited is None
 
 
 def test_what_is_gained_once_and_is_no_number_is_told_of():
@@ -126,7 +126,7 @@ def test_what_is_gained_once_and_is_no_number_is_told_of():
         def score(self, context, view):
             return jnp.nan * view.scan.points[0, 0]
 
-    assert np.isnan(float(propose(SEARCH, PROBLEM.about(Broken())).value))
+    assert np.isnan(float(propose(SEARCH, PROBLEM.with_acquisition(Broken())).value))
 
 
 def test_of_one_sample_no_errors_are_known():
@@ -197,7 +197,7 @@ def test_what_is_picked_by_the_scores_is_what_is_proposed(name, asked):
 @pytest.mark.parametrize("name", SEARCHES)
 def test_scores_are_those_of_each_sample_by_each_acquisition_that_is_asked(name):
     found, acquisitions = score(SEARCHES[name], PROBLEM), ASKED.get(name, ())
-    assert SEARCHES[name].asks(nbv.Coverage()) == acquisitions
+    assert SEARCHES[name].acquisitions(nbv.Coverage()) == acquisitions
     assert found.shape == ((len(acquisitions), 3, 12) if acquisitions else (0, 0, 12))
     for scores, acquisition in zip(found, acquisitions, strict=True):
         np.testing.assert_allclose(scores, sample_by_sample(PROBLEM, acquisition), rtol=1e-5, atol=1e-6)
@@ -233,7 +233,7 @@ def test_the_best_by_the_second_score_of_those_that_are_tied_by_the_first(factor
 
 
 def test_where_the_first_tells_nothing_the_second_decides_and_where_it_tells_all_the_first_does():
-    told = tie_break(PROBLEM.about(Constant(1.0)), nbv.Coverage())
+    told = tie_break(PROBLEM.with_acquisition(Constant(1.0)), nbv.Coverage())
     np.testing.assert_array_equal(told.pose.position, propose(nbv.DiscreteSearch(12), PROBLEM).pose.position)
     # Samples that are all alike tell all, and a single one too.
     for rows in (jnp.zeros(3, int), slice(0, 1)):
@@ -242,7 +242,7 @@ def test_where_the_first_tells_nothing_the_second_decides_and_where_it_tells_all
 
 
 def test_a_tie_break_does_not_choose_visited_views():
-    told, taken = PROBLEM.about(Constant(0.0)), []
+    told, taken = PROBLEM.with_acquisition(Constant(0.0)), []
     for _ in range(3):
         taken.append(tie_break(visit(told, *taken), Height()).pose)
     heights = np.sort(sample_by_sample(PROBLEM, Height()).mean(axis=0))[::-1]
@@ -253,7 +253,7 @@ def test_a_tie_break_does_not_choose_visited_views():
 def test_the_way_there_counts_among_ties():
     """Among candidates that are level but for their way the nearest is taken, whatever the second score."""
     here, cost = nbv.look_at(jnp.array([0.0, 0.0, 2.5])), nbv.ValuePerCost(nbv.arc_length, fixed=1e-3)
-    told = dataclasses.replace(visit(PROBLEM.about(Constant(1.0)), here), cost=cost)
+    told = dataclasses.replace(visit(PROBLEM.with_acquisition(Constant(1.0)), here), cost=cost)
     found = tie_break(told, Height())
     distances = np.linalg.norm(np.asarray(found.candidates.position - here.position), axis=1)
     np.testing.assert_array_equal(found.pose.position, found.candidates.position[distances.argmin()])

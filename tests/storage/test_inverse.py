@@ -62,9 +62,9 @@ def assert_same(loaded, saved):
     assert eqx.tree_equal(loaded, saved), f"{loaded} is not {saved}"
 
 
-@given(planner=PLANNERS, stopped=st.sampled_from([None, "enough"]), in_world=st.booleans())
+@given(planner=PLANNERS, stop_reason=st.sampled_from([None, "enough"]), in_world=st.booleans())
 @settings(max_examples=6, deadline=None)
-def test_an_episode_is_loaded_as_it_was_saved(tmp_path_factory, planner, stopped, in_world):
+def test_an_episode_is_loaded_as_it_was_saved(tmp_path_factory, planner, stop_reason, in_world):
     candidates = nbv.SphereCandidates(5).poses()
     poses, scans = [candidates[index] for index in range(3)], [scan_of(shift) for shift in (-0.5, 0.0, 0.5)]
     values = jnp.arange(5.0)
@@ -77,7 +77,7 @@ def test_an_episode_is_loaded_as_it_was_saved(tmp_path_factory, planner, stopped
             zip(poses, scans, planner.replay(zip(poses, scans, strict=True)), strict=True)
         )
     ]
-    episode = dataclasses.replace(episode, views=tuple(views), stopped=stopped)
+    episode = dataclasses.replace(episode, views=tuple(views), stop_reason=stop_reason)
     folder = tmp_path_factory.mktemp("episode")
     episode.save(folder)
     assert_same(nbv.Episode.load(folder), episode)

@@ -111,7 +111,7 @@ def test_an_episode_ends_once_the_part_is_known():
     episode = nbv.simulate(
         planner, scene, BELOW, 3, jax.random.key(0), nbv.SensorNoise(0.005, 0.005), progress=False, until=until
     )
-    assert episode.stopped is not None
-    assert "high" in episode.stopped
+    assert episode.stop_reason is not None
+    assert "high" in episode.stop_reason
     assert len(episode.views) <= 3
     assert float(episode.views[1].proposal.value) > 0.2

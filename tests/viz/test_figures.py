@@ -31,7 +31,7 @@ from jaxnbv.viz.task import Rival
 
 @pytest.fixture(scope="module")
 def episode():
-    """Of 13 candidates: the second view stands out; the third is level with another, which its picture marks."""
+    """Of 13 candidates: the second view stands out; the third is tied with another, which its picture marks."""
     return small_run(nbv.DiscreteSearch(13))
 
 

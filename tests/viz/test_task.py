@@ -215,7 +215,7 @@ def test_a_class_that_halves_of_the_points_do_not_tell_is_sure_nowhere():
     planner = small_planner(nbv.RandomView(8), nbv.CrossEntropy(by_count), capacity=50)
     episode = nbv.simulate(planner, Sphere(0.9), FIRST, 2, KEY, progress=False, until=nbv.Sure(0.95))
     assert [view.cloud.count for view in episode.views] == [50, 50]
-    assert episode.stopped is None
+    assert episode.stop_reason is None
     task = task_of(episode)
     assert task.answers[-1].values.max() > 0.95
     assert task.sure.startswith("Not yet after 2 views")
@@ -232,9 +232,9 @@ def test_a_rival_is_told_of_and_drawn(plain):
     p = np.exp(np.asarray(Leaning()(other.cloud), np.float64))
     found = f"{NAMES[int(np.argmax(p))]}, probability {p.max():.2f}"
     assert rival.words == f"Farthest view took 3 views from the same start ({found})."
-    ended = dataclasses.replace(episode, stopped="sure of it")
+    ended = dataclasses.replace(episode, stop_reason="sure of it")
     assert race_words(other, ended) == f"Farthest view was not done after 3 views from the same start ({found})."
-    assert race_words(dataclasses.replace(other, stopped="sure of it"), ended).startswith(
+    assert race_words(dataclasses.replace(other, stop_reason="sure of it"), ended).startswith(
         "Farthest view needed 3 views"
     )
     assert report_data(ended, progress=False, imagine=False).task.sure.endswith("It ended by its rule: sure of it.")

@@ -24,7 +24,7 @@ class PartTask(Task):
     name = "parts"
     about = "its parts"
     example = "a procedural object of one of thirteen categories"
-    until = ("found=60",)
+    until = ("parts-found=60",)
     category: Annotated[
         str,
         asking(
