@@ -15,7 +15,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnbv.checks import InputError, check_fields, checked, functions_of_users, is_traced, require, returned, shown
+from jaxnbv.checks import (
+    InputError,
+    check_fields,
+    checked,
+    checked_result,
+    functions_of_users,
+    is_traced,
+    require,
+    short_text,
+)
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud, concatenate, limit_capacity
 from jaxnbv.geometry.pose import Pose
@@ -149,7 +158,7 @@ class ExpectedUtilityImprovement(Acquisition):
         return cloud, self._value(cloud)
 
     def _value(self, cloud: PointCloud) -> Any:
-        return returned(self.utility(cloud), f"the {self.utility.name} of a cloud", 0, "a utility is one number")
+        return checked_result(self.utility(cloud), f"the {self.utility.name} of a cloud", 0, "a utility is one number")
 
     def score(self, context: tuple[PointCloud, Float[Array, ""]], view: ImaginedView) -> Float[Array, ""]:
         """max(0, u(D u scan) - u(D))."""
@@ -215,7 +224,8 @@ class AcquisitionList(Acquisition):
     def __check_init__(self):
         is_valid = isinstance(self.members, tuple) and all(isinstance(member, Acquisition) for member in self.members)
         require(
-            is_valid and len(self.members) > 0, f"the members are {shown(self.members)}; give a tuple of acquisitions"
+            is_valid and len(self.members) > 0,
+            f"the members are {short_text(self.members)}; give a tuple of acquisitions",
         )
 
     @property

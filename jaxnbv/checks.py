@@ -119,23 +119,23 @@ def check_type(value: Any, hint: Any, name: str) -> None:
     """**Raises:** `ValueError` if the value contradicts a plain type hint. Ignores other hints."""
     if hint is int:
         whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
-        require(whole, f"{name} is {shown(value)}; it must be a whole number")
+        require(whole, f"{name} is {short_text(value)}; it must be a whole number")
     elif hint is float:
-        require(_is_number(value), f"{name} is {shown(value)}; it must be a finite number")
+        require(_is_number(value), f"{name} is {short_text(value)}; it must be a finite number")
     elif hint is bool:
-        require(isinstance(value, bool | np.bool_), f"{name} is {shown(value)}; it must be True or False")
+        require(isinstance(value, bool | np.bool_), f"{name} is {short_text(value)}; it must be True or False")
     elif hint in _NUMBERS:
         count = len(get_args(hint))
         proper = isinstance(value, tuple | list) and len(value) == count and all(map(_is_number, value))
-        require(proper, f"{name} is {shown(value)}; it must be {_NUMBERS[hint]} finite numbers")
+        require(proper, f"{name} is {short_text(value)}; it must be {_NUMBERS[hint]} finite numbers")
     elif isinstance(hint, types.UnionType) and type(None) in (kinds := get_args(hint)) and len(kinds) == 2:
         if value is not None:
             check_type(value, kinds[0] if kinds[1] is type(None) else kinds[1], name)
     elif (kinds := _classes(hint)) and not isinstance(value, kinds):
         wanted = " or ".join("None" if kind is type(None) else kind.__name__ for kind in kinds)
-        raise InputError(f"{name} is {shown(value)}; give {wanted}")
+        raise InputError(f"{name} is {short_text(value)}; give {wanted}")
     elif get_origin(hint) is Callable and not callable(value):
-        raise InputError(f"{name} is {shown(value)}; give a function")
+        raise InputError(f"{name} is {short_text(value)}; give a function")
 
 
 def check_index(index: Any, batch: tuple[int, ...], name: str) -> None:
@@ -153,7 +153,7 @@ def check_batch(batch: tuple[int, ...], name: str) -> None:
 def check_key(key: Any) -> None:
     """**Raises:** `ValueError` unless this is a single typed JAX random key."""
     is_key = isinstance(key, Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.ndim == 0
-    require(is_key, f"the key is {shown(key)}: make one with jax.random.key(seed)")
+    require(is_key, f"the key is {short_text(key)}: make one with jax.random.key(seed)")
 
 
 def native(value: Any) -> Any:
@@ -201,13 +201,13 @@ def as_numbers(value: Any, name: str, dtype: Any = float) -> np.ndarray:
         # NumPy would convert text, dates, complex numbers and None to numbers.
         real = array.dtype.kind in "biuf" or jnp.issubdtype(array.dtype, jnp.floating)
         real = real or (array.dtype.kind == "O" and all(isinstance(item, numbers.Real) for item in array.flat))
-        require(real, f"{name} is {shown(value)}; give real numbers")
+        require(real, f"{name} is {short_text(value)}; give real numbers")
         with np.errstate(over="ignore"):
             return array.astype(jnp.result_type(float) if dtype is float else dtype or array.dtype, copy=False)
     except InputError:
         raise
     except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"{name} is {shown(value)}; give numbers") from error
+        raise InputError(f"{name} is {short_text(value)}; give numbers") from error
 
 
 @contextmanager
@@ -232,7 +232,7 @@ def functions_of_users() -> Iterator[None]:
         ) from error
 
 
-def returned(value: Any, name: str, axes: int, wanted: str) -> Any:
+def checked_result(value: Any, name: str, axes: int, wanted: str) -> Any:
     """The value itself, after a check of what a function of the user's returned.
 
     - `axes`: the number of axes. For 0 a plain number will do.
@@ -242,11 +242,11 @@ def returned(value: Any, name: str, axes: int, wanted: str) -> Any:
     """
     dtype = getattr(value, "dtype", None)
     real = isinstance(value, numbers.Real) if dtype is None else any(jnp.issubdtype(dtype, kind) for kind in _REAL)
-    require(real and np.ndim(value) == axes, f"{name} is {shown(value)}: {wanted}")
+    require(real and np.ndim(value) == axes, f"{name} is {short_text(value)}: {wanted}")
     return value
 
 
-def shown(value: Any) -> str:
+def short_text(value: Any) -> str:
     """Short text for a value in an error message: shape and type for an array."""
     if isinstance(value, AnyArray):
         return f"an array of shape {value.shape} and type {value.dtype}" if value.ndim else str(value)

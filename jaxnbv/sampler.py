@@ -18,7 +18,7 @@ from jaxnbv.checks import (
     is_traced,
     own_settings,
     require,
-    shown,
+    short_text,
     takes_native,
 )
 from jaxnbv.geometry.cloud import PointCloud
@@ -217,7 +217,7 @@ class SurfaceSampler(eqx.Module):
         **Raises:** `ValueError` if the values or the observations are of another grid.
         """
         observations, nodes = self.adapt(observations), (self.grid.resolution,) * 3
-        require(jnp.shape(values)[-3:] == nodes, f"the values are {shown(values)}, but the grid has {nodes} nodes")
+        require(jnp.shape(values)[-3:] == nodes, f"the values are {short_text(values)}, but the grid has {nodes} nodes")
         excluded = observations.obstacle_nodes
         if self.carving is not None and observations.empty_nodes is not None:
             elsewhere = observations.empty_nodes | self.carving.outside(self.grid)

@@ -8,7 +8,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnbv.checks import require, shown
+from jaxnbv.checks import require, short_text
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.scanning import Surface
@@ -128,7 +128,7 @@ def plain_function(value: Any, name: str, example: str = "") -> Callable[..., An
     **Raises:** `ValueError` for anything else, a class included.
     """
     proper = callable(value) and not isinstance(value, type)
-    require(proper, f"{name} is {shown(value)}: give one{example}, or a function of a cloud")
+    require(proper, f"{name} is {short_text(value)}: give one{example}, or a function of a cloud")
     return value
 
 

@@ -20,7 +20,7 @@ from jaxnbv.checks import (
     native,
     own_settings,
     require,
-    shown,
+    short_text,
 )
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.depth_image import points_of_depth
@@ -64,7 +64,7 @@ class PointCloud(eqx.Module):
             "PointCloud.from_arrays",
         )
         for leaf, name in ((self.mask, "mask"), (self.missed, "missed")):
-            require(leaf is None or leaf.dtype == bool, f"a cloud's {name} is {shown(leaf)}: give a boolean array")
+            require(leaf is None or leaf.dtype == bool, f"a cloud's {name} is {short_text(leaf)}: give a boolean array")
 
     @classmethod
     @own_settings()

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnbv.checks import AnyArray, as_numbers, check_fields, checked, is_traced, own_settings, require, shown
+from jaxnbv.checks import AnyArray, as_numbers, check_fields, checked, is_traced, own_settings, require, short_text
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
@@ -45,7 +45,7 @@ class Frame(eqx.Module):
     def __check_init__(self):
         check_fields(self)
         require(self.scale > 0, f"the frame's scale is {self.scale}; it must be positive")
-        require(self.up in _UP, f"up is {shown(self.up)}; give one of {', '.join(_UP)}")
+        require(self.up in _UP, f"up is {short_text(self.up)}; give one of {', '.join(_UP)}")
 
     @classmethod
     @checked
@@ -135,5 +135,5 @@ def _apply(value, place, turn, scale: float):
     if isinstance(value, Array) and is_traced(value):
         return place(value)
     array = as_numbers(value, "the points", None)
-    require(array.shape[-1:] == (3,), f"the points are {shown(value)}: give an array (..., 3), a cloud or a pose")
+    require(array.shape[-1:] == (3,), f"the points are {short_text(value)}: give an array (..., 3), a cloud or a pose")
     return place(array)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnbv.checks import AnyArray, InputError, require, shown, takes_native
+from jaxnbv.checks import AnyArray, InputError, require, short_text, takes_native
 from jaxnbv.geometry.pose import fibonacci_sphere
 from jaxnbv.programs import program
 
@@ -28,7 +28,7 @@ def _corner(values) -> Float[np.ndarray, " 3"]:
     try:
         return np.array([float(value) for value in values])
     except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"a corner of a box is {shown(values)}; give three numbers") from error
+        raise InputError(f"a corner of a box is {short_text(values)}; give three numbers") from error
 
 
 class Box(eqx.Module):

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxnbv.checks import AnyArray, check_fields, check_type, is_traced, require, shown
+from jaxnbv.checks import AnyArray, check_fields, check_type, is_traced, require, short_text
 from jaxnbv.geometry.cloud import PointCloud, farthest_point_subsample
 from jaxnbv.networks.categories import CATEGORIES, NUM_PARTS, category_index, part_mask
 from jaxnbv.networks.invariant import InvariantClassifier
@@ -42,7 +42,7 @@ class CloudClassifier(Classifier):
         parts = isinstance(self.network, PointNet2PartSegmenter | CompactPartSegmenter)
         names = () if self.classes is None else self.classes
         proper = isinstance(names, tuple) and all(isinstance(name, str) for name in names)
-        require(proper, f"the classes are {shown(self.classes)}; give a tuple of names")
+        require(proper, f"the classes are {short_text(self.classes)}; give a tuple of names")
         require(not parts, "the network segments parts: give it to CloudSegmenter")
         require(self.num_points >= 1, f"num_points is {self.num_points}; the network needs at least one")
         require(self.scale > 0, f"the scale is {self.scale}; it must be positive")

@@ -11,7 +11,7 @@ import trimesh
 from jax.sharding import Mesh, get_abstract_mesh
 from jaxtyping import Array, Bool, Float, Key
 
-from jaxnbv.checks import InputError, checked, is_traced, require, shown
+from jaxnbv.checks import InputError, checked, is_traced, require, short_text
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.planning.episode_program import answers_by_parts, run
@@ -76,7 +76,7 @@ def episodes(
     are_keys = isinstance(keys, Array) and jnp.issubdtype(keys.dtype, jax.dtypes.prng_key)
     require(
         are_keys and keys.ndim == 1 and keys.size > 0,
-        f"the keys are {shown(keys)}: make them with jax.random.split(jax.random.key(seed), episodes)",
+        f"the keys are {short_text(keys)}: make them with jax.random.split(jax.random.key(seed), episodes)",
     )
     require(not is_traced(scenes, first, keys), "episodes is a compiled program itself: call it outside jit and vmap")
     count = len(keys)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Real
 
-from jaxnbv.checks import AnyArray, as_numbers, require, shown
+from jaxnbv.checks import AnyArray, as_numbers, require, short_text
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.depth_image import without_sentinels
@@ -50,7 +50,9 @@ class Image(NamedTuple):
         pixel_mask = None if mask is None else np.asarray(mask)
         if pixel_mask is not None:
             proper = pixel_mask.dtype == bool and pixel_mask.shape == pixels.shape
-            require(proper, f"the mask is {shown(mask)}: give a boolean array of the image's shape, {pixels.shape}")
+            require(
+                proper, f"the mask is {short_text(mask)}: give a boolean array of the image's shape, {pixels.shape}"
+            )
         # Copy, since a driver may write its next image into the same memory.
         return cls(pixels.copy(), as_numbers(matrix, "the matrix of a pose", np.float64), scale, pixel_mask)
 
@@ -78,7 +80,7 @@ class Image(NamedTuple):
         is_robot = np.asarray(ignore(self.points(camera, pose)[measured]))
         require(
             is_robot.shape == (int(measured.sum()),) and is_robot.dtype == bool,
-            f"ignore returned {shown(is_robot)} for {int(measured.sum())} points: return a bool for each",
+            f"ignore returned {short_text(is_robot)} for {int(measured.sum())} points: return a bool for each",
         )
         robot = np.zeros(self.depth.shape, bool)
         robot[measured] = is_robot

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnbv.checks import InputError, require, shown
+from jaxnbv.checks import InputError, require, short_text
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.pose_list import is_same_view
 from jaxnbv.geometry.rotations import rotation_about
@@ -188,7 +188,7 @@ def _answers(reachable: Reachable, matrices: Float[np.ndarray, "n 4 4"]) -> list
     is_list = isinstance(answers, list | tuple) or (hasattr(answers, "shape") and len(answers.shape) == 1)
     require(
         is_list and len(answers) == len(matrices),
-        f"reachable returned {shown(answers)} for {len(matrices)} poses: return a list with an answer for each",
+        f"reachable returned {short_text(answers)} for {len(matrices)} poses: return a list with an answer for each",
     )
     return [_answer(answer) for answer in answers]
 
@@ -203,7 +203,7 @@ def _answer(answer: Any) -> float | str:
     is_number = isinstance(answer, bool | int | float) or (hasattr(answer, "dtype") and answer.dtype.kind in "bif")
     require(
         is_number and 0 <= float(answer) <= 1,
-        f"reachable returned {shown(answer)} for a pose: return a bool; None if it can be reached, else the reason; or "
-        "a score from 0 to 1",
+        f"reachable returned {short_text(answer)} for a pose: return a bool; None if it can be reached, else the "
+        "reason; or a score from 0 to 1",
     )
     return float(answer) or _NO_REASON

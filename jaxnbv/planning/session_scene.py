@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from jaxnbv.checks import as_numbers, require, shown
+from jaxnbv.checks import as_numbers, require, short_text
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
@@ -34,7 +34,7 @@ def box_of(corners) -> Box:
     """
     if isinstance(corners, Box):
         return corners
-    require(np.shape(corners) == (2, 3), f"the box is {shown(corners)}; give two corners, (low, high), or a Box")
+    require(np.shape(corners) == (2, 3), f"the box is {short_text(corners)}; give two corners, (low, high), or a Box")
     return Box(*(as_numbers(corner, "a corner of the box", np.float64) for corner in corners))
 
 

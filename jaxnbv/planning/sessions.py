@@ -11,7 +11,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from jaxnbv.checks import AnyArray, InputError, as_numbers, checked, require, shown
+from jaxnbv.checks import AnyArray, InputError, as_numbers, checked, require, short_text
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.depth_image import without_sentinels
@@ -123,7 +123,9 @@ class Sessions:
         else:
             numbers = as_numbers(labels, "the labels", None)
             proper = numbers.shape == pixels.shape and np.issubdtype(numbers.dtype, np.integer)
-            require(proper, f"the labels are {shown(labels)}: give whole numbers, one for each of the image's pixels")
+            require(
+                proper, f"the labels are {short_text(labels)}: give whole numbers, one for each of the image's pixels"
+            )
         numbers = np.where(inside, numbers, 0)
         # The rays that a session uses.
         rows = slice(stride // 2, None, stride)

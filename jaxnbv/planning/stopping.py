@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from jaxnbv.acquisition import Acquisition, ExpectedUtilityImprovement, context_of
-from jaxnbv.checks import InputError, check_fields, check_type, require, shown
+from jaxnbv.checks import InputError, check_fields, check_type, require, short_text
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
@@ -120,7 +120,7 @@ def checked_reason(rule: StopRule, reason: str | None) -> str | None:
     name = type(rule).__name__
     require(
         is_proper,
-        f"the stop rule {name} returned {shown(reason)}: it must return the reason in words, or None to go on",
+        f"the stop rule {name} returned {short_text(reason)}: it must return the reason in words, or None to go on",
     )
     return reason
 
@@ -201,7 +201,7 @@ class PartsFound(StopRule):
         check_fields(self)
         require(self.points >= 1, f"a part is found by {self.points} points; give at least 1")
         names = isinstance(self.parts, tuple) and all(isinstance(name, str) for name in self.parts)
-        require(self.parts is None or names, f"the parts are {shown(self.parts)}; give a tuple of their names")
+        require(self.parts is None or names, f"the parts are {short_text(self.parts)}; give a tuple of their names")
 
     def check(self, acquisition: Acquisition) -> None:
         utility = acquisition.utility if isinstance(acquisition, ExpectedUtilityImprovement) else None

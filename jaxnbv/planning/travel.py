@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxnbv.checks import check_fields, checked, require, returned
+from jaxnbv.checks import check_fields, checked, checked_result, require
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.rotations import safe_norm
@@ -90,7 +90,9 @@ class ValuePerCost(eqx.Module):
         self, values: Float[Array, "*samples poses"], observations: Observations, poses: Pose
     ) -> Float[Array, "*samples poses"]:
         """Values of poses, divided by the cost of going there from the last view, if there is one."""
-        cost = jax.vmap(lambda pose: returned(self.of(observations.poses.last, pose), _COST, 0, _ONE_NUMBER))(poses)
+        cost = jax.vmap(lambda pose: checked_result(self.of(observations.poses.last, pose), _COST, 0, _ONE_NUMBER))(
+            poses
+        )
         # An invalid cost becomes NaN, so that the planner raises and names it, see `total_cost`.
         cost = jnp.where((cost >= 0) & (cost < jnp.inf), cost, jnp.nan)
         return values / (self.fixed + jnp.where(observations.num_views > 0, cost, 0.0))
@@ -115,7 +117,7 @@ def total_cost(poses: Sequence[Pose], cost: CostFunction = arc_length) -> float:
     """
     total = 0.0
     for start, end in itertools.pairwise(poses):
-        step = float(returned(cost(start, end), _COST, 0, _ONE_NUMBER))
+        step = float(checked_result(cost(start, end), _COST, 0, _ONE_NUMBER))
         require(0 <= step < math.inf, f"{_COST} is {step}: make it one finite number, zero or more")
         total += step
     return total

@@ -8,7 +8,7 @@ from typing import NamedTuple, TypeVar
 
 import trimesh
 
-from jaxnbv.checks import InputError, checked, require, shown
+from jaxnbv.checks import InputError, checked, require, short_text
 from jaxnbv.networks.categories import CATEGORIES
 from jaxnbv.scanning import TriangleMesh, load_mesh
 
@@ -67,7 +67,7 @@ def class_meshes(folder: str | Path, classes: Sequence[str]) -> tuple[MeshFile, 
     or if `classes` is not a list of names.
     """
     named = isinstance(classes, list | tuple) and all(isinstance(name, str) for name in classes)
-    require(named, f"the classes are {shown(classes)}: give a list of names")
+    require(named, f"the classes are {short_text(classes)}: give a list of names")
     folder = _existing(folder)
     folder = folder / "raw_scans" if (folder / "raw_scans").is_dir() else folder
     paths = {_plain(path.name): path for path in sorted(folder.iterdir()) if path.is_dir()}

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from jaxnbv.checks import AnyArray, InputError, as_numbers, require, shown
+from jaxnbv.checks import AnyArray, InputError, as_numbers, require, short_text
 from jaxnbv.readers.text_files import read_rows, read_table, read_text
 
 # In this order, so that intrinsics of a depth camera come before those of a colour camera.
@@ -23,7 +23,7 @@ def intrinsic_matrix(values: Float[AnyArray, "..."] | list | tuple, name: str) -
     if array.shape == (4,):
         fx, fy, cx, cy = array
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    require(array.shape in ((3, 3), (4, 4)), f"{name} is {shown(values)}: give a 3 x 3 matrix, or fx, fy, cx, cy")
+    require(array.shape in ((3, 3), (4, 4)), f"{name} is {short_text(values)}: give a 3 x 3 matrix, or fx, fy, cx, cy")
     return array[:3, :3]
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt16
 from scipy.spatial.transform import Rotation
 
-from jaxnbv.checks import AnyArray, InputError, as_numbers, require, shown
+from jaxnbv.checks import AnyArray, InputError, as_numbers, require, short_text
 from jaxnbv.errors import optional
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import rigid_matrices
@@ -112,7 +112,7 @@ class RecordedFrames:
         scale = depth_unit(self._stored, self.matrices, self.camera) if scale is None else scale
         if scale is None:
             raise InputError(f"the frames of {folder} cannot tell the unit of their depths: {_ASK_UNIT}")
-        require(0 < scale < 100, f"the depth scale is {shown(scale)}, which is no length of a unit: {_ASK_UNIT}")
+        require(0 < scale < 100, f"the depth scale is {short_text(scale)}, which is no length of a unit: {_ASK_UNIT}")
         self.depth_scale = float(scale)
 
     def __len__(self) -> int:
@@ -215,7 +215,7 @@ def _upward(up: tuple[float, float, float]) -> Float[np.ndarray, "4 4"]:
     """Rotation of the world that maps a direction to z and keeps x in its plane."""
     direction = as_numbers(up, "up", np.float64)
     length = float(np.linalg.norm(direction)) if direction.shape == (3,) else 0.0
-    require(0 < length < math.inf, f"up is {shown(up)}; give a direction, such as (0, -1, 0)")
+    require(0 < length < math.inf, f"up is {short_text(up)}; give a direction, such as (0, -1, 0)")
     # If x is upward, y stays in its plane instead.
     beside = np.eye(3)[int(abs(direction[0]) > 0.9 * length)]
     rotation, _ = Rotation.align_vectors(np.eye(3)[[2, 0]], [direction / length, beside], weights=[np.inf, 1.0])

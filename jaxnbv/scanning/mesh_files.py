@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Array, Float
 
-from jaxnbv.checks import InputError, checked, require, shown
+from jaxnbv.checks import InputError, checked, require, short_text
 from jaxnbv.scanning.gltf import read_gltf
 from jaxnbv.scanning.grid import Grid
 from jaxnbv.scanning.mesh import TriangleMesh
@@ -111,7 +111,7 @@ def read_nodes(path: str | Path | trimesh.Geometry) -> list[tuple[str, trimesh.T
 
 
 def _read_file(path: Path) -> list[tuple[str, trimesh.Trimesh]]:
-    require(os.path.isfile(path), f"no mesh file at {shown(str(path))}: check the path")
+    require(os.path.isfile(path), f"no mesh file at {short_text(str(path))}: check the path")
     try:
         return _read(path)
     except InputError as error:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxnbv.checks import AnyArray, check_fields, check_type, require, shown
+from jaxnbv.checks import AnyArray, check_fields, check_type, require, short_text
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
@@ -48,7 +48,7 @@ class Obstacles(eqx.Module):
 
     def __check_init__(self):
         check_fields(self)
-        require(isinstance(self.solids, tuple), f"the solids are {shown(self.solids)}; give a tuple of solids")
+        require(isinstance(self.solids, tuple), f"the solids are {short_text(self.solids)}; give a tuple of solids")
         for obstacle in self.solids:
             check_type(obstacle, SignedDistance, "an obstacle")
         for name in ("margin", "clearance"):

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import trimesh
 
-from jaxnbv.checks import check_type, require, shown
+from jaxnbv.checks import check_type, require, short_text
 from jaxnbv.scanning.mesh_files import as_surface
 from jaxnbv.scanning.scanner import Surface
 from jaxnbv.scanning.sdf import SignedDistance
@@ -48,7 +48,7 @@ def _traceable(scene: Any, name: str) -> Surface:
     is_mesh = isinstance(scene, trimesh.Geometry) or (isinstance(scene, Surface) and not scene.in_jit)
     require(
         not is_mesh,
-        f"{name} is {shown(scene)}, which a compiled program cannot scan: give it as a solid, "
+        f"{name} is {short_text(scene)}, which a compiled program cannot scan: give it as a solid, "
         "nbv.sdf.solid_of_mesh(mesh.vertices, mesh.faces, cubic=True), or call simulate for each",
     )
     check_type(scene, Surface | SignedDistance, name)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxnbv.checks import AnyArray, InputError, check_fields, require, shown
+from jaxnbv.checks import AnyArray, InputError, check_fields, require, short_text
 from jaxnbv.geometry.pose import Pose, fibonacci_sphere, look_at
 from jaxnbv.geometry.rotations import rotation_between
 from jaxnbv.scanning.sensors import SENSOR_RADIUS
@@ -40,12 +40,12 @@ class Candidates(eqx.Module):
 
         **Raises:** `ValueError` if it allows none, or does not return a single bool.
         """
-        require(callable(allowed), f"the predicate is {shown(allowed)}; give a function of one pose")
+        require(callable(allowed), f"the predicate is {short_text(allowed)}; give a function of one pose")
         poses = self.poses()
         answers = [np.asarray(allowed(poses[index])) for index in range(self.count)]
         for answer in answers:
             is_bool = answer.shape == () and answer.dtype == bool
-            require(is_bool, f"the predicate returned {shown(answer)} for a pose; it must return True or False")
+            require(is_bool, f"the predicate returned {short_text(answer)} for a pose; it must return True or False")
         rows = np.array(answers)
         require(rows.any(), f"none of {self.count} candidates is allowed: give more, or allow more")
         return GivenPoses(poses[jnp.asarray(np.flatnonzero(rows))])
@@ -176,7 +176,9 @@ def as_candidates(value: object) -> Candidates:
         return GivenPoses(value)
     if isinstance(value, int | np.integer) and not isinstance(value, bool):
         return SphereCandidates(int(value))
-    raise InputError(f"the candidates are {shown(value)}: give how many, a batch of poses, or SphereCandidates(...)")
+    raise InputError(
+        f"the candidates are {short_text(value)}: give how many, a batch of poses, or SphereCandidates(...)"
+    )
 
 
 def sphere_candidates(count: int, radius: float = SENSOR_RADIUS) -> Pose:

@@ -16,7 +16,7 @@ import platformdirs
 import trimesh
 from jaxtyping import Float
 
-from jaxnbv.checks import InputError, check_type, require, shown
+from jaxnbv.checks import InputError, check_type, require, short_text
 from jaxnbv.geometry.pose import fibonacci_sphere
 from jaxnbv.progress import progress_bar
 from jaxnbv.scanning.mesh import TriangleMesh
@@ -37,7 +37,7 @@ def as_tuple(values: Sequence[_T], name: str) -> tuple[_T, ...]:
     try:
         return tuple(values)
     except TypeError as error:
-        raise InputError(f"{name} are {shown(values)}; give a list") from error
+        raise InputError(f"{name} are {short_text(values)}; give a list") from error
 
 
 def mesh_paths(meshes: str | Path | Sequence[str | Path | trimesh.Trimesh]) -> list[Path | trimesh.Trimesh]:

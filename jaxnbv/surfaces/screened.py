@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxnbv.checks import AnyArray, check_fields, is_traced, require, shown
+from jaxnbv.checks import AnyArray, check_fields, is_traced, require, short_text
 from jaxnbv.geometry.cloud import PointCloud, some_rows
 from jaxnbv.observations import Observations, as_observations
 from jaxnbv.programs import program
@@ -66,7 +66,8 @@ class ScreenedSPSR(SurfaceModel):
         check_fields(self)
         are_sources = isinstance(self.values, tuple) and all(isinstance(value, ValueSource) for value in self.values)
         require(
-            are_sources, f"the values are {shown(self.values)}; give a tuple such as (OutsideBoundary(), OnSurface())"
+            are_sources,
+            f"the values are {short_text(self.values)}; give a tuple such as (OutsideBoundary(), OnSurface())",
         )
         require(len(self.values) > 0, "no values are given: name some, such as OutsideBoundary(), or use GeometricSPSR")
         for name in ("level_deviation", "offset"):

@@ -12,7 +12,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Array, Float, Int, UInt8
 
-from jaxnbv.checks import InputError, check_type, checked, require, shown
+from jaxnbv.checks import InputError, check_type, checked, require, short_text
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import fibonacci_sphere
 from jaxnbv.programs import program
@@ -211,7 +211,7 @@ def _metres(scale: float | str) -> float:
         )
         return _METRES[scale]
     if not (0 < scale < np.inf):
-        raise InputError(f"the scale is {shown(scale)}: give the length of the meshes' unit in the world, above 0")
+        raise InputError(f"the scale is {short_text(scale)}: give the length of the meshes' unit in the world, above 0")
     return float(scale)
 
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxnbv.checks import InputError, check_fields, check_type, is_traced, native, own_settings, require, shown
+from jaxnbv.checks import InputError, check_fields, check_type, is_traced, native, own_settings, require, short_text
 from jaxnbv.geometry.cloud import farthest_point_subsample
 from jaxnbv.geometry.farthest_points import farthest_point_indices
 from jaxnbv.geometry.volume import Box, Volume, boundary_points, bounding_box
@@ -115,7 +115,7 @@ class OutsideBoundary(ValueSource):
                 middle = float(self.volume(jnp.zeros((1, 3)))[0])
             except Exception as error:
                 raise InputError(
-                    f"the volume {shown(self.volume)} gives no signed distances of points (n, 3) ({error}): "
+                    f"the volume {short_text(self.volume)} gives no signed distances of points (n, 3) ({error}): "
                     "give a Box or a solid of jaxnbv.sdf"
                 ) from error
         require(middle < 0, f"the volume {self.volume} must enclose the origin, whose distance is {middle:.4g}")

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxnbv.acquisition import Acquisition, ImaginedView, context_of, zero_if_empty
-from jaxnbv.checks import check_fields, require, returned
+from jaxnbv.checks import check_fields, checked_result, require
 from jaxnbv.geometry.cloud import PointCloud, concatenate, limit_capacity
 from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning import Surface
@@ -103,7 +103,7 @@ class ClassAcquisition(Acquisition):
         return thinned, self._log_p(thinned)
 
     def _log_p(self, cloud: PointCloud) -> Any:
-        return returned(self.classifier(cloud), "the classifier's answer", 1, _LOG_P)
+        return checked_result(self.classifier(cloud), "the classifier's answer", 1, _LOG_P)
 
     @abstractmethod
     def compare(self, log_p: Float[Array, " classes"], log_q: Float[Array, " classes"]) -> Float[Array, "*values"]:

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxnbv.checks import check_fields, functions_of_users, require, returned
+from jaxnbv.checks import check_fields, checked_result, functions_of_users, require
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.programs import program
 from jaxnbv.scanning import Surface
@@ -157,7 +157,7 @@ class PartAnswer(Answer):
 
 @program
 def _probabilities(segmenter: Segmenter, cloud: PointCloud) -> Any:
-    return returned(segmenter(cloud), "the segmenter's answer", 2, "give probabilities (points, parts)")
+    return checked_result(segmenter(cloud), "the segmenter's answer", 2, "give probabilities (points, parts)")
 
 
 @program

@@ -13,7 +13,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from jaxnbv.checks import AnyArray, as_numbers, checked, require, shown
+from jaxnbv.checks import AnyArray, as_numbers, checked, require, short_text
 from jaxnbv.errors import explained_imports, optional
 from jaxnbv.geometry.cloud import PointCloud, check_single
 from jaxnbv.geometry.frame import Frame
@@ -298,7 +298,7 @@ def _checked_pose(pose: Float[AnyArray, "4 4"] | list | None) -> Float[np.ndarra
         matrix.shape == (4, 4), f"the pose has shape {matrix.shape}: give a matrix (4, 4), from the CAD to the scan"
     )
     (matrix,), (is_rigid,) = rigid_matrices(matrix[None])
-    require(is_rigid, f"the pose is no rigid motion: {shown(pose)}; give a rotation and a shift, [[R, t], [0, 1]]")
+    require(is_rigid, f"the pose is no rigid motion: {short_text(pose)}; give a rotation and a shift, [[R, t], [0, 1]]")
     return matrix
 
 
