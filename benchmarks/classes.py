@@ -104,7 +104,7 @@ class ClassStudy(Study):
         return [one for one in range(len(objects_in(self.meshes)[0])) if one != scene.task]
 
     def sampler_of(self, scene: Scene) -> SurfaceSampler:
-        return self.sampler.with_bank(objects_in(self.meshes)[0].chosen(self.others(scene)), Upright())
+        return self.sampler.with_bank(objects_in(self.meshes)[0].select(self.others(scene)), Upright())
 
     def acquisition(self, method: str, scene: Scene) -> Acquisition:
         kinds = np.array(objects_in(self.meshes)[1])[self.others(scene)]

@@ -24,7 +24,7 @@ def without_the_class(study: ClassificationStudy, scene: Scene) -> Planner:
     assert isinstance(sampler.model, KnownShapes), "run the study by --model known"
     bank, own = sampler.model.bank, study.objects.classes[scene.task.label]
     others = [row for row, name in enumerate(bank.names) if kind_of(name) != own]
-    return _planner(study, scene, sampler.without_bank.with_bank(bank.chosen(others), sampler.model.poses))
+    return _planner(study, scene, sampler.without_bank.with_bank(bank.select(others), sampler.model.poses))
 
 
 def another_kind(study: ClassificationStudy, scene: Scene) -> Planner:

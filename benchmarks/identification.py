@@ -121,7 +121,7 @@ def main() -> None:
         scene = other_scene(study, index, files) if files else study.scene(index)
         planner, name = study.planner(IDENTIFY, scene), NONE if files or options.left_out else scene.name
         if options.left_out:
-            bank = scene.task.bank.chosen([part for part in range(len(scene.task.bank)) if part != scene.task.part])
+            bank = scene.task.bank.select([part for part in range(len(scene.task.bank)) if part != scene.task.part])
             planner = dataclasses.replace(planner, sampler=study.sampler.with_bank(bank, scene.task.poses))
         likeliest = [next(iter(belief.items())) for belief in beliefs(study, planner, scene, options)]
         rows.append([(probability, float(said == name)) for said, probability in likeliest])

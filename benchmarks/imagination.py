@@ -101,7 +101,7 @@ def objects_of(arguments: argparse.Namespace) -> dict[str, Callable[[], nbv.scan
 def with_bank(planner: nbv.Planner, bank: nbv.ShapeBank, name: str) -> nbv.Planner:
     """One that has seen the shapes of a bank, but for the object of this name."""
     others = [row for row, known in enumerate(bank.names) if known != name]
-    sampler = planner.sampler.with_bank(bank.chosen(others), nbv.surfaces.Upright(by_axis=True))
+    sampler = planner.sampler.with_bank(bank.select(others), nbv.surfaces.Upright(by_axis=True))
     return dataclasses.replace(planner, sampler=sampler)
 
 

@@ -39,7 +39,7 @@ from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning import pixel_area, scan
 from jaxnbv.scanning.looks import STEEP
 from jaxnbv.studies.recorded import NEW_AREA, RecordedStudy, frame_of_box
-from jaxnbv.tasks.coverage import Unseen, seen_share
+from jaxnbv.tasks.coverage import Newness, seen_share
 
 KINDS = ("cut", "empty", "silent", "unseen")
 COLUMNS = ("rank", "chosen", "phantom", *KINDS, "covered", "promised", "found", "seen", "area")
@@ -66,7 +66,7 @@ class Case:
         loop = Loop(planner, study.key(start, "episode"), camera=study.camera)
         taken: list[int] = []
         first = recording.poses[study.first_view(scene)]
-        before: tuple[float, Unseen] | None = None
+        before: tuple[float, Newness] | None = None
         for step in itertools.islice(loop.steps(study.sensor(scene), first), study.views):
             taken.append(study.frame_of(step.view.pose))
             row = [np.nan] * len(COLUMNS)
@@ -76,15 +76,15 @@ class Case:
             if before is not None:
                 row[-4:-2] = before[0], float(_new_area(step.view.scan, step.view.pose, study, before[1]))
             inputs = loop.inputs()
-            unseen = planner.acquisition.context(inputs)
+            newness = planner.acquisition.context(inputs)
             if len(taken) < study.views:
-                before = float(loop.propose().value), unseen
-            row[:-4] = self._judge(inputs, unseen, taken)
+                before = float(loop.propose().value), newness
+            row[:-4] = self._judge(inputs, newness, taken)
             yield row
 
-    def _judge(self, inputs: StepInputs, unseen: Unseen, taken: list[int]) -> list[float]:
+    def _judge(self, inputs: StepInputs, newness: Newness, taken: list[int]) -> list[float]:
         recording, camera, surfaces = self.recording, self.study.imagined_camera, inputs.surfaces
-        areas, points = _expected(surfaces, unseen, camera, recording.poses)
+        areas, points = _expected(surfaces, newness, camera, recording.poses)
         expected = np.asarray(areas.sum(axis=-1).mean(axis=0))
         known = recording.shown[taken].any(axis=0)
         gain = (recording.shown & ~known).sum(axis=1)
@@ -98,7 +98,7 @@ class Case:
         kinds = self._kinds(places[phantom], taken)
         share = weights[phantom].sum() / max(weights.sum(), 1e-9)
         of_kind = [weights[phantom][kinds == kind].sum() / max(weights[phantom].sum(), 1e-9) for kind in range(4)]
-        covered = float(seen_share(unseen, surfaces, camera, recording.poses, inputs.observations.poses))
+        covered = float(seen_share(newness, surfaces, camera, recording.poses, inputs.observations.poses))
         return [rank, chosen, share, *of_kind, covered]
 
     def _kinds(self, places: np.ndarray, taken: list[int]) -> np.ndarray:
@@ -123,19 +123,19 @@ class Case:
 
 
 @jax.jit
-def _expected(surfaces, unseen: Unseen, camera, poses: Pose):
+def _expected(surfaces, newness: Newness, camera, poses: Pose):
     def of_sample(surface):
         def of_pose(pose):
             seen = scan(surface, camera, pose)
-            return pixel_area(seen, camera, pose, STEEP) * unseen(seen.points), seen.points
+            return pixel_area(seen, camera, pose, STEEP) * newness(seen.points), seen.points
 
         return jax.lax.map(of_pose, poses, batch_size=32)
 
     return jax.lax.map(of_sample, surfaces)
 
 
-def _new_area(seen: PointCloud, pose: Pose, study: RecordedStudy, unseen: Unseen):
-    return jnp.sum(pixel_area(seen, study.camera, pose, STEEP) * unseen(seen.points))
+def _new_area(seen: PointCloud, pose: Pose, study: RecordedStudy, newness: Newness):
+    return jnp.sum(pixel_area(seen, study.camera, pose, STEEP) * newness(seen.points))
 
 
 def measured(case: Case, starts: int) -> np.ndarray:

@@ -253,24 +253,24 @@ class AcquisitionList(Acquisition):
             member.check(cloud)
 
 
-def inputs_of(seen: StepInputs | Observations | PointCloud) -> StepInputs:
-    """Inputs of a step: `seen` itself, or observations or a cloud as inputs without posterior and samples."""
-    return seen if isinstance(seen, StepInputs) else StepInputs(as_observations(seen))
+def inputs_of(observations: StepInputs | Observations | PointCloud) -> StepInputs:
+    """Inputs of a step: those given, or observations or a cloud as inputs without posterior and samples."""
+    return observations if isinstance(observations, StepInputs) else StepInputs(as_observations(observations))
 
 
-def context_of(acquisition: Acquisition, seen: StepInputs | Observations | PointCloud) -> Any:
+def context_of(acquisition: Acquisition, observations: StepInputs | Observations | PointCloud) -> Any:
     """The acquisition's context, computed by a compiled function.
 
     **Raises:** `ValueError` if JAX cannot trace a function of the user's, or if the acquisition needs a posterior and
     there is none.
     """
-    inputs = _inputs(acquisition, seen)
+    inputs = _inputs(acquisition, observations)
     with functions_of_users():
         return _context_of(acquisition, inputs)
 
 
-def _inputs(acquisition: Acquisition, seen: StepInputs | Observations | PointCloud) -> StepInputs:
-    step = inputs_of(seen)
+def _inputs(acquisition: Acquisition, observations: StepInputs | Observations | PointCloud) -> StepInputs:
+    step = inputs_of(observations)
     require(
         step.posterior is not None or not acquisition.needs_posterior,
         f"{type(acquisition).__name__} needs the posterior: give StepInputs(observations, posterior)",
@@ -289,11 +289,11 @@ def zero_if_empty(scan: PointCloud, value: Float[Array, "*values"]) -> Float[Arr
 
 
 def check_traceable(
-    acquisition: Acquisition, seen: Observations | int, camera: Camera, differentiable: bool = False
+    acquisition: Acquisition, observations: Observations | int, camera: Camera, differentiable: bool = False
 ) -> None:
     """Check that JAX can trace an acquisition. Uses shapes alone and computes nothing.
 
-    - `seen`: observations, or the capacity of a cloud D.
+    - `observations`: observations, or the capacity of a cloud D.
     - `camera`: the camera of the scans that it scores.
     - `differentiable`: whether it must have derivatives in the points and normals of a scan.
 
@@ -309,7 +309,7 @@ def check_traceable(
     def value(rows):
         points, normals = rows
         scan, pose = PointCloud(points, normals, cloud(camera.num_rays).mask), Pose(jnp.eye(3), jnp.zeros(3))
-        step = inputs_of(cloud(seen) if isinstance(seen, int) else seen)
+        step = inputs_of(cloud(observations) if isinstance(observations, int) else observations)
         return acquisition.score(acquisition.context(acquisition.inputs(step)), ImaginedView(scan, camera, pose))
 
     rows = cloud(camera.num_rays).points, cloud(camera.num_rays).normals
@@ -329,7 +329,7 @@ def check_traceable(
 @checked
 def expected_value(
     acquisition: Acquisition,
-    seen: StepInputs | Observations | PointCloud,
+    observations: StepInputs | Observations | PointCloud,
     surfaces: GridSurface,
     camera: Camera,
     poses: Pose,
@@ -337,16 +337,17 @@ def expected_value(
 ) -> Float[Array, "poses *scores"]:
     """The acquisition at each pose of a batch: mean score of the imagined scans over the samples.
 
-    Supports `jit`, `grad` and `vmap`, in the poses and in `seen`. `AcquisitionList` adds an axis for its members.
+    Supports `jit`, `grad` and `vmap`, in the poses and in `observations`. `AcquisitionList` adds an axis for its
+    members.
 
-    - `seen`: the observations, or a cloud D alone. Acquisitions that need the posterior take `StepInputs`.
+    - `observations`: the observations, or a cloud D alone. Acquisitions that need the posterior take `StepInputs`.
     - `surfaces`: the samples along a leading axis.
     - `barrier`: see `scan`.
 
     **Raises:** `ValueError` if the acquisition's `check` does (not run on traced values), or if JAX cannot trace a
     function of the user's.
     """
-    inputs = _inputs(acquisition, seen)
+    inputs = _inputs(acquisition, observations)
     # The zero is traced under jit even if all inputs are concrete. `check` needs concrete results.
     if not is_traced(acquisition, inputs, jnp.zeros(())):
         acquisition.check(inputs.observations.cloud)

@@ -111,7 +111,7 @@ def focus_loss(focus: Focus, example: tuple[PointCloud, Any]) -> Any:
 @eqx.filter_jit
 def chosen_clouds(focus: Focus, clouds: PointCloud) -> PointCloud:
     """What a focused classifier sees of each cloud."""
-    return jax.lax.map(lambda cloud: PointCloud(*focus.chosen(cloud.points, cloud.normals, cloud.mask)), clouds)
+    return jax.lax.map(lambda cloud: PointCloud(*focus.select(cloud.points, cloud.normals, cloud.mask)), clouds)
 
 
 def report(name: str, network: Any, data: LabelledClouds) -> None:

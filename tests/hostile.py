@@ -58,7 +58,7 @@ def number_of_points(cloud):
 
 
 def chosen_of_bank(indices):
-    return BANK.chosen(indices)
+    return BANK.select(indices)
 
 
 def with_bank(bank, poses):

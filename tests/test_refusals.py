@@ -156,7 +156,7 @@ SURFACES = [
     (lambda: nbv.surfaces.KnownShapes(BANK, inverse_temperature=-1.0), "inverse_temperature is -1.0"),
     (lambda: nbv.ShapeBank.of([nbv.sdf.Sphere(1.0), nbv.sdf.Cuboid([1.0, 1.0, 1.0])]), "of 2 kinds, such as numbers"),
     (lambda: nbv.ShapeBank.of([nbv.sdf.Sphere(1.0)], ["a", "b"]), "2 names for 1 solids"),
-    (lambda: BANK.chosen([9]), "the bank has 4 shapes"),
+    (lambda: BANK.select([9]), "the bank has 4 shapes"),
     (lambda: nbv.ShapeBank.from_meshes("nowhere"), "there is no folder"),
     (lambda: nbv.ShapeBank.from_meshes("."), "holds no mesh"),
     (lambda: nbv.ShapeBank.from_meshes([]), "no meshes are named"),

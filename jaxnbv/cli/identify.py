@@ -177,12 +177,12 @@ def _say(name: str, session: "Session", unit: str | None) -> dict[str, Any]:
     for part, share in _likely(session):
         typer.echo(f"{'█' * round(_BAR * share):{_BAR}} {100 * share:3.0f} %  {part}")
     pose, is_none = session.object_pose, next(iter(session.identity)) == NONE
-    typer.echo("It is most likely none of these." if is_none else told(pose, unit or session.frame.unit))
+    typer.echo("It is most likely none of these." if is_none else pose_text(pose, unit or session.frame.unit))
     arrays = {field: getattr(pose, field).tolist() for field in ("matrix", "covariance", "alternatives")}
     return {"names": session.identity, "name": NONE if is_none else pose.name, **arrays}
 
 
-def told(pose: "ObjectPose", unit: str) -> str:
+def pose_text(pose: "ObjectPose", unit: str) -> str:
     """Lines of text with the pose of a part and its standard deviations.
 
     - `unit`: unit of the world.

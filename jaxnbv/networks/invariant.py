@@ -102,7 +102,7 @@ class Focus(eqx.Module):
         first, last = self.head
         return _affine(last, jax.nn.relu(_affine(first, jnp.concatenate([edges, carried], axis=-1))))[:, 0]
 
-    def chosen(
+    def select(
         self, points: Float[Array, "n 3"], normals: Float[Array, "n 3"], mask: Bool[Array, " n"]
     ) -> tuple[Float[Array, "few 3"], Float[Array, "few 3"], Bool[Array, " few"]]:
         """The first 320 points that are on the cue by better than even odds, with their normals and mask.
@@ -179,7 +179,7 @@ class InvariantClassifier(eqx.Module):
         """Log-probabilities of the classes. Normals must have length one. Masked rows are ignored."""
         mask = jnp.ones(len(points), bool) if mask is None else mask
         if self.focus is not None:
-            points, normals, mask = self.focus.chosen(points, normals, mask)
+            points, normals, mask = self.focus.select(points, normals, mask)
         # The first rows in farthest point order are farthest point samples themselves.
         order = farthest_point_indices(points, mask, self.edge.groups)
         centers = points[order], normals[order]

@@ -32,7 +32,7 @@ from jaxnbv.scanning import GridSurface, barrier_of
 from jaxnbv.surfaces.part_hypotheses import hypotheses_of
 from jaxnbv.surfaces.part_pose import surface_error
 from jaxnbv.tasks.classification import ClassAcquisition
-from jaxnbv.tasks.coverage import NewSurface, newness_of, seen_share
+from jaxnbv.tasks.coverage import NewSurface, new_surface_of, seen_share
 from jaxnbv.tasks.segmentation import PartAnswer, SoftPartCount
 
 
@@ -223,7 +223,7 @@ class PartsFound(StopRule):
         if not isinstance(answer, PartAnswer):
             raise InputError("the acquisition's answer has no parts: PartsFound needs that of SoftPartCount")
         counts = dict(zip(answer.names, answer.values.tolist(), strict=True))
-        names = self.parts or tuple(answer.names[index] for index in answer.asked)
+        names = self.parts or tuple(answer.names[index] for index in answer.parts)
         if any(counts.get(name, 0) < self.points for name in names):
             return None
         return f"all {len(names)} parts are found, each by {self.points} points or more"
@@ -248,7 +248,7 @@ class Covered(StopRule):
             NewSurface(self.size)
 
     def after(self, context: StopContext) -> str | None:
-        new = newness_of(context.planner.acquisition)
+        new = new_surface_of(context.planner.acquisition)
         if self.size is not None:
             new = NewSurface(self.size * context.frame.scale)
         share = expected_coverage(context, new)
@@ -268,8 +268,8 @@ def expected_coverage(context: StopContext, new: NewSurface) -> float:
         surfaces = observations.looks.without_unmeasured(surfaces, observations.poses)
     poses = planner.search.poses_around()
     barrier = barrier_of(planner.obstacles, planner.camera, poses)
-    unseen = context_of(new, observations)
-    return float(seen_share(unseen, surfaces, planner.camera, poses, observations.poses, barrier))
+    newness = context_of(new, observations)
+    return float(seen_share(newness, surfaces, planner.camera, poses, observations.poses, barrier))
 
 
 class Identified(StopRule):

@@ -48,7 +48,7 @@ class MeshFile(NamedTuple):
         return load_mesh(self.path, self.up)
 
 
-def taking_turns(groups: Iterable[Sequence[_T]]) -> list[_T]:
+def interleave(groups: Iterable[Sequence[_T]]) -> list[_T]:
     """The first item of each group, then the second of each group that has one, and so on."""
     turns = itertools.chain.from_iterable(itertools.zip_longest(*groups))
     return [item for item in turns if item is not None]
@@ -74,7 +74,7 @@ def class_meshes(folder: str | Path, classes: Sequence[str]) -> tuple[MeshFile, 
     rows = [(label, paths.get(_plain(name), paths.get(_SYNSETS.get(name, "")))) for label, name in enumerate(classes)]
     groups = [_of_class(path, label) for label, path in rows if path is not None]
     require(len(groups) > 0, f"the folder {folder} has none of the folders {', '.join(classes)}: give one that has")
-    return tuple(taking_turns(groups))
+    return tuple(interleave(groups))
 
 
 def _plain(name: str) -> str:

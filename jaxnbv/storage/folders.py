@@ -44,13 +44,13 @@ def versions() -> dict[str, Any]:
     return software() | {"device": jax.devices()[0].device_kind, "cores": num_threads()}
 
 
-def differences(found: Any, asked: Any, name: str = "") -> list[str]:
-    """The differences between two descriptions, in words: `found` in the folder, `asked` now."""
-    if isinstance(found, dict) and isinstance(asked, dict):
-        keys = list(dict.fromkeys([*found, *asked]))
-        nested = (differences(found.get(key), asked.get(key), f"{name}.{key}".lstrip(".")) for key in keys)
+def differences(stored: Any, current: Any, name: str = "") -> list[str]:
+    """The differences between two descriptions, in words: `stored` in the folder, `current` now."""
+    if isinstance(stored, dict) and isinstance(current, dict):
+        keys = list(dict.fromkeys([*stored, *current]))
+        nested = (differences(stored.get(key), current.get(key), f"{name}.{key}".lstrip(".")) for key in keys)
         return [difference for group in nested for difference in group]
-    return [] if found == asked else [f"{name}: {_short(found)} there, {_short(asked)} now"]
+    return [] if stored == current else [f"{name}: {_short(stored)} there, {_short(current)} now"]
 
 
 def _short(value: Any) -> str:
@@ -59,12 +59,12 @@ def _short(value: Any) -> str:
     return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}..."
 
 
-def check_format(found: Any, known: int, file: Path) -> None:
-    """**Raises:** `ValueError` for a file of a format other than `known`."""
+def check_format(format: Any, supported: int, file: Path) -> None:
+    """**Raises:** `ValueError` for a file of a format other than `supported`."""
     require(
-        found == known,
-        f"{file} is of format {str(found)[:20]}; this version of jaxnbv reads format {known}: install a newer one, or "
-        "choose another folder",
+        format == supported,
+        f"{file} is of format {str(format)[:20]}; this version of jaxnbv reads format {supported}: install a newer "
+        "one, or choose another folder",
     )
 
 

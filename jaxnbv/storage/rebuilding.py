@@ -53,12 +53,13 @@ def rebuild(description: Any, arrays: Mapping[str, np.ndarray], way: str) -> Any
     return thing
 
 
-def read_config(path: str | Path, kind: str, format: int, given: Mapping[str, Any]) -> dict[str, Any]:
+def read_config(path: str | Path, kind: str, format: int, replacements: Mapping[str, Any]) -> dict[str, Any]:
     """The configuration of an existing folder, rebuilt from its record.
 
     - `kind`: kind of the folder, such as "episode".
     - `format`: number of the format of its record.
-    - `given`: parts by name that replace those of the record. Opening the folder with them checks that they agree.
+    - `replacements`: parts by name that replace those of the record. Opening the folder with them checks that they
+      agree.
 
     **Raises:** `ValueError` if the folder holds no record, or a damaged one, or has a part that cannot be rebuilt and
     is not given.
@@ -66,10 +67,10 @@ def read_config(path: str | Path, kind: str, format: int, given: Mapping[str, An
     folder, remedy = Path(path), "give the folder of a run"
     record = read_record(folder, kind, remedy)
     check_format(record.get("format"), format, folder / f"{kind}.json")
-    parts = {name: part for name, part in record["config"].items() if name not in given}
+    parts = {name: part for name, part in record["config"].items() if name not in replacements}
     file = folder / ARRAYS
     arrays = read_arrays(file, "restore it", _check_hashes) if file.exists() else {}
-    return dict(given) | {name: rebuild(part, arrays, name) for name, part in parts.items()}
+    return dict(replacements) | {name: rebuild(part, arrays, name) for name, part in parts.items()}
 
 
 def _check_hashes(arrays: dict[str, np.ndarray]) -> None:

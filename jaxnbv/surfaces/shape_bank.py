@@ -185,7 +185,7 @@ class ShapeBank(eqx.Module):
         """Names of all shapes."""
         return tuple(bytes(code).rstrip(b"\0").decode(errors="ignore") for code in np.asarray(self.codes))
 
-    def chosen(self, indices: Sequence[int]) -> "ShapeBank":
+    def select(self, indices: Sequence[int]) -> "ShapeBank":
         """A bank of the shapes at these indices.
 
         **Raises:** `ValueError` for an index out of range.

@@ -57,19 +57,19 @@ class Coverage(Acquisition):
         return _many()
 
 
-class Unseen(eqx.Module):
+class Newness(eqx.Module):
     """How new a point on a surface is, given the observations.
 
-    - `seen`: distance field to all hits of earlier views, or to D if the observations keep no looks.
+    - `distances`: distance field to all hits of earlier views, or to D if the observations keep no looks.
     - `size`: see `NewSurface`.
     """
 
-    seen: Looks | DistanceField
+    distances: Looks | DistanceField
     size: Float[Array, ""]
 
     def __call__(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
         """Newness of surface at each point, from 0 to 1."""
-        return jnp.clip(self.seen(points) / self.size - 1.0, 0.0, 1.0)
+        return jnp.clip(self.distances(points) / self.size - 1.0, 0.0, 1.0)
 
 
 class NewSurface(Acquisition):
@@ -101,15 +101,15 @@ class NewSurface(Acquisition):
         check_fields(self)
         require(self.size is None or self.size > 0, f"the size is {self.size}; it must be positive, in scene units")
 
-    def context(self, step: StepInputs) -> Unseen:
+    def context(self, step: StepInputs) -> Newness:
         """The newness of points, from the looks or from D."""
         cloud, looks = step.observations.cloud, step.observations.looks
         if looks is not None and 2.0 * (self.size or 0.0) <= looks.reach:
-            return Unseen(looks, jnp.asarray(max(looks.grid.spacing, self.size or 0.0), cloud.points.dtype))
+            return Newness(looks, jnp.asarray(max(looks.grid.spacing, self.size or 0.0), cloud.points.dtype))
         size = jnp.maximum(_SIZE if self.size is None else self.size, spacing(cloud))
-        return Unseen(DistanceField.of(cloud, 2.0 * size), size)
+        return Newness(DistanceField.of(cloud, 2.0 * size), size)
 
-    def score(self, context: Unseen, view: ImaginedView) -> Float[Array, ""]:
+    def score(self, context: Newness, view: ImaginedView) -> Float[Array, ""]:
         """New area of one scan. Zero for an empty scan."""
         return jnp.sum(pixel_area(view.scan, view.camera, view.pose, STEEP) * context(view.scan.points))
 
@@ -124,18 +124,18 @@ class NewSurface(Acquisition):
         return _many()
 
 
-def newness_of(acquisition: Acquisition) -> NewSurface:
+def new_surface_of(acquisition: Acquisition) -> NewSurface:
     """The acquisition itself if it is a `NewSurface`, else the default one."""
     return acquisition if isinstance(acquisition, NewSurface) else NewSurface()
 
 
 @program
 def seen_share(
-    unseen: Unseen,
+    newness: Newness,
     surfaces: GridSurface,
     camera: Camera,
     poses: Pose,
-    taken: PoseList,
+    views: PoseList,
     barrier: Float[Array, "poses rays"] | None = None,
 ) -> Float[Array, ""]:
     """Share of the area visible from `poses` on the sampled surfaces that earlier views have seen.
@@ -143,17 +143,17 @@ def seen_share(
     A point has been seen if it is not new and, if the observations keep looks, is visible from the pose of a view. A
     point near to a measured one may still be hidden behind an edge.
 
-    - `taken`: poses of the views so far.
+    - `views`: poses of the views so far.
     - `barrier`: distances to obstacles from `poses`, see `scan`.
     """
-    areas = shared_map(_areas_shown, surfaces, unseen, camera, poses, taken, barrier)
+    areas = shared_map(_areas_shown, surfaces, newness, camera, poses, views, barrier)
     seen_area, visible_area = jnp.sum(areas, axis=0)
     return jnp.where(visible_area > 0, seen_area / jnp.where(visible_area > 0, visible_area, 1.0), 1.0)
 
 
 def _areas_shown(
     surface: GridSurface,
-    unseen: Unseen,
+    newness: Newness,
     camera: Camera,
     poses: Pose,
     views: PoseList,
@@ -163,8 +163,8 @@ def _areas_shown(
     points = spread_points(surface, _POINTS)
     tolerance = surface.grid.spacing
     is_shown = jnp.any(is_visible(surface, camera, poses, points, tolerance, barrier), axis=0)
-    is_seen = unseen(points.points) <= 0
-    if isinstance(unseen.seen, Looks):
-        own = is_visible(surface, unseen.seen.camera, views.rows, points, tolerance)
+    is_seen = newness(points.points) <= 0
+    if isinstance(newness.distances, Looks):
+        own = is_visible(surface, newness.distances.camera, views.rows, points, tolerance)
         is_seen &= jnp.any(own & views.is_filled[:, None], axis=0)
     return jnp.stack([jnp.sum(points.areas, where=is_seen & is_shown), jnp.sum(points.areas, where=is_shown)])

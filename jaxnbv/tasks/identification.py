@@ -25,7 +25,7 @@ from jaxnbv.utility import Answer, Quantity
 # Nodes along each axis of the grid for the hypotheses' surfaces.
 _RESOLUTION = 64
 # Weight of the information about how a part lies, relative to that about which part it is.
-_HOW = 0.1
+_POSE_WEIGHT = 0.1
 # For each ray: distance to the part, cosine of the angle of incidence, and whether it hits the part.
 _Image: TypeAlias = tuple[Float[Array, "..."], Float[Array, "..."], Bool[Array, "..."]]
 
@@ -37,14 +37,14 @@ class ImaginedParts(eqx.Module):
     - `weights`: their probabilities, which sum to one.
     - `classes`: class c of each hypothesis h, one-hot.
     - `tau`: how far a measured point may lie from the surface, in scene units, see `part_evidence`.
-    - `how`: weight of the information about how a part lies, or zero.
+    - `pose_weight`: weight of the information about how a part lies, or zero.
     """
 
     surfaces: GridSurface
     weights: Float[Array, " h"]
     classes: Float[Array, "h c"]
     tau: Float[Array, ""]
-    how: float
+    pose_weight: float
 
 
 class Identify(Acquisition):
@@ -80,9 +80,9 @@ class Identify(Acquisition):
         grid = Grid(min(_RESOLUTION, grid.resolution), grid.half_extent)
         shapes = hypotheses.placed.shape
         weights = hypotheses.weights[:-1] / jnp.maximum(jnp.sum(hypotheses.weights[:-1]), 1e-30)
-        how = _HOW if self.pose and self.group is None else 0.0
+        pose_weight = _POSE_WEIGHT if self.pose and self.group is None else 0.0
         classes = self._classes(shapes, len(hypotheses.bank))
-        return ImaginedParts(hypotheses.surfaces(grid, len(shapes)), weights, classes, hypotheses.tau, how)
+        return ImaginedParts(hypotheses.surfaces(grid, len(shapes)), weights, classes, hypotheses.tau, pose_weight)
 
     def _classes(self, shapes: Int[Array, " h"], num_parts: int) -> Float[Array, "h c"]:
         if self.group is None:
@@ -170,7 +170,7 @@ def _information(images: _Image, context: ImaginedParts, camera: Camera) -> Floa
         return entropy(weights @ classes) - jnp.sum(weights * entropies)
 
     about_class = information(context.classes)
-    return about_class + context.how * (information(jnp.eye(len(weights))) - about_class)
+    return about_class + context.pose_weight * (information(jnp.eye(len(weights))) - about_class)
 
 
 def _misfits(image: _Image, others: _Image, tau: Float[Array, ""]) -> Float[Array, "h rays"]:

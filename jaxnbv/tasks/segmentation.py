@@ -124,7 +124,7 @@ class SoftPartCount(Utility):
         part_names = self.segmenter.part_names
         names = tuple((part_names or {}).get(index, f"part {index}") for index in range(len(counts)))
         parts = tuple(np.flatnonzero(counts > 0).tolist() if part_names is None else part_names)
-        return PartAnswer(names, counts, asked=parts, target=self.target)
+        return PartAnswer(names, counts, parts=parts, target=self.target)
 
     def answer_values(self, cloud: PointCloud) -> Float[Array, " parts"]:
         """Number of points predicted for each part."""
@@ -146,12 +146,12 @@ class SoftPartCount(Utility):
 class PartAnswer(Answer):
     """Number of points predicted for each part.
 
-    - `asked`: indices of the parts to show.
+    - `parts`: indices of the parts to show.
     - `target`: N_target.
     """
 
     form: str = "{:.0f}"
-    asked: tuple[int, ...] = ()
+    parts: tuple[int, ...] = ()
     target: float = 60.0
 
 

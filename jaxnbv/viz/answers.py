@@ -181,7 +181,7 @@ class _PartWords(Words):
 
     @property
     def shown(self) -> Sequence[int]:
-        return self.answer.asked
+        return self.answer.parts
 
     def said(self, before: Answer | None = None) -> str:
         return f"points predicted of {super().said(before) or 'no part'}"

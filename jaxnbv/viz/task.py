@@ -21,7 +21,7 @@ from jaxnbv.planning.stopping import Sure
 from jaxnbv.programs import program
 from jaxnbv.scanning import Surface, pixel_area
 from jaxnbv.scanning.metrics import GRAZING, coverage, true_mesh
-from jaxnbv.tasks.coverage import NewSurface, newness_of
+from jaxnbv.tasks.coverage import NewSurface, new_surface_of
 from jaxnbv.utility import Answer
 from jaxnbv.viz.answers import Chart, CoverageAnswer, capital, words_of
 
@@ -111,7 +111,7 @@ def seen_after(episode: Episode, truth: Float[AnyArray, "n 3"] | None) -> list[C
     if truth is not None:
         shares = [100.0 * float(share) for share in coverage(views, truth)]
         return [CoverageAnswer(("of the surface seen",), np.array([share])) for share in shares]
-    of = newness_of(acquisition)
+    of = new_surface_of(acquisition)
     before = itertools.chain([None], episode.observations())
     new = [
         float(_new_area(of, seen, ImaginedView(view.scan, view.camera, view.pose)))

@@ -80,7 +80,7 @@ def test_a_bank_keeps_true_sizes(meshes):
         assert np.asarray(scaled.shape(jnp.asarray(1)).solid(jnp.asarray(own[:3].T))) == pytest.approx(
             0.0, abs=2e-3 * factor
         )
-    assert bank.chosen([1]).is_true_size
+    assert bank.select([1]).is_true_size
     without = nbv.ShapeBank.from_meshes(meshes, resolution=24, progress=False)
     assert not without.is_true_size
     assert without.in_scene(nbv.Frame(scale=8.0)) is without

@@ -37,10 +37,10 @@ def test_a_bank_gives_back_its_shapes_and_names():
     bank = nbv.ShapeBank.of([Sphere(0.5), Sphere(0.8), Sphere(1.0)], ["small", "größer", "x" * 100])
     assert len(bank) == 3
     assert bank.names == ("small", "größer", "x" * 64)
-    chosen = bank.chosen([2, 0])
+    chosen = bank.select([2, 0])
     assert chosen.names == ("x" * 64, "small")
     np.testing.assert_allclose(chosen.shape(jnp.asarray(0)).solid(jnp.zeros((1, 3))), [-1.0])
-    assert len(bank.chosen([])) == 0
+    assert len(bank.select([])) == 0
 
 
 @pytest.mark.parametrize("inverted", [False, True])

@@ -101,7 +101,7 @@ def test_the_answer_counts_the_points_of_each_part():
     cloud = make_cloud(17, 25)
     counts = np.asarray(part_counts(Linear(weight)(cloud)))
     plain = nbv.SoftPartCount(Linear(weight)).answer(cloud)
-    assert plain.asked == words_of(plain).shown == tuple(np.flatnonzero(counts))
+    assert plain.parts == words_of(plain).shown == tuple(np.flatnonzero(counts))
     np.testing.assert_array_equal(plain.values, counts)
     named = nbv.ExpectedUtilityImprovement(nbv.SoftPartCount(Named(weight)), num_points=5).answer(cloud)
     said = words_of(named).said(plain)

@@ -155,8 +155,8 @@ def test_heat_is_charted_by_temperature_and_distance():
 
 
 def test_parts_are_found_by_their_points():
-    found = PartAnswer(("a", "b", "c", "d"), np.array([70.0, 59.0, 60.0, 500.0]), asked=(0, 1, 2))
-    truth = PartAnswer(("a", "b", "c", "d"), np.array([4.0, 9.0, 0.0, 0.0]), asked=(0, 1, 2), target=1.0)
+    found = PartAnswer(("a", "b", "c", "d"), np.array([70.0, 59.0, 60.0, 500.0]), parts=(0, 1, 2))
+    truth = PartAnswer(("a", "b", "c", "d"), np.array([4.0, 9.0, 0.0, 0.0]), parts=(0, 1, 2), target=1.0)
     count, points = words_of(found).charts([truth, found], truth)
     np.testing.assert_array_equal(count.values, [[0.0], [2.0]])
     assert count.true == [2.0]
@@ -165,7 +165,7 @@ def test_parts_are_found_by_their_points():
     # However few points a part has of the whole surface, the object has it.
     assert words_of(truth).found == "a, b"
     assert words_of(found).settled([truth, found], never) == [False, False]
-    last = PartAnswer(("a",), np.array([60.0]), asked=(0,))
+    last = PartAnswer(("a",), np.array([60.0]), parts=(0,))
     assert words_of(last).settled([last], never) == [True]
 
 

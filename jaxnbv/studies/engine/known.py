@@ -46,7 +46,7 @@ def knowing_those(sampler: SurfaceSampler, wanted: Callable[[str], bool]) -> Sur
     rows = [row for row, name in enumerate(model.bank.names) if wanted(name)]
     if len(rows) == len(model.bank):
         return sampler
-    return dataclasses.replace(sampler, model=dataclasses.replace(model, bank=model.bank.chosen(rows)))
+    return dataclasses.replace(sampler, model=dataclasses.replace(model, bank=model.bank.select(rows)))
 
 
 def knowing_others(sampler: SurfaceSampler, files: Sequence[MeshFile], index: int) -> SurfaceSampler:

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 from jaxnbv.checks import require
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.networks import CATEGORIES, CloudSegmenter, part_segmenter
-from jaxnbv.readers.class_meshes import MeshFile, mesh_files, taking_turns
+from jaxnbv.readers.class_meshes import MeshFile, interleave, mesh_files
 from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning import Grid, MeshParts, SDFSurface, load_parts, scan
 from jaxnbv.scanning.mesh_files import read_nodes
@@ -72,7 +72,7 @@ class MeshPartStudy(PartDiscoveryStudy):
                 kind = Path(file.path).parent.name
                 by_class.setdefault(kind, []).append(file._replace(name=f"{kind} {file.name}"))
         require(len(by_class) > 0, f"the folder {folder} holds no mesh of two nodes or more: each part must be a node")
-        return tuple(taking_turns(by_class.values()))
+        return tuple(interleave(by_class.values()))
 
     def scene(self, index: int) -> Scene:
         """A mesh. The task of the scene is its `PartMesh`."""
