@@ -70,7 +70,7 @@ class Case:
         for step in itertools.islice(loop.steps(study.sensor(scene), first), study.views):
             taken.append(study.frame_of(step.view.pose))
             row = [np.nan] * len(COLUMNS)
-            row[-2] = float(recording.shown[taken].any(axis=0).mean())
+            row[-2] = float(recording.is_shown[taken].any(axis=0).mean())
             if self.area is not None:
                 row[-1] = float(self.area[taken].any(axis=0).mean())
             if before is not None:
@@ -86,8 +86,8 @@ class Case:
         recording, camera, surfaces = self.recording, self.study.imagined_camera, inputs.surfaces
         areas, points = _expected(surfaces, newness, camera, recording.poses)
         expected = np.asarray(areas.sum(axis=-1).mean(axis=0))
-        known = recording.shown[taken].any(axis=0)
-        gain = (recording.shown & ~known).sum(axis=1)
+        known = recording.is_shown[taken].any(axis=0)
+        gain = (recording.is_shown & ~known).sum(axis=1)
         left = ~np.isin(np.arange(len(gain)), taken)
         varies = np.ptp(expected[left]) > 0 and np.ptp(gain[left]) > 0
         rank = float(spearmanr(expected[left], gain[left])[0]) if varies else np.nan

@@ -169,7 +169,7 @@ def covered(study: RecordedStudy, method: str, start: int) -> np.ndarray:
     loop = Loop(study.planner(method, scene), study.key(start, "episode"), camera=study.camera)
     steps = itertools.islice(loop.steps(study.sensor(scene), first), study.views)
     frames = [study.frame_of(step.view.pose) for step in steps]
-    return np.logical_or.accumulate(study.recording.shown[frames]).mean(axis=1)
+    return np.logical_or.accumulate(study.recording.is_shown[frames]).mean(axis=1)
 
 
 def main() -> None:

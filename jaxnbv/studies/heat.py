@@ -24,9 +24,9 @@ from jaxnbv.scanning import Grid, SDFSurface, TriangleMesh, mesh_from_sdf
 from jaxnbv.search import Search
 from jaxnbv.studies.engine.measures import SECONDS, Claim, Measure, Record
 from jaxnbv.studies.engine.run import replay
-from jaxnbv.studies.engine.searches import RULES
+from jaxnbv.studies.engine.searches import BASELINES
 from jaxnbv.studies.engine.study import Scene, Study
-from jaxnbv.studies.engine.tiles import Tiles, across, draw_on, say, still_of
+from jaxnbv.studies.engine.tiles import Tiles, caption_tile, draw_on, opposite_direction, still_of
 from jaxnbv.studies.scenes import heat_scene
 from jaxnbv.studies.sensors import HEAT_SETTING
 from jaxnbv.tasks import ColdestPoint, Coverage, body_temperature
@@ -35,7 +35,7 @@ from jaxnbv.viz.render import Still
 
 # Methods that look for the coldest point. The others ignore heat.
 HEAT_METHODS = ("heat", "heat-reached", "heat-halving")
-_BASELINES = ("coverage", *RULES)
+_OTHERS = ("coverage", *BASELINES)
 # Sets of points in which the coldest point of a cloud is searched for.
 ESTIMATES = {"all": "of all points", "reached": "of the warmed points"}
 # Points within this share of the temperature range from the lowest count as coldest: objects have symmetries, and the
@@ -112,8 +112,8 @@ class HeatStudy(Study):
         "saturated if every view has the value zero, and the first candidate is chosen. This happens when a piece of\n"
         "the cloud is not connected to the source, since it keeps the temperature before heating, which is the lowest."
     )
-    methods: ClassVar[tuple[str, ...]] = (*HEAT_METHODS, *_BASELINES)
-    pictured: ClassVar[tuple[str, ...]] = ("heat", "heat-reached", *RULES)
+    methods: ClassVar[tuple[str, ...]] = (*HEAT_METHODS, *_OTHERS)
+    pictured: ClassVar[tuple[str, ...]] = ("heat", "heat-reached", *BASELINES)
     reference: ClassVar[str] = "heat"
     measures: ClassVar[tuple[Measure, ...]] = (
         *_measures("all"),
@@ -122,7 +122,7 @@ class HeatStudy(Study):
         SECONDS,
     )
     claims: ClassVar[tuple[Claim, ...]] = (
-        Claim("The heat utility gets nearer to the coldest point within few views.", "distance, all", 4, _BASELINES),
+        Claim("The heat utility gets nearer to the coldest point within few views.", "distance, all", 4, _OTHERS),
     )
     seed: ClassVar[int] = 8
     bank: ClassVar[str] = "heat"
@@ -160,9 +160,9 @@ class HeatStudy(Study):
     def search(self, method: str, scene: Scene) -> Search:
         return super().search(method.removeprefix("heat-"), scene)
 
-    def shows_enough(self, scene: Scene, seen: PointCloud) -> bool:
+    def shows_enough(self, scene: Scene, scan: PointCloud) -> bool:
         """Whether the scan shows the heat source."""
-        points, _ = seen.to_numpy()
+        points, _ = scan.to_numpy()
         return bool((np.linalg.norm(points - np.asarray(scene.task), axis=1) <= HeatProblem.radius).any())
 
     def truth(self, scene: Scene) -> Truth:
@@ -175,7 +175,7 @@ class HeatStudy(Study):
         points, temperature = body_temperature(mesh, heat_problem(scene))
         return Truth(mesh, points, temperature.values)
 
-    def facts(self, scene: Scene, truth: Truth, first: int) -> Record:
+    def scene_record(self, scene: Scene, truth: Truth, first: int) -> Record:
         low, high = float(truth.temperatures.min()), float(truth.temperatures.max())
         return {"name": scene.name, "truth": {"point": truth.coldest.tolist(), "temperature": low, "hottest": high}}
 
@@ -205,7 +205,7 @@ class HeatStudy(Study):
         """
         scene, runs = self.scene(record["scene"]), record["methods"]
         truth, heat = self.truth(scene), heat_problem(scene)
-        still = still_of(truth.mesh, across(record), pixels)
+        still = still_of(truth.mesh, opposite_direction(record), pixels)
         colours = ScalarMappable(Normalize(0.0, float(truth.temperatures.max())), _HEAT)
         clouds = {method: [after.cloud for _, after in replay(self, scene, runs[method])] for method in methods}
 
@@ -220,7 +220,7 @@ class HeatStudy(Study):
             estimate = runs[method]["estimates"]["all"]
             _mark(axes, still, truth.coldest, "coldest point of the object")
             _mark(axes, still, np.array(estimate["points"][view]), "coldest point of the cloud")
-            say(axes, f"{estimate['distances'][view]:.2f}")
+            caption_tile(axes, f"{estimate['distances'][view]:.2f}")
 
         caption = "Scanned points, coloured by the temperature simulated on them. Beneath: error of the estimate."
         return Tiles(caption, tile, draw_truth, marks=_MARKS, scale=(colours, "temperature (degrees)"))

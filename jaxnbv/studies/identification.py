@@ -32,7 +32,7 @@ from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.search import Search, SphereCandidates
 from jaxnbv.studies.engine.measures import KNOWN, SECONDS, Claim, Measure, Record
 from jaxnbv.studies.engine.study import Scene, Study
-from jaxnbv.studies.engine.tiles import Tiles, across, say, still_of
+from jaxnbv.studies.engine.tiles import Tiles, caption_tile, opposite_direction, still_of
 from jaxnbv.studies.scenes.framing import Setup
 from jaxnbv.studies.scenes.placed_parts import PlacedPart, confusable_parts, parts_in, place_part
 from jaxnbv.surfaces.part_hypotheses import NONE, PartHypotheses
@@ -89,7 +89,7 @@ class IdentificationStudy(Study):
         "There is no oracle, because scoring each candidate by its true scan takes a search of the bank for each."
     )
     methods: ClassVar[tuple[str, ...]] = (IDENTIFY, BY_NAME, "farthest", "random")
-    further: ClassVar[tuple[str, ...]] = ("new-surface", "uncertainty")
+    extra_methods: ClassVar[tuple[str, ...]] = ("new-surface", "uncertainty")
     pictured: ClassVar[tuple[str, ...]] = (IDENTIFY, "farthest", "random")
     reference: ClassVar[str] = IDENTIFY
     measures: ClassVar[tuple[Measure, ...]] = (
@@ -184,8 +184,8 @@ class IdentificationStudy(Study):
 
         return observe
 
-    def shows_enough(self, scene: Scene, seen: PointCloud) -> bool:
-        return int(seen.count) >= _ENOUGH * self.camera.num_rays
+    def shows_enough(self, scene: Scene, scan: PointCloud) -> bool:
+        return int(scan.count) >= _ENOUGH * self.camera.num_rays
 
     def sampler_of(self, scene: Scene) -> SurfaceSampler:
         """A sampler that holds the bank at the scene's scale. Its parts rest on the table if there is one."""
@@ -206,7 +206,7 @@ class IdentificationStudy(Study):
         corners = mesh.to_trimesh().convex_hull.vertices
         return scene.task, mesh.sample_points(self.key(scene.index, "measure"), _POINTS), float(pdist(corners).max())
 
-    def facts(self, scene: Scene, truth: _Truth, first: int) -> Record:
+    def scene_record(self, scene: Scene, truth: _Truth, first: int) -> Record:
         alike = "" if self.meshes else scene.name.rpartition(" ")[0]
         return {"name": scene.name, "setup": self.setup.value, "set": alike, "part": truth[0].part}
 
@@ -217,10 +217,10 @@ class IdentificationStudy(Study):
 
     def follow(self, scene: Scene, truth: _Truth, planner: Planner, episode: Iterator[Step]) -> Record:
         """Record after each view the likeliest name, the true name's probability, and the error of the pose."""
-        views = [self._told(truth, step.observations.hypotheses) for step in episode]
+        views = [self._view_record(truth, step.observations.hypotheses) for step in episode]
         return {name: [view[name] for view in views] for name in views[0]}
 
-    def _told(self, truth: _Truth, hypotheses: Any) -> Record:
+    def _view_record(self, truth: _Truth, hypotheses: Any) -> Record:
         assert isinstance(hypotheses, PartHypotheses)
         (task, points, diameter), bank = truth, hypotheses.bank
         weights = np.append(np.asarray(hypotheses.shape_weights), hypotheses.weights[-1])
@@ -244,7 +244,7 @@ class IdentificationStudy(Study):
 
     def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
         """Tiles of the likeliest part as placed after each view, coloured by the distance to the true part."""
-        task, runs, eye = self.scene(record["scene"]).task, record["methods"], across(record)
+        task, runs, eye = self.scene(record["scene"]).task, record["methods"], opposite_direction(record)
         true = task.mesh
         tree = cKDTree(true.sample_points(jax.random.key(0), 10 * _DENSE))
 
@@ -253,7 +253,7 @@ class IdentificationStudy(Study):
             at = run["most_likely"][view]
             mesh = task.placed(at["part"], np.asarray(at["rotation"]), np.asarray(at["shift"]))
             axes.imshow(still_of(mesh, eye, pixels, lambda points: tree.query(points)[0], _ERRORS).image)
-            say(axes, f"{run['named'][view]}, {run['p_true'][view]:.2f}", right=run["right"][view] == 1)
+            caption_tile(axes, f"{run['named'][view]}, {run['p_true'][view]:.2f}", right=run["right"][view] == 1)
 
         scale = ScalarMappable(_ERRORS, DEVIATION), "distance to the true part\n(scene units)"
         caption = "The likeliest part as placed, its name, and the probability of the true name."

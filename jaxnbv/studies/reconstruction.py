@@ -24,9 +24,9 @@ from jaxnbv.scanning.metrics import SURFACE_POINTS, coverage, surface_distance, 
 from jaxnbv.scanning.screened_poisson import has_poisson, screened_poisson
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
 from jaxnbv.studies.engine.run import replay
-from jaxnbv.studies.engine.searches import RULES
+from jaxnbv.studies.engine.searches import BASELINES
 from jaxnbv.studies.engine.study import Scene, Study
-from jaxnbv.studies.engine.tiles import Tiles, across, say, still_of
+from jaxnbv.studies.engine.tiles import Tiles, caption_tile, opposite_direction, still_of
 from jaxnbv.studies.scenes import Split, part_scene
 from jaxnbv.tasks import Coverage, NewSurface
 from jaxnbv.viz.style import DEVIATION
@@ -63,7 +63,7 @@ class ReconstructionStudy(Study):
     )
     bank: ClassVar[str] = "parts"
     without_bank: ClassVar[tuple[str, ...]] = ("coverage", "new-surface", "uncertainty")
-    methods: ClassVar[tuple[str, ...]] = ("coverage", "new-surface", *RULES)
+    methods: ClassVar[tuple[str, ...]] = ("coverage", "new-surface", *BASELINES)
     reference: ClassVar[str] = "coverage"
     measures: ClassVar[tuple[Measure, ...]] = (
         _distances("chamfer", "Chamfer distance"),
@@ -78,7 +78,7 @@ class ReconstructionStudy(Study):
             "chamfer",
             POISSON,
             ("farthest", "uncertainty"),
-            ahead=False,
+            must_be_better=False,
         ),
     )
     seed: ClassVar[int] = 4
@@ -137,7 +137,7 @@ class ReconstructionStudy(Study):
         scene, runs = self.scene(record["scene"]), record["methods"]
         truth = cast(TriangleMesh, true_mesh(scene.surface))
         tree = cKDTree(truth.sample_points(jax.random.key(0), _DENSE))
-        eye, sampler = across(record), self.mesher(scene).sampler
+        eye, sampler = opposite_direction(record), self.mesher(scene).sampler
         last = {method: replay(self, scene, runs[method])[-1][1] for method in methods}
         results = {method: runs[method]["reconstructions"] for method in methods}
         names = tuple(name for name in RECONSTRUCTIONS if all(run[name] is not None for run in results.values()))
@@ -149,7 +149,7 @@ class ReconstructionStudy(Study):
             still = still_of(mesh, eye, pixels, lambda points: tree.query(points)[0], _ERRORS)
             axes.imshow(still.image, interpolation="antialiased")
             distances = results[method][names[column]]
-            say(axes, f"CD {distances['chamfer']:.3f}, HD {distances['hausdorff']:.3f}")
+            caption_tile(axes, f"CD {distances['chamfer']:.3f}, HD {distances['hausdorff']:.3f}")
 
         scale = ScalarMappable(_ERRORS, DEVIATION), "distance to the true surface\n(scene units)"
         return Tiles("", tile, lambda axes: axes.imshow(still_of(truth, eye, pixels).image), names, scale=scale)

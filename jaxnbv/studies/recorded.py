@@ -30,9 +30,9 @@ from jaxnbv.scanning.scanner import Hits
 from jaxnbv.search import GivenPoses, Problem, Search
 from jaxnbv.search.base import Baseline
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
-from jaxnbv.studies.engine.searches import RULES
+from jaxnbv.studies.engine.searches import BASELINES
 from jaxnbv.studies.engine.study import Scene, Study
-from jaxnbv.studies.engine.tiles import Tiles, say
+from jaxnbv.studies.engine.tiles import Tiles, caption_tile
 from jaxnbv.tasks import Coverage, NewSurface
 from jaxnbv.utility import Quantity
 from jaxnbv.viz.style import GREY, INK, LINE, NEW
@@ -53,15 +53,15 @@ class Recording(NamedTuple):
     """The frames of a sequence, and the voxels of the box that at least three of them show.
 
     - `poses`: the camera poses; `scans`: what each frame shows of the box; both in scene units.
-    - `shown`: whether any pixel of each frame shows each voxel.
-    - `voxels`: the centres of the voxels; `places`: the positions of the camera; both in the recording's units.
+    - `is_shown`: whether any pixel of each frame shows each voxel.
+    - `voxels`: the centres of the voxels; `camera_positions`: of the frames; both in the recording's units.
     """
 
     poses: Pose
     scans: tuple[PointCloud, ...]
-    shown: Bool[np.ndarray, "frames voxels"]
+    is_shown: Bool[np.ndarray, "frames voxels"]
     voxels: Float[np.ndarray, "voxels 3"]
-    places: Float[np.ndarray, "frames 3"]
+    camera_positions: Float[np.ndarray, "frames 3"]
 
 
 class _Unknown(Surface):
@@ -74,7 +74,7 @@ class _Unknown(Surface):
         raise InputError("the true surface of a recording is unknown: take scans from the study's sensor")
 
 
-class InTurn(Baseline):
+class FixedOrder(Baseline):
     """Visits the candidates in a fixed order.
 
     - `turns`: index of the candidate of each view, the first view included.
@@ -91,18 +91,18 @@ class InTurn(Baseline):
 class MostNewVoxels(Baseline):
     """Greedy oracle: chooses the frame that shows the most voxels not shown by the frames so far.
 
-    - `shown`: whether each candidate shows each voxel.
+    - `is_shown`: whether each candidate shows each voxel.
     """
 
-    shown: Bool[Array, "candidates voxels"] = eqx.field(kw_only=True)
+    is_shown: Bool[Array, "candidates voxels"] = eqx.field(kw_only=True)
 
     def quantity(self, acquisition: Acquisition) -> Quantity:
         return Quantity("new voxels", "", "voxels that a frame shows and no earlier frame does.", smooth=False)
 
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
         """The number of new voxels of each candidate. The key is not used."""
-        is_shown = jnp.any(self.shown & problem.observations.poses.contains(candidates)[:, None], axis=0)
-        gain = jnp.sum(self.shown & ~is_shown, axis=1)
+        is_shown = jnp.any(self.is_shown & problem.observations.poses.contains(candidates)[:, None], axis=0)
+        gain = jnp.sum(self.is_shown & ~is_shown, axis=1)
         return gain.astype(candidates.position.dtype)
 
 
@@ -133,7 +133,7 @@ class RecordedStudy(Study):
         "Share of the voxels in the box that the chosen frames show. A voxel counts if three frames or more show it.\n"
         "The oracle knows what each frame shows. Evenly spaced frames divide the recording in time."
     )
-    methods: ClassVar[tuple[str, ...]] = (NEW_AREA, COVERAGE, *RULES, EVEN, ORACLE)
+    methods: ClassVar[tuple[str, ...]] = (NEW_AREA, COVERAGE, *BASELINES, EVEN, ORACLE)
     reference: ClassVar[str] = NEW_AREA
     measures: ClassVar[tuple[Measure, ...]] = (
         Measure("covered", "Voxels seen", lambda r, m: r["methods"][m]["covered"], unit="%"),
@@ -206,7 +206,7 @@ class RecordedStudy(Study):
 
     def first_view(self, scene: Scene) -> int:
         """Index of a frame that shows enough, a different one in each scene while there are any left."""
-        enough = np.flatnonzero(self.recording.shown.mean(axis=1) >= _ENOUGH)
+        enough = np.flatnonzero(self.recording.is_shown.mean(axis=1) >= _ENOUGH)
         require(len(enough) > 0, f"no frame of {self.folder} shows a twentieth of {self.box}: give a smaller box")
         order = jax.random.permutation(jax.random.key(self.seed), len(enough))
         return int(enough[order[scene.index % len(enough)]])
@@ -223,13 +223,13 @@ class RecordedStudy(Study):
             # Evenly spaced over the recording from the first view on, wrapping around at its end.
             apart = np.round(np.arange(self.views) * self.num_candidates / self.views).astype(int)
             turns = (self.first_view(scene) + apart) % self.num_candidates
-            return InTurn(self.candidates, turns=jnp.asarray(turns))
+            return FixedOrder(self.candidates, turns=jnp.asarray(turns))
         if method == ORACLE:
-            return MostNewVoxels(self.candidates, shown=jnp.asarray(self.recording.shown))
+            return MostNewVoxels(self.candidates, is_shown=jnp.asarray(self.recording.is_shown))
         return super().search(method, scene)
 
     def truth(self, scene: Scene) -> Bool[np.ndarray, "frames voxels"]:
-        return self.recording.shown
+        return self.recording.is_shown
 
     def follow(
         self,
@@ -250,11 +250,11 @@ class RecordedStudy(Study):
         """
         recording, runs = self.recording, record["methods"]
         kept = np.sort(np.argsort(self.box.high - self.box.low)[1:])
-        voxels, places = recording.voxels[:, kept], recording.places[:, kept]
+        voxels, places = recording.voxels[:, kept], recording.camera_positions[:, kept]
 
         def tile(axes: Axes, method: str, view: int) -> None:
             frames = runs[method]["frames"][: view + 1]
-            is_shown = recording.shown[frames].any(axis=0)
+            is_shown = recording.is_shown[frames].any(axis=0)
             for mask, colour in ((~is_shown, LINE), (is_shown, NEW)):
                 axes.scatter(voxels[mask, 0], voxels[mask, 1], s=2.0, c=colour, linewidths=0)
             axes.plot(places[:, 0], places[:, 1], color=GREY, lw=0.6)
@@ -262,7 +262,7 @@ class RecordedStudy(Study):
             for number, place in enumerate(places[frames], start=1):
                 axes.annotate(str(number), place, textcoords="offset points", xytext=(3, 3), fontsize=8, zorder=4)
             axes.set_aspect("equal")
-            say(axes, f"{runs[method]['covered'][view]:.0%}")
+            caption_tile(axes, f"{runs[method]['covered'][view]:.0%}")
 
         return Tiles("Coloured: voxels that the frames show. Numbers: their camera positions, in order.", tile)
 

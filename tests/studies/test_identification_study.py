@@ -133,7 +133,7 @@ def test_a_scan_has_noisy_ranges_and_nothing_of_the_table(folder):
 def test_methods_hold_the_same_bank_and_differ_in_their_views(folder):
     study = small_study(folder, Setup.TABLE)
     scene = study.scene(0)
-    planners = {method: study.planner(method, scene) for method in (*study.methods, *study.further)}
+    planners = {method: study.planner(method, scene) for method in (*study.methods, *study.extra_methods)}
     assert len({planner.sampler.model.bank.names for planner in planners.values()}) == 1
     assert all(planner.obstacles is scene.task.obstacles for planner in planners.values())
     assert planners[IDENTIFY].acquisition == nbv.Identify()
@@ -158,20 +158,20 @@ def test_what_is_measured_is_right_for_the_truth_and_its_symmetries_alone(folder
     assert truth[2] == pytest.approx(task.scale * np.linalg.norm([0.10, 0.06, 0.04]), rel=1e-4)
     half_turn, quarter_turn = np.diag([-1.0, -1.0, 1.0]), np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0, 0, 1.0]])
     for turn in (None, half_turn):
-        told = study._told(truth, hypotheses_of(task, task.part, turn))
+        told = study._view_record(truth, hypotheses_of(task, task.part, turn))
         assert told["named"] == "block"
         assert told["right"] == told["placed"] == 1
         assert told["p_true"] == 1.0
         assert told["fit"] < 0.005
         assert told["add_s"] < 0.01
-    told = study._told(truth, hypotheses_of(task, task.part, quarter_turn))
+    told = study._view_record(truth, hypotheses_of(task, task.part, quarter_turn))
     assert (told["right"], told["placed"]) == (1, 0)
     assert told["fit"] > 0.03
     assert told["add_s"] > 0.03
     other = next(part for part, name in enumerate(task.bank.names) if name == "cross")
-    told = study._told(truth, hypotheses_of(task, other))
+    told = study._view_record(truth, hypotheses_of(task, other))
     assert (told["named"], told["right"], told["placed"], told["p_true"]) == ("cross", 0, 0, 0)
-    told = study._told(truth, hypotheses_of(task, task.part, none=0.6))
+    told = study._view_record(truth, hypotheses_of(task, task.part, none=0.6))
     assert (told["named"], told["right"]) == (NONE, 0)
     assert told["p_true"] == pytest.approx(0.4)
 
@@ -184,7 +184,8 @@ def test_names_that_are_level_share_what_is_right(folder):
     both = jax.tree.map(lambda row: jnp.concatenate([row, row]), alone.placed)
     both = dataclasses.replace(both, shape=jnp.asarray([(task.part + 1) % 3, task.part]))
     for weights, right in (([0.45, 0.45], 0.5), ([0.4, 0.5], 1.0), ([0.5, 0.4], 0.0)):
-        told = study._told(truth, PartHypotheses(task.bank, both, jnp.asarray([*weights, 0.1]), jnp.asarray(0.03)))
+        hypotheses = PartHypotheses(task.bank, both, jnp.asarray([*weights, 0.1]), jnp.asarray(0.03))
+        told = study._view_record(truth, hypotheses)
         assert told["right"] == right
 
 

@@ -346,7 +346,7 @@ def test_its_voxels_are_those_that_three_frames_have_seen(study, sequence):
     """By all pixels; a few lie in the next voxel by rounding."""
     seen = [voxels_of(study, *frame) for frame in zip(*sequence, strict=True)]
     often = {place for place in set().union(*seen) if sum(place in one for one in seen) >= 3}
-    shown = study.recording.shown
+    shown = study.recording.is_shown
     assert shown.shape[1] == pytest.approx(len(often), rel=0.01)
     expected = [len(one & often) / len(often) for one in seen]
     np.testing.assert_allclose(shown.mean(axis=1), expected, atol=0.01)
@@ -359,12 +359,12 @@ def test_a_study_takes_intrinsics_and_unit(study, sequence, tmp_path):
     tum(folder, *sequence)
     given = {"folder": folder, "box": (*LOW, *HIGH), "intrinsics": (40.0, 40.0, 23.5, 17.5), "depth_scale": 1 / 5000}
     told = RecordedStudy.configured("screened", VIEWS, quick=True, **given)[""]
-    np.testing.assert_array_equal(told.recording.shown, study.recording.shown)
+    np.testing.assert_array_equal(told.recording.is_shown, study.recording.is_shown)
 
 
 def test_every_method_is_measured_by_what_its_frames_show(study):
     record = run_scene(study, 1)
-    first, shown = record["first"], study.recording.shown
+    first, shown = record["first"], study.recording.is_shown
     for name, method in record["methods"].items():
         frames = method["frames"]
         assert frames[0] == first, name
@@ -392,7 +392,7 @@ def test_its_pictures_show_every_method(study, tmp_path):
 def test_first_views_differ_and_show_enough(study):
     firsts = [study.first_view(study.scene(index)) for index in range(4)]
     assert len(set(firsts)) == 4
-    assert all(study.recording.shown[first].mean() >= 0.05 for first in firsts)
+    assert all(study.recording.is_shown[first].mean() >= 0.05 for first in firsts)
 
 
 def test_what_the_study_cannot_use_is_named(study, sequence, tmp_path):
@@ -410,7 +410,7 @@ def test_a_frame_that_looks_away_shows_nothing(sequence, tmp_path):
     looks = np.concatenate([depths, depths[:1]]), np.concatenate([matrices, matrices[:1] @ back])
     known_sensor(plain, tmp_path, looks)
     study = RecordedStudy.configured("screened", VIEWS, quick=True, folder=tmp_path, box=(*LOW, *HIGH))[""]
-    shown = study.recording.shown.sum(axis=1)
+    shown = study.recording.is_shown.sum(axis=1)
     assert shown[-1] == 0
     assert (shown[:-1] > 0).all()
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxnbv.checks import require
 from jaxnbv.readers import MeshFile
 from jaxnbv.readers.class_meshes import mesh_files
-from jaxnbv.studies.classification.study import BASELINES, ClassificationStudy, Truth
+from jaxnbv.studies.classification.study import OTHERS, ClassificationStudy, Truth
 from jaxnbv.studies.engine.measures import Claim, Record
 from jaxnbv.studies.engine.study import Scene, Study
 from jaxnbv.studies.scenes import (
@@ -57,14 +57,14 @@ class PyramidStudy(ClassificationStudy):
         least = max(angle for angle in _ANGLES if angle <= record["angle"])
         return f"first view at {least:03d}° or more from the base's normal"
 
-    def facts(self, scene: Scene, truth: Truth, first: int) -> Record:
+    def scene_record(self, scene: Scene, truth: Truth, first: int) -> Record:
         """Also record the first view's angle from the base's normal, in degrees (180: behind the apex)."""
         direction = np.asarray(self.candidates.poses().position[first])
         # The base looks along -z of the pyramid's own frame.
         assert isinstance(truth.thing, Pyramid)
         outward = -np.asarray(truth.thing.solid.rotation)[:, 2]
         cosine = np.clip(direction @ outward / np.linalg.norm(direction), -1.0, 1.0)
-        return super().facts(scene, truth, first) | {"angle": float(np.degrees(np.arccos(cosine)))}
+        return super().scene_record(scene, truth, first) | {"angle": float(np.degrees(np.arccos(cosine)))}
 
     def first_view(self, scene: Scene) -> int:
         """Index of a random candidate that hides the pattern but shows enough, see `shows_enough`."""
@@ -87,7 +87,7 @@ class TruckStudy(ClassificationStudy):
     cue: ClassVar[str] = "cargo"
     bank: ClassVar[str] = "truck"
     network: ClassVar[str] = "truck"
-    fed: ClassVar[tuple[int, int]] = (2048, 1024)
+    network_points: ClassVar[tuple[int, int]] = (2048, 1024)
     seed: ClassVar[int] = 11
 
     num_points: int = eqx.field(static=True, default=1024)
@@ -129,7 +129,9 @@ class HouseholdStudy(ClassificationStudy):
     bank: ClassVar[str] = "household"
     seed: ClassVar[int] = 12
     claims: ClassVar[tuple[Claim, ...]] = (
-        Claim("Where global features tell the class, cross-entropy is as good.", "first", 2, BASELINES, ahead=False),
+        Claim(
+            "Where global features tell the class, cross-entropy is as good.", "first", 2, OTHERS, must_be_better=False
+        ),
     )
 
 

@@ -29,9 +29,9 @@ from jaxnbv.studies.classification.measures import CUE_PIXELS, MEASURES, rank_co
 from jaxnbv.studies.engine.episodes import poses_of
 from jaxnbv.studies.engine.known import study_sampler
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
-from jaxnbv.studies.engine.searches import RULES
+from jaxnbv.studies.engine.searches import BASELINES
 from jaxnbv.studies.engine.study import Scene, Study
-from jaxnbv.studies.engine.tiles import Tiles, say
+from jaxnbv.studies.engine.tiles import Tiles, caption_tile
 from jaxnbv.studies.scenes import ClassObject, ClassSet, FirstView, Framing, Split
 from jaxnbv.studies.scenes.class_object import ClassMesh, scan_cue, surface_of
 from jaxnbv.tasks import Coverage, CrossEntropy, EntropyReduction, MixedEntropy
@@ -40,11 +40,11 @@ from jaxnbv.viz.style import NEW, framed
 
 # Runs of random search in each scene.
 _RUNS = 8
-BASELINES = ("coverage", *RULES)
+OTHERS = ("coverage", *BASELINES)
 _GRADIENT = ("gradient-2dof", "gradient-constrained")
 # All other methods maximise cross-entropy with different searches.
 _ACQUISITIONS: dict[str, type[ClassAcquisition] | None] = {
-    **dict.fromkeys(BASELINES),
+    **dict.fromkeys(OTHERS),
     "entropy": EntropyReduction,
     "mixed": MixedEntropy,
 }
@@ -86,8 +86,8 @@ class ClassificationStudy(Study):
     Settings as in `Study`, and
 
     - `classifier`: classifier of clouds in scene coordinates, applied after each view.
-    - `imagining`: classifier of D u scan for imagined scans; default: `classifier`. One that gets fewer points saves
-      time.
+    - `imagined_classifier`: classifier of D u scan for imagined scans; default: `classifier`. One that gets fewer
+      points saves time.
     - `framing`: size of the object, and so how much of it a view shows.
     - `split`: split of the scenes. Tune settings on the validation split.
     - `num_points`: D is thinned to this number, once a step, before imagined scans are added.
@@ -96,12 +96,13 @@ class ClassificationStudy(Study):
     Class attributes:
 
     - `objects`: the scenes and their classes; `cue`: name of the part that differs by class, "" for the whole object.
-    - `network`: name of the shipped classifier; `fed`: numbers of points for `classifier` and for `imagining`.
+    - `network`: name of the shipped classifier; `network_points`: numbers of points for `classifier` and for
+      `imagined_classifier`.
     - `framings`: framings to study, one study each; `solid`: whether the objects have no thin parts, see `sampler`.
     """
 
-    methods: ClassVar[tuple[str, ...]] = ("cross-entropy", "entropy", "mixed", "tie-break", *BASELINES, "oracle")
-    further: ClassVar[tuple[str, ...]] = ("halving", *_GRADIENT, "hybrid")
+    methods: ClassVar[tuple[str, ...]] = ("cross-entropy", "entropy", "mixed", "tie-break", *OTHERS, "oracle")
+    extra_methods: ClassVar[tuple[str, ...]] = ("halving", *_GRADIENT, "hybrid")
     pictured: ClassVar[tuple[str, ...]] = ("cross-entropy", "farthest", "uncertainty")
     reference: ClassVar[str] = "cross-entropy"
     explanation: ClassVar[str] = (
@@ -116,14 +117,14 @@ class ClassificationStudy(Study):
             "most of all at the second view.",
             "first",
             2,
-            BASELINES,
+            OTHERS,
         ),
         Claim(
             "Search over candidates tells the class as soon as search by gradient, or nearly so.",
             "stable",
             2,
             _GRADIENT,
-            ahead=False,
+            must_be_better=False,
         ),
     )
     quick: ClassVar[Mapping[str, Any]] = {**Study.quick, "num_candidates": 40}
@@ -132,12 +133,12 @@ class ClassificationStudy(Study):
     objects: eqx.AbstractClassVar[ClassSet]
     cue: ClassVar[str] = ""
     network: eqx.AbstractClassVar[str]
-    fed: ClassVar[tuple[int, int]] = (1024, 512)
+    network_points: ClassVar[tuple[int, int]] = (1024, 512)
     framings: ClassVar[tuple[Framing, ...]] = (Framing.CLOSE_UP,)
     solid: ClassVar[bool] = False
 
     classifier: AnyClassifier = eqx.field(kw_only=True, converter=as_classifier)
-    imagining: Classifier | None = None
+    imagined_classifier: Classifier | None = None
     framing: Framing = eqx.field(static=True, default=Framing.CLOSE_UP)
     split: Split = eqx.field(static=True, default=Split.TEST)
     num_points: int = eqx.field(static=True, default=512)
@@ -156,9 +157,10 @@ class ClassificationStudy(Study):
         file = options.pop("classifier", None)
         studies: dict[str, Study] = {}
         for framing in (options["framing"],) if "framing" in options else cls.framings:
-            classifier, imagining = (cls._classifier(file, framing.longest_side, fed) for fed in cls.fed)
+            classifier, imagined = (cls._classifier(file, framing.longest_side, count) for count in cls.network_points)
             sampler = study_sampler(model, cls.bank, (), framing.longest_side, quick, cls.solid)
-            settings: dict[str, Any] = {"classifier": classifier, "imagining": imagining, "framing": framing} | options
+            settings: dict[str, Any] = {"classifier": classifier, "imagined_classifier": imagined, "framing": framing}
+            settings |= options
             name = framing.value if len(cls.framings) > 1 else ""
             studies[name] = cls(views=views, sampler=sampler, **settings | (dict(cls.quick) if quick else {}))
         return studies
@@ -168,13 +170,13 @@ class ClassificationStudy(Study):
         return class_meshes(folder, cls.objects.classes)
 
     @classmethod
-    def _classifier(cls, file: str | Path | None, longest_side: float, fed: int) -> CloudClassifier:
+    def _classifier(cls, file: str | Path | None, longest_side: float, num_points: int) -> CloudClassifier:
         if file is None:
-            return pretrained_classifier(cls.network, longest_side, fed)
+            return pretrained_classifier(cls.network, longest_side, num_points)
         network = load_checkpoint(file)
-        classifier = CloudClassifier(network, fed, network_scale(network, longest_side))
-        rows = jnp.zeros((fed, 3))
-        (num_classes,) = jax.eval_shape(classifier, PointCloud(rows, rows, jnp.ones(fed, bool))).shape
+        classifier = CloudClassifier(network, num_points, network_scale(network, longest_side))
+        rows = jnp.zeros((num_points, 3))
+        (num_classes,) = jax.eval_shape(classifier, PointCloud(rows, rows, jnp.ones(num_points, bool))).shape
         names = cls.objects.classes
         require(
             num_classes == len(names),
@@ -196,11 +198,11 @@ class ClassificationStudy(Study):
         **Raises:** `ValueError` if there is no mesh of this index, or it cannot be read.
         """
         keys = jax.random.split(jax.random.fold_in(jax.random.key(3), index), self.num_candidates)
-        name, thing = self.thing(index)
+        name, thing = self.object_of(index)
         pixels, scans = scan_cue(thing, self.camera, self.candidates.poses())
         return Scene(index, name, surface_of(thing), Truth(int(thing.label), _noisy(scans, keys), thing, pixels))
 
-    def thing(self, index: int) -> tuple[str, ClassObject | ClassMesh]:
+    def object_of(self, index: int) -> tuple[str, ClassObject | ClassMesh]:
         """The name of a scene and its object."""
         file = self.file(index)
         if file is None:
@@ -212,7 +214,7 @@ class ClassificationStudy(Study):
         """The object of a file of `meshes`."""
         return ClassMesh(file.read(), file.label)
 
-    def facts(self, scene: Scene, truth: Truth, first: int) -> Record:
+    def scene_record(self, scene: Scene, truth: Truth, first: int) -> Record:
         return {"name": scene.name, "framing": self.framing.value, "split": self.split.value, "label": truth.label}
 
     @property
@@ -220,16 +222,16 @@ class ClassificationStudy(Study):
         """The grid of samples, in proportion to the object's size."""
         return Grid(self.grid_resolution, 0.7 * self.framing.longest_side)
 
-    def shows_enough(self, scene: Scene, seen: PointCloud) -> bool:
+    def shows_enough(self, scene: Scene, scan: PointCloud) -> bool:
         """Whether a scan shows the object and, if `first` requires it, the classifier is wrong about it."""
-        shows = super().shows_enough(scene, seen)
+        shows = super().shows_enough(scene, scan)
         if self.first is FirstView.ANY or not shows:
             return shows
-        return int(_classify(self.classifier, seen).argmax()) != scene.task.label
+        return int(_classify(self.classifier, scan).argmax()) != scene.task.label
 
     def acquisition(self, method: str, scene: Scene) -> Acquisition:
         kind = _ACQUISITIONS.get(method, CrossEntropy)
-        return kind(self.imagining or self.classifier, num_points=self.num_points) if kind else Coverage()
+        return kind(self.imagined_classifier or self.classifier, num_points=self.num_points) if kind else Coverage()
 
     def search(self, method: str, scene: Scene) -> Search:
         if method == "oracle":
@@ -254,7 +256,7 @@ class ClassificationStudy(Study):
         keys = super().episode_keys(method, scene)
         return [jax.random.fold_in(keys[0], run) for run in range(_RUNS)] if method == "random" else keys
 
-    def joined(self, runs: Sequence[Record]) -> Record:
+    def merge_runs(self, runs: Sequence[Record]) -> Record:
         """The record of the first run, with the predictions and cue pixels of all runs."""
         return runs[0] | {name: [row for run in runs for row in run[name]] for name in ("log_p", "pixels")}
 
@@ -294,7 +296,7 @@ class ClassificationStudy(Study):
                 framed(axes, NEW, 1.6)
             log_p = runs[method]["log_p"][0][view]
             guess = int(np.argmax(log_p))
-            say(axes, f"{names[guess]} {np.exp(log_p[guess]):.0%}", guess == record["label"])
+            caption_tile(axes, f"{names[guess]} {np.exp(log_p[guess]):.0%}", guess == record["label"])
 
         framing = f"Framed: at least {CUE_PIXELS} {self.cue} pixels. " if self.cue else ""
         return Tiles(f"{framing}Beneath: prediction; true: {names[record['label']]}. All methods share view 1.", tile)

@@ -51,13 +51,13 @@ LOOKS = {
 _OTHERS = (("#8c564b", "-", "p"), ("#7f3fbf", "-", "h"), ("#b8860b", "--", "d"))
 
 
-def chart(found: pd.DataFrame, study: type[Study]) -> bytes:
+def chart(table: pd.DataFrame, study: type[Study]) -> bytes:
     """A PNG file of the results over all scenes, one panel per measure.
 
     Error bars are bootstrap intervals. Bands would overlap with this many methods.
     """
-    (group, scenes), *_ = groups_of(found).items()
-    rows = found[found["group"] == group]
+    (group, scenes), *_ = groups_of(table).items()
+    rows = table[table["group"] == group]
     shown = [measure for measure in study.measures if (rows["quantity"] == measure.name).any()]
     tall, wide = -(-len(shown) // _PANELS_A_ROW), min(len(shown), _PANELS_A_ROW)
     file = io.BytesIO()

@@ -18,12 +18,12 @@ from jaxnbv.scanning import SensorNoise, Surface
 from jaxnbv.studies.engine.measures import Record
 
 
-def sensor_before(surface: Surface, camera: Camera) -> Sensor:
+def simulated_sensor(surface: Surface, camera: Camera) -> Sensor:
     """A simulated depth camera with default noise that scans a surface."""
     return lambda pose, key: observe_scene(surface, camera, pose, SensorNoise(), key)
 
 
-def first_showing(
+def random_first_view(
     enough: Callable[[PointCloud], bool], poses: Pose, sensor: Sensor, key: PRNGKeyArray, episode_key: PRNGKeyArray
 ) -> int | None:
     """Index of a random pose whose scan satisfies `enough`; None if there is none.
@@ -67,7 +67,7 @@ def episode_record(
     return {"views": poses, "steps": searches, **followed}
 
 
-def seen_again(
+def replay_views(
     planner: Planner, sensor: Sensor, poses: Sequence[Pose], key: PRNGKeyArray, camera: Camera
 ) -> list[tuple[PointCloud, Observations]]:
     """Compute again, from the poses of an episode, each scan and the observations after it.

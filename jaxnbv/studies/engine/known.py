@@ -38,7 +38,7 @@ def study_sampler(
     return plain.with_bank(shape_bank(bank), bank_poses(bank))
 
 
-def knowing_those(sampler: SurfaceSampler, wanted: Callable[[str], bool]) -> SurfaceSampler:
+def keep_shapes(sampler: SurfaceSampler, wanted: Callable[[str], bool]) -> SurfaceSampler:
     """The sampler with only the known shapes whose names are wanted; unchanged if it has none."""
     model = sampler.model
     if not isinstance(model, KnownShapes):
@@ -49,9 +49,9 @@ def knowing_those(sampler: SurfaceSampler, wanted: Callable[[str], bool]) -> Sur
     return dataclasses.replace(sampler, model=dataclasses.replace(model, bank=model.bank.select(rows)))
 
 
-def knowing_others(sampler: SurfaceSampler, files: Sequence[MeshFile], index: int) -> SurfaceSampler:
+def without_own_shape(sampler: SurfaceSampler, files: Sequence[MeshFile], index: int) -> SurfaceSampler:
     """The sampler without the known shape made from the mesh of a scene; unchanged if it has none."""
-    return knowing_those(sampler, lambda name: name != _name(files, index))
+    return keep_shapes(sampler, lambda name: name != _name(files, index))
 
 
 def _name(files: Sequence[MeshFile], index: int) -> str:

@@ -38,15 +38,15 @@ class Claim(NamedTuple):
 
     - `text`: the claim in words.
     - `measure`, `at`: name of the measure that decides, and its view or other key.
-    - `than`: the other methods.
-    - `ahead`: True if the reference must be better, False if it must not be worse.
+    - `others`: the other methods.
+    - `must_be_better`: True if the reference must be better, False if it must not be worse.
     """
 
     text: str
     measure: str
     at: Any
-    than: tuple[str, ...]
-    ahead: bool = True
+    others: tuple[str, ...]
+    must_be_better: bool = True
 
 
 def _seconds(record: Record, method: str) -> dict[str, float]:

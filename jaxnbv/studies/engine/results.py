@@ -71,16 +71,16 @@ def interval(values: Float[np.ndarray, "scenes columns"]) -> Float[np.ndarray, "
     return np.stack([ends.low, ends.high])
 
 
-def groups_of(found: pd.DataFrame) -> dict[str, int]:
+def groups_of(table: pd.DataFrame) -> dict[str, int]:
     """The number of scenes in each group. The first group, "all", holds all scenes."""
-    return found.groupby("group", sort=False)["scenes"].max().to_dict()
+    return table.groupby("group", sort=False)["scenes"].max().to_dict()
 
 
-def tables(found: pd.DataFrame, study: type[Study], group: str = _ALL) -> list[tuple[str, pd.DataFrame]]:
+def tables(table: pd.DataFrame, study: type[Study], group: str = _ALL) -> list[tuple[str, pd.DataFrame]]:
     """Titles and text cells of two tables per measure: means of the methods, leads of the reference."""
     texts = []
     for measure in study.measures:
-        part = found[(found["group"] == group) & (found["quantity"] == measure.name)]
+        part = table[(table["group"] == group) & (table["quantity"] == measure.name)]
         unit = f" ({measure.unit})" if measure.unit else ""
         others = part[(part["method"] != study.reference) & ~((measure.by == "view") & (part["at"] == 1))]
         others = others.dropna(subset="lead")
@@ -90,8 +90,8 @@ def tables(found: pd.DataFrame, study: type[Study], group: str = _ALL) -> list[t
             (f"{measure.title}{unit}: {study.reference} minus another method", others, _leads(others, measure)),
         ):
             if len(rows):
-                table = rows.assign(text=cells).pivot(index="method", columns="at", values="text")
-                ordered = table.reindex(index=rows["method"].unique(), columns=rows["at"].unique()).fillna("-")
+                pivoted = rows.assign(text=cells).pivot(index="method", columns="at", values="text")
+                ordered = pivoted.reindex(index=rows["method"].unique(), columns=rows["at"].unique()).fillna("-")
                 texts.append((title, ordered.rename_axis(index=None, columns=measure.by)))
     return texts
 
@@ -118,11 +118,11 @@ def _leads(rows: pd.DataFrame, measure: Measure) -> list[str]:
     ]
 
 
-def summary(found: pd.DataFrame, study: type[Study]) -> str:
+def summary(table: pd.DataFrame, study: type[Study]) -> str:
     """The tables of a study over all scenes, as text."""
-    title = f"{study.title}: {count_of(groups_of(found)[_ALL], 'scene')}"
+    title = f"{study.title}: {count_of(groups_of(table)[_ALL], 'scene')}"
     sections = [f"{title}\n{'=' * len(title)}\n\n{study.explanation}\n{explained(study)}\n"]
-    sections += [f"{title}\n{cells.to_string()}\n" for title, cells in tables(found, study)]
+    sections += [f"{title}\n{cells.to_string()}\n" for title, cells in tables(table, study)]
     return "\n".join(sections)
 
 
@@ -139,12 +139,12 @@ class Verdict(NamedTuple):
     """A claim, the number of its methods against which it holds, and a sentence that lists all of them."""
 
     claim: str
-    held: int
-    methods: int
+    num_held: int
+    num_methods: int
     sentence: str
 
 
-def verdicts(found: pd.DataFrame, study: type[Study]) -> list[Verdict]:
+def verdicts(table: pd.DataFrame, study: type[Study]) -> list[Verdict]:
     """Compare the reference with the methods of each claim, over all scenes.
 
     A claim also covers its methods' runs without known shapes. The reference is level with a method if the interval of
@@ -153,15 +153,15 @@ def verdicts(found: pd.DataFrame, study: type[Study]) -> list[Verdict]:
     judged = []
     for claim in study.claims:
         (measure,) = (candidate for candidate in study.measures if candidate.name == claim.measure)
-        at = found[(found["group"] == _ALL) & (found["quantity"] == claim.measure) & (found["at"] == claim.at)]
-        rows = at[at["method"].str.removesuffix(WITHOUT_BANK).isin(claim.than)].dropna(subset="lead")
+        at = table[(table["group"] == _ALL) & (table["quantity"] == claim.measure) & (table["at"] == claim.at)]
+        rows = at[at["method"].str.removesuffix(WITHOUT_BANK).isin(claim.others)].dropna(subset="lead")
         by_place: dict[str, list[str]] = {place: [] for place in _WHERE}
         for row, text in zip(rows.itertuples(), _leads(rows, measure), strict=True):
             level = row.lead_low <= 0 <= row.lead_high
             better = (row.lead < 0) == measure.less
             by_place[_WHERE[1 if level else 0 if better else 2]].append(f"{row.method} ({text.rstrip('*')})")
         if len(rows):
-            num_held = sum(len(by_place[place]) for place in _WHERE[: 1 if claim.ahead else 2])
+            num_held = sum(len(by_place[place]) for place in _WHERE[: 1 if claim.must_be_better else 2])
             parts = "; ".join(f"{place} {', '.join(methods)}" for place, methods in by_place.items() if methods)
             sentence = f"Holds against {num_held} of {len(rows)}: {parts}."
             judged.append(Verdict(claim.text, num_held, len(rows), sentence))

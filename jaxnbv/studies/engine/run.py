@@ -11,7 +11,7 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.observations import Observations
 from jaxnbv.planning.planner import Planner
 from jaxnbv.storage.rebuilding import read_config
-from jaxnbv.studies.engine.episodes import episode_record, poses_of, seen_again
+from jaxnbv.studies.engine.episodes import episode_record, poses_of, replay_views
 from jaxnbv.studies.engine.measures import KNOWN, WITHOUT_BANK, Record
 from jaxnbv.studies.engine.records import RecordFolder, read_records
 from jaxnbv.studies.engine.study import Scene, Study
@@ -40,13 +40,13 @@ def run_scene(
     planners = {name: _own_planner(study, scene, name, make) for name, make in (own or {}).items()}
     first, truth = study.first_view(scene), study.truth(scene)
     sensor, pose = study.sensor(scene), study.candidates.poses()[first]
-    record = {"scene": index, **study.facts(scene, truth, first), "first": first, "study_views": study.views}
+    record = {"scene": index, **study.scene_record(scene, truth, first), "first": first, "study_views": study.views}
     record["methods"] = {}
     for method, planner in ({name: study.planner(name, scene) for name in names} | planners).items():
         follow = functools.partial(study.follow, scene, truth, planner)
         keys = study.episode_keys(method, scene)
         runs = [episode_record(planner, sensor, pose, key, study.camera, study.views, follow) for key in keys]
-        record["methods"][method] = study.joined(runs)
+        record["methods"][method] = study.merge_runs(runs)
     return record | {"seconds": time.perf_counter() - start}
 
 
@@ -72,7 +72,7 @@ def methods_of(study: type[Study], names: Sequence[str] | None, model: str) -> t
     again = tuple(f"{name}{WITHOUT_BANK}" for name in twice)
     if names is None:
         return (*study.methods, *again)
-    available = (*study.methods, *again, *study.further)
+    available = (*study.methods, *again, *study.extra_methods)
     unknown = sorted({*names} - {*available})
     require(not unknown, f"unknown methods: {', '.join(unknown)}; choose from {', '.join(available)}")
     return tuple(name for name in available if name in names)
@@ -100,4 +100,4 @@ def replay(study: Study, scene: Scene, run: Record) -> list[tuple[PointCloud, Ob
         study.sensor(scene),
         study.key(scene.index, "episode"),
     )
-    return seen_again(planner, sensor, poses_of(run), key, study.camera)
+    return replay_views(planner, sensor, poses_of(run), key, study.camera)

@@ -19,7 +19,7 @@ from jaxnbv.search import (
 )
 
 # The baselines of all studies that ignore the acquisition.
-RULES = ("farthest", "uncertainty", "random")
+BASELINES = ("farthest", "uncertainty", "random")
 _OVER_CANDIDATES: dict[str, Callable[..., Search]] = {
     "farthest": FarthestView,
     "uncertainty": UncertaintyView,

@@ -21,8 +21,8 @@ from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning import Grid, Surface
 from jaxnbv.scanning.sensors import SENSOR_RADIUS
 from jaxnbv.search import Candidates, Search, SphereCandidates
-from jaxnbv.studies.engine.episodes import first_showing, sensor_before
-from jaxnbv.studies.engine.known import knowing_others, study_sampler
+from jaxnbv.studies.engine.episodes import random_first_view, simulated_sensor
+from jaxnbv.studies.engine.known import study_sampler, without_own_shape
 from jaxnbv.studies.engine.measures import WITHOUT_BANK, Claim, Measure, Record
 from jaxnbv.studies.engine.searches import search_of
 from jaxnbv.studies.engine.tiles import Tiles
@@ -59,7 +59,7 @@ class Study(eqx.Module):
 
     - `title`, `explanation`: texts above the tables.
     - `methods`: names of the methods, in order; `reference`: the method that the others are compared with.
-    - `further`: methods that run only if a command names them; `pictured`: methods in pictures, default: all.
+    - `extra_methods`: methods that run only if a command names them; `pictured`: methods in pictures, default: all.
     - `measures`: quantities in tables and the chart; `claims`: the paper's claims about the study.
     - `quick`: settings of a quick run; `quick_scenes`: its number of scenes.
     - `seed`: seed of first views, noise and samples.
@@ -75,7 +75,7 @@ class Study(eqx.Module):
     reference: eqx.AbstractClassVar[str]
     measures: eqx.AbstractClassVar[tuple[Measure, ...]]
     seed: eqx.AbstractClassVar[int]
-    further: ClassVar[tuple[str, ...]] = ()
+    extra_methods: ClassVar[tuple[str, ...]] = ()
     pictured: ClassVar[tuple[str, ...]] = ()
     claims: ClassVar[tuple[Claim, ...]] = ()
     radius: ClassVar[float] = SENSOR_RADIUS
@@ -178,7 +178,7 @@ class Study(eqx.Module):
     def follow(self, scene: Scene, truth: Any, planner: Planner, episode: Iterator[Step]) -> Record:
         """The record (JSON) of a planner's episode. It may stop drawing steps early."""
 
-    def facts(self, scene: Scene, truth: Any, first: int) -> Record:
+    def scene_record(self, scene: Scene, truth: Any, first: int) -> Record:
         """The record (JSON) of the scene itself."""
         return {"name": scene.name}
 
@@ -188,11 +188,11 @@ class Study(eqx.Module):
 
     def sensor(self, scene: Scene) -> Sensor:
         """The simulated camera that scans a scene."""
-        return sensor_before(scene.surface, self.camera)
+        return simulated_sensor(scene.surface, self.camera)
 
-    def shows_enough(self, scene: Scene, seen: PointCloud) -> bool:
+    def shows_enough(self, scene: Scene, scan: PointCloud) -> bool:
         """Whether a scan shows enough of the object to be the first."""
-        return bool(seen.mask.any())
+        return bool(scan.mask.any())
 
     @classmethod
     def group(cls, record: Record) -> str:
@@ -216,7 +216,7 @@ class Study(eqx.Module):
 
     def sampler_of(self, scene: Scene) -> SurfaceSampler:
         """The sampler for a scene. A bank made from `meshes` leaves out the mesh of the scene."""
-        return knowing_others(self.sampler, self.meshes, scene.index) if self.meshes else self.sampler
+        return without_own_shape(self.sampler, self.meshes, scene.index) if self.meshes else self.sampler
 
     def planner_of(self, acquisition: Acquisition, search: Search, scene: Scene) -> Planner:
         """A planner with the study's settings and the sampler of the scene."""
@@ -231,10 +231,10 @@ class Study(eqx.Module):
         return jax.random.fold_in(scene_key, _PURPOSES.index(purpose))
 
     def episode_keys(self, method: str, scene: Scene) -> list[PRNGKeyArray]:
-        """The keys of a method's episodes: one, which all methods share, or several to be merged by `joined`."""
+        """The keys of a method's episodes: one, which all methods share, or several to be merged by `merge_runs`."""
         return [self.key(scene.index, "episode")]
 
-    def joined(self, runs: Sequence[Record]) -> Record:
+    def merge_runs(self, runs: Sequence[Record]) -> Record:
         """One record of a method, merged from those of its episodes."""
         return runs[0]
 
@@ -245,7 +245,7 @@ class Study(eqx.Module):
             return self.shows_enough(scene, scan)
 
         keys = self.key(scene.index, "first"), self.key(scene.index, "episode")
-        first = first_showing(enough, self.candidates.poses(), self.sensor(scene), *keys)
+        first = random_first_view(enough, self.candidates.poses(), self.sensor(scene), *keys)
         if first is None:
             raise InputError(f"none of {self.num_candidates} candidates shows enough of {scene.name}: ask for more")
         return first

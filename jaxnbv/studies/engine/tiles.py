@@ -39,13 +39,13 @@ class Tiles(NamedTuple):
     scale: tuple[ScalarMappable, str] | None = None
 
 
-def say(axes: Axes, text: str, right: bool = False) -> None:
+def caption_tile(axes: Axes, text: str, right: bool = False) -> None:
     """Write a line below a tile; in bold green with a tick if `right`."""
     colour, weight = (_RIGHT, "bold") if right else (GREY, "normal")
     axes.set_xlabel(f"{'✓ ' if right else ''}{text}", fontsize=9, color=colour, fontweight=weight)
 
 
-def across(record: Record) -> Float[np.ndarray, "3"]:
+def opposite_direction(record: Record) -> Float[np.ndarray, "3"]:
     """A direction opposite the shared first view and above, to show what this view does not."""
     run = next(iter(record["methods"].values()))
     position = np.asarray(run["views"][0]["position"])

@@ -24,9 +24,9 @@ from jaxnbv.scanning import Grid, MeshParts, TriangleMesh
 from jaxnbv.scanning.metrics import true_mesh
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
 from jaxnbv.studies.engine.run import replay
-from jaxnbv.studies.engine.searches import RULES
+from jaxnbv.studies.engine.searches import BASELINES
 from jaxnbv.studies.engine.study import Scene, Study
-from jaxnbv.studies.engine.tiles import Tiles, across, draw_on, say, still_of
+from jaxnbv.studies.engine.tiles import Tiles, caption_tile, draw_on, opposite_direction, still_of
 from jaxnbv.studies.sensors import PART_SETTING
 from jaxnbv.tasks import Coverage, Segmenter, SoftPartCount, part_counts
 from jaxnbv.viz.style import GREY, SERIES
@@ -35,7 +35,7 @@ from jaxnbv.viz.style import GREY, SERIES
 TARGETS = (20, 40, 60, 80, 100)
 TARGET, NETWORK_POINTS = 60, 2048
 _BY_PARTS = ("discrete", "gradient-2dof", "gradient-6dof")
-_BASELINES = (*RULES, "coverage")
+_OTHERS = (*BASELINES, "coverage")
 # Width w: twice the standard deviation of the sensor noise.
 _WIDTH = 0.02
 # Distance of an absent part, at which its probability and all derivatives are zero.
@@ -130,7 +130,7 @@ class PartDiscoveryStudy(Study):
         "T_discovery for each N_target: views until the segmenter gives that many points to every part of the object.\n"
         "If some part never gets them, it is one more than the number of views, so that means are lower bounds."
     )
-    methods: ClassVar[tuple[str, ...]] = (*_BY_PARTS, *_BASELINES)
+    methods: ClassVar[tuple[str, ...]] = (*_BY_PARTS, *_OTHERS)
     pictured: ClassVar[tuple[str, ...]] = ("discrete", "gradient-2dof", "farthest", "uncertainty")
     reference: ClassVar[str] = "discrete"
     measures: ClassVar[tuple[Measure, ...]] = (
@@ -139,7 +139,7 @@ class PartDiscoveryStudy(Study):
         Measure("found_by_view", f"All parts found, N_target = {TARGET}", _found_by_view, unit="%"),
     )
     claims: ClassVar[tuple[Claim, ...]] = tuple(
-        Claim(f"The utility finds {target} points of every part in fewer views.", "time", target, _BASELINES)
+        Claim(f"The utility finds {target} points of every part in fewer views.", "time", target, _OTHERS)
         for target in (TARGET, max(TARGETS))
     )
     seed: ClassVar[int] = 6
@@ -198,7 +198,7 @@ class PartDiscoveryStudy(Study):
         mesh = cast(TriangleMesh, true_mesh(scene.surface))
         points = mesh.sample_points(jax.random.key(0), _DENSE)
         labels_of_points = np.asarray(self.true_parts(scene, jnp.asarray(points, jnp.float32)))
-        still = still_of(mesh, across(record), pixels)
+        still = still_of(mesh, opposite_direction(record), pixels)
         replays = {method: replay(self, scene, runs[method]) for method in methods}
 
         def tile(axes: Axes, method: str, view: int) -> None:
@@ -206,7 +206,7 @@ class PartDiscoveryStudy(Study):
             mask = np.asarray(fed.mask)
             draw_on(axes, still, np.asarray(fed.points)[mask], colours[np.asarray(predicted)[mask]])
             num_found = sum(count >= TARGET for count in runs[method]["counts"][view])
-            say(axes, f"{num_found} of {len(parts)} parts", num_found == len(parts))
+            caption_tile(axes, f"{num_found} of {len(parts)} parts", num_found == len(parts))
 
         marks = {name: {"marker": "o", "color": colour} for name, colour in zip(record["parts"], palette, strict=True)}
         caption = f"Points: predicted parts. Beneath: parts with {TARGET} points. All methods share view 1."

@@ -17,7 +17,7 @@ from jaxnbv.readers.class_meshes import MeshFile, interleave, mesh_files
 from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning import Grid, MeshParts, SDFSurface, load_parts, scan
 from jaxnbv.scanning.mesh_files import read_nodes
-from jaxnbv.studies.engine.known import knowing_those
+from jaxnbv.studies.engine.known import keep_shapes
 from jaxnbv.studies.engine.measures import Record
 from jaxnbv.studies.engine.study import Scene, Study
 from jaxnbv.studies.parts.discovery import NETWORK_POINTS, TARGETS, NearestPart, PartDiscoveryStudy
@@ -99,7 +99,7 @@ class MeshPartStudy(PartDiscoveryStudy):
         require(len(visible) > 0, f"{scene.name} has no part that shows {max(TARGETS)} points: leave it out")
         return visible
 
-    def facts(self, scene: Scene, truth: list[int], first: int) -> Record:
+    def scene_record(self, scene: Scene, truth: list[int], first: int) -> Record:
         names = scene.task.parts.names
         category = Path(self.meshes[scene.index].path).parent.name
         return {"name": scene.name, "category": category, "parts": [names[part] for part in truth], "of": len(names)}
@@ -140,7 +140,7 @@ class PartStudy(PartDiscoveryStudy):
 
     def sampler_of(self, scene: Scene) -> SurfaceSampler:
         """The sampler, with only the known shapes of the object's category."""
-        return knowing_those(self.sampler, lambda name: kind_of(name) == scene.name)
+        return keep_shapes(self.sampler, lambda name: kind_of(name) == scene.name)
 
     def true_parts(self, scene: Scene, points: Float[Array, "n 3"]) -> Int[Array, " n"]:
         return scene.task.solid.part_labels(points)
@@ -149,7 +149,7 @@ class PartStudy(PartDiscoveryStudy):
         """Labels of the object's parts."""
         return [int(label) for label in np.flatnonzero(np.asarray(scene.task.parts))]
 
-    def facts(self, scene: Scene, truth: list[int], first: int) -> Record:
+    def scene_record(self, scene: Scene, truth: list[int], first: int) -> Record:
         category = CATEGORIES[int(scene.task.category)]
         parts = [category.parts[label - category.first_label] for label in truth]
         return {"name": scene.name, "split": self.split.value, "category": category.name, "parts": parts}

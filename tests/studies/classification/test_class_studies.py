@@ -98,7 +98,7 @@ def test_a_network_of_ones_own_takes_the_place_of_the_shipped_one(tmp_path):
     given = {"meshes": tmp_path, "classifier": tmp_path / "mine.safetensors"}
     (study,) = OmniObject3DStudy.configured("screened", 2, True, **given).values()
     assert study.scene(0).name == "mango mango_001"
-    assert (study.classifier.num_points, study.imagining.num_points) == OmniObject3DStudy.fed
+    assert (study.classifier.num_points, study.imagined_classifier.num_points) == OmniObject3DStudy.network_points
     np.testing.assert_array_equal(study.classifier.network.head[1].bias, network.head[1].bias)
     with pytest.raises(InputError, match=r"knows 5 classes; the study has 10: bathtub, bed"):
         HouseholdStudy.configured("screened", 2, True, classifier=tmp_path / "mine.safetensors")

@@ -14,7 +14,7 @@ from jaxnbv.studies.engine.episodes import poses_of
 from jaxnbv.studies.engine.run import replay, run_scene
 
 SCENE, VIEWS = 3, 3
-SEARCHES = ("cross-entropy", *PyramidStudy.further)
+SEARCHES = ("cross-entropy", *PyramidStudy.extra_methods)
 # One record of all searches, each a program of its own.
 pytestmark = pytest.mark.slow
 

@@ -130,16 +130,16 @@ def test_a_claim_holds_where_the_interval_lies_on_its_side():
         Measure("away", "Away", lambda record, method: [], less=True, digits=1),
         claims=(
             Claim("More are right.", "right", 2, ("a", "b", "c", "absent")),
-            Claim("As near.", "away", 2, ("a", "b", "c"), ahead=False),
+            Claim("As near.", "away", 2, ("a", "b", "c"), must_be_better=False),
             Claim("Later too.", "right", 5, ("a",)),
         ),
     )
     right, away = verdicts(pd.DataFrame(ROWS), said)
-    assert (right.held, right.methods) == (1, 3)
+    assert (right.num_held, right.num_methods) == (1, 3)
     assert right.sentence == (
         "Holds against 1 of 3: ahead of a (+30 [+20, +40]); level with b (+10 [-5, +25]); behind c (-20 [-30, -10])."
     )
-    assert (away.held, away.methods) == (2, 3)
+    assert (away.num_held, away.num_methods) == (2, 3)
     assert "ahead of a (-2.0 [-3.0, -1.0])" in away.sentence
     assert "behind c-screened (+2.0 [+1.0, +3.0])" in away.sentence
 
@@ -150,4 +150,4 @@ def test_the_claims_of_a_study_name_what_it_has(name):
     assert study.claims
     for claim in study.claims:
         assert claim.measure in {measure.name for measure in study.measures}
-        assert {*claim.than} <= {*study.methods, *study.further} - {study.reference}
+        assert {*claim.others} <= {*study.methods, *study.extra_methods} - {study.reference}

@@ -38,7 +38,7 @@ def test_a_chapter_tells_means_differences_times_and_versions(tmp_path):
     assert "<td>+1000.0 [" in tables["Points: farthest minus another method"]
     assert "Many points (%), by view" in dict(chapter.tables["odd: 1 scene"])
     (verdict,) = chapter.verdicts
-    assert (verdict.held, verdict.methods) == (0, 1)
+    assert (verdict.num_held, verdict.num_methods) == (0, 1)
     facts = " ".join(chapter.facts)
     assert "3 seconds per scene" in facts
     assert re.search(r"jax \d", facts)

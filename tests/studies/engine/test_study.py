@@ -120,8 +120,8 @@ def test_a_method_of_ones_own_that_makes_no_planner_is_refused_before_anything_i
 
 def test_the_first_view_shows_enough():
     class Picky(ToyStudy):
-        def shows_enough(self, scene, seen):
-            return float(seen.points[seen.mask].mean(axis=0)[1]) > 0.3
+        def shows_enough(self, scene, scan):
+            return float(scan.points[scan.mask].mean(axis=0)[1]) > 0.3
 
     study = small(Picky)
     for index in range(4):
@@ -131,7 +131,7 @@ def test_the_first_view_shows_enough():
 
 
 class Never(ToyStudy):
-    def shows_enough(self, scene, seen):
+    def shows_enough(self, scene, scan):
         return False
 
 
