@@ -14,6 +14,7 @@ import pickle
 import platform
 import re
 import threading
+import time
 import types
 import uuid
 import zlib
@@ -33,6 +34,8 @@ from jaxnbv.compiled import PROGRAMS
 # Code of these decides, with their versions, what a program computes.
 _LIBRARIES = ("jax", "jaxlib", "numpy", "equinox", "optimistix", "lineax", "optax")
 _STANDARD = ("builtins", "collections", "copyreg", "functools", "math", "operator", "pathlib")
+# The event that JAX's monitoring hears of when a program was loaded.
+LOADED = "/jaxnbv/program_load_duration"
 _compiling = threading.Lock()
 
 
@@ -68,7 +71,7 @@ class _Program:
         leaves, tree = jax.tree.flatten(arrays)
         if folder is None or not all(map(_is_plain, leaves)) or not _is_plain_context():
             return self._jitted(*args, **kwargs)
-        kinds = tuple((jax.typeof(leaf), getattr(leaf, "weak_type", False)) for leaf in leaves)
+        kinds = tuple((leaf.shape, leaf.dtype, getattr(leaf, "weak_type", False)) for leaf in leaves)
         values, structure = jax.tree.flatten(static)
         key = (folder, _settings(), kinds, tree, structure, tuple((type(value), value) for value in values))
         if key not in self._executables:
@@ -235,12 +238,15 @@ def _without_cache(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
 
 
 def _loaded(payload: bytes, leaves: list, num_outputs: int) -> Callable[[list], list]:
+    start = time.monotonic()
     _initialise_lapack()
     inputs, outputs = jax.tree.structure(((leaves,), {})), jax.tree.structure([0] * num_outputs)
     device = jax.local_devices()[0]
-    return serialize_executable.deserialize_and_load(
+    call = serialize_executable.deserialize_and_load(
         payload, inputs, outputs, backend=device.client, execution_devices=[device]
     )
+    jax.monitoring.record_event_duration_secs(LOADED, time.monotonic() - start)
+    return call
 
 
 @functools.cache

@@ -11,6 +11,7 @@ import pytest
 from commands import run_command
 
 import jaxnbv as nbv
+from jaxnbv.compiled import PROGRAMS
 
 # A program that compiles within a millisecond or two is kept, too.
 SCRIPT = """
@@ -67,6 +68,8 @@ def settings():
     for name, value in before.items():
         jax.config.update(name, value)
     nbv.keep_compiled()
+    # Other tests compile as usual.
+    del os.environ[PROGRAMS]
 
 
 def test_a_folder_that_cannot_be_written_is_refused_and_changes_nothing(tmp_path, settings):

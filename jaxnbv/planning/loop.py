@@ -300,7 +300,7 @@ class Loop:
 
 def view_keys(key: PRNGKeyArray, index: int | Int[Array, ""]) -> tuple[PRNGKeyArray, PRNGKeyArray, PRNGKeyArray]:
     """Keys for view `index` (from 0) of an episode: for posterior samples, search and sensor noise."""
-    return _view_keys(key, index if isinstance(index, Array) else np.uint32(index))
+    return _view_keys(key, index if isinstance(index, Array) else np.int32(index))
 
 
 @program

@@ -14,6 +14,7 @@ from jaxnbv.geometry.volume import Box
 from jaxnbv.planning.images import Image
 from jaxnbv.planning.intake import Intake
 from jaxnbv.planning.loop import Loop
+from jaxnbv.programs import LOADED
 
 _COMPILED = "/jax/core/compile/backend_compile_duration"
 # Radius of the ball, as a share of the box's shortest side.
@@ -43,7 +44,7 @@ def rehearse(intake: Intake, loop: Loop) -> Rehearsal:
 
     def listen(event: str, duration_secs: float, **kwargs: str | int) -> None:
         nonlocal programs
-        programs += event == _COMPILED
+        programs += event in (_COMPILED, LOADED)
 
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:
