@@ -135,10 +135,11 @@ class _Program:
 
 
 def program(function: Callable[..., Any]) -> Any:
-    """`eqx.filter_jit(function)` for a function of this package. After `keep_compiled` its programs are kept on disk.
+    """`eqx.filter_jit(function)` for a function of this package.
 
-    Kept programs are for arguments that are arrays on the first device, objects of this package, JAX, NumPy or
-    Equinox, and plain values. Others (an own utility, or transformation by `grad` or `vmap`) are jitted as usual.
+    After `keep_compiled` its programs are kept on disk. Kept programs are for arguments that are arrays on the first
+    device, objects of this package, JAX, NumPy or Equinox, and plain values. Others (an own utility, or transformation
+    by `grad` or `vmap`) are jitted as usual.
     """
     return _Program(function)
 
@@ -256,7 +257,7 @@ def _initialise_lapack() -> None:
 
 
 def _read(path: Path) -> bytes | None:
-    """What `_write` wrote; None without a file, or where it is damaged."""
+    """The bytes that `_write` was given. None if the file is missing or damaged."""
     if not path.exists():
         return None
     data = path.read_bytes()

@@ -159,6 +159,7 @@ class Camera(eqx.Module):
 
     @property
     def num_rays(self) -> int:
+        """Number of pixels, each with one ray."""
         return self.height * self.width
 
     @property

@@ -34,7 +34,11 @@ class NothingInside(UserWarning):
 def points_of_depth(
     depth: Real[AnyArray, "height width"], camera: Camera, pose: Pose, scale: float, stride: int, box: Box | None
 ) -> Rows:
-    """The fields of `PointCloud.from_depth`: points, normals, mask, missed and sight."""
+    """The fields of `PointCloud.from_depth`: points, normals, mask, missed and sight.
+
+    **Raises:** `ValueError` for an image of another shape than the camera's, a scale that is not positive, a batch of
+    poses, or a stride that does not fit.
+    """
     shape = (camera.height, camera.width)
     # Before a conversion that may round large numbers to infinity.
     numbers = depth if is_traced(depth) else as_numbers(depth, "the depth image", None)

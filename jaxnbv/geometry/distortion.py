@@ -36,9 +36,9 @@ def distort_points(
 def undistort_points(
     x: Float[np.ndarray, "*n"], y: Float[np.ndarray, "*n"], coefficients: tuple[float, ...]
 ) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
-    """Undistorted coordinates in the plane Z = 1 of distorted points (x, y): the inverse of `distort_points`.
+    """Undistorted coordinates in the plane Z = 1 of distorted points (x, y).
 
-    By fixed-point iteration as in OpenCV.
+    The inverse of `distort_points`, by fixed-point iteration as in OpenCV.
     """
     across, down = x, y
     for _ in range(_ITERATIONS):

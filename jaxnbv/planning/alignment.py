@@ -89,6 +89,7 @@ class Alignment(eqx.Module):
 
     @property
     def is_corrected(self) -> bool:
+        """Whether any pose is corrected."""
         return bool(np.any(self.corrections != np.eye(4)))
 
     @property

@@ -161,7 +161,10 @@ class IdentificationStudy(Study):
         return self.camera.resized(*_RAYS)
 
     def scene(self, index: int) -> Scene:
-        """A part in a random pose. The task of the scene is its `PlacedPart`."""
+        """A part in a random pose. The task of the scene is its `PlacedPart`.
+
+        **Raises:** `ValueError` if the index is negative.
+        """
         require(index >= 0, f"there is no scene {index}: scenes are counted from 0")
         if self.meshes:
             parts = parts_in(self.meshes)

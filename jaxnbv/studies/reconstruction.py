@@ -100,6 +100,10 @@ class ReconstructionStudy(Study):
         return self.planner("farthest", scene)
 
     def truth(self, scene: Scene) -> Float[np.ndarray, "n 3"]:
+        """Points on the true surface, uniform by area.
+
+        **Raises:** `ValueError` if the surface cannot be sampled.
+        """
         points = truth_points(scene.surface, self.key(scene.index, "scene"), SURFACE_POINTS)
         if points is None:
             raise InputError(f"the surface of scene {scene.index} cannot be sampled: give a mesh")
@@ -133,7 +137,10 @@ class ReconstructionStudy(Study):
         return {"chamfer": distance.chamfer, **distance._asdict()}
 
     def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
-        """Tiles of each reconstruction after the last view, coloured by the distance to the true surface."""
+        """Tiles of each reconstruction after the last view, coloured by the distance to the true surface.
+
+        **Raises:** `ValueError` if the records hold a reconstruction that needs an extra, and this is not installed.
+        """
         scene, runs = self.scene(record["scene"]), record["methods"]
         truth = cast(TriangleMesh, true_mesh(scene.surface))
         tree = cKDTree(truth.sample_points(jax.random.key(0), _DENSE))

@@ -59,7 +59,10 @@ on_grid_of_torus = _on_torus(lambda axis: axis.ndim == 1, "the nodes along one a
 
 
 def sampling_method(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Decorator for a method of a key and a number of samples: check both."""
+    """Decorator for a method of a key and a number of samples: check both.
+
+    **Raises:** the method raises `ValueError` for something else than a key, or a number of samples below 1.
+    """
 
     @functools.wraps(method)
     def call(self: Any, key: PRNGKeyArray, num_samples: int) -> Any:

@@ -140,6 +140,7 @@ class ConjugateGradientSolver(Solver):
 
     @property
     def factor(self) -> CholeskyFactor:
+        """**Raises:** `ValueError`, since this solver has no factor."""
         raise InputError(
             f"covariances and likelihoods need a factorisation, which is done for at most {MOST_FACTORISED} points: "
             "keep fewer points"

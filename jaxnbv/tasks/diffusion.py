@@ -114,7 +114,7 @@ def cloud_laplacian(points: Float[np.ndarray, "n 3"]) -> Laplacian:
     a lone line, conduct no heat.
     """
     if len(points) == 3:
-        # With two neighbours the library reads uninitialised memory.
+        # The library reads uninitialised memory if there are only two neighbours.
         one = np.linalg.matrix_rank(points[1:] - points[0]) == 2
         return mesh_laplacian(points, np.array([[0, 1, 2]])) if one else _nothing(3)
     neighbours = min(_NEIGHBOURS, len(points) - 1)

@@ -139,6 +139,7 @@ class Coldest(Answer):
 
     @property
     def temperature(self) -> float:
+        """Temperature of the point in degrees."""
         return float(self.values[0])
 
 

@@ -35,6 +35,7 @@ def _as_float(value):
 
 
 def parameter(**kwargs):
+    """A field for a parameter of a signed distance."""
     return eqx.field(converter=_as_float, **kwargs)
 
 
@@ -44,15 +45,18 @@ def nonnegative(**kwargs):
 
 
 def split(x):
+    """The three coordinates of points (..., 3)."""
     return x[..., 0], x[..., 1], x[..., 2]
 
 
 # Not jnp.minimum and jnp.maximum, whose derivatives split ties evenly and cost many times as much.
 def least(a, b):
+    """The smaller of two values, the first of equals."""
     return jnp.where(a <= b, a, b)
 
 
 def greatest(a, b):
+    """The larger of two values, the first of equals."""
     return jnp.where(a >= b, a, b)
 
 

@@ -91,7 +91,10 @@ class MeshPartStudy(PartDiscoveryStudy):
         return scene.task.oracle.nearest(points)
 
     def truth(self, scene: Scene) -> list[int]:
-        """Indices of the parts that can be found."""
+        """Indices of the parts that can be found.
+
+        **Raises:** `ValueError` if there are none.
+        """
         scans = scan(scene.surface, self.imagined_camera, self.candidates.poses())
         joined = PointCloud(scans.points.reshape(-1, 3), scans.normals.reshape(-1, 3), scans.mask.reshape(-1))
         counts = part_counts(scene.task.oracle(joined))
