@@ -1,13 +1,13 @@
-"""Time every stage of planning on this machine, as ratios to a yardstick, to rivals, and to what the arithmetic takes.
+"""Time every stage of planning on this machine, as ratios to a yardstick, to other programs, and to the arithmetic.
 
     python benchmarks/all.py [--mesh FILE] [--only STAGE ...] [--out runs/all]
     JAX_NUM_CPU_DEVICES=2 python benchmarks/all.py --only devices episodes
 
-The paper's settings: 16 samples, 120 candidates, 50 x 50 rays, samples on a 100^3 grid, one view of a mug or of a
-mesh. Times are after compilation, the least of three; "first" says where it is included. The yardstick is a 2,000^3
-float32 product; the rival of a scan is marching cubes (scikit-image) and Embree (through trimesh) on the same samples,
-meshes and trees included; the floor of a network is its multiply-adds at the yardstick's rate. A step is
-shared among all devices there are. Writes OUT.json and OUT.md.
+Settings are the paper's: 16 samples on a 100^3 grid, 120 candidates, 50 x 50 rays, one view of a mug or of a mesh.
+Times are the least of three, without compilation. Times with compilation are called "first". The yardstick is a 2,000^3
+float32 product. A scan is compared with marching cubes (scikit-image) and Embree (through trimesh) on the same samples,
+including the time for meshes and trees. The least time of a network is its multiply-adds at the yardstick's rate. A
+step is shared among all devices. Writes OUT.json and OUT.md.
 """
 
 import argparse
@@ -36,7 +36,7 @@ from jaxnbv.studies.scenes import Framing, Split, demo_object, hidden_view, pyra
 
 
 class Bench:
-    """What all stages start from; seconds by stage, and what each is compared to."""
+    """Inputs that all stages share, and the results: seconds by stage, with ratios."""
 
     def __init__(self, mesh: str | None):
         self.key, self.first = jax.random.key(0), nbv.look_at((0.8, 0.9, 2.2))
@@ -45,7 +45,7 @@ class Bench:
         self.rows: dict[str, dict[str, float]] = {}
 
     def take(self, stage: str, function, **beside: float) -> float:
-        """`beside`: what it is told as a ratio to, by name, in seconds."""
+        """Time a function and record it. `beside`: seconds of what it is compared to, by name."""
         return self.note(stage, least_time(function), **beside)
 
     def note(self, stage: str, seconds: float, **beside: float) -> float:
@@ -54,7 +54,7 @@ class Bench:
         return seconds
 
     def observations(self, planner: nbv.Planner, views: int = 1) -> nbv.Observations:
-        """After a first view, and others from around the object."""
+        """Observations after the first view and `views - 1` others around the object."""
         observations, around = None, map(nbv.look_at, nbv.geometry.fibonacci_sphere(views, 2.5))
         for index, pose in enumerate([self.first, *around][:views]):
             seen = observe_scene(self.scene, planner.camera, pose, nbv.SensorNoise(), jax.random.key(index))
@@ -63,7 +63,7 @@ class Bench:
 
 
 def rival_scan(surfaces: nbv.scanning.GridSurface, camera: nbv.Camera, poses: nbv.Pose) -> float:
-    """Seconds that marching cubes and Embree take for the scans of all samples from all poses."""
+    """Seconds that marching cubes and Embree take to scan all samples from all poses."""
     values, spacing = np.array(surfaces.values), surfaces.grid.spacing
     origins, directions = (np.asarray(rays).reshape(-1, 3) for rays in camera.rays(poses))
     start = time.perf_counter()
@@ -75,7 +75,7 @@ def rival_scan(surfaces: nbv.scanning.GridSurface, camera: nbv.Camera, poses: nb
 
 
 def coverage(bench: Bench) -> None:
-    """The paper's acquisition by the full search, after one view and with its 8,192 points full."""
+    """The paper's acquisition by the full search, after one view and with a full cloud of 8,192 points."""
     planner = nbv.Planner(nbv.Coverage())
     observations = bench.observations(planner)
     start = time.perf_counter()
@@ -97,7 +97,7 @@ def coverage(bench: Bench) -> None:
         score = lambda of: scores(planner.acquisition, context, of, planner.camera, bench.candidates)  # noqa: E731
         return jnp.mean(jax.lax.map(score, seen, batch_size=samples_at_once(planner.camera, bench.candidates)), axis=0)
 
-    # What is timed must be what a step does.
+    # The parts that are timed must give the values of a real step.
     expected = nbv.expected_value(planner.acquisition, observations.cloud, surfaces, planner.camera, bench.candidates)
     np.testing.assert_allclose(values(observations.cloud, seen), expected, rtol=1e-3)
     bench.take("coverage: values of the 1,920 scans", lambda: values(observations.cloud, seen), step=step)
@@ -108,7 +108,7 @@ def coverage(bench: Bench) -> None:
 
 
 def sessions(bench: Bench) -> None:
-    """What sessions plan by."""
+    """New surface, the acquisition of sessions."""
     planner = usual_planner()
     second = bench.observations(planner, 2)
     step = bench.take("new surface, as sessions plan: the second step", lambda: planner.propose(second, bench.key))
@@ -117,7 +117,7 @@ def sessions(bench: Bench) -> None:
 
 
 def cross_entropy(bench: Bench) -> None:
-    """The shipped classifier of pyramids on 1,920 clouds of 1,024 points, and by halving; the paper's surfaces."""
+    """The shipped classifier of pyramids on 1,920 clouds of 1,024 points, by the full search and by halving."""
     pyramid = pyramid_scene(Split.TEST, 0, Framing.CLOSE_UP)
     classifier = pretrained_classifier("pyramid", Framing.CLOSE_UP.longest_side)
     sampler = nbv.SurfaceSampler.preset("paper")
@@ -149,7 +149,7 @@ def cross_entropy(bench: Bench) -> None:
 
 
 def gradient(bench: Bench) -> None:
-    """Searches on the same samples, as ratios to the discrete one."""
+    """Searches on the same samples, as ratios to discrete search."""
     planner = nbv.Planner(nbv.Coverage())
     observations = bench.observations(planner)
     inputs = planner.step_inputs(observations, bench.key)
@@ -166,7 +166,7 @@ def gradient(bench: Bench) -> None:
 
 
 def networks(bench: Bench) -> None:
-    """PointNet++ at its published sizes, one cloud of 1,024 points, against its multiply-adds."""
+    """PointNet++ at its published sizes on one cloud of 1,024 points, against its multiply-adds."""
     from networks import NETWORKS, multiply_adds, random_network, timings
 
     rate = 2000**3 / yardstick()
@@ -179,7 +179,7 @@ def networks(bench: Bench) -> None:
 
 
 def devices(bench: Bench) -> None:
-    """A step by the full search on one device and shared among all."""
+    """A step by the full search, on one device and on all."""
     planner, count = nbv.Planner(nbv.NewSurface(), nbv.DiscreteSearch()), len(jax.devices())
     observations = bench.observations(planner)
     step = lambda: planner.propose(observations, bench.key)  # noqa: E731
@@ -190,7 +190,7 @@ def devices(bench: Bench) -> None:
 
 
 def episodes(bench: Bench) -> None:
-    """Eight episodes of five views in one program and by `simulate` in a loop; on a GPU also 64, against one."""
+    """Eight episodes of five views, in one program and by `simulate` in a loop. On a GPU also 64, against one."""
     planner, key = usual_planner(), bench.key
 
     def program(count: int, batch_size: int | None = None):

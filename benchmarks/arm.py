@@ -1,11 +1,11 @@
-"""What an arm reaches, how long it moves and how exactly it scans, in a simulator.
+"""Poses that an arm reaches, its time in motion, and the accuracy of its scans, in a simulator.
 
     python benchmarks/arm.py --parts FOLDER [--objects 10] [--views 6] [--degrees 1] [--millimetres 5]
 
-For each mesh, in metres, as it stands on a table: new surface with motion as its cost, farthest view among the poses
-that the arm reaches, and new surface with a camera whose mount is off, without and with its correction. A column has
-the share of proposals that can be reached, the seconds of motion, the share of the surface within 3 mm of a measured
-point, and the median and 90 % distance of the points from the object in millimetres.
+Each mesh (in metres) stands on a table. Methods are new surface with motion as its cost, farthest view among the poses
+that the arm reaches, and new surface with an error in the camera's mount, without and with its correction. Columns are
+the share of proposals that the arm reaches, the seconds of motion, the share of the surface within 3 mm of a measured
+point, and the median and 90 % quantile of the distances between points and object in millimetres.
 """
 
 import argparse
@@ -54,7 +54,7 @@ def main() -> None:
     parser.add_argument("--degrees", default=1.0, type=float)
     parser.add_argument("--millimetres", default=5.0, type=float)
     options = parser.parse_args()
-    # Planes that are taken for tables, and mounts that are off on purpose.
+    # Sessions warn of the table that they detect, and of the error in the mount, which is on purpose.
     warnings.simplefilter("ignore", UserWarning)
     nbv.keep_compiled()
     exact, off = np.eye(4), hand_eye_error(options.degrees, options.millimetres)

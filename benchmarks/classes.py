@@ -1,11 +1,10 @@
-"""Which class an object is of, by the other objects of all classes alone, without a network.
+"""The class of an object from known shapes of all classes, without a network.
 
     python benchmarks/classes.py --meshes FOLDER [--scenes 16] [--views 3] [--out runs/classes]
 
-The folder has a folder of meshes for each class. The bank holds all meshes but the one that is scanned, upright and
-with longest sides that are equal; `Identify(group=...)` asks for the class. *Class right*: the class that has the most
-weight among the bank's objects is the true one; *network*: so is the one that the shipped classifier of household
-objects names, of the classes that it knows.
+The folder has a folder of meshes for each class. The bank holds all other meshes, upright, with equal longest sides.
+`Identify(group=...)` asks for the class. *Class right*: the class with the most weight among the bank's objects is the
+true one. *Network*: the shipped classifier of household objects names the true class, among the classes that it knows.
 """
 
 import argparse
@@ -37,14 +36,14 @@ from jaxnbv.studies.identification import IDENTIFY
 from jaxnbv.studies.scenes.household import HOUSEHOLD
 from jaxnbv.surfaces import Upright
 
-# The longest side of an object in scene units: turned about the vertical it fits into the box, with some room.
+# The longest side of an object in scene units. The object fits into the box at any angle about the vertical.
 _SIDE = 1.6
 _ORDER = 7
 
 
 @functools.cache
 def objects_in(files: tuple[MeshFile, ...]) -> tuple[nbv.ShapeBank, tuple[str, ...], list[trimesh.Trimesh]]:
-    """A bank of the meshes at equal sizes, the class of each, and the meshes."""
+    """A bank of the meshes at equal sizes, the class of each, and the meshes themselves."""
     meshes, names = [], []
     for number, file in enumerate(files):
         read = file.read()
@@ -60,7 +59,7 @@ def _by_view(name: str) -> Any:
 
 
 class ClassStudy(Study):
-    """The class of an object that the bank lacks."""
+    """The class of an object that is not in the bank."""
 
     title: ClassVar[str] = "The class of an object, by the others alone"
     explanation: ClassVar[str] = "Class right: the class of most weight is the true one."
@@ -76,11 +75,11 @@ class ClassStudy(Study):
 
     @functools.cached_property
     def order(self) -> np.ndarray:
-        """Classes take turns in the files; scenes take any."""
+        """Random order of the objects, since the files list one of each class in turn."""
         return np.random.default_rng(_ORDER).permutation(len(objects_in(self.meshes)[2]))
 
     def scene(self, index: int) -> Scene:
-        """An upright object; its task is its number in the bank."""
+        """An upright object. The task of the scene is its number in the bank."""
         (bank, _, meshes), one = objects_in(self.meshes), int(self.order[index])
         angle = np.random.default_rng(1000 + index).uniform(0.0, 2.0 * np.pi)
         turn = Rotation.from_rotvec([0.0, angle, 0.0]).as_matrix()
@@ -111,7 +110,7 @@ class ClassStudy(Study):
         return nbv.Identify(group=kinds.tolist()) if method == IDENTIFY else nbv.NewSurface()
 
     def follow(self, scene: Scene, truth: Any, planner: Planner, episode: Iterator[Step]) -> Record:
-        """After each view: whether the class is right, by the hypotheses and by the network."""
+        """Record after each view whether the class is right, by the hypotheses and by the network."""
         kinds = np.array(objects_in(self.meshes)[1])
         own, others = kinds[scene.task], kinds[self.others(scene)]
         network = pretrained_classifier("household", _SIDE)

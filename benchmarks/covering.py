@@ -1,5 +1,5 @@
-"""What scans of an object cover, as peers count it: points of its surface that a scanned point is near to; and views
-beyond the boundary of what has been seen, the candidates of Boundary Exploration NBV (leihui6/BENBV)."""
+"""Coverage as other papers count it, the points of a surface near a scanned point; and the candidates of Boundary
+Exploration NBV (leihui6/BENBV), views beyond the boundary of the scanned surface."""
 
 import zlib
 from collections.abc import Callable, Iterable
@@ -16,16 +16,18 @@ from scipy.spatial.transform import Rotation
 import jaxnbv as nbv
 
 CANDIDATES = 800
-# Of the paper's code: neighbours of a point, the angle without any of them that makes it a boundary point, clusters of
-# boundary points, and by which angles the view is turned about the boundary, one after the other.
+# Settings of the published code: neighbours of a point, the empty angle that makes it a boundary point, clusters of
+# boundary points, and the angles by which views turn about the boundary.
 NEIGHBOURS, GAP, VIEWS, TURNS = 30, np.radians(120.0), 20, np.radians([-45.0, 0.0, 45.0])
 
 
 class Protocol(NamedTuple):
-    """Lengths in metres; `scale`: metres for one scene unit, of an object whose box has these sides.
+    """Settings of a paper's experiments. Lengths in metres.
 
+    - `scale`: metres of one scene unit, for an object whose box has these sides.
     - `stride`: of the camera's image, for fewer rays of the same cone.
-    - `step`: to what the sensor measures; 0 for exactly. `voxel`: of which one point is kept; 0 for all.
+    - `step`: resolution of measured depths; 0 for exact ones.
+    - `voxel`: size of the voxels of which one point each is kept; 0 to keep all points.
     """
 
     scale: Callable[[np.ndarray], float]
@@ -42,7 +44,7 @@ class Protocol(NamedTuple):
 
 
 class Look(NamedTuple):
-    """What one scan shows: whether it covers each point of the surface; the normals there; and its own points."""
+    """One scan: the points of the surface that it covers, the normals there, and its own points."""
 
     covers: Bool[np.ndarray, " points"]
     normals: Float[np.ndarray, "points 3"]
@@ -50,7 +52,7 @@ class Look(NamedTuple):
 
 
 class Trial:
-    """An object in a protocol: points of its surface, candidates about it, and what each pose shows of it."""
+    """An object in a protocol: points of its surface, candidates around it, and the scans from poses."""
 
     def __init__(self, file: Path, protocol: Protocol, half: bool, up: str):
         self.mesh, self.protocol = nbv.load_mesh(file, up), protocol
@@ -70,14 +72,14 @@ class Trial:
         self._directions = directions.reshape(self.camera.height, self.camera.width, 3)
 
     def covers(self, candidates: Iterable[int]) -> Bool[np.ndarray, "candidates points"]:
-        """What each of some candidates covers; none is scanned twice."""
+        """Points of the surface that each of some candidates covers. Keeps the scans."""
         for index in candidates:
             if index not in self._known:
                 self._known[index] = self.look(self.poses[index]).covers
         return np.stack([self._known[index] for index in candidates])
 
     def look(self, pose: nbv.Pose) -> Look:
-        """What the sensor sees from a pose, by those of its rays that can meet the object."""
+        """The scan from a pose, by the rays that can meet the object."""
         origin, rotation = np.asarray(pose.position, np.float64), np.asarray(pose.rotation, np.float64)
         local = (self.points - origin) @ rotation
         column, row = self.camera.to_pixels(local[:, :2] / local[:, 2:]).T
@@ -113,8 +115,8 @@ def one_a_voxel(points, normals, size: float) -> tuple[Float[np.ndarray, "m 3"],
 def boundary_views(
     points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], seed: int
 ) -> tuple[Float[np.ndarray, "views 3"], Float[np.ndarray, "views 3"]]:
-    """Points of the boundary to look at, one a cluster, and the unit directions to look from; none where no point is
-    of the boundary."""
+    """Boundary points to look at, one for each cluster, and unit directions to look from. Both are empty if there is no
+    boundary."""
     tree = cKDTree(points)
     apart, near = tree.query(points, k=min(NEIGHBOURS, len(points)))
     (rows,) = np.nonzero(is_boundary(points, normals, apart[:, 1:], near[:, 1:]))
@@ -135,7 +137,7 @@ def boundary_views(
 
 
 def is_boundary(points, normals, apart, near) -> Bool[np.ndarray, " n"]:
-    """Whether the neighbours, seen along the normal, leave a gap of more than `GAP` around a point."""
+    """Whether the directions to a point's neighbours, seen along its normal, leave a gap of more than `GAP`."""
     first = unit(np.cross(normals, np.eye(3)[np.argmin(np.abs(normals), axis=1)]))
     second = np.cross(normals, first)
     away = points[near] - points[:, None]

@@ -1,10 +1,10 @@
-"""How well the derivative of an acquisition in a 6-DOF pose points the way that its values rise.
+"""Compare the gradient of an acquisition in a 6-DOF pose with central differences.
 
     python benchmarks/derivatives.py [--mesh FILE] [--step 0.02] [--seeds 2]
 
-After one view, of eight poses around the object: the cosine of the angle between the gradient and central differences
-over a step along each of the nine parameters of `FreePoses`, its median and its least over poses and seeds. In
-close-up the object fills the image; whole, its silhouette is in view.
+Prints the cosine of the angle between the two, as median and minimum over eight poses around the object and all seeds,
+after one view. The differences are over a step along each of the nine parameters of `FreePoses`. In close-up the object
+fills the image. Whole, its silhouette is in view.
 """
 
 import argparse
@@ -39,7 +39,7 @@ def gradients(planner: nbv.Planner, inputs: StepInputs, starts: Pose, parameters
 
 
 def cosines(planner: nbv.Planner, scene, seed: int, step: float) -> np.ndarray:
-    """Of the angles between gradients and central differences, by pose."""
+    """Cosine of the angle between gradient and central differences at each pose."""
     first = nbv.look_at(RADIUS * np.array([0.6, 0.5, 0.62]))
     observations = planner.init(first, nbv.scan(scene, planner.camera, first))
     inputs = planner.step_inputs(observations, jax.random.key(seed))

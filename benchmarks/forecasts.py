@@ -1,8 +1,8 @@
-"""How good the surfaces that a planner imagines are, measured against the true one.
+"""Scores of a planner's posterior samples against the true surface.
 
-Samples of the posterior are forecasts: of the depth along a ray, of whether a place is inside, of the value of a view.
-They are judged by proper scores (Gneiting and Raftery 2007), whose expectation is least for the true distribution, in
-the forms that are fair to small ensembles (Ferro 2014): no number of samples is at an advantage.
+The samples are forecasts of the depth along a ray, of whether a place is inside, and of the value of a view. They are
+judged by proper scores (Gneiting and Raftery 2007), whose expectation is least for the true distribution, in the forms
+that are fair to small ensembles (Ferro 2014), so that no number of samples is at an advantage.
 """
 
 from typing import NamedTuple
@@ -30,14 +30,14 @@ _scan = eqx.filter_jit(scan)
 
 
 class Truth(eqx.Module):
-    """What is known of the true surface, as arrays alone: one compiled program judges samples against any object.
+    """The true surface as arrays, so that one compiled program judges samples against any object.
 
-    - `candidates`: the poses that are imagined from.
-    - `camera`: the one whose rays the depths are along.
+    - `candidates`: poses of the imagined scans.
+    - `camera`: the camera of the depths.
     - `volume`: where the object can be.
-    - `inside`: the nodes of the planner's grid inside the solid; none of them for a surface that encloses nothing.
-    - `depths`: as `ray_depths` gives them, without noise.
-    - `scans`: what the planner's camera would see from the candidates, without noise, as imagined scans have none.
+    - `inside`: the nodes of the planner's grid inside the solid; all False for a surface that encloses nothing.
+    - `depths`: result of `ray_depths`, without noise.
+    - `scans`: scans by the planner's camera from the candidates, without noise, as in imagined scans.
     """
 
     candidates: Pose
@@ -61,9 +61,9 @@ class Truth(eqx.Module):
 
 
 class Reliability(NamedTuple):
-    """Forecast probabilities in bins of equal width; means of an empty bin are None.
+    """Forecast probabilities in bins of equal width. Means of an empty bin are None.
 
-    - `forecast`: mean forecast; `observed`: share of what happened; `nodes`: how many forecasts there are.
+    - `forecast`: mean forecast. `observed`: share of events that happened. `nodes`: number of forecasts.
     """
 
     forecast: list[float | None]
@@ -72,17 +72,17 @@ class Reliability(NamedTuple):
 
 
 class Judgement(NamedTuple):
-    """How good the samples of one step are. What is not defined is None.
+    """Scores of the samples of one step. Undefined ones are None.
 
-    - `crps`: of the depth, mean over rays, in scene units; less is better, as for the Brier scores.
-    - `brier`, `fair_brier`: of being inside, mean over the unseen nodes; None for a surface that encloses nothing, as
-      are the next three. The plain score takes the share of the samples for the probability; the fair one does not
-      charge the error of this share.
-    - `mean_inside`, `true_inside`: mean probability of being inside, and the share that is inside, of the same nodes.
+    - `crps`: of the depth, mean over rays, in scene units. Less is better, as for the Brier scores.
+    - `brier`, `fair_brier`: of being inside, mean over the unseen nodes. They and the next three are None for a surface
+      that encloses nothing. The plain score uses the share of the samples as probability; the fair one corrects for
+      the sampling error of this share.
+    - `mean_inside`, `true_inside`: mean probability of being inside, and the true share inside, at the same nodes.
     - `reliability`: of the same probabilities.
     - `in_empty`: share of the imagined hits that lie in space seen to be empty; None without hits.
     - `rank`: Spearman's correlation of the acquisition with the true values of the candidates.
-    - `share_of_best`: true value of the candidate of the greatest acquisition, as a share of the best one's.
+    - `share_of_best`: true value of the candidate with the greatest acquisition, as a share of the greatest true value.
     """
 
     crps: float
@@ -103,10 +103,10 @@ def judge(
     truth: Truth,
     empty_nodes: Bool[AnyArray, "g g g"],
 ) -> Judgement:
-    """How good `surfaces`, the planner's samples given the observations, are.
+    """Scores of `surfaces`, the planner's samples given the observations.
 
-    - `empty_nodes`: the nodes that the scans have shown to be empty, whether the planner carves by them or not:
-      all planners are judged on the same nodes, those inside the volume that are not seen empty.
+    - `empty_nodes`: nodes that the scans have shown to be empty, whether or not the planner carves by them. All
+      planners are judged on the same nodes: those inside the volume that were not seen to be empty.
 
     **Raises:** `ValueError` if the truth is on another grid, or there are fewer than two samples.
     """
@@ -144,15 +144,15 @@ def crps(samples: Float[AnyArray, "s *n"], truth: Float[AnyArray, "*n"]) -> Floa
 
         mean_s |x_s - y| - sum_{s, s'} |x_s - x_s'| / (2 S (S - 1)).
 
-    This is the fair estimator: unbiased for the score of the distribution that the samples are drawn from, and so
-    sometimes negative. Runs under `jit`.
+    This is the fair estimator: it is unbiased for the score of the samples' distribution, and so sometimes negative.
+    Runs under `jit`.
 
     **Raises:** `ValueError` for fewer than two samples.
     """
     samples, truth = jnp.asarray(samples), jnp.asarray(truth)
     count = samples.shape[0]
     require(count >= 2, f"the fair CRPS of {count} samples is not defined: draw at least two")
-    # In order, x_(i) stands above i - 1 others and below S - i, which saves the S^2 differences.
+    # In sorted order x_(i) is above i - 1 others and below S - i, which saves the S^2 differences.
     weight = jnp.asarray(2 * np.arange(1, count + 1) - count - 1, samples.dtype)
     spread = jnp.tensordot(weight, jnp.sort(samples, axis=0), axes=1) / (count * (count - 1))
     return jnp.mean(jnp.abs(samples - truth), axis=0) - spread
@@ -161,7 +161,7 @@ def crps(samples: Float[AnyArray, "s *n"], truth: Float[AnyArray, "*n"]) -> Floa
 def exit_depths(
     volume: Box, origins: Float[AnyArray, "*n 3"], directions: Float[AnyArray, "*n 3"]
 ) -> tuple[Float[Array, "*n"], Bool[Array, "*n"]]:
-    """Where rays leave a box, in lengths of their directions, and whether they meet it at all (Kay and Kajiya 1986)."""
+    """Distance at which rays leave a box, in their directions' lengths, and whether they meet it (Kay and Kajiya 1986)."""
     origins, directions = jnp.asarray(origins), jnp.asarray(directions)
     start, along = (list(jnp.moveaxis(vectors, -1, 0)) for vectors in (origins, directions))
     enters, leaves = ray_interval(start, along, volume.low, volume.high)
@@ -173,8 +173,8 @@ def ray_depths(
 ) -> tuple[Float[Array, "*poses rays"], Bool[Array, "*poses rays"]]:
     """Depth along the rays of a scan, in scene units, and which rays meet the volume.
 
-    A ray that misses, or hits beyond the volume only, has the depth at which it leaves the volume: there is nothing
-    behind. A hit before the volume counts as it is.
+    A ray that misses, or hits only beyond the volume, gets the depth at which it leaves the volume. A hit before the
+    volume keeps its depth.
     """
     origins, directions = camera.rays(poses)
     leaves, meets = exit_depths(volume, origins, directions)
@@ -183,7 +183,7 @@ def ray_depths(
 
 
 def brier(forecast: Float[AnyArray, " n"], happened: Bool[AnyArray, " n"]) -> float:
-    """Mean squared difference of probabilities and what happened (1 or 0).
+    """Mean squared difference between probabilities and outcomes (1 or 0).
 
     **Raises:** `ValueError` if there are none.
     """
@@ -207,7 +207,7 @@ def reliability(forecast: Float[AnyArray, " n"], happened: Bool[AnyArray, " n"],
 def empty_share(
     points: Float[Array, "*n 3"], mask: Bool[Array, "*n"], empty: Bool[Array, "g g g"], grid: Grid
 ) -> Float[Array, ""]:
-    """Share of the filled points (scene coordinates) whose nearest node of the grid is empty; NaN without points.
+    """Share of the filled points (scene coordinates) whose nearest node of the grid is empty. NaN without points.
 
     Runs under `jit`.
     """
@@ -216,7 +216,7 @@ def empty_share(
 
 
 def share_of_best(values: Float[AnyArray, " c"], true_values: Float[AnyArray, " c"]) -> float | None:
-    """True value of the candidate of the greatest value, as a share of the greatest; None where all are zero.
+    """True value of the candidate with the greatest value, as a share of the greatest true value. None if all are zero.
 
     One minus this is the relative regret.
     """

@@ -1,12 +1,12 @@
-"""What gradient searches find, and how long they take, as ratios to the discrete search of 120 candidates.
+"""Values and times of gradient searches, as ratios to discrete search over 120 candidates.
 
     python benchmarks/gradient.py [--task coverage|cross-entropy] [--mesh FILE] [--seeds 10] [--only NAME] [--out FILE]
 
-One step after one random view, at the paper's settings: S = 16, 50 x 50 rays, L = 50, grid 100^3. The object is the
-demo's: a mug for coverage, or a mesh; a pyramid in close-up for cross-entropy. All searches of a seed see the same
-samples. Times are without compilation; "step" adds the drawing of the samples, which all searches need. Also the time
-of one gradient of the acquisition at six poses, in times of its value. Continues after the last seed in the file, where
-this has the same settings.
+Runs one step after one random view, at the paper's settings: S = 16, 50 x 50 rays, L = 50, grid 100^3. The object is a
+mug (as in the demo) or a mesh for coverage, and a pyramid in close-up for cross-entropy. All searches of a seed see the
+same samples. Times are without compilation. "step" includes the drawing of the samples, which all searches need. Also
+prints the time of one gradient of the acquisition at six poses, divided by that of its value. Continues after the last
+seed in the file if its settings are the same.
 """
 
 import argparse
@@ -33,7 +33,7 @@ SEARCHES = {
     "discrete": nbv.DiscreteSearch(),
     "2-DOF": nbv.GradientSearch(dof=2),
     "2-DOF, six starts only": nbv.GradientSearch(dof=2, num_candidates=6),
-    # The rates of the authors' published code; the paper's is 0.01.
+    # The learning rates of the authors' published code. The paper has 0.01.
     "2-DOF, six starts, rate 5e-3": nbv.GradientSearch(dof=2, num_candidates=6, learning_rate=5e-3),
     "2-DOF, six starts, rate 1e-4": nbv.GradientSearch(dof=2, num_candidates=6, learning_rate=1e-4),
     "6-DOF": nbv.GradientSearch(dof=6),
@@ -45,7 +45,7 @@ COVERAGE_ONLY = ("6-DOF",)
 
 
 def scene_and_first(task: str, mesh: str | None, seed: int, key: jax.Array) -> tuple[nbv.scanning.Surface, nbv.Pose]:
-    """The object, and a random first view of it; of a pyramid one that does not show the pattern."""
+    """The object and a random first view, which does not show the pattern of a pyramid."""
     if task == "cross-entropy":
         pyramid = pyramid_scene(Split.TEST, seed, Framing.CLOSE_UP)
         return nbv.SDFSurface(pyramid), hidden_view(pyramid, key)
@@ -56,7 +56,7 @@ def scene_and_first(task: str, mesh: str | None, seed: int, key: jax.Array) -> t
 
 @eqx.filter_jit
 def value(planner: nbv.Planner, observations: nbv.Observations, surfaces: nbv.scanning.GridSurface, parameters):
-    """The acquisition at six poses of the sphere, moved by parameters."""
+    """The acquisition at six poses on the sphere, moved by the parameters."""
     starts = sphere_candidates(6)
     poses = jax.vmap(nbv.search.SpherePoses().retract)(starts, parameters)
     return nbv.expected_value(planner.acquisition, observations.cloud, surfaces, planner.camera, poses)
@@ -64,12 +64,12 @@ def value(planner: nbv.Planner, observations: nbv.Observations, surfaces: nbv.sc
 
 @eqx.filter_jit
 def gradient(planner: nbv.Planner, observations: nbv.Observations, surfaces: nbv.scanning.GridSurface, parameters):
-    """Its gradient, and its value with it."""
+    """Value and gradient of the acquisition at the same poses."""
     return jax.value_and_grad(lambda moved: value(planner, observations, surfaces, moved).sum())(parameters)
 
 
 def run_seed(planners: dict[str, nbv.Planner], task: str, mesh: str | None, seed: int, compiled: bool) -> dict:
-    """Values and seconds of every search on one step; where nothing is compiled yet, of the second time."""
+    """Values and seconds of every search on one step. If nothing is compiled yet, times the second run."""
     first_key, noise_key, sample_key, search_key = jax.random.split(jax.random.key(seed), 4)
     scene, first = scene_and_first(task, mesh, seed, first_key)
     planner = planners["discrete"]
@@ -93,7 +93,7 @@ def run_seed(planners: dict[str, nbv.Planner], task: str, mesh: str | None, seed
 
 
 def show(rows: list[dict], names: list[str]) -> None:
-    """The table: medians over the seeds, and how often the discrete value is reached."""
+    """Print medians over the seeds, and how often a search reaches the value of discrete search."""
 
     def column(name: str, what: str) -> np.ndarray:
         return np.array([row[name][what] for row in rows])

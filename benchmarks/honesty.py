@@ -1,11 +1,11 @@
-"""What known shapes cost where none is of the object's class, or all are of another kind: methods of the studies of
-classes, beside the study's own, which knows objects of all classes.
+"""The harm of known shapes that do not include the object's class, or are all of another kind. These are methods for
+the studies of classes, to compare with the study's own, whose bank has objects of all classes.
 
     cd benchmarks
     jaxnbv study pyramid --framing close-up --model known --views 2 --scenes 60 --methods cross-entropy \
         --method honesty:without_the_class --method honesty:another_kind --method honesty:no_shapes
 
-All choose by cross-entropy. The other kind is trucks, and pyramids for trucks.
+All methods choose by cross-entropy. The other kind is trucks, or pyramids if the objects are trucks.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ from jaxnbv.surfaces.shipped_banks import bank_poses, shape_bank
 
 
 def without_the_class(study: ClassificationStudy, scene: Scene) -> Planner:
-    """Who has seen the study's objects of all classes but the scene's."""
+    """A planner whose bank has the study's objects of all classes but the scene's."""
     sampler = study.sampler
     assert isinstance(sampler.model, KnownShapes), "run the study by --model known"
     bank, own = sampler.model.bank, study.objects.classes[scene.task.label]
@@ -28,13 +28,13 @@ def without_the_class(study: ClassificationStudy, scene: Scene) -> Planner:
 
 
 def another_kind(study: ClassificationStudy, scene: Scene) -> Planner:
-    """Who has seen objects of another kind alone."""
+    """A planner whose bank has only objects of another kind."""
     other = "pyramid" if study.bank == "truck" else "truck"
     return _planner(study, scene, study.sampler.without_bank.with_bank(shape_bank(other), bank_poses(other)))
 
 
 def no_shapes(study: ClassificationStudy, scene: Scene) -> Planner:
-    """Who has seen none."""
+    """A planner without a bank."""
     return _planner(study, scene, study.sampler.without_bank)
 
 

@@ -1,16 +1,16 @@
-"""How sure names may be: right names and their probabilities under a real sensor's noise, with a mount that is off, and
-for objects that are in no file.
+"""Calibration of identified names: right names and their probabilities under a real sensor's noise, with an error in
+the camera's mount, and for objects that are not in the bank.
 
     python benchmarks/identification.py --parts FOLDER [--setup whole] [--scenes 8] [--views 2] [--odd]
         [--noise 1.4] [--mount 0.5] [--others FOLDER | --left-out]
 
-Parts are drawn in metres. Views are drawn at random. Noise is along the rays, in millimetres; normals are off by 8
-degrees. A mount that is off turns every camera by the same angle, in degrees, about an axis of its own. With --others
-the objects are of that folder, none of them in the bank, at 8 to 25 cm; with --left-out each is a part that the bank
-lacks. Scenes of even and of odd numbers share no parts.
+The files of parts are in metres. Views are random. Noise is along the rays, in millimetres; normals are off by 8
+degrees. --mount turns every camera by the same angle, in degrees, about an axis of the camera. With --others the
+objects are from that folder, at 8 to 25 cm, and none is in the bank. With --left-out each object is a part that is left
+out of the bank. Scenes of even and of odd numbers share no parts.
 
-Columns, after each view: *right*, percent of likeliest names, "none of these" for what is in no file; *probability* of
-the likeliest name. Below: the expected calibration error over all views, in ten bins.
+Columns, after each view: *right*, percent of likeliest names that are right ("none of these" for objects that are not
+in the bank); *probability* of the likeliest name. Below: the expected calibration error over all views, in ten bins.
 """
 
 import argparse
@@ -35,13 +35,13 @@ from jaxnbv.studies.scenes.framing import Setup
 from jaxnbv.studies.scenes.placed_parts import Parts, parts_in, place_part
 from jaxnbv.surfaces.part_hypotheses import NONE
 
-# Longest sides of objects that are in no file, metres; the error of normals, radians; the axis of the mount's error.
+# Longest sides of objects of --others in metres, error of normals in radians, axis of the mount's error.
 _SIDES, _NORMALS, _AXIS = (0.08, 0.25), 0.15, np.array([0.6, 0.64, 0.48])
 _BINS = 10
 
 
 def other_scene(study: IdentificationStudy, index: int, files: list[Path]) -> Scene:
-    """An object of another folder, placed as the parts are."""
+    """An object of another folder, placed like the parts."""
     random, parts = np.random.default_rng(500 + index), parts_in(study.meshes)
     file = files[int(random.integers(len(files)))]
     read = trimesh.load(file, force="mesh")
@@ -49,7 +49,7 @@ def other_scene(study: IdentificationStudy, index: int, files: list[Path]) -> Sc
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     vertices = (vertices - 0.5 * (low + high)) / (high - low).max() * random.uniform(*_SIDES)
     mesh = TriangleMesh(vertices.astype(np.float32), np.asarray(read.faces, np.int32), Frame())
-    # How it rests is not asked: the hypotheses are of the bank's parts.
+    # The resting pose of the object does not matter, since the hypotheses are the bank's parts.
     placed = place_part(
         Parts(parts.bank, (*parts.meshes, mesh)), len(parts.bank), study.setup, study.key(index, "scene")
     )
@@ -59,7 +59,7 @@ def other_scene(study: IdentificationStudy, index: int, files: list[Path]) -> Sc
 def image_of(
     study: IdentificationStudy, scene: Scene, pose: Pose, noise: float, mount: float, seed: int
 ) -> tuple[PointCloud, Pose]:
-    """What a noisy camera sees, and from where it is said to have been."""
+    """A noisy scan, and the pose that the robot reports for it."""
     seen, random = scan(scene.surface, study.camera, pose), np.random.default_rng(seed)
     mask, place = np.asarray(seen.mask)[:, None], np.asarray(pose.position)
     rays = np.asarray(seen.points) - place
@@ -80,7 +80,7 @@ def image_of(
 def beliefs(
     study: IdentificationStudy, planner: Planner, scene: Scene, options: argparse.Namespace
 ) -> Iterator[dict[str, float]]:
-    """The names after each view."""
+    """The identity after each view."""
     poses, random = study.candidates.poses(), np.random.default_rng(77 + scene.index)
     first = int(study.first_view(scene))
     others = random.choice(np.delete(np.arange(study.num_candidates), first), options.views - 1, replace=False)
@@ -97,7 +97,7 @@ def beliefs(
 
 
 def calibration_error(rows: np.ndarray) -> float:
-    """Of probabilities and whether each was right: the mean of their differences over bins, by how many fall there."""
+    """Expected calibration error of rows (probability, whether it was right), by the numbers of rows in the bins."""
     bins = np.minimum((_BINS * rows[:, 0]).astype(int), _BINS - 1)
     return sum(abs(np.sum(rows[bins == one, 0] - rows[bins == one, 1])) for one in range(_BINS)) / len(rows)
 

@@ -1,18 +1,18 @@
-"""How good imagined surfaces are: samples of several models against the true surface, after one view and after two.
+"""Quality of imagined surfaces: samples of several models against the true surface, after one view and after two.
 
     python benchmarks/imagination.py [--scenes N] [--parts NAME ...] [--mesh FILE ...] [--candidates 24] [--seeds 0 1]
         [--models NAME ...] [--variant "NAME=EXPRESSION" ...] [--figure PATH] [--reliability PATH]
         [--known FOLDER] [--better NAME] [--out FILE]
 
-Objects are N validation pyramids in close-up, one validation object of each part category named, and the demo object;
-with meshes, these alone and what else is asked for. All models see the same scans of 50 x 50 rays with the default
-noise, from the same two random views. Samples are 8 on a grid of 64^3 nodes; depths are along 32 x 32 rays from each
-candidate. See `forecasts.py` for the numbers. Continues with what the file does not hold yet.
+Objects are N validation pyramids in close-up, one validation object of each named part category, and the demo object.
+With --mesh they are the meshes, and those of --scenes and --parts if given. All models see the same scans of 50 x 50
+rays with the default noise, from the same two random views. There are 8 samples on a grid of 64^3 nodes. Depths are
+along 32 x 32 rays from each candidate. See `forecasts.py` for the scores. Runs only what is not in the file yet.
 
-With --known the model "known" is the default that has seen the meshes of a folder, upright, all but the object itself.
+With --known the model "known" is the default model with a bank of the folder's meshes, upright, without the object.
 
 A variant is a model of your own, carved: --variant "smooth=nbv.GeometricSPSR(lengthscale=0.03, truncation=32)". All of
-jaxnbv, jaxnbv.surfaces and the grid are in scope. A change of a model's code is not noticed: take another file then.
+jaxnbv, jaxnbv.surfaces and the grid are in scope. If you change the code of a model, use another file.
 """
 
 import argparse
@@ -60,7 +60,7 @@ VARIANTS: dict[str, Variant] = {
     ),
     "default": lambda grid: (nbv.ScreenedSPSR(), nbv.Carving()),
 }
-# What the table shows: heading, key of the record, digits.
+# Columns of the table: heading, key of the record, digits.
 COLUMNS = (
     ("CRPS", "crps", 4),
     ("Brier", "brier", 4),
@@ -74,14 +74,14 @@ COLUMNS = (
 
 
 def planner_of(variant: Variant) -> nbv.Planner:
-    """The planner whose samples are judged; its search is never asked."""
+    """The planner whose samples are judged. Its search is not used."""
     model, carving = variant(GRID)
     sampler = nbv.SurfaceSampler(model, GRID, 8, carving)
     return nbv.Planner(nbv.Coverage(), sampler=sampler, capacity=4096, max_views=VIEWS)
 
 
 def objects_of(arguments: argparse.Namespace) -> dict[str, Callable[[], nbv.scanning.Surface]]:
-    """How to make each object, by the name "class/object"."""
+    """Functions that make the objects, by the name "class/object"."""
     alone = not arguments.mesh
     scenes = (2 if alone else 0) if arguments.scenes is None else arguments.scenes
     parts = (["chair", "mug", "motorbike"] if alone else []) if arguments.parts is None else arguments.parts
@@ -99,14 +99,14 @@ def objects_of(arguments: argparse.Namespace) -> dict[str, Callable[[], nbv.scan
 
 
 def with_bank(planner: nbv.Planner, bank: nbv.ShapeBank, name: str) -> nbv.Planner:
-    """One that has seen the shapes of a bank, but for the object of this name."""
+    """A planner with the shapes of a bank, without the object of this name."""
     others = [row for row, known in enumerate(bank.names) if known != name]
     sampler = planner.sampler.with_bank(bank.select(others), nbv.surfaces.Upright(by_axis=True))
     return dataclasses.replace(planner, sampler=sampler)
 
 
 def random_views(scene: nbv.scanning.Surface, key: jax.Array) -> list[tuple[nbv.Pose, nbv.PointCloud]]:
-    """Views from random directions, each of which sees something of the object."""
+    """Views from random directions that each see some of the object."""
     views = []
     for index in range(100):
         direction_key, noise_key = jax.random.split(jax.random.fold_in(key, index))
@@ -121,12 +121,12 @@ def random_views(scene: nbv.scanning.Surface, key: jax.Array) -> list[tuple[nbv.
 
 @eqx.filter_jit
 def seen_space(scan: nbv.PointCloud, pose: nbv.Pose) -> jax.Array:
-    """What one scan shows to be empty, by the default carving, for all models alike."""
+    """Nodes that one scan shows to be empty, by the default carving for all models."""
     return nbv.Carving().empty_nodes(GRID, pose, scan, nbv.Camera())
 
 
 def run(planner: nbv.Planner, views: list, truth: Truth, key: jax.Array, compiled: bool) -> list[dict]:
-    """One record for each number of views; seconds are of a run that compiles nothing."""
+    """One record for each number of views. Seconds do not include compilation."""
     records, observations, empty = [], None, jnp.zeros((GRID.resolution,) * 3, bool)
     for index, (pose, scan) in enumerate(views):
         observations = planner.init(pose, scan) if observations is None else planner.observe(observations, pose, scan)
@@ -144,7 +144,7 @@ def run(planner: nbv.Planner, views: list, truth: Truth, key: jax.Array, compile
 
 
 def show(rows: dict[tuple[str, int, str], list[dict]], names: list[str]) -> None:
-    """Means over objects and seeds, and the change of each object against the first model's."""
+    """Print means over objects and seeds, and the paired differences to the first model."""
     pairs = list(dict.fromkeys((name, seed) for name, seed, _ in rows))
     objects = list(dict.fromkeys(name for name, _ in pairs))
     wide = max(map(len, [*names, "model"])) + 2

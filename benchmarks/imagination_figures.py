@@ -19,7 +19,7 @@ TINT = "#f0a45c"
 
 
 def picture(surface: nbv.scanning.Surface, eye: nbv.Pose, seen: nbv.PointCloud, pixels: int = 440) -> np.ndarray:
-    """The surface lit from beside the eye, tinted where it lies at scanned points; four rays a pixel, RGBA."""
+    """The surface lit from beside the eye, tinted near scanned points, as RGBA. Four rays a pixel."""
     camera = nbv.Camera(2.0 * math.atan(1.9 / 11.0), 2 * pixels, 2 * pixels)
     view = nbv.scan(surface, camera, eye)
     normals = np.asarray(view.normals)
@@ -34,7 +34,7 @@ def picture(surface: nbv.scanning.Surface, eye: nbv.Pose, seen: nbv.PointCloud, 
 
 
 def crop(images: list[np.ndarray]) -> tuple[slice, slice]:
-    """The rows and columns that any of the pictures needs, but for stray specks."""
+    """The rows and columns that any of the pictures needs, except for stray specks."""
     shown = np.mean([image[..., 3] for image in images], axis=0)
     spans = []
     for axis in (1, 0):
@@ -46,7 +46,7 @@ def crop(images: list[np.ndarray]) -> tuple[slice, slice]:
 def draw_samples(
     path: Path, scene: nbv.scanning.Surface, view: tuple, named: dict[str, nbv.Planner], key: jax.Array
 ) -> None:
-    """The true surface, and four surfaces that each of two models imagines after one view, seen from its side."""
+    """Draw the true surface and four samples of each of two models after one view, seen from the side of the view."""
     pose, scan = view
     away, up = np.asarray(pose.position) / 2.5, np.array([0.0, 1.0, 0.0])
     across = np.cross(up, away) / max(float(np.linalg.norm(np.cross(up, away))), 1e-6)
@@ -56,7 +56,7 @@ def draw_samples(
         surfaces = planner.sampler.sample(planner.init(pose, scan), key)
         images += [picture(jax.tree.map(lambda leaf, i=i: leaf[i], surfaces), eye, scan) for i in range(4)]
     rows, columns = crop(images)
-    # Inches: a small picture, the gap below a heading, and the true surface at both rows' height.
+    # Inches: height of a small picture and of a heading. The true surface is as high as both rows.
     tall, head = 1.75, 0.3
     wide = tall * (columns.stop - columns.start) / (rows.stop - rows.start)
     large = 2 * tall + head
@@ -90,9 +90,9 @@ def draw_samples(
 
 
 def draw_reliability(path: Path, rows: dict[tuple[str, int, str], list[dict]], names: tuple[str, str]) -> None:
-    """How often nodes were inside for which a probability was forecast, over all runs; one panel a number of views.
+    """Draw observed frequency against forecast probability of being inside, over all runs. One panel a number of views.
 
-    Areas of the marks are in proportion to the numbers of nodes.
+    Areas of the marks are proportional to the numbers of nodes.
     """
     views = len(next(iter(rows.values())))
     with mpl.rc_context(STYLE):
@@ -114,7 +114,7 @@ def draw_reliability(path: Path, rows: dict[tuple[str, int, str], list[dict]], n
 
 
 def pooled(runs: list[dict]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean forecast, share inside and share of the nodes for each bin of several runs that holds any."""
+    """Mean forecast, share inside and share of the nodes, for each bin of some runs that is not empty."""
     nodes = np.array([run["nodes"] for run in runs])
     filled = nodes.sum(axis=0) > 0
     forecast, observed = (

@@ -1,11 +1,11 @@
-"""Kill runs at well spread moments and start them again: each ends with the files of a run that was left alone.
+"""Kill runs at moments spread over their time, and start them again. Each must end with the files of a run that was
+not killed.
 
     python benchmarks/kills.py --kills 1000 --out runs/kills
 
-Commands are a run, two of it at once in one folder, its report, a study by one process and by two, and a session that
-takes images where it says and reports, all at small settings. Each is killed (SIGKILL) at moments that are spread over
-the time that it takes, and started again until it has been killed so often. Then it is let through. Not part of the
-tests: about five seconds a kill.
+Commands are a run, two runs at once in one folder, the report of a run, a study by one process and by two, and a
+session with its report, all at small settings. Each is killed (SIGKILL) and started again until it has had its share of
+the kills. The last start runs to its end. A kill takes about five seconds, so this is not one of the tests.
 """
 
 import argparse
@@ -34,12 +34,12 @@ COMMANDS = {
     "session": (),
 }
 STRATA = 8
-# What says when it was made, and by what means.
+# Files that differ between equal runs, since they hold the time.
 UNLIKE = {"report.html", ".lock"}
 
 
 def take_session(folder: Path) -> None:
-    """Four images of a ball by a simulated sensor, from where the planner asks for them, and the report."""
+    """Run a session with four images of a ball by a simulated sensor, from proposed poses, and write its report."""
     keep_compiled()
     camera, ball = nbv.Camera(height=48, width=64), nbv.SDFSurface(nbv.sdf.Sphere(0.1))
     planner = nbv.Planner(
@@ -61,7 +61,7 @@ def take_session(folder: Path) -> None:
 
 
 def start(name: str, out: Path, inputs: Path) -> list[subprocess.Popen]:
-    """The processes of a command, which write to a folder."""
+    """Start the processes of a command, which write to a folder."""
     words = [str(inputs / "box.ply") if word == "BOX.PLY" else word for word in COMMANDS[name]]
     if name == "session":
         command = [sys.executable, __file__, "--session", str(out)]
@@ -80,7 +80,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def content(path: Path) -> bytes:
-    """Of a study's record all but the seconds that it and its steps took."""
+    """The bytes of a file. In records of a study all times are set to zero."""
     if not path.name.startswith("scene_"):
         return path.read_bytes()
     record = json.loads(path.read_text(), object_hook=lambda held: held | {"seconds": 0})["record"]
@@ -88,13 +88,13 @@ def content(path: Path) -> bytes:
 
 
 def let_through(name: str, out: Path, inputs: Path) -> float:
-    """Seconds that it took."""
+    """Run a command to its end. Returns its seconds."""
     began = time.monotonic()
     process, *others = start(name, out, inputs)
     _, errors = process.communicate()
     for other in others:
         other.communicate()
-    # Of two in one folder one is refused: it is asked again, alone.
+    # The folder's lock may have refused this process while the other ran. Run it again, alone.
     if process.returncode and others:
         return let_through(name, out, inputs)
     if process.returncode:
@@ -117,14 +117,14 @@ def main() -> None:
     random, failures = np.random.default_rng(0), []
     share = -(-asked.kills // len(asked.commands))
     for name in asked.commands:
-        # The second time all programs are compiled, as they will be when it is killed.
+        # The second run compiles nothing, like the runs that are killed.
         let_through(name, asked.out / name / "first", inputs)
         seconds = let_through(name, asked.out / name / "whole", inputs)
         expected, killed = contents(asked.out / name / "whole"), 0
         with tqdm(total=share, desc=name, unit="kill") as bar:
             while killed < share:
                 shutil.rmtree(out := asked.out / name / "killed", ignore_errors=True)
-                # A few times the same folder, at moments of strata over the whole time.
+                # Kill several times in the same folder, at one random moment of each stratum of the run's time.
                 for moment in random.permutation(min(STRATA, share - killed)):
                     processes = start(name, out, inputs)
                     time.sleep(seconds * (moment + random.random()) / STRATA)

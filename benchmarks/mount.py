@@ -1,12 +1,12 @@
-"""What the error of a camera's mount costs, and how much of it its views tell.
+"""Cost of an error in the camera's mount, and the share of it that alignment of the views removes.
 
     python benchmarks/mount.py --parts FOLDER [--objects 10] [--degrees 1] [--length 0.005]
     python benchmarks/mount.py --recording FOLDER [--every 3] [--degrees 1] [--length 0.005]
 
-With --parts six views are simulated of each mesh, in metres, as it stands on a table, with 1 mm of noise: the median
-and the 90 % distance of a session's points from the surface, in millimetres, by exact poses, by poses of a mount that
-is off, and by corrected ones; and by corrections where the poses are exact. With --recording the poses of a recording
-are made worse: how far its views disagree, what is left of the error, and the seconds that it takes.
+--parts simulates six views of each mesh (in metres) on a table, with 1 mm of noise. It prints the median and 90 %
+distance of a session's points from the surface, in millimetres, for exact poses, poses with the error, corrected poses,
+and corrected exact poses. --recording adds the error to the poses of a recording, and prints the disagreement of its
+views, the remaining error, and the seconds of the alignment.
 """
 
 import argparse
@@ -33,7 +33,7 @@ _POINTS = 40_000
 
 
 def error_of(seed: int, degrees: float, length: float) -> np.ndarray:
-    """A turn and a shift by so much, about and along random axes."""
+    """A rotation and a translation of these sizes about and along random axes, 4 x 4."""
     turn, shift = np.random.default_rng(seed).normal(size=(2, 3))
     matrix = np.eye(4)
     matrix[:3, :3] = Rotation.from_rotvec(np.radians(degrees) * turn / np.linalg.norm(turn)).as_matrix()
@@ -42,7 +42,7 @@ def error_of(seed: int, degrees: float, length: float) -> np.ndarray:
 
 
 def on_a_table(file: Path) -> trimesh.Trimesh:
-    """A mesh as it comes to rest most often, its middle over the origin and a millimetre above the table."""
+    """A mesh in its likeliest resting pose, with its middle over the origin, a millimetre above the table."""
     read = trimesh.load(file, force="mesh")
     mesh = trimesh.Trimesh(read.vertices, read.faces, process=False)
     mesh.apply_transform(trimesh.poses.compute_stable_poses(mesh.convex_hull)[0][0])
@@ -51,7 +51,7 @@ def on_a_table(file: Path) -> trimesh.Trimesh:
 
 
 def views_of(mesh: trimesh.Trimesh, seed: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Depth images and matrices of cameras around a mesh on a table."""
+    """Depth images and pose matrices of cameras around a mesh on a table."""
     table = trimesh.creation.box((1.0, 1.0, 0.02), trimesh.transformations.translation_matrix((0.0, 0.0, -0.01)))
     both = trimesh.util.concatenate([mesh, table])
     world = TriangleMesh(np.asarray(both.vertices, np.float32), np.asarray(both.faces, np.int32), Frame())
@@ -131,7 +131,7 @@ def main() -> None:
     parser.add_argument("--degrees", default=1.0, type=float)
     parser.add_argument("--length", default=0.005, type=float)
     options = parser.parse_args()
-    # Of tables that are found, and poses that are off on purpose.
+    # Sessions warn of the table that they detect, and of the error in the poses, which is on purpose.
     warnings.simplefilter("ignore", UserWarning)
     of_parts(options) if options.parts else of_recording(options)
 

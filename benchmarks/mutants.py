@@ -1,14 +1,14 @@
-"""Change one place of the code at a time: does a test fail?
+"""Mutation testing: change one place of the code at a time, and check that a test fails.
 
     pip install cosmic-ray pytest-cov
     pytest --dist no --cov=jaxnbv --cov-context=test --cov-report= --durations=0 > runs/durations.txt
     python benchmarks/mutants.py --mutants 200 --durations runs/durations.txt --out runs/mutants.json
 
-Mutants are those of cosmic-ray: another operator, comparison or number, a condition turned round, a loop without a
-pass, an exception that is not caught. Places are drawn at random from the packages named below, annotations left out,
-and one mutant of each. It is run against the tests that execute its statement, then those that execute anything of its
-module, each time those of the file named after the module first, then the quick ones, as many as take two minutes,
-until one fails. Run it in a clone: it rewrites the files there, and puts them back. Continues after the last mutant in
+Mutants are those of cosmic-ray: another operator, comparison or number, a negated condition, a loop without a pass, an
+exception that is not caught. Places are drawn at random from the packages named below, without annotations, and one
+mutant is made at each place. It runs against the tests that execute its statement, then those that execute anything in
+its module, until one fails. Tests in the file named after the module come first, then the quickest, up to two minutes
+in all. Run it in a clone, because it rewrites the files there and restores them. Continues after the last mutant in
 --out.
 """
 
@@ -31,14 +31,14 @@ SECONDS = 120.0
 
 
 def places(path: Path) -> dict[tuple[int, int], list[tuple[str, int]]]:
-    """Where a file can be changed, and by which occurrences of which operators."""
+    """Places where a file can be changed, with the operators and their occurrences there."""
     from cosmic_ray.ast import ast_nodes, get_ast
     from cosmic_ray.plugins import get_operator, operator_names
 
     code = path.read_text()
     parsed, found = get_ast(code), {}
     for name in operator_names():
-        # One that takes arguments changes nothing without them.
+        # An operator with arguments changes nothing without them.
         if (kind := get_operator(name)).arguments():
             continue
         spots = [at for node in ast_nodes(parsed) for at, _ in kind().mutation_positions(node)]
@@ -57,7 +57,7 @@ def covers(node: ast.AST, at: tuple[int, int]) -> bool:
 
 
 def statement(code: str, line: int) -> range:
-    """Lines of the smallest statement that holds a line; of one that holds others, its head."""
+    """Lines of the smallest statement around a line, or of its head if it contains other statements."""
     found = [node for node in ast.walk(ast.parse(code)) if isinstance(node, ast.stmt)]
     first = {node: min(one.lineno for one in (node, *getattr(node, "decorator_list", ()))) for node in found}
     inner = max((node for node in found if first[node] <= line <= node.end_lineno), key=first.__getitem__)
@@ -66,7 +66,7 @@ def statement(code: str, line: int) -> range:
 
 
 def tests_of(path: Path, code: str, line: int, by_line: dict[int, list[str]], seconds: dict[str, float]) -> list[str]:
-    """Names of the tests that are asked, in their order; `by_line`: what ran each line, `seconds`: what they take."""
+    """Names of the tests to run, in order. `by_line`: tests that execute each line. `seconds`: time of each test."""
 
     def running(lines: Iterable[int]) -> set[str]:
         return {context.rpartition("|")[0] for each in lines for context in by_line.get(each, ()) if context}
@@ -74,7 +74,7 @@ def tests_of(path: Path, code: str, line: int, by_line: dict[int, list[str]], se
     def order(name: str) -> tuple[bool, float, str]:
         return f"test_{path.stem}.py" not in name, seconds.get(name, 0.0), name
 
-    # What is compiled is traced by the first test of a process alone that needs it.
+    # Only the first test of a process that needs a compiled function traces it, so others may need the line too.
     of_statement, of_module = running(statement(code, line)), running(by_line)
     names = [*sorted(of_statement, key=order), *sorted(of_module - of_statement, key=order)]
     taken = np.cumsum([seconds.get(name, 0.0) for name in names])
@@ -82,12 +82,12 @@ def tests_of(path: Path, code: str, line: int, by_line: dict[int, list[str]], se
 
 
 def outcome(path: Path, mutated: str, tests: list[str]) -> str:
-    """Killed, or survived; of a file that is put back."""
+    """Whether the mutant is "killed" or "survived". Restores the file."""
     if not tests:
         return "no test"
     code, times = path.read_text(), path.stat()
     path.write_text(mutated)
-    # Python tells by size and second whether a file is still the one it compiled.
+    # Python recognises a compiled file by its size and the second of its change.
     os.utime(path, (time.time() + 10, times.st_mtime + np.random.default_rng().integers(1, 1 << 20)))
     command = [sys.executable, "-m", "pytest", "-x", "-p", "no:cacheprovider", "-o", "addopts=", *tests]
     try:
@@ -107,7 +107,7 @@ def main() -> None:
     parser.add_argument("--durations", type=Path, required=True, help="what pytest --durations=0 printed")
     parser.add_argument("--out", type=Path, default=Path("runs/mutants.json"))
     asked = parser.parse_args()
-    # Not among what the tests need.
+    # The tests do not depend on it.
     from cosmic_ray.mutating import mutate_code
     from cosmic_ray.plugins import get_operator
     from coverage import CoverageData

@@ -1,10 +1,10 @@
-"""Time PointNet++ at its published sizes, on this machine, against what its multiply-adds would take.
+"""Time PointNet++ at its published sizes on this machine, against the time of its multiply-adds.
 
     python benchmarks/networks.py [--points 1024] [--batch 16] [--out results.json]
 
-The yardstick is the rate of a 2,000^3 float32 matrix product; the multiply-adds are those of the published layers, each
-at every member of every group. Weights are random: they do not change the work. Times are after compilation, the least
-of several runs.
+The yardstick is the rate of a 2,000^3 float32 matrix product. The multiply-adds are those of the published layers, each
+for every member of every group. Weights are random, which does not change the work. Times are the least of several
+runs, without compilation.
 """
 
 import argparse
@@ -54,7 +54,7 @@ def random_network(name: str, key: jax.Array) -> PointNet2Classifier:
 
 
 def multiply_adds(network: PointNet2Classifier) -> int:
-    """Of the published layers for one cloud."""
+    """Multiply-adds of the published layers for one cloud."""
     parts = [
         (level.centers * members, branch.layers)
         for level in network.levels
@@ -65,7 +65,7 @@ def multiply_adds(network: PointNet2Classifier) -> int:
 
 
 def groups(network: PointNet2Classifier, points: jax.Array) -> list[jax.Array]:
-    """The sampling and grouping of all levels, without the products."""
+    """Sampling and grouping at all levels, without the products."""
     found = []
     for level in network.levels:
         mask = jnp.ones(len(points), dtype=bool)

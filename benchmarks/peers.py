@@ -1,18 +1,18 @@
-"""The protocols by which peers report coverage, run here: how much of an object each view adds, and how long it takes.
+"""Coverage after each view, and time of a choice, by the experimental protocols of other papers.
 
     python benchmarks/peers.py pb-nbv --mesh FILE ... [--half] [--up z] [--out FILE]
     python benchmarks/peers.py benbv --mesh FILE ... [--up z] [--out FILE]
 
-pb-nbv (Jia et al., RA-L 2025; settings of dspangpang/pb_nbv): shortest side 0.3 m, a camera of f = 696 pixels for
-1280 x 720 at 0.9 m, the first view from (0.9, 0, 0), 800 random candidates on the sphere, or with --half on its upper
-half, ten views; covered within 5 mm. benbv (settings of leihui6/BENBV): diagonal 0.2 m, a camera of 70 degrees for 720
-rows at 1.2 m that measures to 1 mm, the first view at random from above, fifteen views, ten repeats; covered within
-2 mm, of clouds of one point a voxel as large as what neighbouring rays are apart.
+pb-nbv (Jia et al., RA-L 2025; settings of dspangpang/pb_nbv): shortest side 0.3 m; a camera of f = 696 pixels for
+1280 x 720 at 0.9 m; the first view from (0.9, 0, 0); 800 random candidates on the sphere, or with --half on its upper
+half; ten views; tolerance 5 mm. benbv (settings of leihui6/BENBV): diagonal 0.2 m; a camera of 70 degrees for 720 rows
+at 1.2 m, with a depth resolution of 1 mm; a random first view from above; fifteen views; ten repeats; tolerance 2 mm;
+clouds with one point a voxel, whose size is the distance between neighbouring rays.
 
-Covered: of the points of the surface, those that a scanned point is near to within the tolerance. The views of
-`new surface` and `farthest view` are planned with 40 x 40 rays of the part of the cone that holds the object; what
-counts is what the sensor sees, in pb-nbv by every other row and column. `oracle` takes the candidate that truly adds
-most, `uniform` spreads its views before it has seen anything. Continues after the last run in the file, which is of
+Coverage is the share of the surface's points that have a scanned point within the tolerance. `new surface` and
+`farthest view` plan with 40 x 40 rays through the part of the image that holds the object. The scans that count have
+the sensor's resolution, in pb-nbv every other row and column. `oracle` takes the candidate that truly adds most.
+`uniform` spreads its views evenly without looking at scans. Continues after the last run in the file, which must have
 the same settings.
 """
 
@@ -78,10 +78,10 @@ METHODS = {
 
 
 def planned(trial: Trial, search: nbv.search.Search, rays: int, first: int, seed: int) -> tuple[list[int], list[float]]:
-    """The candidates that a planner takes, and seconds for each choice after those that compile."""
+    """The candidates that a planner chooses, and the seconds of each choice that does not compile."""
     distance = float(np.linalg.norm(trial.poses.position[0]))
     needed = 2.0 * math.asin(min(1.05 * trial.mesh.bounding_radius / distance, 1.0))
-    # In steps, so that objects of about one size share their programs.
+    # Rounded up, so that objects of similar size share their programs.
     needed = math.radians(5.0) * math.ceil(needed / math.radians(5.0))
     camera = nbv.Camera(min(needed, trial.protocol.camera.fov), rays, rays)
     planner = nbv.Planner(
@@ -105,7 +105,7 @@ def planned(trial: Trial, search: nbv.search.Search, rays: int, first: int, seed
 
 
 def greedy(trial: Trial, first: int) -> list[int]:
-    """The candidates that truly add most, of those that `new surface` looks at."""
+    """The candidates that truly add most, among those that `new surface` scores."""
     among = spread(trial.poses)
     covers, taken, known = trial.covers(among.tolist()), [first], trial.covers([first])[0]
     while len(taken) < trial.protocol.views:
@@ -115,7 +115,7 @@ def greedy(trial: Trial, first: int) -> list[int]:
 
 
 def uniform(trial: Trial, first: int) -> list[int]:
-    """The candidates nearest to a lattice of as many places."""
+    """The candidates nearest to an even lattice with one place for each view."""
     places = np.asarray(trial.poses.position, np.float64)
     lattice = np.array(
         nbv.geometry.fibonacci_sphere(trial.protocol.views, float(np.linalg.norm(places[0]))), np.float64
@@ -127,7 +127,7 @@ def uniform(trial: Trial, first: int) -> list[int]:
 
 
 def from_sphere(trial: Trial, first: int, angles: Float[np.ndarray, "views 2"]) -> list[Bool[np.ndarray, " points"]]:
-    """What is covered by the first view, and from polar angles and azimuths on BENBV's larger sphere of 1.5 m."""
+    """Coverage of the first view, and of views from polar angles and azimuths on BENBV's larger sphere of 1.5 m."""
     polar, azimuth = angles.T
     x, y, z = np.sin(polar) * np.cos(azimuth), np.cos(polar), np.sin(polar) * np.sin(azimuth)
     poses = nbv.look_at(1.5 / trial.unit * np.stack([x, y, z], axis=1))
@@ -135,8 +135,8 @@ def from_sphere(trial: Trial, first: int, angles: Float[np.ndarray, "views 2"]) 
 
 
 def beyond_boundary(trial: Trial, first: int, seed: int, best: bool) -> list[Bool[np.ndarray, " points"]]:
-    """What is covered by views beyond the boundary: one of the twenty at random, or the best by BENBV's own score of
-    what each would truly show, its coverage weighed against its overlap with what is known."""
+    """Coverage of views beyond the boundary, of which there are twenty. Takes a random one, or the best by BENBV's
+    score of its true scan, which weighs new coverage against overlap with the scanned surface."""
     random, look = np.random.default_rng(seed), trial.look(trial.poses[first])
     known, normals, shown = look.covers.copy(), look.normals, [look.covers]
     while len(shown) < trial.protocol.views:
@@ -153,7 +153,7 @@ def beyond_boundary(trial: Trial, first: int, seed: int, best: bool) -> list[Boo
 
 
 def score(trial: Trial, look: Look, known: Bool[np.ndarray, " points"]) -> float:
-    """BENBV's: w coverage + (1 - w) f(overlap), w = 1 / (1 + exp(-10 (known - 0.5)))."""
+    """BENBV's score: w coverage + (1 - w) f(overlap), w = 1 / (1 + exp(-10 (known - 0.5)))."""
     if len(look.cloud) == 0:
         return 0.0
     reach = trial.protocol.tolerance / trial.unit
@@ -164,12 +164,12 @@ def score(trial: Trial, look: Look, known: Bool[np.ndarray, " points"]) -> float
 
 
 def spread(poses: nbv.Pose) -> Int[np.ndarray, " some"]:
-    """`LOOKED_AT` of the candidates, by farthest point sampling."""
+    """Indices of `LOOKED_AT` candidates, by farthest point sampling."""
     return np.asarray(farthest_point_indices(poses.position, np.ones(CANDIDATES, bool), LOOKED_AT))
 
 
 def run(trial: Trial, methods: tuple[str, ...], rays: int, seed: int) -> dict:
-    """Of each method the coverage after each view, and the seconds a choice of those that plan."""
+    """Coverage of each method after each view, and the seconds of a choice for planning methods."""
     protocol, random, found = trial.protocol, np.random.default_rng(seed), {}
     above = np.asarray(trial.poses.position)[:, 1] >= 0
     first = 0 if protocol.repeats == 1 else int(random.choice(np.nonzero(above)[0]))
@@ -202,8 +202,8 @@ def run(trial: Trial, methods: tuple[str, ...], rays: int, seed: int) -> dict:
 
 
 def table(records: dict, methods: tuple[str, ...], protocol: Protocol) -> str:
-    """Coverage in percent after some views and the mean over all views, by how much the first method is ahead in that
-    mean, and seconds a choice; means over objects."""
+    """Coverage in percent after some views, its mean over all views, the lead of the first method in that mean, and
+    seconds of a choice. All are means over objects."""
     by_object: dict[str, list[dict]] = {}
     for name, record in records.items():
         by_object.setdefault(name.rpartition(" ")[0], []).append(record)

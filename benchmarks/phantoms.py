@@ -1,23 +1,23 @@
-"""How much of the new surface that is expected is there: ranks, phantoms and where they lie, promised against found.
+"""Check expected new surface against truth: rank correlation, phantoms and their places, promised and found area.
 
     python benchmarks/phantoms.py --recorded FOLDER ... [--box ...] [--up ...] [--starts 6] [--views 6]
     python benchmarks/phantoms.py --mesh FILE ... [--above] [--bunny FILE] --work FOLDER
 
-Meshes are recorded first, into the folder that is given, by a camera with noise: whole in view, from all around, or
-with --above on a table from the upper half. A *phantom* is surface that the samples show, count as new, and that lies
-more than two voxels from anything that any frame of the recording shows. Each lies at the first of these that is true:
+Meshes are first recorded into the --work folder by a noisy camera, whole in view, from all around, or with --above on a
+table from the upper half. A *phantom* is sampled surface that counts as new and lies more than two voxels from
+everything that the frames of the recording show. Its kind is the first of these that applies:
 
     cut     within a voxel of a face of the box, or beyond it
-    empty   where a ray of a view that was taken went past, by a voxel
-    silent  along a ray of a view that was taken which came back with nothing
+    empty   a ray of a previous view passed it by more than a voxel
+    silent  on a ray of a previous view that had no return
     unseen  elsewhere
 
-Rows are means over the starts, after each view: *rank* correlation of the expected with the true gain over frames that
-were not taken; *chosen*, the true gain of the best of them by expectation, of the largest there is; *phantom*, share of
-the expected area; the kinds, as shares of it; *covered*, the share that `Covered` expects to be seen; *promised* and
-*found*, the area that was expected of the frame that was taken and that its image added, in squared scene units;
-*seen*, the share of the voxels, and *area*, of a known mesh what the frames truly show, of what all of them show. Last
-comes what was seen when `Covered(0.9)` would have ended.
+Rows are means over the starts, after each view. *rank*: correlation of expected and true gain over the remaining
+frames. *chosen*: true gain of the frame with the largest expectation, as a share of the largest true gain. *phantom*:
+share of the expected area, followed by the shares of the kinds in it. *covered*: share that `Covered` expects to be
+seen. *promised* and *found*: area expected of the chosen frame, and added by its image, in squared scene units. *seen*
+and *area*: share of the voxels, and of the area of a known mesh, that the views show, out of what all frames show. The
+last line has these two at the view where `Covered(0.9)` would have stopped.
 """
 
 import argparse
@@ -47,7 +47,7 @@ _ENOUGH = 0.9
 
 
 class Case:
-    """A recording as a study, and what all of its frames show, in scene units."""
+    """A recording as a study, with the surface that all of its frames show, in scene units."""
 
     def __init__(self, recorded: Recorded, views: int):
         self.study = study_of(recorded, views)
@@ -55,12 +55,12 @@ class Case:
         frame = frame_of_box(self.study.box)
         self.voxel = frame.scale * self.study.voxel
         area = None if recorded.mesh is None else area_shown(recorded)
-        # What no frame shows counts for nothing.
+        # Leave out points that no frame shows.
         self.area = None if area is None else area[:, area.any(axis=0)]
         self.shown = cKDTree(np.asarray(frame.to_scene(jnp.asarray(self.recording.voxels))))
 
     def rows(self, start: int) -> Iterable[list[float]]:
-        """The columns after each view of an episode of the study's own."""
+        """The columns after each view of an episode by the study's own planner."""
         study, scene = self.study, self.study.scene(start)
         planner, recording = study.planner(NEW_AREA, scene), self.recording
         loop = Loop(planner, study.key(start, "episode"), camera=study.camera)
@@ -139,12 +139,12 @@ def _new_area(seen: PointCloud, pose: Pose, study: RecordedStudy, newness: Newne
 
 
 def measured(case: Case, starts: int) -> np.ndarray:
-    """(starts, views, columns)."""
+    """The numbers of the table before the mean: (starts, views, columns)."""
     return np.array([list(case.rows(start)) for start in range(starts)])
 
 
 def at_the_end(rows: np.ndarray) -> np.ndarray:
-    """What was seen, by voxels and by area, when so much was expected to be: (episodes that came so far, 2)."""
+    """Shares seen, by voxels and by area, when the expected share was first reached: (episodes that reached it, 2)."""
     enough = rows[..., COLUMNS.index("covered")] >= _ENOUGH
     ended = enough.any(axis=1)
     return rows[ended, enough[ended].argmax(axis=1)][:, -2:]
@@ -169,7 +169,7 @@ def main() -> None:
         cases.append(of_bunny(args.bunny, args.work / "bunny"))
     tables = []
     for recorded in cases:
-        # Each has a box of its own, and so programs of its own: those of twenty do not fit in memory's map.
+        # Each object has its own box, and so its own programs. Those of twenty exceed the limit of memory maps.
         jax.clear_caches()
         tables.append(measured(Case(recorded, args.views), args.starts))
         _show(recorded.name, np.mean(tables[-1], axis=0))
@@ -179,7 +179,7 @@ def main() -> None:
     ended = at_the_end(episodes)
     print(f"\nCovered({_ENOUGH}) ends {len(ended)} of {len(episodes)} episodes; seen by then, in percent:")
     for name, column in zip(COLUMNS[-2:], 100 * ended.T, strict=True):
-        # What is recorded has no known area.
+        # The area of a real recording is not known.
         if len(values := column[~np.isnan(column)]) == 0:
             continue
         print(f"{name:>6}: mean {values.mean():.1f}, least {values.min():.1f}, largest {values.max():.1f}")

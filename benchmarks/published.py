@@ -1,4 +1,4 @@
-"""What the authors' published code does otherwise than their paper says, as methods of the studies.
+"""Differences of the authors' published code from their paper, as methods of the studies.
 
     cd benchmarks
     jaxnbv study reconstruction --model paper --scenes 16 --methods coverage,farthest,random \
@@ -14,13 +14,13 @@ from jaxnbv.studies.reconstruction import ReconstructionStudy
 
 
 class MeanCoverage(Coverage):
-    """Squared distances to the cloud, averaged over the points of a scan where the paper sums them."""
+    """Squared distances to the cloud, averaged over the points of a scan. The paper sums them."""
 
     def __call__(self, context: PointCloud, scan: PointCloud) -> Float[Array, ""]:
-        """Zero for a scan that sees nothing."""
+        """The mean squared distance. Zero for an empty scan."""
         return super().__call__(context, scan) / jnp.maximum(scan.count, 1)
 
 
 def mean_coverage(study: ReconstructionStudy, scene: Scene) -> Planner:
-    """The study's coverage by the mean."""
+    """The study's planner with `MeanCoverage`."""
     return study.planner_of(MeanCoverage(), DiscreteSearch(study.candidates), scene)

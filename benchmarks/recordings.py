@@ -1,11 +1,11 @@
-"""Recordings of known objects, as folders that `RecordedFrames` reads: what a noisy depth camera sees of a mesh on a
-table, and the range scans of the Stanford bunny. And how much of them views by new surface show.
+"""Coverage by new surface on recordings of known objects: simulated depth images of meshes, and the range scans of the
+Stanford bunny, written as folders for `RecordedFrames`.
 
     python benchmarks/recordings.py --mesh FILE ... --work FOLDER [--above] [--starts 2] [--views 6]
 
-Each object is a study of a recording (`jaxnbv study recorded`), with other first views for each start. The table has
-the share of the voxels seen after views 2 and on, mean over objects; then new surface less each other, with paired 90 %
-intervals over objects, and at last the mean over the views.
+Each object is a study of a recording (`jaxnbv study recorded`). Each start has another first view. The table has the
+share of voxels seen after each view from the second on, mean over objects, and then the difference of new surface to
+each other method, with paired 90 % intervals over objects. The last column is the mean over the views.
 """
 
 import argparse
@@ -29,22 +29,22 @@ from jaxnbv.scanning.sensors import Setting, fit_distance
 from jaxnbv.studies.engine.results import interval
 from jaxnbv.studies.recorded import NEW_AREA, ORACLE, RecordedStudy
 
-# 640 x 480 pixels, f = 600; nothing steeper than 75 degrees returns.
+# 640 x 480 pixels, f = 600. Surface steeper than 75 degrees gives no return.
 _INTRINSICS = np.array([[600.0, 0.0, 320.0], [0.0, 600.0, 240.0], [0.0, 0.0, 1.0]])
 _CAMERA = nbv.Camera(2.0 * math.atan(0.4), 480, 640, max_incidence=math.radians(75.0))
-# The longest side of an object in metres; the noise at a metre, and a unit of the images.
+# In metres: longest side of an object, noise at a distance of 1, unit of the images.
 _SIDE, _NOISE, _UNIT = 0.5, 1e-3, 1e-4
-# Poses on the whole sphere, and on its upper half.
+# Numbers of poses on the whole sphere, and on its upper half.
 _AROUND, _ABOVE = 60, 40
 _HALF_TABLE = 20.0
-# How far from the bunny its range scans are drawn from, in metres: the sensor's rays were nearly parallel.
+# Distance of the camera from the bunny in metres, and its focal length. The scanner's rays were nearly parallel.
 _FAR, _BUNNY_PIXELS = 1.0, 600.0
 
 
 class Recorded(NamedTuple):
-    """A recording: its name, its folder, and the box that a study is to look at, with what is upward in its world.
+    """A recording: its name, its folder, the box of the study, and the upward axis of its world.
 
-    - `mesh`: of the object, in the recording's world; None where it is not known.
+    - `mesh`: the object's true mesh, in the recording's world, or None.
     """
 
     name: str
@@ -55,7 +55,7 @@ class Recorded(NamedTuple):
 
 
 def of_mesh(file: Path, folder: Path, above: bool) -> Recorded:
-    """A mesh seen whole from all around, or with `above` on a table from the upper half. Written once."""
+    """A recording of a mesh, from all around, or with `above` on a table from the upper half. Written only once."""
     mesh = nbv.load_mesh(file)
     extents = np.ptp(mesh.vertices, axis=0)
     size = _SIDE / extents.max() * np.array([extents[0], extents[2], extents[1]])
@@ -86,7 +86,7 @@ def of_mesh(file: Path, folder: Path, above: bool) -> Recorded:
 
 
 def of_bunny(file: Path, folder: Path) -> Recorded:
-    """The ten range scans of the Stanford bunny, drawn from a metre away each."""
+    """The ten range scans of the Stanford bunny, each rendered from a metre away."""
     recorded = Recorded("bunny", folder)
     if (folder / "frames.json").exists():
         return recorded
@@ -96,7 +96,7 @@ def of_bunny(file: Path, folder: Path) -> Recorded:
     for points, rotation, shift in zip(np.split(data["points_10um"], ends[:-1]), data["R"], data["t"], strict=True):
         own = points * 1e-5
         middle = own.mean(axis=0)
-        # The sensor looks along -z of its own coordinates, y up; the camera along its z, y down.
+        # The scanner looks along -z with y up, the camera along z with y down.
         local = (own - middle) * (1.0, -1.0, -1.0) + np.array([0.0, 0.0, _FAR])
         column, row = np.round(_BUNNY_PIXELS * local[:, :2] / local[:, 2:] + 120.0).astype(int).T
         image = np.full((240, 240), np.inf)
@@ -121,7 +121,7 @@ def _on_table(mesh: TriangleMesh, height: float) -> TriangleMesh:
 
 
 def _write(folder: Path, images: list[np.ndarray], matrices: np.ndarray, intrinsics: np.ndarray) -> None:
-    """Images in metres."""
+    """Write images, given in metres, with their poses and intrinsics."""
     folder.mkdir(parents=True, exist_ok=True)
     frames = []
     for index, (image, matrix) in enumerate(zip(images, matrices, strict=True)):
@@ -133,9 +133,9 @@ def _write(folder: Path, images: list[np.ndarray], matrices: np.ndarray, intrins
 
 
 def area_shown(recorded: Recorded, count: int = 20_000) -> np.ndarray:
-    """Which of some points, uniform by area on the known mesh and within the box, each frame shows: (frames, points).
+    """Whether each frame shows each of some points, uniform by area on the known mesh in the box: (frames, points).
 
-    The study's voxels tell less than was seen: one that the surface only cuts at a corner has few pixels of each frame.
+    The study's voxels underestimate coverage: a voxel that the surface cuts at a corner gets few pixels of a frame.
     """
     assert recorded.mesh is not None
     assert recorded.box is not None
@@ -163,7 +163,7 @@ def study_of(recorded: Recorded, views: int) -> RecordedStudy:
 
 
 def covered(study: RecordedStudy, method: str, start: int) -> np.ndarray:
-    """Share of the voxels that the views of a method have shown, after each."""
+    """Share of the voxels seen after each view of a method."""
     scene = study.scene(start)
     first = study.recording.poses[study.first_view(scene)]
     loop = Loop(study.planner(method, scene), study.key(start, "episode"), camera=study.camera)
@@ -182,7 +182,7 @@ def main() -> None:
     args = parser.parse_args()
     seen: dict[str, list[np.ndarray]] = {method: [] for method in (NEW_AREA, "farthest", "random", ORACLE)}
     for file in args.mesh:
-        # Each has a box of its own, and so programs of its own: those of twenty do not fit in memory's map.
+        # Each object has its own box, and so its own programs. Those of twenty exceed the limit of memory maps.
         jax.clear_caches()
         folder = args.work / f"{file.stem}-{'above' if args.above else 'around'}"
         study = study_of(of_mesh(file, folder, args.above), args.views)

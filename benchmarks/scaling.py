@@ -1,11 +1,11 @@
-"""How the time of a step grows with points, samples, candidates and rays, as JSON and a figure.
+"""Time of a step against the numbers of points, samples, candidates and rays, as JSON and a figure.
 
     python benchmarks/scaling.py [--out runs/scaling]
 
-One of the four is changed at a time, about what sessions plan by: new surface, two views of a mug of which 2,000 points
-are kept, 16 samples, 120 candidates, 50 x 50 rays, here by the full search. Times are after compilation, the least of
-three: of the samples (posterior, values on the grid) and of the search. Continues after the last time in the file:
-give another file for another machine.
+Changes one of the four at a time. The others have the settings of sessions: new surface, two views of a mug, 2,000
+points, 16 samples, 120 candidates, 50 x 50 rays, here by the full search. Times are the least of three, without
+compilation, for the samples (posterior, values on the grid) and for the search. Continues after the last time in the
+file, so give another file for another machine.
 """
 
 import argparse
@@ -35,12 +35,12 @@ STAGES = {"samples": "posterior and samples", "search": "search"}
 
 @functools.cache
 def measured(points: int, samples: int, candidates: int, rays: int) -> dict[str, float]:
-    """Seconds by stage."""
+    """Seconds of each stage at these sizes."""
     side, key = round(rays**0.5), jax.random.key(0)
     sampler = dataclasses.replace(nbv.SurfaceSampler(), num_samples=samples)
     camera, search = nbv.Camera(height=side, width=side), nbv.DiscreteSearch(candidates)
     planner = nbv.Planner(nbv.NewSurface(), search, camera, sampler, capacity=points)
-    # The sensor's own rays are more than those that are imagined: D is full at any size.
+    # The sensor has more rays than imagined scans, so that D is full at any size.
     sensor, scene, observations = nbv.Camera(height=150, width=150), demo_object(), None
     for position in ((0.8, 0.9, 2.2), (-1.4, 0.6, -1.9)):
         pose = nbv.look_at(position)
@@ -57,7 +57,7 @@ def measured(points: int, samples: int, candidates: int, rays: int) -> dict[str,
 
 
 def figure(held: dict[str, dict[str, dict[str, float]]], path: Path) -> None:
-    """A panel for each of the four, both axes logarithmic."""
+    """Draw a panel for each of the four, with logarithmic axes."""
     shown, panels = plt.subplots(1, len(ASKED), figsize=(11, 2.7), sharey=True, layout="constrained")
     for panel, (name, sizes) in zip(panels, ASKED.items(), strict=True):
         for stage, label in STAGES.items():

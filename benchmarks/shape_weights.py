@@ -1,11 +1,11 @@
-"""How often the kind of shape that is held likely is the true one: the weights of known shapes, by their frequency.
+"""Calibration of the weights of known shapes: how often the likeliest kind of shape is the true one.
 
     python benchmarks/shape_weights.py [--scenes 30] [--kinds NAME ...] [--out FILE]
 
-Of each kind of the studies of classes, N validation scenes and the bank that ships; the first view is the study's, the
-next two are drawn at random. Says after one to three views how often the most likely kind is the true one, how likely
-it was held on average, the weight of the true kind and of none, and the expected calibration error in ten bins: over
-all views together there is enough to fill these. Continues with what the file does not hold yet.
+Uses N validation scenes of each study of classes, with the shipped bank. The first view is the study's, the next two
+are random. Prints after one to three views how often the likeliest kind is the true one, its mean weight, the mean
+weights of the true kind and of "none of these", and the expected calibration error in ten bins, which needs all views
+together to fill them. Runs only what is not in the file yet.
 """
 
 import argparse
@@ -34,7 +34,7 @@ KINDS: dict[str, type[ClassificationStudy]] = {
 
 
 def study_of(kind: str) -> ClassificationStudy:
-    """On the validation split."""
+    """The study of a kind on the validation split."""
     found = KINDS[kind].configured(KNOWN, VIEWS, False, split=Split.VALIDATION, framing=Framing.CLOSE_UP)
     (study,) = found.values()
     assert isinstance(study, ClassificationStudy)
@@ -42,7 +42,7 @@ def study_of(kind: str) -> ClassificationStudy:
 
 
 def weights(study: ClassificationStudy, index: int) -> dict:
-    """The true class, and how likely each class and none is after each view."""
+    """The true class, and the weights of each class and of none after each view."""
     scene = study.scene(index)
     planner, sensor, poses = study.planner("coverage", scene), study.sensor(scene), study.candidates.poses()
     first = study.first_view(scene)
@@ -60,7 +60,7 @@ def weights(study: ClassificationStudy, index: int) -> dict:
 
 
 def show(kind: str, records: list[dict]) -> None:
-    """A line for each number of views, and one for all."""
+    """Print a line for each number of views, and one for all."""
     labels = np.array([record["label"] for record in records])
     held = np.array([record["weights"] for record in records])
     for view in range(VIEWS):

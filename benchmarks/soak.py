@@ -1,10 +1,10 @@
-"""Steps without end: does a planner or a session grow in memory, or compile, as it goes on?
+"""Many steps: check that memory and compilations of a planner or a session do not grow.
 
     python benchmarks/soak.py --steps 2000
 
-Small settings, so that what grows shows beside what a step needs. A planner is asked and told about a ball, an episode
-of eight views after another; a session takes an image a step in its one folder, and is asked every tenth. Tables:
-resident memory in MiB, milliseconds a step, and programs compiled since the second view, at ten moments.
+Settings are small, so that growth is large compared with the memory of a step. A planner runs one episode of eight
+views of a ball after another. A session adds one image a step to its folder, and proposes a view every tenth step. The
+tables have resident memory in MiB, milliseconds a step, and programs compiled since the second view, at ten moments.
 """
 
 import argparse
@@ -45,7 +45,7 @@ def session(steps: int) -> Iterator[None]:
     poses = nbv.SphereCandidates(steps, 2.5).poses()
     matrices = np.asarray(poses.to_matrix())
     with tempfile.TemporaryDirectory() as folder:
-        # A session asks for no pose twice.
+        # A session proposes no pose twice, so it needs enough candidates.
         asked = planner(steps, 20 + steps // 10)
         taken = nbv.Session(CAMERA, ((-1.2,) * 3, (1.2,) * 3), asked, up="y", folder=folder, progress=False)
         for step in range(steps):
@@ -60,7 +60,7 @@ def session(steps: int) -> Iterator[None]:
 
 
 def watched(going: Iterator[None], steps: int) -> pd.DataFrame:
-    """Memory, time and compilations at ten moments."""
+    """Table of memory, time and compilations at ten moments."""
     process, compiled, rows = psutil.Process(), [], []
 
     def listen(event: str, duration: float, **_: object) -> None:
@@ -70,7 +70,7 @@ def watched(going: Iterator[None], steps: int) -> pd.DataFrame:
     jax.monitoring.register_event_duration_secs_listener(listen)
     began, before, every = time.perf_counter(), 0, max(steps // 10, 1)
     for step, _ in enumerate(going, start=1):
-        # All that is needed again has been compiled: the session is asked for the second time at its eleventh image.
+        # Everything is compiled by now. The second proposal of the session comes at its eleventh image.
         if step == 2 * VIEWS:
             compiled.clear()
         if step % every == 0:

@@ -1,13 +1,12 @@
-"""How many views a stop rule saves, and what it costs.
+"""Views that a stop rule saves, and its effect on the answers.
 
     python benchmarks/stopping.py [--task class parts coverage] [--scenes 24] [--out FILE]
 
-Each object of the test split is scanned to the end once; every rule is then asked after each view, which is what it
-would have been asked had it been in force. `class`: pyramids, whole, by cross-entropy, 6 views; right is the class of
-the highest probability. `parts`: objects of thirteen categories by soft part count, 6 views; right is that every part
-that the object has is given 60 points. `coverage`: the same objects by coverage, 14 views; right is the share truly
-seen, of what the camera would see from all candidates. Intervals are of 90 %, by resampling the scenes. Continues after
-the last scene in the file.
+Scans each object of the test split to the end once, then evaluates every rule after each view. `class`: pyramids,
+whole, by cross-entropy, 6 views; right if the likeliest class is the true one. `parts`: objects of thirteen categories
+by soft part count, 6 views; right if every part of the object has 60 points. `coverage`: the same objects by coverage,
+14 views; right is the share truly seen, out of what the camera would see from all candidates. Intervals are of 90 %, by
+resampling the scenes. Continues after the last scene in the file.
 """
 
 import argparse
@@ -54,7 +53,7 @@ def planner_of(acquisition: nbv.Acquisition, radius: float, side: float = 2.5, s
 
 @functools.cache
 def planner_for(task: str, category: str) -> nbv.Planner:
-    """One for all objects of a category, so that nothing is compiled twice."""
+    """A planner for all objects of a category, so that nothing is compiled twice."""
     if task == "class":
         return planner_of(nbv.CrossEntropy(pretrained_classifier("pyramid", SIDE)), 2.5, SIDE, solid=True)
     if task == "coverage":
@@ -64,7 +63,7 @@ def planner_for(task: str, category: str) -> nbv.Planner:
 
 
 def measured(task: str, index: int) -> dict:
-    """After which view each rule ends it, and what is right after every view."""
+    """The view after which each rule stops, and the correctness after every view."""
     key = jax.random.fold_in(jax.random.key(15), index)
     if task == "class":
         pyramid = pyramid_scene(Split.TEST, index, Framing.WHOLE)
@@ -97,7 +96,7 @@ def measured(task: str, index: int) -> dict:
 
 
 def truly_shown(solid, planner: nbv.Planner, episode: Episode) -> tuple[np.ndarray, np.ndarray]:
-    """Which points of the true surface each view shows, of those that a candidate shows; and their areas."""
+    """Whether each view shows each point of the true surface that a candidate shows, and the areas of the points."""
     grid = planner.sampler.grid
     nodes = np.stack(np.meshgrid(*3 * [grid.axis], indexing="ij"), axis=-1).reshape(-1, 3)
     values = jax.lax.map(solid, jnp.asarray(nodes, jnp.float32), batch_size=65_536)

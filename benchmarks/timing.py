@@ -6,7 +6,7 @@ import jax
 
 
 def least_time(function, repeats: int = 3) -> float:
-    """Least wall time in seconds of a few runs after one that compiles."""
+    """Least wall time of some runs in seconds, after one run that compiles."""
     jax.block_until_ready(function())
     times = []
     for _ in range(repeats):

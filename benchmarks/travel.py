@@ -1,11 +1,11 @@
-"""Coverage by views and by the camera's way, with and without the cost of going there.
+"""Coverage against the number of views and the length of the camera's path, with and without a cost of travel.
 
     python benchmarks/travel.py --mesh FILE ... [--views 8] [--out FILE]
 
-Each mesh is scanned from one random first view on, by coverage over 60 candidates on a sphere: for its value, for its
-value per cost (fixed + length of the way, in scene units), and from the farthest view. All see the same noise and the
-same samples at the same view. Coverage is the share of the true surface within 0.05 of the cloud. Continues after the
-last mesh in the file.
+Each mesh is scanned from one random first view by coverage over 60 candidates on a sphere: by value, by value per cost
+(fixed + length of the path, in scene units), and by farthest view. All methods see the same noise and the same samples
+at the same view. Coverage is the share of the true surface within 0.05 of the cloud. Continues after the last mesh in
+the file.
 """
 
 import argparse
@@ -36,7 +36,7 @@ METHODS = {
 
 
 def episode(planner: nbv.Planner, mesh: nbv.TriangleMesh, truth: np.ndarray, views: int, key) -> dict:
-    """Coverage, and length of the way so far, after each view."""
+    """Coverage and length of the path after each view."""
     direction = jax.random.normal(jax.random.fold_in(key, 99), (3,))
     pose = nbv.look_at(2.5 * direction / jnp.linalg.norm(direction))
     observations, taken, scans, found = None, [], [], {"way": []}
