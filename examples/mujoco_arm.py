@@ -1,10 +1,10 @@
-"""A robot's arm scans an object in a simulator, from the first image to a mesh:
+"""A robot arm scans an object in a simulator, from the first image to a mesh:
 
     pip install "jaxnbv[arm]"
     python examples/mujoco_arm.py [FILE] --gif arm.gif
 
-`FILE` is a mesh in metres, a mug by default. The arm is in `arm_simulator.py`; `scan_object` is the loop that a real
-arm runs. At the end the measured points and the mesh are compared with the object, in millimetres.
+`FILE` is a mesh in metres, by default a mug. The arm is in `arm_simulator.py`. A real arm runs the same loop,
+`scan_object`. At the end the measured points and the mesh are compared with the object, in millimetres.
 """
 
 import argparse
@@ -21,20 +21,21 @@ from scipy.spatial.transform import Rotation
 
 import jaxnbv as nbv
 
-# Room about the object, which stands on the lower side of its box.
+# Margin of the box around the object, except below it.
 ROOM = 0.015
 
 
 def box_about(mesh: trimesh.Trimesh) -> np.ndarray:
-    """Two corners of the box that is scanned."""
+    """Two corners of the box to scan."""
     return np.array([mesh.bounds[0] - [ROOM, ROOM, 0.0], mesh.bounds[1] + ROOM])
 
 
 class Scan(NamedTuple):
     """A scanned object.
 
-    - `session`: holds the images; `refusals`: poses that the arm could not reach, by the reason, and `proposals` how
-      many it was sent to.
+    - `session`: the session, with its images.
+    - `refusals`: numbers of poses that the arm could not reach, by reason.
+    - `proposals`: number of poses that the session proposed.
     """
 
     session: nbv.Session
@@ -52,10 +53,10 @@ def scan_object(
     reachable: Callable[[np.ndarray], list] | None = None,
     moved: Callable[[nbv.Session, list[np.ndarray]], None] = lambda session, way: None,
 ) -> Scan:
-    """Scan what stands in a box until that is enough.
+    """Scan the object in a box until the session is done.
 
-    - `reachable`: as of `nbv.Session`, by default the arm's own scores.
-    - `moved`: is called with the session and the postures on each way, once the image at its end is added.
+    - `reachable`: see `nbv.Session`. By default the arm's own scores.
+    - `moved`: called with the session and the postures of each motion, after the image at its end is added.
     """
     session = nbv.Session(
         arm.camera,
@@ -83,7 +84,7 @@ def scan_object(
 
 
 def hand_eye_error(degrees: float, millimetres: float) -> np.ndarray:
-    """A turn about one axis and a shift along another, 4 x 4."""
+    """A rotation about one axis and a translation along another, 4 x 4."""
     error = np.eye(4)
     error[:3, :3] = Rotation.from_rotvec(np.radians(degrees) * np.array([0.6, -0.64, 0.48])).as_matrix()
     error[:3, 3] = 1e-3 * millimetres * np.array([0.48, 0.6, -0.64])
@@ -91,7 +92,7 @@ def hand_eye_error(degrees: float, millimetres: float) -> np.ndarray:
 
 
 def distances_mm(points: np.ndarray, mesh: trimesh.Trimesh) -> tuple[float, float]:
-    """Median and 90 % of the distances of points from the object's surface, in millimetres."""
+    """Median and 90 % quantile of the distances of points from the object's surface, in millimetres."""
     squared, _, _ = igl.point_mesh_squared_distance(points, mesh.vertices, mesh.faces)
     away = 1e3 * np.sqrt(squared)
     return float(np.median(away)), float(np.percentile(away, 90))

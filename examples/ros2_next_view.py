@@ -60,7 +60,7 @@ def camera_of(message: Any, is_rectified: bool = False) -> nbv.Camera:
     width, height = (roi.width or message.width) // binning[0], (roi.height or message.height) // binning[1]
     for row, (offset, factor) in enumerate(zip((roi.x_offset, roi.y_offset), binning, strict=True)):
         matrix[row] /= factor
-        # The centre of the first binned pixel is in the middle of those that it stands for.
+        # The centre of the first binned pixel is in the middle of the pixels that it combines.
         matrix[row, 2] -= (offset + 0.5 * (factor - 1)) / factor
     return nbv.Camera.from_intrinsics(matrix, height, width, distortion=coefficients)
 
@@ -112,7 +112,7 @@ class Bridge:
         self.latest = message
 
     def take(self) -> str:
-        """Add the latest image, publish where to go next, and say so. An image is added once.
+        """Add the latest image, publish the next pose, and return a message. An image is added only once.
 
         **Raises:** `ValueError` as `image_of`, `matrix_of` and `Session.add` do.
         """

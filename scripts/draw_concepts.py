@@ -1,4 +1,4 @@
-"""The pictures of docs/concepts.md, one step of the demo object, small: `python scripts/draw_concepts.py`."""
+"""Draw the pictures of docs/concepts.md, one small step of the demo object: `python scripts/draw_concepts.py`."""
 
 import argparse
 import dataclasses
@@ -37,17 +37,17 @@ def drawn(figure: Figure, dpi: int) -> Image.Image:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """With few colours, which makes the file small."""
+    """Write a figure with few colours, which makes the file small."""
     drawn(figure, 170).quantize(128, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
 def draw_posterior(
     planner: nbv.Planner, observations: nbv.Observations, surfaces: nbv.scanning.GridSurface, scene: nbv.SDFSurface
 ) -> Figure:
-    """What one view saw; outlines of samples on the plane x = 0, and the probability of being inside there."""
+    """Draw the scan of one view, outlines of samples on the plane x = 0, and the probability of being inside there."""
     axis = np.asarray(planner.sampler.grid.axis)
     middle = len(axis) // 2
-    # Variances take long: every second node.
+    # Only every second node, since variances take long.
     y, z = np.meshgrid(axis[::2], axis[::2], indexing="ij")
     plane = jnp.asarray(np.stack([np.full(y.size, axis[middle]), y.ravel(), z.ravel()], axis=1))
     posterior = planner.sampler.posterior(observations)
@@ -82,7 +82,7 @@ def draw_utility(
     surfaces: nbv.scanning.GridSurface,
     proposal: nbv.search.Proposal,
 ) -> Figure:
-    """Imagined scans of the best candidate and of one of the worst tenth, coloured by what each point is worth."""
+    """Draw imagined scans of the best candidate and of one of the worst tenth, coloured by the worth of each point."""
     order = np.argsort(np.asarray(proposal.values))
     chosen = np.array([order[-1], order[len(order) // 10]])
     poses = proposal.candidates[jnp.asarray(chosen)]
@@ -127,7 +127,7 @@ def draw_utility(
 
 
 def draw_search(found: dict[str, nbv.search.Proposal], quantities: dict[str, nbv.Quantity]) -> Figure:
-    """Maps of the sphere of directions, by one search each."""
+    """Draw a map of the sphere of directions for each search."""
     figure = Figure(figsize=(9.6, 2.3))
     for index, (name, proposal) in enumerate(found.items()):
         axes = figure.add_axes((0.005 + 0.333 * index, 0.02, 0.323, 0.76))
@@ -137,7 +137,7 @@ def draw_search(found: dict[str, nbv.search.Proposal], quantities: dict[str, nbv
 
 
 def draw_known() -> Figure:
-    """Bases that were imagined after a view that shows none of the base: by the model alone, and with known shapes."""
+    """Draw bases imagined after a view that shows none of the base, without and with known shapes."""
     pyramid = pyramid_scene(Split.VALIDATION, 2)
     first = hidden_view(pyramid, jax.random.key(0))
     plain = dataclasses.replace(nbv.SurfaceSampler.preset("screened", solid=True), grid=nbv.Grid(100), num_samples=16)

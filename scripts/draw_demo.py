@@ -1,4 +1,4 @@
-"""The moving picture docs/demo.gif, `jaxnbv demo` view by view: `python scripts/draw_demo.py`. Some five minutes."""
+"""Draw the GIF docs/demo.gif, `jaxnbv demo` view by view: `python scripts/draw_demo.py`. Takes five minutes."""
 
 import argparse
 import dataclasses
@@ -23,15 +23,15 @@ from jaxnbv.viz.render import draw_scene, painted
 from jaxnbv.viz.style import GREY, NEW
 
 SIZE, DPI, COLOURS = (9.2, 3.5), 120, 128
-# That of the demo.
+# The demo's own seed.
 SEED = 2
 MOST_VIEWS, RACE_VIEWS = 5, 10
-# Milliseconds.
+# Milliseconds of the frames with a guess, with the answer, and at the end.
 GUESS, ANSWER, END = 700, 1800, 5000
 
 
 def demo_episode(seed: int, search: str, views: int) -> nbv.Episode:
-    """The demo of a seed, by a search of the command line, until its own rule or so many views end it."""
+    """An episode of the demo by a search of the command line, until the demo's stop rule or after `views` views."""
     task = TASKS["cross-entropy"]
     subject, enough = task.demo(0, seed), rule(task.until)
     sampler = dataclasses.replace(imagined("screened", False, subject.bank), grid=subject.grid)
@@ -48,7 +48,7 @@ class Film:
         self.times: list[int] = []
 
     def add(self, view: int, tile: Tile, head: str, time: int, rival: int | None = None) -> None:
-        """What is known after `view` views, a picture, and the answers so far; of the rival up to another view."""
+        """Add a frame: a picture after `view` views, and the answers so far, for the rival up to view `rival`."""
         figure = Figure(figsize=SIZE)
         figure.text(0.19, 0.95, f"after view {view}: what is known", ha="center", fontsize=10)
         known = figure.add_axes((0.0, 0.0, 0.38, 0.93))
@@ -82,7 +82,7 @@ class Film:
         axes.legend(loc="lower right", frameon=False, fontsize=9)
 
     def save(self, path: Path) -> None:
-        """With the colours of all frames, and a white background: Pillow looks colours up by their leading bits."""
+        """Write the film with one palette, on a white background: Pillow looks colours up by their leading bits."""
         strip = Image.fromarray(np.concatenate([np.asarray(frame)[::3, ::3] for frame in self.frames]))
         palette = strip.quantize(COLOURS - 1, dither=Image.Dither.NONE)
         colours = [*palette.getpalette()[: 3 * (COLOURS - 1)], 255, 255, 255]

@@ -1,5 +1,5 @@
-"""The pictures docs/gallery.png, eight objects that ship as they are known after four views, and docs/hero.png, one
-step of one of them: `python scripts/draw_gallery.py`. About fifteen minutes on two cores."""
+"""Draw docs/gallery.png, the posteriors of eight shipped objects after four views, and docs/hero.png, one step of one
+of them: `python scripts/draw_gallery.py`. Takes fifteen minutes on two cores."""
 
 import argparse
 from pathlib import Path
@@ -31,7 +31,7 @@ FIRST = nbv.look_at((0.8, 0.9, 2.2))
 
 
 def objects() -> dict[str, Surface]:
-    """Those of the gallery."""
+    """The objects of the gallery by name."""
     return {
         "mug": demo_object(),
         "truck with a chair": SDFSurface(truck_scene(Split.TEST, 2)),
@@ -45,7 +45,7 @@ def objects() -> dict[str, Surface]:
 
 
 def episode_of(surface: Surface, views: int) -> nbv.Episode:
-    """Views of an object that fits the image."""
+    """An episode of an object that fits into the image."""
     points = truth_points(surface, jax.random.key(0))
     setting = fit_distance(USUAL_SETTING, float(np.linalg.norm(points, axis=1).max()))
     camera = setting.camera.resized(RAYS, RAYS)
@@ -57,7 +57,7 @@ def episode_of(surface: Surface, views: int) -> nbv.Episode:
 
 
 def draw_gallery(figure: Figure, columns: int = 4) -> None:
-    """All objects, each as it is known in the end."""
+    """Draw the posterior mean of each object after its last view."""
     shown = objects()
     rows = -(-len(shown) // columns)
     for index, (name, surface) in enumerate(tqdm(shown.items(), "objects")):
@@ -72,7 +72,7 @@ def draw_gallery(figure: Figure, columns: int = 4) -> None:
 
 
 def draw_hero(figure: Figure) -> None:
-    """One step: what is known, what is imagined, which view is worth most, what it shows, and the answer."""
+    """Draw one step: the cloud, the samples, the values of candidates, the scan from the best, and the answer."""
     episode = demo_episode(SEED, "halving", 2)
     data: ReportData = report_data(episode, progress=False)
     seen, proposal = data.views[1].imagined, data.views[1].proposal

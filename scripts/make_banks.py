@@ -1,7 +1,7 @@
 """Make the banks of known shapes that ship with jaxnbv: `python scripts/make_banks.py [NAME ...] [--household FOLDER]`.
 
-Those of procedural objects take half a minute; that of real ones needs the meshes of the CC0 catalogue of Sweet Home
-3D, in folders of their classes.
+Banks of procedural objects take half a minute. The bank of real objects needs the meshes of the CC0 catalogue of Sweet
+Home 3D, in one folder for each class.
 """
 
 import argparse
@@ -19,12 +19,12 @@ BANKS = Path(__file__).parents[1] / "jaxnbv" / "surfaces" / "shapes"
 
 
 def write_bank(path: Path, bank: ShapeBank) -> None:
-    """Numbers are rounded to sixteen bits, whole ones and distances on grids to eight; see `read_bank`."""
+    """Write a bank. Floats have sixteen bits, integers and distances on grids have eight, see `read_bank`."""
     solids, extremes = bank.shapes
     leaves = [np.asarray(leaf) for leaf in (*jax.tree.leaves(solids), extremes)]
     if isinstance(solids, Sampled):
         steps = np.clip(np.round(leaves[0] / QUANTUM), -127, 127).astype(np.int8)
-        # Neighbours are alike, so that their differences take less room.
+        # Neighbours are similar, so their differences compress better.
         leaves[0] = np.diff(steps, axis=-1, prepend=np.int8(0))
     narrow = {"f": np.float16, "i": np.int8, "b": np.bool_}
     arrays = {f"{index:02d}": leaf.astype(narrow[leaf.dtype.kind]) for index, leaf in enumerate(leaves)}

@@ -1,11 +1,11 @@
-"""How often the shipped classifier of household objects is right on real ones, as it is and tuned on a few of them.
+"""Accuracy of the shipped classifier of household objects on real ones, as shipped and tuned on a few of them.
 
     python scripts/real_classes.py FOLDER [--few 2] [--steps 300] [--out results.json]
 
-FOLDER holds a folder of meshes for each class, as `jaxnbv study household --meshes` takes it. The first objects of
-each class, `few` of them where the class has more, tune the network, together with stand-ins so that it does not
-forget; the others test it. A cloud is of five random views with the sensor's noise, ten clouds an object; objects count
-alike, and their standard error is that over objects.
+FOLDER has a folder of meshes for each class, as for `jaxnbv study household --meshes`. The first `few` objects of each
+class that has more tune the network, together with procedural objects so that it does not forget these. The other
+objects test it, with ten clouds each, of five random views with the sensor's noise. Accuracy is the mean over objects,
+with its standard error over objects.
 """
 
 import argparse
@@ -32,7 +32,7 @@ CLOUDS, VIEWS, STAND_INS = 10, 5, 200
 
 
 def clouds_of(file: MeshFile, number: int, points: int) -> PointCloud:
-    """Clouds of an object, each of its own random views."""
+    """Clouds of an object, each from different random views."""
     mesh = file.read()
     made = []
     for key in jax.random.split(jax.random.fold_in(jax.random.key(0), number), CLOUDS):
@@ -44,7 +44,7 @@ def clouds_of(file: MeshFile, number: int, points: int) -> PointCloud:
 
 
 def told(network, objects: list[tuple[MeshFile, PointCloud]], names: tuple[str, ...]) -> dict:
-    """The share of an object's clouds that the network is right about: mean and standard error over objects."""
+    """Share of an object's clouds that the network classifies correctly: mean and standard error over objects."""
     shares = {
         f"{names[file.label]} {file.name}": float(np.mean(log_probabilities(network, clouds).argmax(1) == file.label))
         for file, clouds in objects

@@ -1,7 +1,6 @@
-"""Run the notebooks as they are, and store what they show: `python scripts/run_notebooks.py [NAME ...]`; all of them
-where none is named.
+"""Run notebooks and store their outputs: `python scripts/run_notebooks.py [NAME ...]`. Without a name, runs all.
 
-The hash of the code is kept beside the outputs, so that the tests notice outputs of other code.
+A hash of the code is stored with the outputs, so that the tests notice outputs of other code.
 """
 
 import argparse
@@ -19,18 +18,18 @@ from PIL import Image
 
 NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
 LARGEST = 1_000_000
-# What XLA writes on a busy machine.
+# XLA's warning on a busy machine, which is no output of the notebook.
 _SLOW = "slow_operation_alarm"
 
 
 def code_hash(notebook: NotebookNode) -> str:
-    """Of all code cells, in order."""
+    """Hash of all code cells in order."""
     code = [cell.source for cell in notebook.cells if cell.cell_type == "code"]
     return hashlib.sha256("\0".join(code).encode()).hexdigest()
 
 
 def run(path: Path, folder: str) -> None:
-    """Run a notebook in a folder, where it may leave files, and write it with its outputs."""
+    """Run a notebook in a folder, where it may write files, and store it with its outputs."""
     notebook = nbformat.read(path, as_version=4)
     start = time.perf_counter()
     NotebookClient(notebook, timeout=1800, kernel_name="python3", resources={"metadata": {"path": folder}}).execute()
@@ -43,7 +42,7 @@ def run(path: Path, folder: str) -> None:
             if "image/png" in output.get("data", {}):
                 output.data["image/png"] = _fewer_colours(output.data["image/png"])
     notebook.metadata["jaxnbv"] = {"code": code_hash(notebook)}
-    # Which Python ran it is no part of what it shows.
+    # The version of Python is no part of the outputs.
     notebook.metadata["language_info"] = {"name": "python"}
     text = nbformat.writes(notebook)
     if len(text.encode()) > LARGEST:
@@ -53,7 +52,7 @@ def run(path: Path, folder: str) -> None:
 
 
 def _fewer_colours(png: str) -> str:
-    """A PNG in base64, of 256 colours."""
+    """The PNG in base64, with 256 colours."""
     file = io.BytesIO()
     Image.open(io.BytesIO(base64.b64decode(png))).convert("RGB").quantize(256).save(file, "png", optimize=True)
     return base64.b64encode(file.getvalue()).decode()

@@ -1,9 +1,9 @@
 """Train, calibrate and test a classifier that ships with jaxnbv: `python scripts/train_classifier.py truck`.
 
-Two stages: clouds of true scans, then the same beside clouds whose last view is of a posterior sample, since those are
-what an acquisition feeds the network; where little of a cloud tells the class, first which points do. Clouds and the
-network after each stage stay in the output folder, so that a run that was interrupted continues. One to two hours on
-one CPU core.
+The first stage has clouds of true scans. The second adds clouds whose last view is of a posterior sample, since
+acquisitions give such clouds to the network. If few points of a cloud tell the class, an earlier stage learns which
+points do. Clouds and the network after each stage stay in the output folder, so that an interrupted run continues.
+Takes one to two hours on one CPU core.
 """
 
 import argparse
@@ -40,15 +40,15 @@ WEIGHTS = Path(__file__).parents[1] / "jaxnbv" / "networks" / "weights"
 
 
 class Recipe(NamedTuple):
-    """What a network is trained on.
+    """Training data and steps of a network.
 
     - `objects`: the scenes and their classes.
-    - `framings`: how large the objects stand.
-    - `solid`: whether they are nowhere thin, see `SurfaceSampler.preset`.
-    - `scenes`: of which there are true scans, in each framing; of 100 there are imagined ones, 16 each.
+    - `framings`: sizes of the objects.
+    - `solid`: whether no object is thin, see `SurfaceSampler.preset`.
+    - `scenes`: number of scenes with true scans, in each framing. 100 scenes have 16 imagined scans each.
     - `groups`: of the network.
-    - `focus`: steps of learning which points tell the class, where these are few; the classifier sees them alone.
-    - `steps`: on true scans, or what of them tells the class, and on these beside imagined ones.
+    - `focus`: steps of learning which points tell the class, if these are few. The classifier then gets only these.
+    - `steps`: steps of the first and of the second stage.
     """
 
     objects: ClassSet
@@ -77,14 +77,14 @@ def source(name: str, framing: Framing, folder: Path) -> Source:
 
 
 def informative(data: LabelledClouds) -> LabelledClouds:
-    """All clouds that show the cue of the class, and a quarter of the others, of which there is little to learn."""
+    """All clouds that show the cue of the class, and a quarter of the others, which teach little."""
     turn = np.arange(len(data.labels)) // (data.labels.max() + 1)
     rows = (data.cue_pixels > 0) | (turn % 4 == 0)
     return jax.tree.map(lambda leaf: leaf[rows], data)
 
 
 def thinned(data: LabelledClouds) -> LabelledClouds:
-    """Each cloud cut to the first three eighths of its points or more, in farthest point order: studies feed fewer."""
+    """Each cloud cut at random to its first 3/8 or more, in farthest point order, since studies use fewer points."""
     rows = data.clouds.mask.shape[1]
     count = np.random.default_rng(0).integers(3 * rows // 8, rows + 1, (len(data.labels), 1))
     mask = data.clouds.mask & (np.arange(rows) < count)
@@ -92,7 +92,7 @@ def thinned(data: LabelledClouds) -> LabelledClouds:
 
 
 def telling_alone(data: LabelledClouds, points: int = 320) -> LabelledClouds:
-    """The points that tell the class, of the clouds that have twenty of them or more."""
+    """Clouds of only the points that tell the class, if there are twenty or more."""
     data = jax.tree.map(lambda leaf: leaf[data.point_labels.sum(axis=1) >= 20], data)
     order = np.argsort(~data.point_labels, axis=1, kind="stable")[:, :points]
     rows = np.arange(len(order))[:, None]
@@ -102,7 +102,7 @@ def telling_alone(data: LabelledClouds, points: int = 320) -> LabelledClouds:
 
 
 def focus_loss(focus: Focus, example: tuple[PointCloud, Any]) -> Any:
-    """Cross-entropy of which points tell the class."""
+    """Cross-entropy of the prediction whether each point tells the class."""
     cloud, tells = example
     loss = optax.sigmoid_binary_cross_entropy(focus(cloud.points, cloud.normals, cloud.mask), tells)
     return jnp.sum(jnp.where(cloud.mask, loss, 0.0)) / jnp.maximum(cloud.count, 1)
@@ -110,13 +110,13 @@ def focus_loss(focus: Focus, example: tuple[PointCloud, Any]) -> Any:
 
 @eqx.filter_jit
 def chosen_clouds(focus: Focus, clouds: PointCloud) -> PointCloud:
-    """What a focused classifier sees of each cloud."""
+    """The points of each cloud that a focused classifier uses."""
     return jax.lax.map(lambda cloud: PointCloud(*focus.select(cloud.points, cloud.normals, cloud.mask)), clouds)
 
 
 def report(name: str, network: Any, data: LabelledClouds) -> None:
-    """Accuracy and entropy by the telling pixels of the best view, on clouds of two or more views, and by the number of
-    views; calibration."""
+    """Print calibration, and accuracy and entropy by the number of views, and by the pixels of the cue in the best view
+    for clouds of two or more views."""
     log_p = log_probabilities(network, jax.tree.map(jnp.asarray, data.clouds))
     right = np.asarray(log_p).argmax(axis=1) == data.labels
     uncertain = np.asarray(entropy(log_p))
@@ -150,7 +150,7 @@ def main() -> None:
         network = train(network, alone.clouds, alone.labels, jax.random.key(3), first, file=folder / "alone.eqx")
         both = informative(concatenated(thinned(scans), imagined))
         data, keys = (both.clouds, both.point_labels), jax.random.split(jax.random.key(4))
-        # Every point is an example: few clouds make a batch.
+        # Every point is an example, so a batch needs few clouds.
         focus = fit(Focus(keys[0]), focus_loss, data, keys[1], recipe.focus, 8, file=folder / "focus.eqx")
         chosen = chosen_clouds(focus, both.clouds)
         network = train(network, chosen, both.labels, jax.random.key(2), second, file=folder / "imagined.eqx")

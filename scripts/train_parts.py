@@ -1,8 +1,8 @@
 """Train and test the part segmenter that ships with jaxnbv: `python scripts/train_parts.py`.
 
-Clouds of true scans of procedural objects, and beside them clouds that end in a scan of a posterior sample, since those
-are what an acquisition feeds the network. Clouds and network stay in the output folder, so that a run that was
-interrupted continues. Half an hour on two CPU cores.
+The data are clouds of true scans of procedural objects, and clouds whose last scan is of a posterior sample, since
+acquisitions give such clouds to the network. Clouds and network stay in the output folder, so that an interrupted run
+continues. Takes half an hour on two CPU cores.
 """
 
 import argparse
@@ -27,7 +27,7 @@ WEIGHTS = Path(__file__).parents[1] / "jaxnbv" / "networks" / "weights" / "parts
 
 
 def log_probabilities(network: CompactPartSegmenter, example: LabelledClouds):
-    """log p of the parts of the cloud's category, point by point; very low for the parts of others."""
+    """log p of the parts at each point, very low for parts of other categories than the cloud's."""
     cloud = example.clouds
     log_p = network(cloud.points, cloud.normals, example.labels, cloud.mask)
     allowed = jnp.asarray(part_mask())[example.labels]
@@ -35,7 +35,7 @@ def log_probabilities(network: CompactPartSegmenter, example: LabelledClouds):
 
 
 def loss(network: CompactPartSegmenter, example: LabelledClouds):
-    """Mean of -log p(part) over the points that are there."""
+    """Mean of -log p(part) over the points that are not masked."""
     of_points = -jnp.take_along_axis(log_probabilities(network, example), example.point_labels[:, None], axis=1)[:, 0]
     mask = example.clouds.mask
     return jnp.sum(jnp.where(mask, of_points, 0.0)) / jnp.maximum(jnp.sum(mask), 1)
@@ -43,7 +43,7 @@ def loss(network: CompactPartSegmenter, example: LabelledClouds):
 
 @eqx.filter_jit
 def predicted(network: CompactPartSegmenter, data: LabelledClouds):
-    """The likeliest part of every point, and its probability."""
+    """The likeliest part at every point, and its probability."""
 
     def of_cloud(example):
         log_p = log_probabilities(network, example)
@@ -53,7 +53,7 @@ def predicted(network: CompactPartSegmenter, data: LabelledClouds):
 
 
 def report(name: str, network: CompactPartSegmenter, data: LabelledClouds) -> None:
-    """Accuracy over points and intersection over union, mean over the parts of a category."""
+    """Print the accuracy over points, and the mean intersection over union of the parts of a category."""
     labels, confidence = (np.asarray(array) for array in predicted(network, jax.tree.map(jnp.asarray, data)))
     mask, right = data.clouds.mask, labels == data.point_labels
     print(f"{name}: {right[mask].mean():.1%} of points right, mean confidence {confidence[mask].mean():.1%}")

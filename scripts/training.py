@@ -20,7 +20,7 @@ from jaxnbv.storage.files import write_whole
 
 Network = TypeVar("Network", bound=eqx.Module)
 
-# Examples whose derivatives are computed together: more would leave a processor's cache.
+# Examples whose derivatives are computed together. More would not fit into a processor's cache.
 _TOGETHER = 2
 
 
@@ -52,9 +52,9 @@ def fit(
     - `loss`: a function of the network and one example.
     - `data`: the examples, arrays of any structure with a leading axis. Batches are drawn with replacement.
     - `batch_size`: an even number.
-    - `file`: of the network as it was trained before, which is read, or else written.
+    - `file`: the trained network. It is read if it exists, else written.
 
-    A leaf `temperature` of the network is left to `calibrate`.
+    A leaf `temperature` of the network is not trained, see `calibrate`.
     """
     if file is not None and file.exists():
         return eqx.tree_deserialise_leaves(file, network)
@@ -93,7 +93,7 @@ def fit(
 
 @eqx.filter_jit
 def log_probabilities(network: Any, clouds: PointCloud) -> Float[Array, "b classes"]:
-    """The network's answers to a batch of clouds, one after the other."""
+    """The network's log-probabilities for a batch of clouds, computed one after the other."""
     return jax.lax.map(lambda cloud: network(cloud.points, cloud.normals, cloud.mask), clouds)
 
 

@@ -1,4 +1,4 @@
-"""Clouds that the shipped networks are trained and tested on: what a few views show, and what is true of it."""
+"""Training and test clouds of the shipped networks: scans from a few views, with true labels."""
 
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -19,26 +19,26 @@ from jaxnbv.studies.scenes import ClassObject, PartScene, Split
 from jaxnbv.studies.scenes.class_object import scan_cue
 from jaxnbv.studies.scenes.splits import scene_key
 
-# Scenes whose posterior is sampled come from numbers that no scanned cloud uses.
+# Imagined clouds use scene numbers from here on, which no scanned cloud uses.
 FIRST_IMAGINED = 100_000
-# Of true views, and of those before an imagined one.
+# Maximum number of true views in a cloud, and before an imagined view.
 MOST_VIEWS = 5
 _AT_ONCE, _POSES = 100, 4
-# Three standard deviations of the sensor's.
+# Three standard deviations of the sensor's noise.
 _NOISE = 3 * SensorNoise().points
 
 Thing: TypeAlias = ClassObject | PartScene
 
 
 class LabelledClouds(eqx.Module):
-    """A batch of clouds, thinned by farthest point sampling, and what a network should say of them.
+    """A batch of clouds, thinned by farthest point sampling, with labels.
 
     - `labels`: the objects' classes or categories.
-    - `point_labels`: the part that is nearest to each point in truth; or, of an object of a class, whether the point
-      lies on the cue of the class, up to the sensor's noise.
-    - `views`: how many true views the cloud is of.
-    - `cue_pixels`: the most rays of one of these views that hit the cue of the class.
-    - `imagined`: whether a view of a posterior sample was added to them.
+    - `point_labels`: the true part that is nearest to each point; for classes, whether the point lies on the cue of the
+      class, up to the sensor's noise.
+    - `views`: number of true views in the cloud.
+    - `cue_pixels`: the largest number of rays of a view that hit the cue of the class.
+    - `imagined`: whether the cloud ends in a view of a posterior sample.
     """
 
     clouds: PointCloud
@@ -50,16 +50,16 @@ class LabelledClouds(eqx.Module):
 
 
 def concatenated(*parts: LabelledClouds) -> LabelledClouds:
-    """Several batches as one."""
+    """Concatenate batches."""
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
 
 class Source(NamedTuple):
-    """Scenes of one kind, whose clouds are made once and kept in a folder.
+    """Scenes of one kind. Their clouds are made once and stored in a folder.
 
-    - `scene`: an object, of a split and an index.
-    - `planner`: what imagines the views of `imagined`.
-    - `setting`: the sensor's.
+    - `scene`: function from split and index to an object.
+    - `planner`: the planner that samples surfaces for `imagined`.
+    - `setting`: of the sensor.
     - `scale`: network units per scene unit.
     """
 
@@ -71,7 +71,7 @@ class Source(NamedTuple):
     scale: float = 1.0
 
     def scanned(self, split: Split, count: int) -> LabelledClouds:
-        """Clouds of true scans, one of each of `count` scenes, in the network's units."""
+        """Clouds of true scans, one for each of `count` scenes, in the network's units."""
 
         def make(first: int) -> LabelledClouds:
             return scanned_clouds(self.scene, split, range(first, first + _AT_ONCE), self.num_points, self.setting)
@@ -79,7 +79,7 @@ class Source(NamedTuple):
         return self._kept(f"scanned-{split}", range(0, count, _AT_ONCE), make)
 
     def imagined(self, split: Split, count: int) -> LabelledClouds:
-        """Clouds that end in a scan of a posterior sample, four of each sample of `count` scenes."""
+        """Clouds that end in a scan of a posterior sample, four for each sample of `count` scenes."""
 
         def make(index: int) -> LabelledClouds:
             return imagined_clouds(self.scene, split, index, self.planner, self.num_points, self.setting)
@@ -87,7 +87,7 @@ class Source(NamedTuple):
         return self._kept(f"imagined-{split}", range(FIRST_IMAGINED, FIRST_IMAGINED + count), make)
 
     def _kept(self, name: str, steps: Iterable[int], make: Callable[[int], LabelledClouds]) -> LabelledClouds:
-        """What all steps give; each has a file of its own, so that a run that was interrupted makes those missing."""
+        """Clouds of all steps. Each step has its own file, so that an interrupted run makes only the missing ones."""
         folder = make_folder(self.folder / name)
         parts = []
         for step in tqdm(steps, name):
@@ -98,7 +98,7 @@ class Source(NamedTuple):
             with np.load(path) as saved:
                 parts.append([saved[key] for key in saved.files])
         points, normals, mask, *rest = (jnp.asarray(np.concatenate(rows)) for rows in zip(*parts, strict=True))
-        # What is picked from them is picked on the host.
+        # On the host, where batches are picked.
         return jax.tree.map(np.asarray, LabelledClouds(PointCloud(self.scale * points, normals, mask), *rest))
 
 
@@ -109,7 +109,7 @@ def scanned_clouds(
     num_points: int = 1024,
     setting: Setting = USUAL_SETTING,
 ) -> LabelledClouds:
-    """A cloud of each scene, of one to five random views with the sensor's noise, in scene units."""
+    """A cloud of each scene from one to five random views with the sensor's noise, in scene units."""
     things = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(scene(split, index) for index in indices))
     keys = jax.vmap(lambda index: scene_key(1, split, index))(jnp.asarray(indices))
     return _scanned(things, keys, num_points, setting)
@@ -123,15 +123,15 @@ def imagined_clouds(
     num_points: int = 1024,
     setting: Setting = USUAL_SETTING,
 ) -> LabelledClouds:
-    """D u scan(theta; f_s) of one scene: D of one to four random views, every f_s seen from its own four random poses.
+    """D u scan(theta; f_s) of one scene, where D is from one to four random views, with four random poses for each f_s.
 
-    The samples are those of a planner that has seen D. What is true is that of the scene, whatever a sample shows.
+    The samples f_s are a planner's, given D. Labels are those of the true scene, even where a sample differs.
     """
     return _imagined(scene(split, index), scene_key(1, split, index), planner, num_points, setting)
 
 
 def random_poses(key: PRNGKeyArray, count: int, radius: float) -> Pose:
-    """Uniform on a sphere about the scene's middle, looking at it."""
+    """Poses uniform on a sphere around the scene's centre, looking at it."""
     direction = jax.random.normal(key, (count, 3))
     return look_at(radius * direction / jnp.linalg.norm(direction, axis=-1, keepdims=True))
 
@@ -177,8 +177,8 @@ def _imagined(thing: Thing, key: PRNGKeyArray, planner: Planner, num_points: int
 def _partial_views(
     thing: Thing, key: PRNGKeyArray, most: int, setting: Setting
 ) -> tuple[PointCloud, Pose, Int[Array, ""], Int[Array, ""]]:
-    """What one to `most` random views show, the rays of the others masked; their poses, how many they are, and the most
-    telling pixels of one."""
+    """Scans from one to `most` random views, with all further views masked; the poses, the number of views, and the
+    largest number of pixels on the cue in a view."""
     pose_key, noise_key, count_key = jax.random.split(key, 3)
     poses = random_poses(pose_key, most, setting.radius)
     if isinstance(thing, PartScene):
