@@ -1,6 +1,7 @@
-"""Numbers in another byte order, or longer than JAX's, give what they give in its own: `python byte_order.py`.
+"""Functions give the same result for arrays of another byte order, or of longer types than JAX's: `python
+byte_order.py`.
 
-A program of its own: in the tests annotations are checked before anything else is.
+This is a program of its own, because in the tests beartype checks annotations before anything else.
 """
 
 import sys
@@ -28,7 +29,7 @@ VALUES = np.asarray(sdf.Sphere(0.7)(np.stack(np.meshgrid(*[GRID.axis] * 3, index
 
 
 class Shell(sdf.SignedDistance):
-    """A solid of a user's."""
+    """A user's own solid."""
 
     def __call__(self, x):
         return jnp.abs(jnp.linalg.norm(jnp.asarray(x), axis=-1) - 0.9) - 0.05
@@ -68,7 +69,7 @@ TAKES_VALUES = {
 
 
 def different(function, array, kind):
-    """How far apart the results are, or the error that there is instead."""
+    """Largest difference of the results, or the error that is raised instead."""
     try:
         expected, given = (np.asarray(function(numbers), float) for numbers in (array, array.astype(kind)))
     except Exception as error:

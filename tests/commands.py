@@ -1,4 +1,4 @@
-"""The command line, called as a user calls it."""
+"""Call the command line as a user does."""
 
 import contextlib
 import io
@@ -19,7 +19,7 @@ def run_process(*arguments: str, cwd) -> subprocess.CompletedProcess:
 
 
 def run_command(*arguments: str, cwd) -> subprocess.CompletedProcess:
-    """As `run_process`, without the seconds that a process takes to start; what is not caught there raises here."""
+    """The result of `run_process`, without the start of a process. Unexpected errors are raised here."""
     stdout, stderr, code = io.StringIO(), io.StringIO(), 0
     with (
         contextlib.chdir(cwd),

@@ -1,4 +1,4 @@
-"""Shapes and types of every public signature are checked while the tests run."""
+"""Fixtures and settings of all tests. Shapes and types of public signatures are checked while the tests run."""
 
 import ctypes
 import gc
@@ -6,12 +6,12 @@ import importlib.metadata
 import os
 from pathlib import Path
 
-# Before NumPy, SciPy and JAX are loaded, and for the processes that tests start. Workers whose linear algebra takes all
-# cores each wait for one another, and so do those that compile in several threads. Most programs of the tests run for
-# less time than they take to compile: neither LLVM's passes nor wide registers nor XLA's newer emitters of fused loops
-# pay. Modules that compute for long, some five times longer so, say COMPUTES = True. What one worker has compiled the
-# others find, if it took longer than reading it back. Tracing makes and drops many small objects: collecting them as
-# often as Python does by default takes a tenth of the time.
+# These are set before NumPy, SciPy and JAX are loaded, and for the processes that tests start. Workers whose linear
+# algebra or compiler uses all cores wait for each other. Most programs of the tests run for less time than they take to
+# compile, so LLVM's passes, wide registers and XLA's newer emitters of fused loops do not pay. Modules that compute for
+# long say COMPUTES = True (some take five times longer without). Workers share compiled programs through a cache, if
+# compiling took longer than reading. Tracing makes and drops many small objects, and Python's default garbage
+# collection would take a tenth of the time.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 # Versions of XLA after 0.9 have no older emitters, and end a process that asks for them.
@@ -21,7 +21,7 @@ os.environ.setdefault(
     "--xla_cpu_parallel_codegen_split_count=1"
     + (" --xla_cpu_use_fusion_emitters=false" if importlib.metadata.version("jaxlib").startswith("0.9.") else ""),
 )
-# As `keep_compiled` says.
+# See `keep_compiled`.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).resolve().parents[1] / ".pytest_cache" / "xla"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
@@ -36,12 +36,12 @@ from jaxtyping import install_import_hook
 gc.set_threshold(100_000, 20, 100)
 install_import_hook(["jaxnbv", "forecasts", "covering", "peers", "training", "training_clouds"], "beartype.beartype")
 
-# Bytes of a worker.
+# Memory of a worker in bytes.
 MEMORY = 3 << 30
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 
-# A worker takes files as a whole, so that what a module prepares is prepared once; the longest come first.
+# A worker takes whole files, so that fixtures of a module run once. The longest files come first.
 LONGEST_FIRST = (
     "test_cli.py",
     "test_notebooks.py",
@@ -60,7 +60,7 @@ LONGEST_FIRST = (
 
 def pytest_collection_modifyitems(items):
     def place(item):
-        """Those that compute come together: what was compiled for the others is of no use to them."""
+        """Modules that compute for long come together, because they share no programs with the others."""
         name = item.path.name
         return LONGEST_FIRST.index(name) if name in LONGEST_FIRST else 99, not getattr(item.module, "COMPUTES", False)
 
@@ -70,7 +70,7 @@ def pytest_collection_modifyitems(items):
 def compile_for_speed(wanted):
     jax.clear_caches()
     gc.collect()
-    # The C library keeps what was freed, by which the next module would look as large.
+    # The C library keeps freed memory, which would count for the next module.
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:
         trim(0)
@@ -79,7 +79,7 @@ def compile_for_speed(wanted):
 
 @pytest.fixture(scope="module", autouse=True)
 def compiled_programs(request):
-    """As a module asks for them; let go before they fill the memory, which those of a whole run would."""
+    """Compile as the module asks for. Drop all programs when they fill the memory, as they would in a whole run."""
     computes = getattr(request.module, "COMPUTES", False)
     if computes == jax.config.values["jax_disable_most_optimizations"] or psutil.Process().memory_info().rss > MEMORY:
         compile_for_speed(computes)
@@ -87,7 +87,7 @@ def compiled_programs(request):
 
 @pytest.fixture
 def computes():
-    """For a single test that computes for long."""
+    """Compile a single test for speed."""
     compile_for_speed(True)
     yield
     compile_for_speed(False)
@@ -95,14 +95,14 @@ def computes():
 
 @pytest.fixture(autouse=True)
 def random_numbers_of_its_own(request):
-    """A test draws the same numbers from its module's generator whichever tests ran before it."""
+    """Reseed the module's generator, so that a test draws the same numbers whichever tests ran before it."""
     if hasattr(request.module, "RNG"):
         request.module.RNG = np.random.default_rng(0)
 
 
 @pytest.fixture
 def compilations():
-    """Names of events by which JAX tells of a compilation, eager operations included, in the order they came."""
+    """Names of JAX's compilation events in order, including those of eager operations."""
     seen = []
 
     def listen(event, duration, **_):
@@ -116,7 +116,7 @@ def compilations():
 
 @pytest.fixture
 def x64():
-    """Double precision for one test, for comparison with float64 oracles."""
+    """Double precision for one test, to compare with float64 oracles."""
     with jax.enable_x64(True):
         yield
 

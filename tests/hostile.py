@@ -1,6 +1,6 @@
-"""Any argument of a public constructor or function either works or raises `InputError`: `python tests/hostile.py`.
+"""Any argument of a public constructor or function works or raises `InputError`: `python tests/hostile.py`.
 
-A program of its own: in the tests annotations are checked by beartype before anything else is.
+This is a program of its own, because in the tests beartype checks annotations before anything else.
 """
 
 import contextlib
@@ -30,7 +30,7 @@ BALL = nbv.sdf.Sphere(1.0)
 MODEL = nbv.GeometricSPSR(0.05, 0.2, 6)
 RESIDUAL = nbv.ScreenedSPSR(MODEL, (nbv.surfaces.OnSurface(),))
 BANK = nbv.ShapeBank.of([BALL])
-# Until the program ends.
+# Kept until the program ends.
 _HELD = tempfile.TemporaryDirectory()
 COPY = Path(_HELD.name)
 for name, content in {
@@ -49,7 +49,7 @@ for name, content in {
     (COPY / name).write_text(content)
 
 
-# Of no use, so that nothing is kept in the cache.
+# An empty file, so that no mesh is cached.
 MESH = COPY / "02958343" / "a" / "model.obj"
 
 
@@ -65,7 +65,7 @@ def with_bank(bank, poses):
     return nbv.SurfaceSampler().with_bank(bank, poses)
 
 
-# What is called, and arguments that work; each is replaced in turn.
+# Functions, and arguments that work. Each argument is replaced in turn.
 CALLS = {
     nbv.Budget: {"seconds": 60.0, "cost": 3.0, "of": nbv.arc_length},
     nbv.Box: {"low": (-1.0, -1.0, -1.0), "high": (1.0, 1.0, 1.0)},
@@ -168,7 +168,7 @@ ANYTHING = st.one_of(
 
 
 def hold(function, arguments):
-    """What is called holds: it works, or says by an `InputError` what is wrong."""
+    """Assert that a call works, or raises an `InputError` that says what is wrong."""
     with contextlib.suppress(nbv.InputError):
         function(**arguments)
 

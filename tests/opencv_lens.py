@@ -1,10 +1,10 @@
-"""OpenCV's lens model in NumPy, as its page on calibration has it (calib3d, "Detailed Description")."""
+"""OpenCV's lens model in NumPy, from its page on calibration (calib3d, "Detailed Description")."""
 
 import numpy as np
 
 
 def distort(places: np.ndarray, coefficients) -> np.ndarray:
-    """Where the lens shows places (x, y) of the plane z = 1, an array (..., 2), in that plane.
+    """Image of places (x, y) of the plane z = 1 in that plane, an array (..., 2).
 
     - `coefficients`: k1, k2, p1, p2[, k3[, k4, k5, k6]].
     """

@@ -1,4 +1,4 @@
-"""Opinions on classes, in JAX and in NumPy, and on parts, and clouds to have them of."""
+"""Simple classifiers in JAX and NumPy, a segmenter, and clouds for them."""
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,7 @@ def linear_in_numpy(points, normals):
 
 
 def linear_of_batch(points, normals, mask):
-    """`linear` as it is asked on the host."""
+    """`linear` for a batch, as the host calls it."""
     return np.log([linear_in_numpy(p[m], n[m]) for p, n, m in zip(points, normals, mask, strict=True)])
 
 
@@ -40,17 +40,17 @@ def nothing(capacity):
 
 
 def context_of(acquisition, cloud):
-    """The acquisition's context of a cloud, not compiled."""
+    """The acquisition's context for a cloud, not compiled."""
     return acquisition.context(inputs_of(cloud))
 
 
 def score_of(acquisition, context, scan):
-    """The score of a scan by an acquisition that does not look at where it was taken from."""
+    """The score of a scan by an acquisition that does not depend on the scan's pose."""
     return acquisition.score(context, ImaginedView(scan, nbv.Camera(height=2, width=2), nbv.look_at((0.0, 0.0, 2.5))))
 
 
 class Linear(Segmenter):
-    """Probabilities of parts that follow from where a point is and how it faces."""
+    """Probabilities of parts from the point's position and normal."""
 
     weight: jax.Array
 

@@ -1,6 +1,7 @@
-"""What once failed by an internal error, or gave a wrong value without a word, is refused by name: `python refused.py`.
+"""Calls that once failed by an internal error, or silently gave a wrong value, raise an `InputError`: `python
+refused.py`.
 
-A program of its own: in the tests annotations are checked by beartype before anything else is.
+This is a program of its own, because in the tests beartype checks annotations before anything else.
 """
 
 import dataclasses
@@ -31,7 +32,7 @@ from jaxnbv.networks import (
 )
 from jaxnbv.studies.engine.records import read_records
 
-# Until the program ends.
+# Kept until the program ends.
 _HELD = tempfile.TemporaryDirectory()
 FOLDER = Path(_HELD.name)
 WEIGHTS = Path(nbv.__file__).parent / "networks" / "weights"
@@ -82,7 +83,7 @@ def first_if_positive(cloud):
 
 
 class Deciding(nbv.Acquisition):
-    """Scores a scan by a value that JAX traces."""
+    """An acquisition that branches on a traced value."""
 
     def context(self, step):
         return None
@@ -117,7 +118,7 @@ def stored(name, changes):
 
 
 def large_view():
-    """A view whose arrays are zeros, of which a megabyte holds gigabytes."""
+    """A view of zero arrays, a megabyte on disk that expands to gigabytes."""
     folder = FOLDER / "episode"
     nbv.simulate(P, BALL, POSE, 1, KEY, folder=folder, progress=False)
     np.savez_compressed(folder / "view_00.npz", points=np.zeros(2**26 + 2**18))
@@ -133,7 +134,7 @@ def folder_of_images(name, count=3):
 
 
 def reopened(name, change):
-    """A session whose folder was changed behind its back."""
+    """Open a session again after its folder was changed."""
     change(folder_of_images(name))
     return session(folder=FOLDER / name)
 
@@ -155,7 +156,7 @@ def older_session_asks():
 
 
 def cut(name, share, text=None):
-    """A mesh whose file ends early."""
+    """A mesh whose file is cut short."""
     ball = nbv.mesh_from_sdf(nbv.sdf.Sphere(1.0), nbv.Grid(16)).to_trimesh()
     encoding = {"encoding": "ascii"} if name.endswith(".ply") else {}
     written = ball.export(file_type=name[-3:], **encoding) if text is None else text
@@ -172,13 +173,13 @@ def records(name):
 
 
 def costing(cost):
-    """A step whose way has a cost."""
+    """A step with a cost of travel."""
     priced = dataclasses.replace(P, cost=nbv.ValuePerCost(cost))
     return priced.propose(priced.init(POSE, SCAN), KEY)
 
 
 def nan_if(condition, bad=jnp.nan):
-    """A utility that is `bad` of clouds with so many points, and zero of others."""
+    """A utility that is `bad` if the number of points meets the condition, and zero otherwise."""
 
     def lacking(cloud):
         return jnp.where(condition(jnp.sum(cloud.mask)), bad, 0.0)
@@ -187,7 +188,7 @@ def nan_if(condition, bad=jnp.nan):
 
 
 class NaNView(nbv.search.Baseline):
-    """A baseline whose values are not numbers."""
+    """A baseline whose values are NaN."""
 
     def values(self, problem, candidates, key):
         return jnp.full(self.candidates.count, jnp.nan)
@@ -199,7 +200,7 @@ def nan_baseline():
 
 
 class Saying(nbv.StopRule):
-    """A rule that says what it was given."""
+    """A stop rule that returns a given reason."""
 
     reason: object = eqx.field(static=True)
 
@@ -223,7 +224,7 @@ COMMAS = "v 0,5 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
 BOAST = "OFF\n3 10000000 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
 NEVER = nbv.SurfaceSampler(MODEL, nbv.Grid(12), 2, nbv.Carving(lambda x: jnp.full(x.shape[:1], jnp.nan)))
 
-# What is done, and some of what must be said.
+# Calls, and words that the error must contain.
 REFUSED = {
     "index beyond a batch": (lambda: POSES[6], "no index 6"),
     "iteration of a single pose": (lambda: list(POSE), "a single one"),
@@ -495,7 +496,7 @@ REFUSED = {
 
 
 def problem(action, *words):
-    """What is wrong with how something is refused, or None."""
+    """The problem of a refusal, or None."""
     try:
         action()
     except nbv.InputError as error:

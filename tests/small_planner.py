@@ -1,5 +1,4 @@
-"""A planner whose programs are small, with a scene and a first view for it; alike in many tests, which then share what
-was compiled."""
+"""A planner with small programs, a scene and a first view. Many tests share them, and so share compiled programs."""
 
 import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Capsule, Sphere

@@ -1,4 +1,4 @@
-"""A simulated sensor of 64 x 48 pixels in millimetres, in a world in metres with z up, with a table in view."""
+"""A simulated sensor of 64 x 48 pixels in millimetres, and a world in metres with z up and a table in view."""
 
 import numpy as np
 
@@ -29,8 +29,8 @@ FIRST = around(0.2, 0.5)
 
 
 def shot(matrix, unit=1000.0):
-    """What the sensor gives: whole millimetres, zero where nothing is hit. A pixel in a corner flickers, so that images
-    differ that were taken from several sides of what is round."""
+    """A depth image in whole millimetres, zero without a hit. A pixel in a corner flickers, so that images of a round
+    object from different sides differ."""
     pose = Pose.from_matrix(matrix)
     seen = scan(WORLD, CAMERA, pose)
     depth = (np.asarray(seen.points, np.float64) - np.asarray(pose.position)) @ np.asarray(pose.forward, np.float64)

@@ -17,14 +17,14 @@ from jaxnbv.utility import default_batch_size
 
 CAMERA = nbv.Camera(height=6, width=7)
 GRID = nbv.Grid(20)
-# The last looks away from the object and sees nothing.
+# The last pose looks away from the object and sees nothing.
 POSES = nbv.look_at(jnp.concatenate([nbv.geometry.fibonacci_sphere(6, 2.5), jnp.array([[0.0, 3.0, 0.0]])]))
 POSES = eqx.tree_at(lambda pose: pose.rotation, POSES, POSES.rotation.at[-1].set(jnp.eye(3)))
 
 
 @pytest.fixture(scope="module")
 def surfaces():
-    """Three balls apart from the origin, as samples of a surface."""
+    """Three balls away from the origin, as sampled surfaces."""
     return balls(GRID, [0.9, 0.7, 0.5], [[0.2, 0.0, 0.1], [-0.3, 0.3, 0.0], [0.0, -0.2, 0.4]])
 
 
@@ -35,7 +35,7 @@ def cloud():
 
 
 def height(cloud):
-    """A utility with both signs: how high the points lie, less what each costs."""
+    """A utility of either sign: the heights of the points, minus a cost for each."""
     return jnp.sum(jnp.where(cloud.mask, jnp.tanh(2 * cloud.points[:, 1] + cloud.normals[:, 2]) - 0.1, 0.0))
 
 
@@ -44,7 +44,7 @@ def height_in_numpy(points, normals):
 
 
 class Toy(nbv.Acquisition):
-    """Counts the rows and weighs them by the context, the highest point of D."""
+    """Counts the rows, with the highest point of D (the context) as weight."""
 
     def context(self, step):
         cloud = step.observations.cloud
@@ -101,12 +101,12 @@ def test_the_context_is_computed_once_a_step(surfaces, cloud):
 
     nbv.expected_value(nbv.ExpectedUtilityImprovement(utility), cloud, surfaces, CAMERA, POSES).block_until_ready()
     jax.effects_barrier()
-    # And once before it, to check it.
+    # It runs once before that, for the check.
     assert len(ran) == 2
 
 
 class Vector(Toy):
-    """An acquisition that is a vector itself."""
+    """An acquisition with several parameters."""
 
     def score(self, context, view):
         value = super().score(context, view)
@@ -127,7 +127,7 @@ def test_several_acquisitions_of_the_same_scans_are_each_that_of_its_own(surface
 
 
 class Highest(eqx.Module):
-    """A utility that is no function."""
+    """A utility that is a callable object and no function."""
 
     def __call__(self, cloud):
         return height(cloud)
@@ -164,7 +164,7 @@ ALL = {
 
 
 def value_of(acquisition, surfaces, cloud):
-    """The expected value at one pose, a function of where it is and of the points of the cloud."""
+    """The expected value at one pose, as a function of its position and the cloud's points."""
 
     def value(x, points=cloud.points):
         seen = nbv.PointCloud(points, cloud.normals, cloud.mask)
@@ -179,7 +179,7 @@ def value_of(acquisition, surfaces, cloud):
 def test_every_acquisition_has_a_gradient_under_jit_and_vmap_but_heat_says_that_it_has_none(
     surfaces, cloud, name, wrap
 ):
-    """In the pose, with the cloud known, and in both."""
+    """In the pose, in the cloud, and in both."""
     value = value_of(ALL[name], surfaces, cloud)
     x = jnp.asarray(0.5) if wrap is not jax.vmap else jnp.asarray([0.5, 0.2])
     points = jnp.broadcast_to(cloud.points, (*x.shape, *cloud.points.shape))
@@ -222,7 +222,7 @@ def test_heat_is_valued_under_vmap(surfaces, cloud):
 
 @pytest.mark.parametrize("name", ACQUISITIONS)
 def test_only_heat_is_computed_by_the_host(surfaces, cloud, name):
-    """Its Laplacian has no JAX; all else stays on the device."""
+    """Its Laplacian has no implementation in JAX. Everything else stays on the device."""
 
     def step(cloud, surfaces):
         return nbv.expected_value(ACQUISITIONS[name], cloud, surfaces, CAMERA, POSES)
@@ -264,7 +264,7 @@ def test_a_device_that_is_set_counts_and_not_the_one_that_was_found(monkeypatch)
 )
 @pytest.mark.parametrize("model", [nbv.GeometricSPSR(0.1, truncation=6), nbv.ScreenedSPSR()], ids=["paper", "screened"])
 def test_all_products_have_full_precision(model, search):
-    """GPUs multiply float32 matrices with 10 bits of each number unless asked not to."""
+    """GPUs multiply float32 matrices with 10 bits of each number by default."""
     first = nbv.look_at((0.3, 1.0, 2.3))
 
     def step(angle, key):

@@ -1,4 +1,4 @@
-"""The listing is the architecture: imports follow the order of the packages, and go round in no circle."""
+"""The folders are the architecture: imports follow the order of the packages, without cycles."""
 
 import ast
 from pathlib import Path
@@ -8,7 +8,7 @@ import pytest
 import jaxnbv
 
 ROOT = Path(jaxnbv.__file__).parent
-# Data flows down this list: each imports only from those before it, and from itself.
+# Data flows down this list. Each package imports only from those before it and from itself.
 ORDER = (
     "version",
     "errors",
@@ -34,7 +34,7 @@ ORDER = (
     "studies",
     "cli",
 )
-# What stands beside the library, of which the root and all before it know nothing.
+# Packages outside the library. The root and the packages before them do not import them.
 LABORATORY = ("studies", "cli")
 FILES = {
     ".".join(path.relative_to(ROOT.parent).with_suffix("").parts).removesuffix(".__init__"): path
@@ -43,8 +43,8 @@ FILES = {
 
 
 def imported(path: Path, name: str) -> set[str]:
-    """The modules of the package that a file names: in imports anywhere in it, in its stub, and in text that is a
-    module's name, as registries hold and `import_module` takes."""
+    """Modules of the package that a file names: in any import, in its stub, and in strings that are names of modules,
+    as in registries and for `import_module`."""
     found: set[str] = set()
     stub = path.with_suffix(".pyi")
     package = name if path.name == "__init__.py" else name.rpartition(".")[0]
@@ -57,7 +57,7 @@ def imported(path: Path, name: str) -> set[str]:
                 found |= {base, *(f"{base}.{alias.name}" for alias in node.names)}
             elif isinstance(node, ast.Constant) and isinstance(node.value, str):
                 found.add(node.value.partition(":")[0])
-    # A package whose file is named along with what it holds is meant by what it holds.
+    # A package that is imported together with its members counts by these.
     modules = {module for module in found if module in FILES and module != "jaxnbv"}
     return modules - {name}
 
@@ -97,7 +97,7 @@ def test_the_library_and_its_root_import_nothing_of_the_laboratory():
 
 
 def test_no_file_imports_itself_by_way_of_others():
-    """Kahn's algorithm; a package's own face, which lists what is in it, counts as no importer."""
+    """Kahn's algorithm. A package's `__init__`, which lists its members, does not count."""
     faces = {name for name, path in FILES.items() if path.name == "__init__.py"}
     graph = {name: {other for other in others if other not in faces} for name, others in GRAPH.items()}
     graph = {name: others for name, others in graph.items() if name not in faces}

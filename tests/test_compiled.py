@@ -1,4 +1,4 @@
-"""Programs that are kept: a later process compiles nothing, and says what stops it from keeping them."""
+"""Compiled programs on disk: a later process compiles nothing, and warnings say why programs are not stored."""
 
 import os
 import shutil
@@ -13,7 +13,7 @@ from commands import run_command
 import jaxnbv as nbv
 from jaxnbv.compiled import PROGRAMS
 
-# A program that compiles within a millisecond or two is kept, too.
+# Programs that compile within a millisecond or two are stored as well.
 SCRIPT = """
 import sys
 import jax
@@ -53,14 +53,14 @@ def test_a_damaged_program_is_named_and_compiled_again(tmp_path):
     hits, _, said = run_script(tmp_path)
     assert hits == 0
     assert said.count("Error reading persistent compilation cache entry") == misses
-    # The page of troubles says so.
+    # The page on troubles gives this remedy.
     shutil.rmtree(tmp_path)
     assert run_script(tmp_path)[2] == ""
 
 
 @pytest.fixture
 def settings():
-    """Those of this process, as they were."""
+    """JAX's settings of this process, restored after the test."""
     names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
     before = {name: jax.config.values[name] for name in names}
     with mock.patch.dict(os.environ):

@@ -1,5 +1,5 @@
-"""What the README and the site's pages name is there: files, commands, options, messages, public names; and formulas
-are whole."""
+"""Everything that the README and the site's pages name exists: files, commands, options, messages and public names.
+Formulas are complete."""
 
 import importlib
 import inspect
@@ -32,7 +32,7 @@ def test_links_and_paths_lead_somewhere(document):
 
 
 def test_a_package_page_has_links_to_the_web_alone():
-    """Of the README, as the package's build rewrites it."""
+    """For the README as the package's build rewrites it."""
     text = (ROOT / "README.md").read_text()
     links = re.compile(r"!?\[[^\]]*\]\(([^)]*)\)")
     assert "docs/demo.gif" in links.findall(text)
@@ -52,7 +52,7 @@ def test_each_command_of_the_readme_is_one_line(name):
 
 
 def test_messages_that_are_explained_are_given():
-    """Each in the code, where it may be broken over lines."""
+    """Each message is in the code, where it may span lines."""
     code = "".join(re.sub(r'"\s*\n\s*f?"', "", path.read_text()) for path in (ROOT / "jaxnbv").rglob("*.py"))
     said = (DOCS / "how_to" / "trouble.md").read_text().partition("## It says nothing")[0]
     messages = [phrase for row in re.findall(r"(?m)^\| (`.*?) \|", said) for phrase in re.findall("`([^`]+)`", row)]
@@ -61,7 +61,7 @@ def test_messages_that_are_explained_are_given():
 
 
 def commands(text: str) -> list[list[str]]:
-    """Those of blocks of shell, without the variables that are set before them."""
+    """Commands in blocks of shell, without variables that are set before them."""
     found = []
     for block in re.findall(r"(?ms)^```bash\n(.*?)^```$", text):
         for line in block.replace("\\\n", " ").splitlines():
@@ -79,7 +79,7 @@ COMMAND = typer.main.get_command(cli.app)
 
 
 def parse(arguments: list[str], whole: bool = True) -> None:
-    """As the command line takes them. Runs nothing. What is named in a sentence need not be whole."""
+    """Check a command with the parser of the command line. Runs nothing. In a sentence a command may lack arguments."""
     command = COMMAND
     while arguments and arguments[0] in getattr(command, "commands", {}):
         command, arguments = command.commands[arguments[0]], arguments[1:]
@@ -90,15 +90,15 @@ def parse(arguments: list[str], whole: bool = True) -> None:
     try:
         command.make_context("jaxnbv", list(arguments))
     except typer.Exit:
-        pass  # After its help or its version.
+        pass  # Raised after the help or the version.
     except Exception as error:
-        # Typer carries its own click, or does not.
+        # Some versions of typer have their own click.
         if whole or type(error).__name__ != "MissingParameter":
             raise
 
 
 def check_script(arguments: list[str]) -> None:
-    """A script of the repository, whose parser names the options."""
+    """Check a script of the repository. Its parser names the options."""
     if arguments[0] == "-m":
         assert arguments[1] == "venv"
         return
@@ -108,14 +108,14 @@ def check_script(arguments: list[str]) -> None:
 
 
 def check_extras(arguments: list[str]) -> None:
-    """Extras that are installed are those of the package."""
+    """Check that installed extras are extras of the package."""
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     named = [name for word in arguments for group in re.findall(r"\[(.*)\]", word) for name in group.split(",")]
     assert set(named) <= set(extras)
 
 
 CHECKS = {"jaxnbv": parse, "python": check_script, "python3": check_script, "pip": check_extras, "uv": check_extras}
-# Programs of others, whose options are not looked at.
+# Other programs, whose options are not checked.
 OTHERS = {"mkdir", "tar", "cp", "ruff", "mypy", "pytest", "sphinx-build", "dask"}
 
 
@@ -132,7 +132,7 @@ def test_the_commands_of_a_page_are_there(page, capsys):
 
 @pytest.mark.parametrize("page", PAGES)
 def test_formulas_in_tables_are_whole(page):
-    """A bar ends a cell of a table, within a formula too."""
+    """A bar ends a table cell, even within a formula."""
     rows = [line for line in (DOCS / page).read_text().splitlines() if line.startswith("|")]
     assert not [cell for row in rows for cell in row.split("|") if cell.count("$") % 2]
 
@@ -165,6 +165,6 @@ def test_every_public_class_and_function_has_its_place_in_the_reference(package)
 
 
 def test_the_example_of_style_is_the_code():
-    """CONTRIBUTING.md shows a class as it is."""
+    """CONTRIBUTING.md shows the class as it is in the code."""
     (shown,) = re.findall(r"(?ms)^```python\n(.*?)^```$", (ROOT / "CONTRIBUTING.md").read_text())
     assert shown.strip() in (ROOT / "jaxnbv" / "tasks" / "coverage.py").read_text()

@@ -1,4 +1,4 @@
-"""Whatever is given to a public constructor or function, it works or says what was wrong."""
+"""Public constructors and functions accept any argument, or say what is wrong with it."""
 
 import subprocess
 import sys

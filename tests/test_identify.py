@@ -1,4 +1,4 @@
-"""`jaxnbv identify`: a recording of a known part, against where it truly lies."""
+"""`jaxnbv identify` on a recording of a known part, against the true pose."""
 
 import dataclasses
 import json
@@ -42,7 +42,7 @@ def parts(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
-    """Four depth images of the bracket, in millimetres; poses in metres, z up."""
+    """Four depth images of the bracket in millimetres, with poses in metres and z up."""
     folder, frames = tmp_path_factory.mktemp("recording"), []
     vertices = 0.001 * np.asarray(PARTS["bracket"].vertices) @ TURN.T + CENTRE
     mesh = nbv.TriangleMesh(vertices, np.asarray(PARTS["bracket"].faces), nbv.Frame())
@@ -85,7 +85,7 @@ def test_a_recorded_part_is_named_and_lies_where_it_does(parts, recording, tmp_p
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:no table is found", "ignore:there is no table under")
 def test_objects_that_masks_show_are_named_apart(parts, recording, tmp_path, capsys):
-    """The bracket alone is masked, and not in every frame."""
+    """Only the bracket is masked, and not in every frame."""
     (tmp_path / "masks").mkdir()
     for index in (0, 2):
         pixels = np.asarray(Image.open(recording / f"{index}.png")) > 0

@@ -1,4 +1,4 @@
-"""The installed JAX computes on a CPU what it should, by the known reproductions; versions that do not are refused."""
+"""The installed JAX passes the known reproductions of errors on a CPU. Versions that do not are refused."""
 
 import os
 import subprocess
@@ -8,8 +8,8 @@ import pytest
 
 from jaxnbv.version import check_jax
 
-# Compiled as users compile them, and compared with NumPy in double precision. jax issue 39103 is a matrix by a vector
-# under vmap, then a reduction: rows after the 32,768th came out wrong in single precision, after the 16,384th in
+# Compiled as users compile, and compared with NumPy in double precision. jax issue 39103 is a matrix-vector product
+# under vmap, followed by a reduction: rows after the 32,768th were wrong in single precision, and after the 16,384th in
 # double. Issues 39257 and 40412 end the process: sums over arrays of rank 8 and 7.
 PROGRAMS = """
 import jax

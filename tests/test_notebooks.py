@@ -1,5 +1,5 @@
-"""The notebooks run from top to bottom, at small settings (their cell tagged `parameters` is replaced), and what they
-have stored is of their code."""
+"""Notebooks run from top to bottom at small settings (their cell tagged `parameters` is replaced), and their stored
+outputs belong to their code."""
 
 import re
 import runpy
@@ -15,7 +15,7 @@ NOTEBOOKS = ROOT / "notebooks"
 EACH = pytest.mark.parametrize("name", sorted(path.name for path in NOTEBOOKS.glob("*.ipynb")))
 
 MODEL = "model = nbv.ScreenedSPSR(nbv.GeometricSPSR((0.05, 0.1), (0.2, 0.25), truncation=8))"
-# The same everywhere, so that what one notebook has compiled the next one reads.
+# The same sizes everywhere, so that notebooks share compiled programs.
 SIZES = "num_samples, resolution, pixels, num_candidates, capacity, views = 2, 24, 12, 12, 512, 2"
 SMALL = {
     "01_quickstart.ipynb": f"{MODEL}\n{SIZES}",
@@ -50,7 +50,7 @@ def code_cells(notebook):
 
 
 def kinds(cell):
-    """What a cell shows: text, pictures, pages."""
+    """Kinds of outputs of a cell: text, pictures, pages."""
     found = set()
     for output in cell.outputs:
         found |= (
@@ -60,7 +60,7 @@ def kinds(cell):
 
 
 def wording(cell):
-    """The lines that a cell prints, numbers and blanks aside."""
+    """Lines that a cell prints, without numbers and blanks."""
     text = "".join(output.text for output in cell.outputs if output.get("name") == "stdout")
     lines = (re.sub(r"\s", "", re.sub(r"[-+]?\d+(\.\d*)?(e[-+]?\d+)?", "#", line)) for line in text.splitlines())
     return {line for line in lines if line}
@@ -68,7 +68,7 @@ def wording(cell):
 
 @EACH
 def test_what_is_stored_is_of_this_code(name):
-    """Otherwise: python scripts/run_notebooks.py NAME."""
+    """If it fails, run python scripts/run_notebooks.py NAME."""
     script, notebook = runpy.run_path(str(ROOT / "scripts" / "run_notebooks.py")), stored(name)
     assert notebook.metadata["jaxnbv"]["code"] == script["code_hash"](notebook)
     cells = code_cells(notebook)
@@ -81,7 +81,7 @@ def test_what_is_stored_is_of_this_code(name):
 
 @pytest.fixture(scope="module")
 def kernel():
-    """One for all, so that what a notebook has compiled the next one has; they share no names."""
+    """One kernel for all notebooks, which share compiled programs and no names."""
     manager = KernelManager(kernel_name="python3")
     manager.start_kernel()
     yield manager
@@ -91,7 +91,7 @@ def kernel():
 @pytest.mark.slow
 @EACH
 def test_notebook_runs(name, kernel, tmp_path):
-    """And every cell shows the same kinds of things as it has stored, in the same words."""
+    """Every cell has outputs of the same kinds as the stored ones, with the same words."""
     notebook = stored(name)
     (cell,) = (cell for cell in notebook.cells if "parameters" in cell.metadata.get("tags", []))
     cell.source = SMALL[name]
@@ -102,5 +102,5 @@ def test_notebook_runs(name, kernel, tmp_path):
     assert any("next view from" in text for text in printed)
     for now, before in zip(code_cells(notebook), code_cells(stored(name)), strict=True):
         assert kinds(now) - {"stderr"} == kinds(before), before.source
-        # Which of several lines are printed may depend on the settings.
+        # Some of the printed lines may depend on the settings.
         assert wording(now) & wording(before) or wording(now) == wording(before) == set(), before.source

@@ -1,4 +1,4 @@
-"""What commands print reaches terminals and files of every encoding, in a likeness where it lacks a character."""
+"""Output of commands reaches terminals and files of every encoding, with substitutes for missing characters."""
 
 import ast
 import io
@@ -41,7 +41,7 @@ def test_a_likeness_stands_for_what_an_encoding_lacks(encoding, expected, name):
 
 
 def test_every_character_of_the_package_has_a_likeness():
-    """None is left as a code, which a reader would have to look up."""
+    """No character is replaced by a code, which a reader would have to look up."""
     texts = {
         node.value
         for file in Path(jaxnbv.__file__).parent.rglob("*.py")
@@ -60,7 +60,7 @@ def test_a_path_that_is_no_text_is_written_by_its_codes():
 
 
 def test_commands_answer_in_every_encoding():
-    """One after the other in one process, as its entry point runs them."""
+    """The commands run one after the other in one process, through its entry point."""
     script = f"""
 import sys
 from jaxnbv.cli import main

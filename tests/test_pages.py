@@ -1,4 +1,4 @@
-"""The programs of the README and of the site's pages run, one a page."""
+"""The programs of the README and of the site's pages run, one for each page."""
 
 import dataclasses
 import json
@@ -35,7 +35,7 @@ PROGRAMS = [page for page in PAGES if blocks(page) and page != "how_to/depth_cam
 
 
 def smaller(planner_of=nbv.Planner):
-    """A planner as it is asked for, with less of what takes long alone. Models of a page's own are left as they are."""
+    """Replace `Planner` by one with smaller settings where computation is long. Models of a page's own stay."""
 
     def make(*given, **named):
         planner = planner_of(*given, **named)
@@ -67,7 +67,7 @@ def before_mesh(monkeypatch):
 
 
 def before_pytorch(monkeypatch):
-    """A model that tells classes by the height of the points, in place of PyTorch."""
+    """A model that classifies by the height of the points, in place of PyTorch."""
 
     def log_softmax(logits, dim):
         return (logits - np.log(np.exp(logits).sum(axis=dim, keepdims=True))).view(Tensor)
@@ -81,7 +81,7 @@ def before_pytorch(monkeypatch):
 
 
 def before_cluster(monkeypatch):
-    """Clusters that nobody has started, and a command that is not run."""
+    """Fake clusters, and a command that is not run."""
 
     class Started:
         scheduler_address = "tcp://HOST:8786"
@@ -102,7 +102,7 @@ def before_cluster(monkeypatch):
     monkeypatch.setattr("subprocess.run", lambda words, check: parse(words[1:]))
 
 
-# What a page leaves to its reader.
+# Preparations that a page leaves to its reader.
 BEFORE = {
     "how_to/cluster.md": before_cluster,
     "how_to/mesh.md": before_mesh,
@@ -113,7 +113,7 @@ NAMES = {"how_to/utility.md": {"source": np.array([0.0, 1.25, 0.0])}}
 
 @pytest.fixture
 def as_before():
-    """The device that a page chooses is not kept."""
+    """Restore the default device after a page."""
     yield
     jax.config.update("jax_default_device", None)
 
@@ -122,7 +122,7 @@ def as_before():
 @pytest.mark.usefixtures("as_before")
 @pytest.mark.parametrize("page", PROGRAMS)
 def test_the_program_of_a_page_runs(page, tmp_path, monkeypatch):
-    """As it is written, but for sizes; reports are tested on their own."""
+    """As written, except for sizes. Reports have their own tests."""
     monkeypatch.chdir(tmp_path)
     BEFORE.get(page, lambda _: None)(monkeypatch)
     reported = []
@@ -136,7 +136,7 @@ def test_the_program_of_a_page_runs(page, tmp_path, monkeypatch):
         assert np.isfinite(float(names[name].value))
 
 
-# Less of what takes long alone: frequencies of the prior, views, samples, nodes, points, rays and candidates.
+# Smaller numbers of frequencies, views, samples, nodes, points, rays and candidates.
 LESS = {
     "nbv.ScreenedSPSR(),": "nbv.ScreenedSPSR(nbv.GeometricSPSR(0.05, truncation=8)),",
     "views=5": "views=2",
@@ -147,7 +147,7 @@ LESS = {
 
 
 def test_the_script_of_the_readme_runs(tmp_path, monkeypatch):
-    """As it is written, but for sizes, with a scan that is told by its points alone."""
+    """As written, except for sizes, with a scan that has only points."""
     monkeypatch.chdir(tmp_path)
     trimesh.creation.icosphere().export("spot.obj")
     script = blocks("../README.md")[0]
@@ -176,7 +176,7 @@ def test_the_block_of_episodes_runs():
 
 
 def image_of_a_ball(matrix):
-    """Of 0.1 metres, on the table z = 0; in millimetres along the camera's axis."""
+    """A ball of 0.1 metres on the table z = 0, as depths along the camera's axis in millimetres."""
     matrix = np.asarray(matrix, np.float64)
     row, column = np.indices((480, 640))
     rays = np.stack([column, row, np.ones_like(row)], axis=-1) @ np.linalg.inv(INTRINSICS).T @ matrix[:3, :3].T
@@ -196,7 +196,7 @@ def poses_about_a_ball(count):
 
 @pytest.mark.slow
 def test_the_block_of_a_session_runs(tmp_path, monkeypatch):
-    """Until the ball is expected to be covered. Reports of sessions are tested on their own."""
+    """Runs until the ball is expected to be covered. Reports of sessions have their own tests."""
     monkeypatch.chdir(tmp_path)
     reported = []
     monkeypatch.setattr(nbv, "write_report", lambda episode, folder: reported.append(episode))
@@ -221,7 +221,7 @@ def test_the_block_of_a_session_runs(tmp_path, monkeypatch):
     assert np.abs(np.linalg.norm(points - [0.0, 0.0, 0.1], axis=1) - 0.1).max() < 0.01
     assert points[:, 0].min() < -0.08
     assert points[:, 0].max() > 0.08
-    # Loaded again, it is the same session.
+    # The loaded session is the same.
     (block,) = (block for block in blocks("how_to/depth_camera.md") if "Session.load" in block)
     exec(block, given)
     assert given["session"] is not session

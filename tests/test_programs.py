@@ -1,4 +1,4 @@
-"""Programs that are kept: a later process neither traces nor compiles them, and gets the same numbers."""
+"""Programs on disk: a later process neither traces nor compiles them, and gets the same numbers."""
 
 import os
 import subprocess
@@ -15,7 +15,7 @@ from jaxnbv.compiled import PROGRAMS
 from jaxnbv.programs import program
 from jaxnbv.scanning import sdf
 
-# One proposal, with what it counts: programs that were compiled, and functions of the package that were traced.
+# One proposal. Prints the numbers of compiled programs and of traced functions of the package.
 SCRIPT = """
 import sys
 import jax
@@ -45,7 +45,7 @@ def folder(tmp_path, monkeypatch):
 
 
 def counted(function):
-    """A program of a function of the package, and the arguments that it was traced with."""
+    """A program of a function of the package, and a list of the arguments of its traces."""
     calls = []
 
     def counting(*args, **kwargs):
@@ -76,7 +76,7 @@ def test_a_later_process_traces_and_compiles_nothing(tmp_path):
 
 
 class Line(eqx.Module):
-    """Of the tests, not of the package."""
+    """A class outside the package."""
 
     slope: jax.Array
 
@@ -91,7 +91,7 @@ def test_numbers_and_structure_are_those_of_filter_jit(folder):
     ball, x = sdf.Sphere(0.5), np.linspace(-1, 1, 12, dtype=np.float32).reshape(4, 3)
     expected = eqx.filter_jit(function)(ball, x, 2, label="ball")
     for _ in range(2):
-        # The second is read.
+        # The second one is read from disk.
         kept, calls = counted(function)
         result = kept(ball, x, 2, label="ball")
         assert eqx.tree_equal(result, expected, typematch=True)
@@ -119,7 +119,7 @@ def test_settings_are_part_of_a_program(folder):
 
 
 def test_code_of_others_is_not_kept(folder):
-    """The user may change it, and a kept program would stay as it was."""
+    """The user may change it, and a stored program would not follow."""
     kept, _ = counted(lambda line, x: line(x))
     np.testing.assert_array_equal(kept(Line(jnp.asarray(2.0)), jnp.ones(2)), [2.0, 2.0])
     np.testing.assert_array_equal(kept(lambda x: -x, jnp.ones(2)), [-1.0, -1.0])
@@ -167,7 +167,7 @@ def test_after_an_edit_the_same_code_is_not_compiled_again(folder, monkeypatch):
 
 
 def test_programs_call_lapack_in_a_process_that_never_lowered_it(folder):
-    """JAX finds LAPACK's functions while it lowers."""
+    """JAX finds LAPACK's functions only while it lowers."""
     script = (
         "import jax.numpy as jnp; from jaxnbv.programs import program\n"
         "def f(x): return jnp.linalg.eigh(x)[0]\n"

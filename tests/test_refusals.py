@@ -1,4 +1,4 @@
-"""What cannot be meant is refused where it is given, by an error that names the value and what to give instead."""
+"""Impossible input is refused where it is given, by an error that names the value and the remedy."""
 
 import math
 
@@ -128,7 +128,7 @@ SEARCH = [
     (lambda: nbv.search.ConstrainedPoses(2.0, 2.0), "from 2.0 to 2.0"),
     (lambda: nbv.search.ConstrainedPoses(0.0, 2.0), "from 0.0 to 2.0"),
     (lambda: nbv.search.ConstrainedPoses(off_axis=0.5 * math.pi), "off_axis is 1.57"),
-    # The default camera ends 15 degrees from its centre; half as wide as high, it ends at about half of that.
+    # The default camera's image ends 15 degrees from its centre. With half the width it ends at about half of that.
     (lambda: nbv.search.ConstrainedPoses().check_camera(nbv.Camera(width=25)), "but the image ends 0.133 rad"),
     (lambda: IN_VIEW.check_camera(nbv.Camera()), "centre would leave it"),
     (lambda: nbv.NewSurface(0.0), r"size is 0\.0"),

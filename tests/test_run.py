@@ -1,4 +1,4 @@
-"""`jaxnbv run` on a mesh: its folder, its sensor and what it says of the mesh."""
+"""`jaxnbv run` on a mesh: its folder, its sensor and its output."""
 
 import json
 from unittest import mock
@@ -14,17 +14,17 @@ from jaxnbv.planning.planner import Planner
 
 @pytest.fixture
 def ring(tmp_path):
-    """A folder with a mesh whose surface is 1.25 from the centre at most."""
+    """A folder with a mesh whose surface is at most 1.25 from the centre."""
     trimesh.creation.torus(1.0, 0.4).export(tmp_path / "ring.ply")
     return tmp_path
 
 
-# Without samples of surfaces, in seconds.
+# This search needs no samples, and takes seconds.
 FARTHEST = ("run", "ring.ply", "--search", "farthest", "--views", "2", "--no-report")
 
 
 def border_hits(file):
-    """How many of the rays along the image's border met the object, and how many of all."""
+    """Number of rays along the image's border that hit the object, and of all rays."""
     with np.load(file) as view:
         side = round(len(view["scan.mask"]) ** 0.5)
         image = view["scan.mask"].reshape(side, side)
@@ -53,7 +53,7 @@ def test_the_papers_close_up_is_there_when_asked(ring):
 
 
 def test_a_view_is_told_when_it_is_done(ring):
-    """Before the next is looked for, which fails here."""
+    """The line is printed before the search for the next view, which fails here."""
     with mock.patch.object(Planner, "choose", side_effect=InputError("stopped here")):
         result = run_command(*FARTHEST, cwd=ring)
     assert "stopped here" in result.stderr

@@ -1,4 +1,4 @@
-"""The surfaces that are held possible: the presets, and what is made of observations, against closed forms."""
+"""The sampler of surfaces: its presets, and the use of observations, against closed forms."""
 
 import dataclasses
 
@@ -66,7 +66,7 @@ GRID, CAMERA, KEY = nbv.Grid(26, 1.6), nbv.Camera(height=30, width=30), jax.rand
 POSES = nbv.look_at(jnp.array([[0.0, 0.2, 2.5], [2.3, 0.0, -0.9]]))
 SCANS = nbv.scan(nbv.SDFSurface(nbv.sdf.Sphere(0.6)), CAMERA, POSES)
 AWAY = np.linalg.norm(np.stack(np.meshgrid(*[GRID.axis] * 3, indexing="ij"), axis=-1), axis=-1)
-# Few of the nodes are so near to one of the balls that rounding decides.
+# For few nodes rounding decides whether they are inside a ball.
 SHARE = (AWAY[..., None] < RADII).mean(axis=-1)
 
 
@@ -76,7 +76,7 @@ class Balls(nbv.surfaces.Fields):
 
 
 class BallsPosterior(nbv.surfaces.SurfacePosterior):
-    """Whatever was seen, balls of eight radii, of the level 0.3."""
+    """Balls of eight radii with the level 0.3, for any observations."""
 
     level: Float[Array, ""]
 
@@ -112,7 +112,7 @@ def test_the_probability_is_the_share_of_the_samples_that_hold_a_node():
     for observations in (SCANS[0], seen(balls(None))):
         np.testing.assert_allclose(balls(None).probability_inside(observations), SHARE, atol=1e-6)
     assert len(np.unique(SHARE)) == 9
-    # Of a cloud alone nothing is known to be empty, but the volume is.
+    # A cloud alone shows nothing to be empty, but the volume still carves.
     small = balls(nbv.Carving(nbv.Box.cube(0.8)))
     np.testing.assert_allclose(
         small.probability_inside(SCANS[0]), np.where(small.carving.outside(GRID), 0.0, SHARE), atol=1e-6
@@ -124,7 +124,7 @@ TABLE = nbv.Obstacles((nbv.sdf.HalfSpace([0.0, -0.3, 0.0], [0.0, 1.0, 0.0]),))
 
 @pytest.mark.parametrize(("obstacles", "carving"), [(None, nbv.Carving()), (TABLE, nbv.Carving()), (TABLE, None)])
 def test_nothing_is_imagined_where_the_object_cannot_be(obstacles, carving):
-    """Within obstacles, with carving or without."""
+    """Within obstacles, with and without carving."""
     sampler = balls(carving)
     observations = seen(sampler, obstacles)
     nowhere = np.asarray(GRID.axis)[None, :, None] < (-np.inf if obstacles is None else -0.3)
@@ -141,8 +141,7 @@ def test_nothing_is_imagined_where_the_object_cannot_be(obstacles, carving):
 
 
 def test_what_a_volume_cuts_is_no_surface():
-    """Balls within a slab that cuts them above: from above a ray meets the cut, and has met nothing; from the side it
-    meets the ball."""
+    """A slab cuts balls at the top. From above a ray meets the cut, which is no hit. From the side it hits the ball."""
     slab = nbv.Carving(nbv.Box((-1.25, -1.25, -1.25), (1.25, 0.1, 1.25)))
     surfaces = balls(slab).sample(SCANS[0], KEY)
     poses = nbv.look_at(jnp.array([[0.0, 2.5, 0.1], [0.0, 0.0, 2.5]]))
@@ -150,7 +149,7 @@ def test_what_a_volume_cuts_is_no_surface():
     largest = np.argmax(RADII)
     assert int(above[largest]) < 0.1 * int(beside[largest])
     whole = balls().sample(SCANS[0], KEY)
-    # The smallest ball reaches two spacings beyond the slab at most, so nothing of it is cut.
+    # The smallest ball reaches at most two spacings beyond the slab, so that nothing of it is cut.
     small = [nbv.scanning.scan_samples(one, CAMERA, POSES[1:]).mask[0].sum() for one in (surfaces, whole)]
     assert int(small[0]) == int(small[1]) > 0
 
@@ -201,7 +200,7 @@ def test_another_box_takes_the_place_of_the_default_one_alone():
     assert [source.volume for source in after.model.values] == [box, own, box]
     assert after.carving == nbv.Carving(box, 1.5)
     assert [source.room for source in after.model.values] == [0.2, 0.0, 0.2]
-    # The rest is as it was.
+    # Everything else is unchanged.
     default = {"volume": nbv.Box(), "room": 0.0}
     back = [dataclasses.replace(one, **default) for one in (after.model.values[0], after.model.values[2])]
     values = (back[0], after.model.values[1], back[1])

@@ -1,4 +1,5 @@
-"""Samples and candidates shared among eight devices have the values of one; each device has its share of the work."""
+"""Samples and candidates shared among eight devices have the values of a single device, and each device has its share
+of the work."""
 
 import subprocess
 import sys
@@ -60,7 +61,7 @@ PROGRAM = """
 
 
 def test_eight_devices_agree_with_one(tmp_path):
-    """In a process of its own: how many devices there are is said before JAX starts."""
+    """In its own process, because the number of devices must be set before JAX starts."""
     program = tmp_path / "program.py"
     program.write_text(textwrap.dedent(PROGRAM))
     ended = subprocess.run([sys.executable, program], capture_output=True, text=True, timeout=600)

@@ -1,5 +1,5 @@
-"""Cameras of any intrinsics against the pinhole formula in float64, their range and incidence; poses, look_at, matrices
-and the Fibonacci sphere."""
+"""Cameras with any intrinsics against the pinhole formula in float64, with range and incidence; poses, `look_at`,
+matrices and the Fibonacci sphere."""
 
 import math
 
@@ -18,7 +18,7 @@ from jaxnbv.viz.scene import frustum
 
 coordinate = st.floats(-3.0, 3.0, width=32)
 vector = st.tuples(coordinate, coordinate, coordinate)
-# Of few sizes, since each is compiled for.
+# Few sizes, since each is compiled.
 sizes = st.sampled_from([2, 7, 60])
 lengths = st.floats(5.0, 500.0)
 shares = st.floats(0.05, 0.95)
@@ -93,7 +93,7 @@ CENTERS = [
 
 @pytest.mark.parametrize(("left", "top"), [(320, 240), (600, 0), (-300, 100), (0, 400), (100, -200)])
 def test_the_rays_of_a_window_are_those_of_the_whole_image(left, top):
-    """Wherever its principal point lies, as of structured light too."""
+    """For principal points anywhere, even outside the image, as of structured light."""
     matrix, whole = FULL - np.array([[0.0, 0.0, left], [0.0, 0.0, top], [0.0, 0.0, 0.0]]), np.array(FULL)
     camera = nbv.Camera.from_intrinsics(matrix, 120, 160)
     directions = np.asarray(camera.pixel_directions(), np.float64).reshape(120, 160, 3)
@@ -130,7 +130,7 @@ LENSES = [
 
 
 def through_lens(x, y, k1, k2, p1, p2, k3=0.0, k4=0.0, k5=0.0, k6=0.0):
-    """OpenCV's formula, in float64."""
+    """OpenCV's formula in float64."""
     r2 = x * x + y * y
     radial = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
     return x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
@@ -138,8 +138,8 @@ def through_lens(x, y, k1, k2, p1, p2, k3=0.0, k4=0.0, k5=0.0, k6=0.0):
 
 @pytest.mark.parametrize("lens", LENSES)
 def test_distortion_is_undone_once_an_image(lens):
-    """A ball before a slanted wall through a lens: analytic depths on rays found by iteration from the forward model.
-    What met nothing stays so."""
+    """A ball before a slanted wall through a lens. Analytic depths on rays from the inverted forward model. Pixels
+    without a return keep none."""
     matrix = np.array([[250.0, 0.0, 160.5], [0.0, 252.0, 118.0], [0.0, 0.0, 1.0]])
     v, u = np.mgrid[:240, :320].astype(float)
     seen = (u - 160.5) / 250.0, (v - 118.0) / 252.0
@@ -178,7 +178,7 @@ def test_distortion_is_undone_once_an_image(lens):
 
 
 def test_a_scan_tells_what_lies_in_range_and_is_not_aslant():
-    """A ball before a wall: analytic depths and angles, ray by ray."""
+    """A ball before a wall, with analytic depths and angles at each ray."""
     surface = nbv.SDFSurface(Sphere(0.5) | Cuboid([1.2, 1.2, 0.1]).translate([0.0, 0.0, -1.0]))
     pose = nbv.look_at((0.0, 0.0, 2.5))
     whole = nbv.Camera(math.radians(50.0), 40, 40)
@@ -297,7 +297,8 @@ def test_look_at_and_rays_run_under_jit_and_are_differentiable():
 
 @pytest.mark.parametrize("count", [12, 120, 1000])
 def test_fibonacci_sphere_is_even(count):
-    """Nearest neighbours against Fejes Toth's bound, which no set of n points on the sphere can exceed."""
+    """Distances between nearest neighbours against Fejes Toth's bound, which no set of n points on the sphere can
+    exceed."""
     points = np.asarray(nbv.geometry.fibonacci_sphere(count, 2.5), dtype=np.float64)
     np.testing.assert_allclose(np.linalg.norm(points, axis=1), 2.5, atol=1e-5)
     unit = points / 2.5
@@ -305,7 +306,7 @@ def test_fibonacci_sphere_is_even(count):
     bound = math.sqrt(4 - 1 / math.sin(math.pi * count / (6 * (count - 2))) ** 2)
     assert 0.8 * bound < distance.min() <= bound
     assert np.linalg.norm(unit.mean(axis=0)) < 2 / count
-    # No hole: any direction has a point within the distance at which the bound's neighbours lie.
+    # There is no hole: any direction has a point within the distance of neighbours at the bound.
     probes = np.random.default_rng(1).normal(size=(2000, 3))
     probes /= np.linalg.norm(probes, axis=1, keepdims=True)
     assert np.linalg.norm(probes[:, None] - unit[None], axis=-1).min(axis=1).max() < bound
@@ -319,7 +320,7 @@ def test_a_batch_of_poses_is_iterated_once():
 
 
 def test_a_program_for_one_range_runs_for_any():
-    """A session's range is in scene units, which another box changes."""
+    """A session's range is in scene units, which depend on its box."""
     traces = []
 
     @eqx.filter_jit

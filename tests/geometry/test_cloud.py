@@ -1,4 +1,4 @@
-"""Point clouds: bad input, depth images, farthest point sampling against a slow greedy version."""
+"""Point clouds: bad input, depth images, and farthest point sampling against a slow greedy version."""
 
 import math
 
@@ -63,7 +63,7 @@ def test_masked_rows_are_not_taken_for_data():
 
 
 def rays_by_hand(camera, pose):
-    """Rays through the pixel centres with a forward component of one, in float64."""
+    """Rays through the pixel centres in float64, with a forward component of one."""
     focal = camera.height / 2 / math.tan(camera.fov / 2)
     row, column = np.mgrid[: camera.height, : camera.width]
     x, y = (column + 0.5 - camera.width / 2) / focal, (row + 0.5 - camera.height / 2) / focal
@@ -85,7 +85,7 @@ def test_depth_of_a_plane_gives_its_points_and_exact_normals(x64, normal):
 
 
 def test_depth_of_a_sphere_gives_normals_within_a_pixel(x64):
-    """A plane through what lies within a step h on a unit sphere is tilted by less than h, and off by its sagitta."""
+    """A plane through points within a step h on a unit sphere is tilted by less than h, and off by the sagitta."""
     camera, pose = nbv.Camera(height=60, width=60, fov=0.3), nbv.look_at((0.8, 0.9, 2.2), target=(0.1, 0.0, 0.0))
     rays, origin = rays_by_hand(camera, pose), np.asarray(pose.position)
     a, b, c = (rays**2).sum(-1), rays @ origin, origin @ origin - 1
@@ -117,7 +117,7 @@ def test_invalid_pixels_and_pixels_without_a_plane_are_masked(bad):
     camera, pose = nbv.Camera(height=6, width=7), nbv.look_at((0.8, 0.9, 2.2))
     depth = np.full((6, 7), 2.0)
     depth[1, 2] = bad
-    # A pixel alone, one of a row alone, and one at the end of a row.
+    # A lone pixel, a pixel with neighbours in one row only, and one at the end of a row.
     depth[3:, 3:] = bad
     depth[4, 5] = 2.0
     depth[5, :2], depth[4, :3] = 2.0, bad
@@ -136,7 +136,7 @@ def test_invalid_pixels_and_pixels_without_a_plane_are_masked(bad):
 
 
 def greedy(points, mask, count):
-    """Rows chosen by the definition of farthest point sampling, ties to the first row."""
+    """Rows by the definition of farthest point sampling. The first row wins ties."""
     left = [i for i in range(len(points)) if mask[i]]
     chosen = left[:1]
     left = left[1:]
@@ -147,7 +147,7 @@ def greedy(points, mask, count):
 
 
 def tagged(points, mask):
-    """A cloud whose normals carry the row's number, so that a choice among duplicates shows."""
+    """A cloud whose normals hold the row's number, which tells duplicates apart."""
     mask = np.asarray(mask)
     points = np.where(mask[:, None], points, 0.0).astype(np.float32)
     tags = np.where(mask[:, None], np.arange(len(points))[:, None] * np.ones(3), 0.0).astype(np.float32)
@@ -164,7 +164,7 @@ subsample = jax.jit(nbv.geometry.farthest_point_subsample, static_argnums=1)
     st.sampled_from([1, 6, 20, 23]),
 )
 def test_farthest_points_against_the_greedy_definition(points, mask, count):
-    """Small integers: exact in float32, with many ties and duplicates."""
+    """Small integers are exact in float32, and give many ties and duplicates."""
     points = np.asarray(points)
     thinned = subsample(tagged(points, mask), count)
     expected = greedy(points, mask, count)

@@ -1,4 +1,4 @@
-"""Depth images as a sensor gives them: units, strides, a box, range; and what cannot be meant."""
+"""Depth images of a sensor: units, strides, boxes, ranges, and input that cannot be right."""
 
 import functools
 import itertools
@@ -22,14 +22,14 @@ BOX = nbv.Box((-0.15, -0.15, 0.002), (0.15, 0.15, 0.25))
 
 
 def depth_of(*solids, camera=CAMERA, pose=POSE):
-    """Along the camera's axis; infinite where nothing is hit."""
+    """Depth along the camera's axis. Infinite where nothing is hit."""
     seen = nbv.scan(nbv.SDFSurface(functools.reduce(operator.or_, solids)), camera, pose)
     depth = (np.asarray(seen.points, np.float64) - np.asarray(pose.position)) @ np.asarray(pose.forward, np.float64)
     return np.where(seen.mask, depth, np.inf).reshape(camera.height, camera.width)
 
 
 def test_millimetres_of_a_sensor_give_the_points_in_metres():
-    """Integers, holes of zero, an off-centre camera with pixels that are not square."""
+    """Integers, zeros for holes, an off-centre camera, and pixels that are not square."""
     depth = depth_of(BALL)
     image = np.where(np.isfinite(depth), np.round(1000.0 * depth), 0.0).astype(np.uint16)
     cloud = nbv.PointCloud.from_depth(image, CAMERA, POSE, depth_scale=1e-3)
@@ -43,7 +43,7 @@ def test_millimetres_of_a_sensor_give_the_points_in_metres():
 
 @pytest.mark.parametrize("stride", [2, 3, 5])
 def test_a_strided_image_has_rows_of_the_whole(stride):
-    """Planes are fitted to all pixels."""
+    """Planes are fitted to all pixels, whatever the stride."""
     strided, rows = CAMERA.strided(stride), slice(stride // 2, None, stride)
     cloud, whole = (nbv.PointCloud.from_depth(depth_of(BALL, TABLE), CAMERA, POSE, stride=n) for n in (stride, 1))
     assert cloud.capacity == strided.num_rays
@@ -65,7 +65,7 @@ def test_a_box_keeps_the_object_and_knows_what_was_crossed():
     inside = np.asarray(whole.mask) & np.all((points >= low) & (points <= high), axis=1)
     np.testing.assert_array_equal(cropped.mask, inside)
     assert inside.sum() > 200
-    # Ray by ray, in float64 and by small steps: does the way to the hit leave the box again, or never meet it?
+    # For each ray, in float64 by small steps: whether it leaves the box again before its hit, or never meets the box.
     position = np.asarray(POSE.position, np.float64)
     rays = np.asarray(CAMERA.pixel_directions(), np.float64) @ np.asarray(POSE.rotation, np.float64).T
     steps = np.linspace(0.0, 3.0, 3001)[:, None, None]
@@ -78,7 +78,7 @@ def test_a_box_keeps_the_object_and_knows_what_was_crossed():
     sure = np.abs(flat - last) > 2e-3
     missed = np.asarray(cropped.missed)
     np.testing.assert_array_equal(missed[sure], (~hit | beyond)[sure])
-    # The pillar hides a part of the box: of that nothing is known.
+    # The pillar hides a part of the box, where nothing is known.
     hidden = ~missed & ~np.asarray(cropped.mask) & hit
     assert hidden.sum() > 20
     assert (np.abs(points[hidden & np.asarray(whole.mask)][:, 1] + 0.5) < 0.02).mean() > 0.9
@@ -95,7 +95,8 @@ def test_beyond_its_range_a_sensor_met_nothing_and_before_it_says_nothing():
 
 
 def image_with(mark, background, dtype, camera=CAMERA):
-    """The ball before a background, millimetres or metres; the left half of it is marked as not measured."""
+    """The ball before a background, in millimetres or metres. In the left half, `mark` replaces all unmeasured
+    depths."""
     depth = depth_of(BALL, camera=camera)
     ball = np.isfinite(depth)
     shown = np.where(ball, 1000.0 * depth, background)
@@ -112,7 +113,7 @@ WALL = 2500.0 + 5.0 * np.random.default_rng(0).normal(size=(48, 64))
 @pytest.mark.parametrize("mark", [65535, 32767, 10000, 8191, 4095, 2047])
 @pytest.mark.filterwarnings("ignore:the depth image has the value")
 def test_a_mark_says_no_more_than_zero(mark, alone, dtype, farthest):
-    """Row by row the same cloud, and no node within the ball is known to be empty."""
+    """The clouds are the same row by row, and no node within the ball is known to be empty."""
     camera = nbv.Camera.from_intrinsics(CAMERA.intrinsics, 48, 64, farthest=farthest)
     scale = 1e-3 if dtype == np.uint16 else 1.0
     clouds = []
@@ -171,7 +172,7 @@ SPARSE = {
 @pytest.mark.parametrize("stride", [4, 8])
 @pytest.mark.parametrize("name", SPARSE)
 def test_an_image_with_gaps_shows_the_object(name, stride):
-    """As many rows as of the whole image but for the rim, on their rays, near the ball and with its normals."""
+    """Almost as many rows as from the whole image, on their rays, near the ball and with its normals."""
     depth = depth_of(BALL, TABLE, camera=FINE)
     image = np.where(np.isfinite(depth) & SPARSE[name](*np.mgrid[:480, :640]), np.round(1e4 * depth), 0.0)
     whole = nbv.PointCloud.from_depth(np.where(np.isfinite(depth), depth, 0.0), FINE, POSE, 1.0, stride, BOX)
@@ -185,15 +186,15 @@ def test_an_image_with_gaps_shows_the_object(name, stride):
     rays = np.asarray(FINE.strided(stride).pixel_directions(), np.float64)[np.asarray(cloud.mask)]
     local = (points - np.asarray(POSE.position, np.float64)) @ np.asarray(POSE.rotation, np.float64)
     np.testing.assert_allclose(local / local[:, 2:], rays, atol=1e-5)
-    # What lies between samples is not seen through.
+    # Rays between the samples are not taken to have passed.
     assert not np.asarray(cloud.missed & whole.mask).any()
     both = np.asarray(cloud.mask & whole.mask)
     assert np.median(np.abs(np.asarray(cloud.sight) / np.asarray(whole.sight) - 1.0)[both]) < 0.03
 
 
 def test_holes_are_no_gaps():
-    """A quarter of the pixels, in clumps as a sensor returns them: each has neighbours, so that none stands for others.
-    Of as many at random few have."""
+    """A quarter of the pixels in clumps, as from a sensor. Each has neighbours, so that none stands for others. Few
+    have neighbours if as many pixels are random."""
     noise = gaussian_filter(np.random.default_rng(0).normal(size=(240, 320)), 1.5)
     clumps = noise > np.quantile(noise, 0.75)
     assert gap_of(clumps) == 1
@@ -202,12 +203,12 @@ def test_holes_are_no_gaps():
 
 
 def test_planes_are_seen_exactly_between_samples():
-    """Linear in inverse depth: the pattern and the phase of the gaps do not matter."""
+    """Planes are linear in inverse depth, so that the pattern and the phase of the gaps do not matter."""
     depth = depth_of(Cuboid([3.0, 3.0, 0.02]).translate([0.0, 0.0, -0.02]), camera=FINE)
     for keep in SPARSE.values():
         image = np.where(np.isfinite(depth) & keep(*np.mgrid[:480, :640]), depth, 0.0)
         points, normals = nbv.PointCloud.from_depth(image, FINE, POSE, stride=5).to_numpy()
-        # Farther away it is seen aslant by more than planes are fitted to.
+        # Farther away the plane is too oblique for a fit.
         points, normals = points[points[:, 1] < 0.0], normals[points[:, 1] < 0.0]
         assert len(points) > 2000
         assert np.percentile(np.abs(points[:, 2]), 99) < 1e-4
@@ -247,8 +248,8 @@ def test_depths_beyond_the_type_say_nothing_and_only_infinity_says_nothing_is_th
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
 @pytest.mark.parametrize("noise", [0.0, 1e-3])
 def test_pixels_that_mix_a_near_and_a_far_surface_are_left_out_and_thin_parts_stay(share, noise):
-    """A ball and a leg three pixels wide, 0.8 m away before a wall; in some of the pixels beside an edge the depth is
-    anywhere between."""
+    """A ball and a leg three pixels wide stand 0.8 m away before a wall. Some of the pixels beside an edge have a depth
+    anywhere between the two."""
     camera = CAMERA.resized(192, 256)
     leg = Cuboid([0.0035, 0.0035, 0.1]).translate([0.14, 0.0, 0.1])
     near = np.minimum(depth_of(BALL, leg, camera=camera), 1.6)

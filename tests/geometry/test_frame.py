@@ -1,4 +1,4 @@
-"""Frames: between the world and the scene, and which way is up."""
+"""Frames: world and scene coordinates, and the upward axis."""
 
 import jax
 import numpy as np
@@ -36,7 +36,7 @@ def test_up_is_the_scene_s_y_by_a_rotation(up):
 
 @pytest.mark.parametrize("up", ["y", "-z"])
 def test_what_a_sensor_sees_in_the_world_is_what_it_sees_in_the_scene(up):
-    """A depth image, its camera, pose and box, brought to the scene before or after it becomes a cloud."""
+    """A depth image with its camera, pose and box maps to the scene before or after it becomes a cloud."""
     frame = nbv.Frame(0.01, (50.0, -20.0, 30.0), up)
     camera = nbv.Camera(0.6, 12, 14, nearest=150.0, farthest=260.0)
     pose = nbv.look_at((50.0, 90.0, 190.0), (48.0, -18.0, 31.0), up=(0.1, 0.9, 0.3))

@@ -86,7 +86,7 @@ def test_second_derivatives(x64):
 
 @pytest.mark.parametrize("count", [2, 3, 200, 700])
 def test_the_spacing_is_the_median_distance_between_neighbours(count):
-    """Of some of many points: within a tenth."""
+    """For many points the median of some is within a tenth."""
     points = np.random.default_rng(3).normal(size=(count, 3))
     rows = np.random.default_rng(4).permutation(1000)[:count]
     held, mask = np.zeros((1000, 3), np.float32), np.zeros(1000, bool)

@@ -1,5 +1,5 @@
-"""Normals of plain points against those of their surface; planes through the noise of a depth image: the noise that
-is found, and what it leaves of normals and depths."""
+"""Normals of plain points against those of their surface; planes fitted to noisy depth images: the estimated noise, and
+the errors that remain in normals and depths."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +16,7 @@ def angles(found, expected):
 
 
 def test_normals_of_a_ball_are_its_radii_and_face_each_points_own_sensor():
-    """Within a patch of 16 of 3,000 points, 0.073 in radius, a ball turns by four degrees."""
+    """Within a patch of 16 of 3,000 points (radius 0.073) the normal of a ball turns by four degrees."""
     found = nbv.geometry.estimate_normals(0.7 * CENTRES, 3.0 * CENTRES)
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1.0, atol=1e-9)
     assert np.percentile(angles(found, CENTRES), 99) < 2.0
@@ -33,7 +33,7 @@ def test_more_neighbours_smooth_noise():
     assert many < 3.0
 
 
-# A ball of 8 cm before a slanted plane, 0.45 m away: in metres, as a sensor of 640 x 480 pixels sees its middle.
+# A ball of 8 cm before a slanted plane, 0.45 m away, in metres, as in the middle of a sensor's 640 x 480 pixels.
 CAMERA = nbv.Camera.from_intrinsics([[570.0, 0.0, 99.5], [0.0, 570.0, 79.5], [0.0, 0.0, 1.0]], 160, 200)
 POSE = nbv.look_at((0.03, 0.0, 0.45))
 RADIUS = 0.08
@@ -41,7 +41,7 @@ SLANTED, BEHIND = np.array([0.3, -0.2, 1.0]) / np.sqrt(1.13), -0.05
 
 
 def ball_and_plane():
-    """Depth and outward normals, from the equations, in float64."""
+    """Depth and outward normals in closed form, in float64."""
     rays = np.asarray(CAMERA.pixel_directions(), np.float64) @ np.asarray(POSE.rotation, np.float64).T
     origin, forward = np.asarray(POSE.position, np.float64), np.asarray(POSE.forward, np.float64)
     plane = (BEHIND - origin @ SLANTED) / (rays @ SLANTED)
@@ -55,7 +55,7 @@ def ball_and_plane():
 
 
 def image(noise, seed=0):
-    """In whole millimetres."""
+    """A noisy image in whole millimetres."""
     depth, _ = ball_and_plane()
     noisy = depth + noise * np.random.default_rng(seed).normal(size=depth.shape)
     return np.round(1000.0 * noisy).astype(np.uint16)
@@ -63,7 +63,7 @@ def image(noise, seed=0):
 
 @pytest.mark.parametrize("noise", [1e-3, 2e-3, 5e-3])
 def test_the_noise_of_an_image_is_found(noise):
-    """The tolerance is that of the median of some hundred differences near a pixel, and the surface bends."""
+    """The tolerance is that of the median of some hundred differences near a pixel, and of the surface's curvature."""
     depth = jnp.asarray(1e-3 * image(noise))
     found = np.asarray(depth_noise(depth, depth > 0, 0.0)) / np.hypot(noise, 1e-3 / np.sqrt(12))
     assert np.median(found) == pytest.approx(1.0, rel=0.1)
@@ -71,9 +71,10 @@ def test_the_noise_of_an_image_is_found(noise):
 
 
 def test_noise_is_that_of_a_pixels_own_place_and_depth():
-    """Two walls, each quiet on its left and loud on its right; pixels of both lie side by side, a third of them near.
+    """Two walls, both with low noise on the left and high noise on the right. Their pixels are mixed, and a third
+    belong to the near wall.
 
-    In the middle, within a tile and a half of which both are, it may be either.
+    Within a tile and a half of the middle the estimate may be either.
     """
     rng = np.random.default_rng(0)
     near = np.arange(240) % 15 < 5
@@ -86,8 +87,8 @@ def test_noise_is_that_of_a_pixels_own_place_and_depth():
 
 
 def test_neighbours_that_err_alike_hide_no_noise():
-    """Each error that of a pixel and the next ones, as in an image that its sensor has smoothed: less than the sum of
-    independent ones, but more than half."""
+    """Each error is averaged with those of the next pixels, as by a sensor that smooths. The estimate is less than for
+    independent errors, but more than half."""
     rng = np.random.default_rng(0)
     independent = 1e-3 * rng.normal(size=(121, 161))
     smoothed = 0.25 * sum(independent[down : 120 + down, right : 160 + right] for down in (0, 1) for right in (0, 1))
@@ -96,7 +97,7 @@ def test_neighbours_that_err_alike_hide_no_noise():
 
 
 def test_steps_of_depth_are_noise():
-    """A slope whose depth changes in steps of 1 cm, each over a dozen pixels: most differences are zero."""
+    """The depth of a slope changes in steps of 1 cm, each over a dozen pixels, so most differences are zero."""
     slope = 2.0 + 0.01 * np.floor(np.arange(320) / 12.0) * np.ones((240, 1))
     found = depth_noise(jnp.asarray(slope), jnp.ones(slope.shape, bool), 0.0)
     assert np.median(found) == pytest.approx(0.01 / np.sqrt(12), rel=0.5)
@@ -112,8 +113,8 @@ def test_an_image_without_four_pixels_in_a_row_has_no_noise_but_that_of_rounding
 
 @pytest.mark.parametrize("wall", [0.75, 1.5, 4.0])
 def test_a_noisy_background_does_not_blur_what_is_before_it(wall):
-    """A ball of 8 cm at 0.57 m, a wall over most of the image, and noise that grows with the square of the depth; the
-    oracle is the ball's equation, and the image without a wall."""
+    """A ball of 8 cm at 0.57 m before a wall over most of the image, with noise that grows as the square of the depth.
+    Compares with the ball's equation, and with the image without a wall."""
     camera = nbv.Camera.from_intrinsics([[570.0, 0.0, 319.5], [0.0, 570.0, 239.5], [0.0, 0.0, 1.0]], 480, 640)
     pose = nbv.look_at((0.03, 0.0, 0.57))
     ball = nbv.scan(nbv.SDFSurface(nbv.scanning.sdf.Sphere(RADIUS)), camera, pose)
@@ -141,7 +142,8 @@ def test_a_noisy_background_does_not_blur_what_is_before_it(wall):
 )
 @pytest.mark.parametrize("stride", [1, 4])
 def test_normals_see_through_the_noise(noise, median, most, stride):
-    """Degrees, half and nine tenths of the pixels; the edge of the ball among them. Depths are better than measured."""
+    """Errors in degrees at half and nine tenths of the pixels, including the edge of the ball. Fitted depths are better
+    than measured ones."""
     depth, normals = ball_and_plane()
     rows = slice(stride // 2, None, stride)
     cloud = nbv.PointCloud.from_depth(image(noise), CAMERA, POSE, depth_scale=1e-3, stride=stride)

@@ -1,4 +1,5 @@
-"""Rotations: turns against SciPy, the 6-D map against a float64 Gram-Schmidt, the least rotation by its angle."""
+"""Rotations: rotation vectors against SciPy, the 6-D map against Gram-Schmidt in float64, and the least rotation by its
+angle."""
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +26,7 @@ BETWEEN_JACOBIAN = jax.jit(jax.jacfwd(rotation_between, argnums=(0, 1))), jax.ji
 component = st.floats(-1.0, 1.0, width=32)
 vector = st.tuples(component, component, component)
 scale = st.sampled_from([1e-12, 1e-6, 1.0, 1e6, 1e12])
-# How much of the second vector is the first one, and how much is another: parallel, nearly so, or neither.
+# Share of the first vector in the second, and of another vector: parallel, nearly parallel, or neither.
 mixture = st.sampled_from([(0.0, 1.0), (1.0, 0.0), (-1.0, 0.0), (1.0, 1e-8), (1.0, 1e-7), (-1.0, 1e-6), (1.0, 1e-4)])
 
 
@@ -35,7 +36,7 @@ def units(count):
 
 
 def error_of_rotations(rotations):
-    """Greatest entry of |R^T R - 1|, and the least determinant, in float64."""
+    """Largest entry of |R^T R - 1|, and the least determinant, in float64."""
     r = np.asarray(rotations, np.float64).reshape(-1, 3, 3)
     return np.abs(np.swapaxes(r, 1, 2) @ r - np.eye(3)).max(), np.linalg.det(r).min()
 
@@ -73,7 +74,7 @@ def test_turns_are_those_of_scipy_with_their_derivatives(x64, angle):
 
 
 def test_at_zero_a_turn_has_the_cross_product_as_its_derivative():
-    """In float32, where nothing may be 0 / 0: d R u = d w x u. Nor has a length a slope there."""
+    """In float32, without 0 / 0: d R u = d w x u. A length has no slope at zero."""
     slope = jax.jit(jax.jacrev(rotation_from_vector))(jnp.zeros(3))
     expected = np.stack([np.cross(e, np.eye(3)).T for e in np.eye(3)], axis=-1)
     np.testing.assert_array_equal(slope, expected)
@@ -93,7 +94,7 @@ def test_random_columns_against_gram_schmidt_in_double_precision():
     a, b = np.split(columns.astype(np.float64), 2, axis=-1)
     sine = np.linalg.norm(np.cross(a, b), axis=1) / np.linalg.norm(a, axis=1) / np.linalg.norm(b, axis=1)
     got = np.asarray(FROM_6D(columns))
-    # The rounding of two unit vectors turns what is left of the second by itself over the sine between them.
+    # Rounding of two unit vectors turns the orthogonal remainder of the second by itself over the sine between them.
     assert (np.abs(got - gram_schmidt(columns)).max(axis=(1, 2)) * sine).max() < 1e-6
     assert_rotations(got, 2e-6)
 
@@ -115,7 +116,7 @@ def test_every_pair_of_vectors_gives_a_rotation(a, b, first_scale, second_scale,
 
 @pytest.mark.parametrize("double", [False, True])
 def test_parallel_pairs_give_rotations(double):
-    """Parallel but for rounding, in many directions: what is left of the second vector is noise."""
+    """Parallel up to rounding, in many directions. The orthogonal remainder of the second vector is noise."""
     with jax.enable_x64(double):
         dtype = np.float64 if double else np.float32
         a = np.concatenate([units(4000), [[1, 1, 0], [1, 1, 1], [0, 1, 1], [1, 2, 2]]])
@@ -149,7 +150,7 @@ def test_least_rotation_takes_start_to_end_about_an_axis_orthogonal_to_both(x64)
 def test_equal_vectors_are_not_turned():
     start = jnp.asarray(units(500), jnp.float32)
     np.testing.assert_allclose(BETWEEN(start, start), np.tile(np.eye(3), (500, 1, 1)), atol=5e-7)
-    # Nor is the derivative special there: d R = [start x d end]_x.
+    # The derivative has no singularity there: d R = [start x d end]_x.
     jacobian = np.asarray(BETWEEN_JACOBIAN[0](start[0], start[0])[1])
     move = np.cross(start[0], np.eye(3)[1])
     move /= np.linalg.norm(move)
@@ -158,7 +159,7 @@ def test_equal_vectors_are_not_turned():
 
 
 def test_opposite_vectors_are_turned_by_half_a_turn_with_finite_derivatives():
-    """Opposite exactly or but for rounding: their sum is noise, which may point anywhere."""
+    """Opposite exactly or up to rounding. Their sum is noise in any direction."""
     start = np.concatenate([units(2000), np.eye(3), -np.eye(3)]).astype(np.float32)
     for end in (-start, -start * np.float32(1 + 2e-7), -start + 1e-7 * RNG.normal(size=start.shape)):
         end = end.astype(np.float32)

@@ -1,4 +1,4 @@
-"""Volumes: box distances against brute force, and points on a volume's boundary."""
+"""Volumes: distances from boxes against brute force, and points on a volume's boundary."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -36,7 +36,7 @@ def test_box_distances_against_the_nearest_of_many_surface_points(x64):
 
 
 def ellipsoid(x):
-    """Smaller in magnitude than the distance to an ellipsoid with half axes 0.9, 0.5 and 0.7."""
+    """An implicit function of an ellipsoid with half axes 0.9, 0.5 and 0.7, smaller in magnitude than the distance."""
     return 0.5 * (jnp.sqrt(jnp.sum((x / jnp.asarray([0.9, 0.5, 0.7])) ** 2, axis=-1)) - 1.0)
 
 
@@ -56,7 +56,7 @@ def test_boundary_points_lie_on_the_boundary_all_around(name):
     volume, zero_on_boundary = BOUNDARIES[name]
     points = np.asarray(boundary_points(volume, 300), np.float64)
     np.testing.assert_allclose(zero_on_boundary(points), 0.0, atol=2e-6)
-    # Every direction has a point near it: 300 cells of the sphere have a radius of about 0.12 each.
+    # Every direction has a point nearby: each of 300 cells of the sphere has a radius of about 0.12.
     directions = points / np.linalg.norm(points, axis=1, keepdims=True)
     asked = RNG.normal(size=(500, 3))
     cosines = (asked / np.linalg.norm(asked, axis=1, keepdims=True)) @ directions.T
@@ -72,7 +72,7 @@ def test_the_share_of_points_beyond_each_face():
 
 
 def test_a_program_runs_for_any_box():
-    """Without being traced again."""
+    """The program is not traced again."""
     traced = []
 
     @eqx.filter_jit

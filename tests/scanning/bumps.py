@@ -1,4 +1,4 @@
-"""Surfaces and rays to differentiate scans on."""
+"""Surfaces and rays for derivatives of scans."""
 
 import equinox as eqx
 import jax
@@ -20,7 +20,7 @@ def solid():
 
 
 class Bumps(eqx.Module):
-    """|x| - 0.9 and a dozen random waves: smooth and band-limited but for the ball's centre."""
+    """|x| - 0.9 and a dozen random waves: smooth and band-limited except at the ball's centre."""
 
     waves: jax.Array
     phases: jax.Array
@@ -43,14 +43,14 @@ def small_surfaces(rng, count):
 
 
 def rough_values(grid, seed, amplitude):
-    """A sphere with smoothed noise, of several cells' wavelength."""
+    """A sphere with smoothed noise whose wavelength is several cells."""
     noise = np.random.default_rng(seed).standard_normal((grid.resolution,) * 3)
     noise = scipy.ndimage.gaussian_filter(noise, 1.2)
     return np.linalg.norm(nodes(grid.axis), axis=-1) - 0.9 + amplitude * noise / noise.std()
 
 
 def random_rays(rng, count, radius=2.5, spread=1.0, dtype=np.float32):
-    """From places on a sphere towards places in a cube; `rng` may be a seed."""
+    """Rays from points on a sphere towards points in a cube. `rng` may be a seed."""
     rng = np.random.default_rng(rng)
     origins = rng.standard_normal((count, 3))
     origins *= radius / np.linalg.norm(origins, axis=1, keepdims=True)
@@ -60,7 +60,7 @@ def random_rays(rng, count, radius=2.5, spread=1.0, dtype=np.float32):
 
 
 def sphere_hit(o, d, radius):
-    """How far along rays a ball about the origin is met, from outside or within, in float64; infinite where not."""
+    """Distance along rays to a ball about the origin, from outside or within, in float64. Infinite for a miss."""
     o, d = o.astype(float), d.astype(float)
     b = np.sum(o * d, axis=1)
     squared = b**2 - np.sum(o**2, axis=1) + radius**2
@@ -70,7 +70,7 @@ def sphere_hit(o, d, radius):
 
 
 def box_hit(o, d, half):
-    """As of a ball, and the outward normal there."""
+    """Distance along rays to a box about the origin, and the outward normal there."""
     o, d = o.astype(float), d.astype(float)
     a, b = (-half - o) / d, (half - o) / d
     near, far = np.minimum(a, b), np.maximum(a, b)

@@ -1,4 +1,4 @@
-"""Solids, a camera and projections that the tests of free space and of carving share."""
+"""Solids, a camera and projections for the tests of free space and carving."""
 
 import math
 
@@ -9,7 +9,7 @@ from on_grid import nodes
 import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Cuboid, Sphere
 
-# Rays 0.02 apart on the object, nodes 0.07.
+# Rays are 0.02 apart on the object, and nodes 0.07.
 CAMERA, GRID, POSE = (
     nbv.Camera(height=56, width=70, fov=0.5),
     nbv.Grid(50),
@@ -33,7 +33,7 @@ def in_camera(x, pose):
 
 
 def image(x, camera, pose):
-    """Column and row, in pixels from the image's corner, and depth."""
+    """Depth, and column and row in pixels from the image's corner."""
     right, down, ahead = np.moveaxis(in_camera(x, pose), -1, 0)
     focal = 0.5 * camera.height / math.tan(0.5 * camera.fov)
     with np.errstate(divide="ignore", invalid="ignore"):

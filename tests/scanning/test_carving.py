@@ -1,4 +1,4 @@
-"""The planner and what was seen to be empty: carved samples, what the model is told, refused scans and observations."""
+"""Carving by the planner: carved samples, empty space passed to the model, and refused scans and observations."""
 
 import dataclasses
 
@@ -19,7 +19,7 @@ POSES = [nbv.look_at((0.0, 0.3, 2.5)), nbv.look_at((0.0, 0.3, -2.5))]
 
 
 class Waves(nbv.surfaces.Fields):
-    """A ball under random waves, whatever was scanned: dents and islands all over the scene."""
+    """A ball under random waves, with dents and islands all over the scene, whatever was scanned."""
 
     phases: Float[Array, "s 3"]
 
@@ -81,12 +81,13 @@ def test_no_sample_is_inside_what_was_seen_empty_nor_outside_the_volume():
     assert (values[:, outside] < 0).any(), "there was nothing to carve"
     assert (carved[:, nowhere] > 0).all()
     np.testing.assert_allclose(carved[:, ~nowhere], values[:, ~nowhere], atol=1e-5 * np.abs(values).max())
-    # What is inside somewhere was so before.
+    # Carving makes no place more likely to be inside.
     assert ((carved < 0).mean(axis=0) <= (values < 0).mean(axis=0))[np.abs(values).min(axis=0) > 1e-4].all()
 
 
 class Told(WavesModel):
-    """Is told of space seen empty: its level says of how many points, and how far the farthest is out of the volume."""
+    """A model whose level encodes the number of empty points that it gets, and how far the farthest lies outside the
+    volume."""
 
     def condition(self, observations):
         empty = nbv.as_observations(observations).empty_points
@@ -115,7 +116,7 @@ ABOVE_AND_BELOW = [nbv.look_at((0.0, 0.0, 2.5)), nbv.look_at((0.0, 0.0, -2.5))]
 
 
 def test_carved_samples_keep_a_thin_sheet_that_was_seen_from_both_sides():
-    """Rays straight at the sheet from both sides meet every sample there, as they do where nothing is carved."""
+    """Rays perpendicular to the sheet, from both sides, hit every sample there, as without carving."""
     model = nbv.GeometricSPSR(truncation=12, lengthscale=0.1)
     planner, raw = (planner_of(carving, model=model) for carving in (nbv.Carving(), None))
     sheet = nbv.SDFSurface(Cuboid([0.6, 0.6, 0.04]))
@@ -139,7 +140,7 @@ def test_a_scan_of_another_camera_needs_that_camera():
     seen = nbv.scan(SOLIDS["ball"], other, pose)
     expected = np.asarray(SEE(CARVING, SMALL_GRID, pose, seen, other))
     column, row, _ = image(nodes_of(SMALL_GRID)[expected], other, pose)
-    # Wider than the planner's own image.
+    # The image is wider than the planner's.
     assert np.ptp(column) > 25
     assert np.ptp(row) > 10
     np.testing.assert_array_equal(planner.init(pose, seen, camera=other).empty_nodes, expected)
@@ -164,7 +165,7 @@ def test_a_cloud_that_is_no_image_carves_nothing():
 
 
 def test_an_object_larger_than_its_volume_is_refused_and_one_that_fits_is_not():
-    """The ball's near side reaches 0.65 along z; two margins are 0.22."""
+    """The near side of the ball is at z = 0.65. Two margins are 0.22."""
     noisy = nbv.SensorNoise()(nbv.scan(SOLIDS["ball"], nbv.Camera(height=40, width=40), POSES[0]), jax.random.key(0))
 
     def boxed(half):

@@ -1,4 +1,5 @@
-"""Free space: against exact rays in float64, true distances, thin sheets, sensor noise; and the planner's use of it."""
+"""Free space against exact rays in float64 and true distances, with thin sheets and sensor noise; its use by the
+planner."""
 
 import math
 
@@ -19,7 +20,7 @@ RNG = np.random.default_rng(0)
 
 
 def segment_meets(name, x, pose):
-    """Whether the straight way from the camera to x meets the solid, in closed form."""
+    """Whether the segment from the camera to x meets the solid, in closed form."""
     start = np.asarray(pose.position, np.float64) - CENTRE
     way = x - CENTRE - start
     if name == "ball":
@@ -30,8 +31,8 @@ def segment_meets(name, x, pose):
 
 
 def wholly_free(name, node, radius, camera, pose, in_image=True):
-    """Whether the whole ball about each node is in front of the camera, before the solid and in the image; or all of
-    it that is in the image."""
+    """Whether the whole ball about each node is before the solid, in front of the camera and in the image. With
+    `in_image=False` only the part of the ball in the image counts."""
     shell = np.asarray(nbv.geometry.fibonacci_sphere(80), np.float64)
     ball = node[:, None] + radius[:, None, None] * np.concatenate([np.zeros((1, 3)), shell])
     column, row, ahead = image(ball, camera, pose)
@@ -41,14 +42,15 @@ def wholly_free(name, node, radius, camera, pose, in_image=True):
 
 
 def pixel(node, camera, pose):
-    """What a pixel measures at the depth of a node."""
+    """Pixel whose measurement decides on a node."""
     return np.maximum(in_camera(node, pose)[..., 2], 0.0) * 2.0 * math.tan(0.5 * camera.fov) / camera.height
 
 
 @pytest.mark.parametrize("margin", [0.5, 1.0])
 @pytest.mark.parametrize(("name", "slack"), [("ball", 0.15), ("box", 1.5)])
 def test_a_marked_node_has_a_free_ball_about_it_and_well_inside_free_space_nodes_are_marked(name, slack, margin):
-    """But for what is smaller than a pixel: the solid's outline between pixel centres, where only a box has corners."""
+    """Except for details below a pixel, which are the solid's outline between pixel centres. Only a box has corners
+    there."""
     marked = np.asarray(
         SEE(nbv.Carving(margin_voxels=margin), GRID, POSE, nbv.scan(SOLIDS[name], CAMERA, POSE), CAMERA)
     )
@@ -71,7 +73,7 @@ def test_a_marked_node_has_a_free_ball_about_it_and_well_inside_free_space_nodes
 
 
 def test_a_node_is_marked_only_if_all_rays_near_it_and_their_neighbours_went_on_beyond_it():
-    """The definition, ray by ray in float64, on an image of random depths with holes and misses."""
+    """The definition for each ray in float64, on an image of random depths with holes and misses."""
     grid, camera, margin = nbv.Grid(16, 0.6), nbv.Camera(height=30, width=24, fov=0.5), 0.08
     shape = (camera.height, camera.width)
     depth = np.where(RNG.random(shape) < 0.03, RNG.uniform(1.8, 3.0, shape), np.inf)
@@ -104,7 +106,7 @@ FINE_NODES = jnp.asarray(nodes_of(FINE), jnp.float32)
 
 @jax.jit
 def marked_and_inside(centre, radius, half, axis, angle, start, end, direction, target, distance, key):
-    """How many nodes are marked, how many are inside the solid, and how many are both."""
+    """Numbers of nodes that are marked, inside the solid, and both."""
     solid = Cuboid(half).rotate(axis, angle).translate(centre) | Capsule(start, end, radius)
     pose = nbv.look_at(target + distance * direction, target)
     seen = nbv.SensorNoise()(nbv.scan(nbv.SDFSurface(solid), PLAIN, pose), key)
@@ -116,7 +118,7 @@ def marked_and_inside(centre, radius, half, axis, angle, start, end, direction, 
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(st.integers(0, 2**31))
 def test_noise_on_any_solid_from_anywhere_carves_nothing_of_it(seed):
-    """Nodes 0.036 apart: the margin is 3.6 standard deviations."""
+    """Nodes are 0.036 apart, so that the margin is 3.6 standard deviations."""
     rng = np.random.default_rng(seed)
     ends, target = rng.uniform(-0.5, 0.5, (2, 3)), rng.uniform(-0.2, 0.2, 3)
     axis, direction = rng.normal(size=(2, 3))
@@ -135,7 +137,7 @@ BALL_SCAN = nbv.scan(SOLIDS["ball"], CAMERA, POSE)
 
 
 def with_invalid(cloud, invalid):
-    """The scan with some pixels invalid."""
+    """The scan, with some pixels invalid."""
     keep = jnp.asarray(~invalid)
     points, normals = (jnp.where(keep[:, None], a, 0.0) for a in (cloud.points, cloud.normals))
     return nbv.PointCloud(points, normals, cloud.mask & keep, cloud.missed & keep)
@@ -152,7 +154,7 @@ def test_of_a_camera_among_the_nodes_those_behind_it_are_not_seen():
 
 
 def test_a_depth_image_carves_what_the_scan_carves_and_says_which_rays_missed():
-    """Pixels of infinity met nothing; zero, negative and not a number are invalid, as is a lone pixel's depth."""
+    """Pixels of infinity have no return. Zero, negative values, NaN and the depth of a lone pixel are invalid."""
     hit = np.asarray(BALL_SCAN.mask)
     depth = np.where(hit, in_camera(np.asarray(BALL_SCAN.points, np.float64), POSE)[:, 2], np.inf)
     bad = np.zeros(depth.shape, bool)
@@ -168,7 +170,7 @@ def test_a_depth_image_carves_what_the_scan_carves_and_says_which_rays_missed():
     from_depth = np.asarray(SEE(nbv.Carving(), GRID, POSE, cloud, CAMERA))
     from_scan = SEE(nbv.Carving(), GRID, POSE, with_invalid(BALL_SCAN, ~np.asarray(cloud.mask | cloud.missed)), CAMERA)
     assert from_depth.sum() > 1000
-    # Depths are rounded, so a node exactly a margin before a hit may fall either way.
+    # Depths are rounded, so a node exactly a margin before a hit may have either mark.
     assert (from_depth != np.asarray(from_scan)).sum() <= 3
 
 
@@ -188,7 +190,7 @@ def test_the_outside_is_what_lies_a_margin_beyond_the_volume():
 
 
 def test_carved_values_are_positive_where_empty_and_twice_the_largest_about():
-    """So, along every edge of the grid, what remains crosses it at a third, near the node that was not carved."""
+    """On every edge of the grid the rest crosses zero at a third, near the node that was not carved."""
     values = jnp.asarray(RNG.normal(size=(2, 4, 4, 4)), jnp.float32).at[0, 1, 1, 1].set(0.0)
     empty = jnp.asarray(RNG.random((4, 4, 4)) < 0.5).at[1, 1, 1].set(True)
     carved = np.asarray(carve(values, empty))

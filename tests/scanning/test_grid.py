@@ -1,5 +1,5 @@
-"""Traced hits on sampled fields: closed forms, a float64 brute-force march, Embree on marching cubes, properties; and
-the parts of the march."""
+"""Ray tracing in sampled fields against closed forms, a float64 brute-force march and Embree on marching cubes;
+properties; and the parts of the march."""
 
 import jax
 import jax.numpy as jnp
@@ -32,7 +32,7 @@ def camera_rays(poses):
     return np.asarray(origins).reshape(-1, 3), np.asarray(directions).reshape(-1, 3)
 
 
-# Linear interpolation of f errs by at most h^2 / 8 (|f_xx| + |f_yy| + |f_zz|); 2e-6 is the rounding of coordinates.
+# Linear interpolation of f errs by at most h^2 / 8 (|f_xx| + |f_yy| + |f_zz|). Rounding of coordinates adds 2e-6.
 def interpolation_error(curvatures):
     return GRID.spacing**2 / 8 * curvatures + 2e-6
 
@@ -41,7 +41,7 @@ def test_sphere_closed_form():
     origins, directions = random_rays(0, 4000, spread=1.5)
     hits = sphere().trace(origins, directions)
     points, mask = np.asarray(hits.points, np.float64), np.asarray(hits.mask)
-    # f = |x| has the second derivatives of a sphere, 2 / |x| in all, at nodes no further in than a cell's diagonal.
+    # f = |x| has second derivatives of 2 / |x| in total, at nodes inside by a cell's diagonal at most.
     error = interpolation_error(2 / (1 - 2 * GRID.spacing))
     o, d = origins.astype(np.float64), directions.astype(np.float64)
     along = -np.sum(o * d, axis=1)
@@ -52,11 +52,12 @@ def test_sphere_closed_form():
     assert np.abs(np.linalg.norm(points[mask], axis=1) - 1).max() < error
     steep = mask & (squared < 0.5)
     t = along - np.sqrt(np.maximum(1 - squared, 0))
-    # Where the ray meets the sphere at 45 degrees or more, an error of f moves the hit by at most sqrt(2) of it.
+    # Where the ray meets the sphere at 45 degrees or more, an error of f moves the hit by at most sqrt(2) times the
+    # error.
     assert np.abs(points - (o + t[:, None] * d))[steep].max() < 1.6 * error
     assert np.all(points[~mask] == 0)
     assert np.all(np.asarray(hits.normals)[~mask] == 0)
-    # Central differences of |x| err by h^2 / 6 |f_xxx| < h^2 / 2, interpolation by no more.
+    # Central differences of |x| err by h^2 / 6 |f_xxx| < h^2 / 2, and interpolation by no more.
     assert np.abs(np.asarray(hits.normals)[mask] - points[mask]).max() < 2 * GRID.spacing**2
 
 
@@ -70,20 +71,21 @@ def test_box_closed_form():
     expected = origins + t[:, None] * directions.astype(np.float64)
     assert np.asarray(hits.mask).all()
     error = np.linalg.norm(np.asarray(hits.points) - expected, axis=1)
-    # The distance is linear around a face, so interpolation is exact two voxels away from the edges.
+    # The distance is linear near a face, so interpolation is exact two voxels away from the edges.
     margin = np.sort(half - np.abs(expected), axis=1)[:, 1]
     face = margin > 2 * GRID.spacing
     assert face.sum() > 1000
     assert error[face].max() < 1e-5 / 0.2
-    # Central differences reach a voxel further out, and as far inwards, where another face may be the nearest.
+    # Central differences reach a voxel further out, and as far inwards, where another face may be nearer.
     face = margin > 4 * GRID.spacing
     np.testing.assert_allclose(np.asarray(hits.normals)[face], normal[face], atol=1e-4)
-    # Nearer to an edge the hits are still zeros of the interpolant, but for rounding.
+    # Nearer to an edge the hits are still zeros of the interpolant up to rounding.
     assert np.abs(interpolate(outside, hits.points, GRID)).max() < 1e-5
 
 
 def brute_force(values, origins, directions, grid, step):
-    """t of the first change of sign of the interpolant in the box, by dense sampling in float64; inf where none."""
+    """t at the first change of sign of the interpolant in the box, by dense sampling in float64. Infinite if there is
+    none."""
     o, d = origins.astype(np.float64), directions.astype(np.float64)
     result = np.full(len(o), np.inf)
     for i in range(len(o)):
@@ -111,7 +113,7 @@ def test_brute_force_march(amplitude):
     traced = np.where(hits.mask, np.linalg.norm(np.asarray(hits.points) - origins, axis=1), np.inf)
     assert 100 < np.isfinite(expected).sum() <= 300
     late = np.subtract(traced, expected, out=np.zeros(300), where=np.isfinite(traced) | np.isfinite(expected))
-    # A march never ends later than the brute force; it may end earlier, where two zeros lie within one of its steps.
+    # The march never ends after the brute force. It may end earlier, if two zeros lie within one brute-force step.
     assert late.max() < 0.01 * grid.spacing
     early = late < -0.01 * grid.spacing
     assert early.mean() < 0.02
@@ -129,7 +131,7 @@ def test_no_tunnelling_through_a_two_voxel_sheet(normal, direction, shift, slide
     h = grid.spacing
     n, d = (np.array(v) / np.linalg.norm(v) for v in (normal, direction))
     side = -np.sign(d @ n)
-    # A flatter ray enters the box within the sheet.
+    # A flatter ray may start within the sheet.
     assume(abs(d @ n) > 0.15)
     surface = nbv.scanning.GridSurface.from_values(np.abs(nodes(grid.axis) @ n - shift) - h, 0.0, grid)
     across = np.cross(n, np.eye(3)[np.argmin(np.abs(n))])
@@ -180,7 +182,7 @@ def test_samples_in_a_batch_equal_single_ones():
     origins, directions = camera_rays(poses)
     vmapped = jax.vmap(lambda surface: surface.trace(origins, directions))(surfaces)
 
-    # Compiled in another way the rays round in another way, which may turn a few at the silhouettes.
+    # Another compilation rounds the rays differently, which may change a few at the silhouettes.
     def differs(a, b):
         return np.abs(np.asarray(a) - np.asarray(b)).max(axis=-1) > 1e-5
 
@@ -219,7 +221,7 @@ def test_roots_of_cubics():
         expected[i] = real.min(initial=np.inf)
     _, found = cubic.first_bracket([jnp.asarray(row, jnp.float32) for row in c])
     root = cubic.first_root([jnp.asarray(row, jnp.float32) for row in c])
-    # Double roots, and roots at an end of the interval, may fall either way in float32.
+    # Double roots, and roots at an end of the interval, may be missed or not in float32.
     assert (np.asarray(found) == np.isfinite(expected)).mean() > 0.999
     hit = np.isfinite(expected) & np.asarray(found)
     error = np.abs(np.asarray(root) - expected)[hit]
@@ -243,7 +245,7 @@ def test_free_distance_against_a_distance_transform():
 
 
 def test_outside_a_grid_there_is_no_cell():
-    """Nor is it one that counts from the other end."""
+    """Indices do not count from the other end either."""
     grid = nbv.Grid(11, 1.0)
     cells = np.asarray(grid.cell_of(jnp.array([[-0.99, 0.01, 0.99], [-1.01, -3.0, 1.01]])))
     np.testing.assert_array_equal(cells[0], [0, 5, 9])

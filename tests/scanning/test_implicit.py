@@ -1,4 +1,4 @@
-"""The implicit rule for depths: against Optimistix, by hand, and its second derivatives."""
+"""The implicit rule for depths against Optimistix and by hand, and its second derivatives."""
 
 import functools
 
@@ -20,7 +20,7 @@ RNG = np.random.default_rng(0)
 
 
 class Along(eqx.Module):
-    """A function along rays, all of which can be differentiated in."""
+    """A function along rays, differentiable in all of its arguments."""
 
     function: eqx.Module
     origins: jax.Array
@@ -39,7 +39,7 @@ class Interpolant(eqx.Module):
 
 
 def optimistix_depth(along, near):
-    """The roots by Newton's method, differentiated by Optimistix' own implicit adjoint."""
+    """Roots by Newton's method, differentiated by Optimistix's implicit adjoint."""
 
     def root(function, origin, direction, near):
         solver = optx.Newton(rtol=1e-13, atol=1e-13)
@@ -89,7 +89,7 @@ def test_gradients_of_depths_equal_those_of_optimistix(name, x64):
 
 
 def test_rule_on_straight_functions_by_hand():
-    """f = s t - c has dt/dc = 1 / s, with |s| held at 0.1 and its sign kept; and no derivative where nothing is hit."""
+    """f = s t - c has dt/dc = 1 / s, with |s| at least 0.1 and its sign kept. A miss has no derivative."""
 
     class Line(eqx.Module):
         slope: jax.Array

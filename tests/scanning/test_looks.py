@@ -1,4 +1,4 @@
-"""What rays came back with, against brute force in float64."""
+"""The looks of views against brute force in float64."""
 
 import dataclasses
 
@@ -31,7 +31,7 @@ def distances(points):
 
 
 def test_distances_are_those_to_all_hits_within_reach():
-    """At nodes, whichever scan the hits came with; those beyond the border of the grid count too."""
+    """Distances at nodes, for hits of any scan, also for hits outside the grid."""
     points = RNG.uniform(-1.25, 1.25, (60, 3))
     looks = nothing().with_points(cloud_of(points[:40], 50)).with_points(cloud_of(points[40:], 20))
     found, expected = np.asarray(looks.distance, np.float64), distances(points)
@@ -56,13 +56,13 @@ def sampled(*radii):
 
 
 def after(pose, seen, camera=CAMERA, barrier=None):
-    """The looks, and the list of poses, after one view."""
+    """The looks and the poses after one view."""
     looks = nothing().with_view(jnp.asarray(0), pose, seen, camera, barrier)
     return looks, PoseList.empty(3).append(pose)
 
 
 def shown(surfaces, pose, index=0):
-    """How many rays hit a sampled surface."""
+    """Number of rays that hit a sampled surface."""
     return int(scan(jax.tree.map(lambda leaf: leaf[index], surfaces), CAMERA, pose).mask.sum())
 
 
@@ -70,8 +70,8 @@ EMPTY = nbv.PointCloud(jnp.zeros((600, 3)), jnp.zeros((600, 3)), jnp.zeros(600, 
 
 
 def test_what_a_view_measured_stays_and_what_it_looked_at_in_vain_goes():
-    """A view of the ball of radius 0.6: the sampled one of 0.6 is as it was, one of 0.8 cannot be seen from there any
-    more; from the other side, where nobody looked, it can."""
+    """A view of the ball of radius 0.6 keeps the sample of radius 0.6, and hides the one of 0.8 from there. From the
+    other side, which was not seen, it is still visible."""
     surfaces = sampled(0.6, 0.8)
     looks, poses = after(POSE, scan(nbv.SDFSurface(BALL), CAMERA, POSE))
     found = looks.without_unmeasured(surfaces, poses)
@@ -85,7 +85,7 @@ def test_what_a_view_measured_stays_and_what_it_looked_at_in_vain_goes():
 
 @pytest.mark.parametrize(("sight", "share"), [(np.inf, 0.5), (1.0, 1.0), (0.0, 1.0)])
 def test_only_as_far_as_a_view_saw_it_looked(sight, share):
-    """Without a single return: to the end, to something before the ball, or not at all."""
+    """Without a single return: sight to the end, up to something before the ball, or none."""
     surfaces = sampled(0.6)
     looks, poses = after(POSE, dataclasses.replace(EMPTY, sight=jnp.full(600, sight)))
     count = shown(looks.without_unmeasured(surfaces, poses), POSE)
@@ -93,8 +93,8 @@ def test_only_as_far_as_a_view_saw_it_looked(sight, share):
 
 
 def test_a_ray_that_met_something_deeper_has_passed_however_steep_the_surface():
-    """Of the rays that meet the ball, what came back from a wall behind it leaves those at the very limb; what did not
-    come back leaves all that are steeper than 60 degrees."""
+    """A return from a wall behind the ball removes rays up to the very limb. No return removes rays up to 60 degrees
+    only."""
     surfaces, left = sampled(0.6), []
     for sight in (np.inf, 4.0):
         looks, poses = after(POSE, dataclasses.replace(EMPTY, sight=jnp.full(600, sight)))
@@ -129,7 +129,7 @@ def test_the_sight_of_a_finer_sensor_is_that_of_the_pixel_about_each_ray():
 
 
 def test_a_depth_image_says_how_far_it_saw():
-    """To a wall, though it stands before the box; without end where nothing came back. In units of the frame."""
+    """It saw up to a wall, even before the box, and without limit where nothing returned. In units of the frame."""
     camera = nbv.Camera(fov=0.8, height=24, width=24)
     depth = np.full((24, 24), 1.0)
     depth[:, 12:] = 0.0
@@ -145,7 +145,7 @@ def test_a_depth_image_says_how_far_it_saw():
 
 
 def test_a_simulated_scan_says_how_far_it_saw():
-    """To its hits; what is too aslant returns nothing."""
+    """It saw up to its hits. A surface that is too oblique returns nothing."""
     camera = nbv.Camera(fov=0.6, height=40, width=40, max_incidence=0.8)
     pose = nbv.look_at((0.0, 0.0, 2.5))
     seen = scan(nbv.SDFSurface(BALL), camera, pose)

@@ -1,4 +1,4 @@
-"""Mesh rays against closed forms and a slow Moller-Trumbore in NumPy; meshes that are broken."""
+"""Rays of meshes against closed forms and a slow Moller-Trumbore in NumPy; broken meshes."""
 
 import copy
 import pickle
@@ -23,7 +23,7 @@ RNG = np.random.default_rng(1)
 
 
 def moller_trumbore(vertices, faces, o, d):
-    """Least positive ray parameter over all triangles, in float64; infinite where a ray misses."""
+    """Least positive ray parameter over all triangles, in float64. Infinite for a miss."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     e1, e2 = b - a, c - a
     p = np.cross(d[:, None], e2)
@@ -86,7 +86,8 @@ def test_hits_of_a_box_equal_the_closed_form():
 
 @pytest.mark.usefixtures("tracer")
 def test_few_rays_slip_through_edges_of_small_triangles():
-    """From the middle of a ball of 327,680 faces to its corners and the middles of its edges: Embree loses 0.2 %."""
+    """Rays from the middle of a ball of 327,680 faces to its corners and the middles of its edges. Embree loses 0.2
+    %."""
     ball = trimesh.creation.icosphere(7, 1.25)
     mesh = nbv.TriangleMesh(ball.vertices, ball.faces, nbv.Frame())
     targets = np.concatenate([mesh.vertices, mesh.vertices[ball.edges_unique].mean(axis=1)])[::7]
@@ -185,7 +186,7 @@ def test_samples_lie_on_the_surface_and_are_even_by_area():
     assert on.any(axis=1).all()
     area = 8 * np.prod(half) / half
     share = area / area.sum()
-    # Five standard errors of a proportion of 20,000.
+    # Five standard errors of a proportion of 20,000 samples.
     assert (np.abs(on.mean(axis=0) - share) < 5 * np.sqrt(share * (1 - share) / 20_000)).all()
     np.testing.assert_array_equal(points, mesh.sample_points(jax.random.key(0), 20_000))
     assert (points != mesh.sample_points(jax.random.key(1), 20_000)).any()
@@ -194,7 +195,7 @@ def test_samples_lie_on_the_surface_and_are_even_by_area():
 def test_mesh_of_a_solid():
     mesh = nbv.mesh_from_sdf(Torus(0.8, 0.3), nbv.Grid(80))
     assert mesh.to_trimesh().is_watertight
-    # Marching cubes inscribes: a deficit of order spacing^2 / radius^2, and outward faces give a positive volume.
+    # Marching cubes inscribes: the volume is too small by order spacing^2 / radius^2. Outward faces make it positive.
     assert mesh.to_trimesh().volume == pytest.approx(2 * np.pi**2 * 0.8 * 0.3**2, rel=0.02)
     ring = np.hypot(mesh.vertices[:, 0], mesh.vertices[:, 2]) - 0.8
     np.testing.assert_allclose(np.hypot(ring, mesh.vertices[:, 1]), 0.3, atol=3e-3)
@@ -204,7 +205,7 @@ def test_mesh_of_a_solid():
 
 
 def test_an_off_file_whose_first_two_lines_run_together_is_read(tmp_path):
-    """As many of ModelNet are."""
+    """ModelNet has many such files."""
     text = trimesh.creation.box((1.0, 2.0, 4.0)).export(file_type="off")
     assert text.startswith("OFF\n8 12 0")
     for name, written in (("well", text), ("glued", "OFF" + text[4:])):
@@ -235,7 +236,7 @@ def test_a_ball_contains_what_is_nearer_than_its_radius_however_it_is_wound(outw
     np.testing.assert_array_equal(mesh.contains(points)[clear], distance[clear] < 1.25)
 
 
-# A slab that stands on a post: the whole is 4 wide and 3 high.
+# A slab on a post. The whole is 4 wide and 3 high.
 BOXES = {"post": ((0.0, 1.0, 0.0), (1.0, 2.0, 1.0)), "slab": ((0.5, 2.5, 0.0), (4.0, 1.0, 2.0))}
 
 
@@ -249,7 +250,7 @@ def saved(path, boxes=BOXES):
 
 
 def box_distance(x, center, extents):
-    """From points to the surface of a box."""
+    """Distance from points to the surface of a box."""
     beyond = np.abs(x - center) - 0.5 * np.asarray(extents)
     outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=-1)
     return np.where((beyond <= 0).all(axis=-1), -beyond.max(axis=-1), outside)
@@ -262,7 +263,7 @@ def test_parts_are_the_nodes_where_the_whole_has_them(tmp_path):
     joined = np.concatenate([part.vertices for part in found.parts])
     np.testing.assert_allclose(np.sort(joined, axis=0), np.sort(found.mesh.vertices, axis=0), atol=1e-6)
     np.testing.assert_array_equal(found.mesh.vertices, whole.vertices)
-    # Longest side 4, now 2.5; the box around both is centred at (0.5, 1.5, 0).
+    # The longest side is 4, and now 2.5. The box around both is centred at (0.5, 1.5, 0).
     expected = (np.array([0.0, 1.0, 0.0]) - [0.5, 1.5, 0.0]) * 2.5 / 4
     np.testing.assert_allclose(found.parts[0].vertices.mean(axis=0), expected, atol=1e-6)
 

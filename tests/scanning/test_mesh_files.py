@@ -1,4 +1,4 @@
-"""Files of meshes against what they hold by construction: boxes of known places, areas and numbers of faces."""
+"""Files of meshes against their construction: boxes with given places, areas and numbers of faces."""
 
 import json
 import struct
@@ -12,7 +12,7 @@ import jaxnbv as nbv
 
 BOX = trimesh.creation.box((1.0, 2.0, 3.0))
 AREA = 2 * (2.0 + 3.0 + 6.0)
-# Polygons of the box by their corners, and two places that nothing uses.
+# Polygons of the box by their corners, and two unused places.
 CORNERS = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 2.0) for z in (0.0, 3.0)])
 QUADS = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
 MIXED = [*QUADS[:5], [1, 5, 7], [1, 7, 3], [0, 1]]
@@ -20,7 +20,7 @@ UNUSED = np.array([[50.0, 0.0, 0.0], [0.0, -60.0, 0.0]])
 
 
 def glb(path, tree, *arrays):
-    """A GLB of these arrays, one accessor each; `tree` has the rest."""
+    """A GLB file of these arrays, one accessor each. `tree` has the rest."""
     kinds = {"f4": 5126, "i2": 5122, "u2": 5123, "u1": 5121, "i1": 5120}
     views, accessors, binary = [], [], b""
     for array in arrays:
@@ -41,7 +41,7 @@ def glb(path, tree, *arrays):
 
 
 def boxes(**changes):
-    """Two boxes three apart that share their triangles; the first is on a node of its own."""
+    """Two boxes three apart that share their triangles. The first is on a node of its own."""
     tree = {
         "scenes": [{"nodes": [0, 1]}],
         "nodes": [{"mesh": 0, "name": "near"}, {"mesh": 0, "name": "far", "translation": [3.0, 0.0, 0.0]}],
@@ -54,7 +54,7 @@ PLACES, ROWS = BOX.vertices.astype("<f4"), BOX.faces.astype("<u2").ravel()
 
 
 def world(mesh):
-    """The area, the lowest and the highest corner in the file's coordinates."""
+    """The area, and the lowest and highest corner in the file's coordinates."""
     found = mesh.frame.to_world(mesh.vertices)
     return trimesh.Trimesh(found, mesh.faces, process=False).area, found.min(axis=0), found.max(axis=0)
 
@@ -72,7 +72,7 @@ def test_a_plain_file_of_two_boxes(tmp_path):
 
 @pytest.mark.parametrize(("kind", "largest"), [("<i2", 32767), ("i1", 127)])
 def test_normalised_integers_are_shares_of_their_largest(tmp_path, kind, largest):
-    """As quantised files have them: the nodes scale them back, here by 2."""
+    """Quantised files have such integers, and nodes that scale them back, here by 2."""
     stored = np.round(PLACES / 2.0 * largest).astype(kind)
     if kind == "i1":
         stored = np.concatenate([stored, np.zeros((1, 3), kind)])
@@ -189,7 +189,7 @@ WHOLE = {
 
 @pytest.mark.parametrize("name", WHOLE)
 def test_whole_files_are_read_as_they_are_meant(tmp_path, name):
-    """A box of 1 x 2 x 3: places that nothing uses and faces of two corners are no damage."""
+    """A box of 1 x 2 x 3. Unused places and faces with two corners are allowed."""
     content = WHOLE[name]
     (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
     mesh = nbv.load_mesh(tmp_path / name)
@@ -197,7 +197,7 @@ def test_whole_files_are_read_as_they_are_meant(tmp_path, name):
     assert len(mesh.faces) == 12
     assert area == pytest.approx(AREA)
     np.testing.assert_allclose([low, high], [[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]], atol=1e-6)
-    # Strips are wound by turns; polygons that share an edge run along it in opposite directions.
+    # The winding of strips alternates. Polygons that share an edge run along it in opposite directions.
     whole = trimesh.Trimesh(mesh.vertices, mesh.faces, process=True)
     assert whole.is_watertight
     assert "strips" in name or whole.is_winding_consistent
@@ -246,7 +246,7 @@ def test_what_takes_a_mesh_takes_that_of_trimesh():
     places = np.array([[0.0, 0.0, 0.0], [0.6, 0.0, 0.0], [0.0, 0.0, 1.1]])
     solids = [jax.tree.map(lambda rows, row=row: rows[row], bank.solids) for row in range(2)]
     inside = [np.asarray(solid(places)) < 0 for solid in solids]
-    # The box is 0.83 x 1.67 x 2.5, the ball's radius 1.25.
+    # The box is 0.83 x 1.67 x 2.5. The ball's radius is 1.25.
     np.testing.assert_array_equal(inside, [[True, False, True], [True, True, True]])
     assert bank.names == ("0", "1")
     ray = np.array([[0.0, 0.0, 3.0]]), np.array([[0.0, 0.0, -1.0]])

@@ -1,4 +1,4 @@
-"""Coverage of a ball against the areas of its caps; distances of surfaces against brute force and closed forms."""
+"""Coverage of a ball against areas of caps; distances of surfaces against brute force and closed forms."""
 
 import dataclasses
 
@@ -17,7 +17,7 @@ from jaxnbv.scanning.sdf import Sphere
 
 RADIUS, AWAY = 0.8, 2.5
 BALL = nbv.SDFSurface(Sphere(RADIUS))
-# Uniform by area: the share of them in any part of the ball has a standard error of 0.0035 at most.
+# Uniform by area. Their share in any part of the ball has a standard error of at most 0.0035.
 POINTS = RADIUS * np.asarray(nbv.geometry.fibonacci_sphere(20_000), np.float64)
 SIDES = nbv.look_at(AWAY * jnp.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]))
 
@@ -31,15 +31,15 @@ def views_of(camera, poses=SIDES, deviation=0.0):
 @pytest.mark.parametrize("pixels", [40, 200])
 @pytest.mark.parametrize("noise", [0.0, 0.01])
 def test_coverage_of_a_ball_is_the_area_of_its_caps(pixels, noise):
-    """From a distance d a ball of radius r shows (1 - r / d) / 2 of its area; from two opposite ones twice that, and
-    from the side what lies between these and half of the rest: all but two opposite parts of the belt."""
+    """From a distance d a ball of radius r shows the share (1 - r / d) / 2 of its area. Two opposite views show twice
+    that. A view from the side adds half of the rest, except for two opposite parts of the belt."""
     camera = nbv.Camera(height=pixels, width=pixels, fov=0.75)
     shares = coverage(views_of(camera, deviation=noise), POINTS)
     limit = RADIUS / AWAY
     visible = [POINTS @ np.asarray(pose.position, np.float64) / AWAY >= RADIUS * limit for pose in SIDES]
     expected = [np.mean(np.any(visible[: count + 1], axis=0)) for count in range(3)]
     assert expected[:2] == pytest.approx([(1 - limit) / 2, 1 - limit], abs=0.01)
-    # A pixel at the limb shows a little more, or less, than the ball's own limb.
+    # A pixel at the limb shows a little more or less than the ball's own limb.
     np.testing.assert_allclose(shares, expected, atol=0.03)
     assert shares == sorted(shares)
 
@@ -102,13 +102,13 @@ def test_concentric_spheres_are_their_radii_apart():
     inner, outer = (trimesh.creation.icosphere(5, radius) for radius in (0.6, 0.9))
     found = surface_distance(points_of(inner, 0), points_of(outer, 1))
     for value in (found.accuracy, found.completeness):
-        # Nearest samples lie beside the foot of the perpendicular, a little farther.
+        # The nearest samples lie beside the foot of the perpendicular, a little farther away.
         assert 0.299 < value < 0.302
     assert 0.3 < found.hausdorff < 0.32
 
 
 def test_a_square_shifted_in_its_plane_lacks_a_strip():
-    """Of the unit square a strip of width s sticks out on one side, where the mean distance is s / 2."""
+    """A strip of width s of the unit square sticks out on one side, with a mean distance of s / 2."""
     square = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]], process=False)
     shifted = square.copy().apply_translation([0.4, 0.0, 0.0])
     found = surface_distance(points_of(square, 0), points_of(shifted, 1))

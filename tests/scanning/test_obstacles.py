@@ -1,4 +1,5 @@
-"""Tables, walls and meshes around the object: what they hide, by Embree and float64; where cameras may stand."""
+"""Tables, walls and meshes around the object: what they hide, against Embree and float64, and where cameras may
+stand."""
 
 import jax
 import jax.numpy as jnp
@@ -32,7 +33,7 @@ def rays_of(pose):
 
 
 def first_hits(vertices, faces, pose):
-    """How far along the camera's rays a mesh is met, by Embree; infinite where it is not."""
+    """Distance along the camera's rays to a mesh, by Embree. Infinite for a miss."""
     mesh = nbv.TriangleMesh(vertices, faces, nbv.Frame())
     origin, directions = rays_of(pose)
     hits = mesh.trace(np.tile(origin, (len(directions), 1)), directions)
@@ -45,7 +46,7 @@ def test_a_table_is_met_where_its_plane_is(index):
     found = np.asarray(nbv.Obstacles((TABLE,)).barrier(CAMERA, POSES[index]), np.float64)
     origin, directions = rays_of(POSES[index])
     if origin[1] < -0.5:
-        # From within: the way out.
+        # The pose is within the obstacle, and the hit is the exit.
         assert np.isfinite(found).mean() > 0.3
     else:
         along = (-0.5 - origin[1]) / directions[:, 1]
@@ -57,7 +58,7 @@ def test_a_table_is_met_where_its_plane_is(index):
 @pytest.mark.parametrize("as_mesh", [False, True])
 @pytest.mark.parametrize("index", range(3))
 def test_what_a_wall_hides_is_what_embree_says(as_mesh, index):
-    """The wall as a box, and as a mesh of its twelve triangles."""
+    """The wall is a box, or a mesh of twelve triangles."""
     low, high = [1.5, -1.0, -1.0], [1.7, 1.0, 1.0]
     mesh = box_mesh(low, high)
     wall = solid_of_mesh(*mesh, resolution=60) if as_mesh else WALL
@@ -65,7 +66,7 @@ def test_what_a_wall_hides_is_what_embree_says(as_mesh, index):
     barrier = nbv.Obstacles((wall,)).barrier(CAMERA, pose)
     expected = first_hits(*mesh, pose)
     found = np.asarray(barrier)
-    # Beside the edges a cell of the sampled distances counts.
+    # Rays beside the edges may differ, since distances of meshes are sampled on cells.
     same = np.isfinite(found) == np.isfinite(expected)
     assert same.mean() > (0.95 if as_mesh else 0.99)
     both = np.isfinite(found) & np.isfinite(expected)
@@ -102,7 +103,7 @@ def test_points_of_obstacles_are_not_the_objects():
 
 
 def test_space_is_seen_empty_up_to_an_obstacle():
-    """Every ray misses the ball's place; nodes before the wall are empty, those behind it are not known."""
+    """Every ray misses the ball. Nodes before the wall are empty, and nodes behind it are unknown."""
     grid, pose = nbv.Grid(40), nbv.look_at((-2.4, 0.0, 0.0))
     nothing = nbv.scan(nbv.SDFSurface(Sphere(0.01).translate([0.0, 5.0, 0.0])), CAMERA, pose)
     wall = nbv.Obstacles((Cuboid([0.1, 2.0, 2.0]).translate([0.5, 0.0, 0.0]),))
@@ -140,7 +141,7 @@ def test_an_episode_stands_and_sees_above_the_table():
 
 @pytest.mark.slow
 def test_a_search_by_gradient_stays_out_of_obstacles():
-    """Its starts are all too low; free, ascent stays there."""
+    """All starts are too low, and ascent without obstacles stays there."""
     starts = nbv.look_at(2.3 * np.array([[np.cos(a), -0.05, np.sin(a)] for a in (0.3, 1.9, 3.5, 5.1)]))
     search = nbv.GradientSearch(dof=2, num_starts=4, iterations=12, learning_rate=0.05, candidates=starts)
     table = HalfSpace([0.0, -0.2, 0.0], [0.0, 1.0, 0.0])
@@ -153,7 +154,7 @@ def test_a_search_by_gradient_stays_out_of_obstacles():
 
 
 def test_from_the_world_to_the_scene():
-    """Distances in the world times the scale are those in the scene."""
+    """Distances in the world times the scale equal those in the scene."""
     frame = nbv.Frame.fit(np.array([[0.1, 0.2, 0.0], [0.4, 0.5, 0.25]]), up="z")
     table, block = HalfSpace([0.0, 0.0, 0.01], [0.0, 0.0, 1.0]), Cuboid([0.05, 0.1, 0.2]).translate([0.6, 0.0, 0.2])
     world = nbv.Obstacles((table, block), margin=0.01, clearance=0.05)
@@ -169,7 +170,7 @@ BOX = nbv.Box((-0.5, -0.25, -1.25), (0.5, 1.2, 1.25))
 
 
 def level_board(rng, half, height, count=800):
-    """Points of a board about the y axis, with a little noise."""
+    """Points of a board across the y axis, with a little noise."""
     points = rng.uniform(-1.0, 1.0, (count, 3)) * [half[0], 0.0, half[1]] + [0.0, height, 0.0]
     return points + rng.normal(0.0, 0.005, points.shape)
 
@@ -181,7 +182,7 @@ def under(*parts):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_what_an_object_stands_on_is_found(seed):
-    """In the box or a little below it, and tilted by as much as 10 degrees."""
+    """The board is in the box or a little below it, with a tilt of up to 10 degrees."""
     rng = np.random.default_rng(seed)
     turn = Rotation.from_euler("xz", rng.uniform(-0.12, 0.12, 2)).as_matrix()
     height = rng.uniform(-0.3, -0.05)
@@ -211,8 +212,8 @@ SEEN_BY = nbv.Camera(fov=0.75, height=120, width=160)
 
 
 def carton_before_a_wall(rng, size, tilt, gap, table=True):
-    """An image of a block on a table, with a wall at a gap behind it, all turned by a tilt; by closed forms, with noise
-    of 1.5 mm at 1 m. Also the pose, the block's corners, and the table's normal."""
+    """An image of a block on a table with a wall behind it at a gap, all turned by a tilt, in closed form with noise of
+    1.5 mm at 1 m. Also returns the pose, the block's corners and the table's normal."""
     axis = rng.normal(size=2)
     turn = Rotation.from_rotvec(np.radians(tilt) * np.array([*axis, 0.0]) / np.linalg.norm(axis)).as_matrix()
     angle, elevation, distance = rng.uniform(-1.0, 1.0), rng.uniform(0.25, 1.1), rng.uniform(0.45, 0.8)
@@ -243,7 +244,7 @@ SIZES = {"carton": (0.3, 0.22, 0.2), "book on edge": (0.17, 0.03, 0.24), "cereal
 @pytest.mark.parametrize("tilt", [0.0, 20.0])
 @pytest.mark.parametrize("size", SIZES.values(), ids=SIZES)
 def test_a_table_before_a_wall_is_found_from_any_side(size, tilt):
-    """In all views, whatever room the box leaves; the plane is within 0.5 degrees and 1.5 mm of the true one."""
+    """In all views, whatever margin the box has. The plane is within 0.5 degrees and 1.5 mm of the true one."""
     rng = np.random.default_rng(5)
     for room in (0.003, 0.01, 0.03, 0.06):
         for gap in (0.02, 0.1):
@@ -259,7 +260,7 @@ def test_a_table_before_a_wall_is_found_from_any_side(size, tilt):
 
 
 def test_no_wall_is_a_table_and_another_axis_is_named():
-    """Of a block in the air before a wall; and of one on a table, where what is upward is wrong."""
+    """A block in the air before a wall, and a block on a table with a wrong upward axis."""
     rng = np.random.default_rng(6)
     for _ in range(3):
         for table in (False, True):
@@ -273,8 +274,8 @@ def test_no_wall_is_a_table_and_another_axis_is_named():
 
 
 def test_no_proposal_is_inside_or_under_what_is_known():
-    """1,000 random scenes of a slanted table, a block, an arm between two points, and a few points that were seen.
-    Distances from the definitions, in float64."""
+    """1,000 random scenes of a slanted table, a block, a capsule for an arm, and a few scanned points. Distances come
+    from the definitions, in float64."""
     camera, clearance = nbv.Camera(height=4, width=4), 0.15
     poses = jax.tree.map(
         lambda *rows: jnp.concatenate(rows), *(nbv.SphereCandidates(60, radius=r).poses() for r in (0.6, 1.2, 2.4))

@@ -1,4 +1,4 @@
-"""Surfaces from clouds: against the sphere they were scanned from, and against the posterior mean itself."""
+"""Surfaces from clouds, against the sphere that was scanned and against the posterior mean."""
 
 import sys
 import warnings
@@ -23,7 +23,7 @@ def mean_mesh(model, cloud, grid):
 
 
 def sphere_cloud(count=600, capacity=700):
-    """Points all over a sphere about (0.2, 0, 0), in a cloud with rows to spare."""
+    """Points all over a sphere about (0.2, 0, 0), in a cloud with spare rows."""
     normals = np.asarray(nbv.geometry.fibonacci_sphere(count, 1.0))
     return nbv.PointCloud.from_arrays(RADIUS * normals + [0.2, 0.0, 0.0], normals, capacity)
 
@@ -33,7 +33,7 @@ def check_sphere(mesh, tolerance):
     radii = np.linalg.norm(mesh.vertices - [0.2, 0.0, 0.0], axis=1)
     np.testing.assert_allclose(radii, RADIUS, atol=tolerance)
     assert solid.is_watertight
-    # Wound outward, the volume is positive.
+    # An outward winding makes the volume positive.
     assert solid.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=4 * tolerance)
     assert mesh.frame == nbv.Frame()
 
@@ -43,7 +43,7 @@ def test_the_mean_of_a_whole_scan_is_the_surface():
 
 
 def test_vertices_lie_where_the_posterior_mean_equals_its_level():
-    """Of half a sphere, too, where the rest is the model's guess."""
+    """Also for half a sphere, where the model guesses the rest."""
     whole = sphere_cloud()
     half = nbv.PointCloud(whole.points, whole.normals, whole.mask & (whole.points[:, 1] > 0.0))
     posterior = MODEL.condition(half)
@@ -52,14 +52,14 @@ def test_vertices_lie_where_the_posterior_mean_equals_its_level():
     inside = float(posterior.mean(jnp.array([[0.2, 0.5, 0.0]]))[0] - posterior.level)
     assert inside < 0
     assert np.abs(mean).max() < 0.03 * abs(inside)
-    # The half that was seen is right, and there is surface where nothing was seen.
+    # The scanned half is right, and the mesh continues where nothing was scanned.
     seen = mesh.vertices[mesh.vertices[:, 1] > 0.1]
     assert np.abs(np.linalg.norm(seen - [0.2, 0.0, 0.0], axis=1) - RADIUS).mean() < 0.03
     assert (mesh.vertices[:, 1] < -0.1).any()
 
 
 class Balls(nbv.SurfaceModel):
-    """A model of its own, with a mean in closed form: whatever the cloud, two balls, of which one holds no data."""
+    """A user's model with a mean in closed form: two balls for any cloud, one of them without data."""
 
     def condition(self, observations):
         return BallsPosterior()
@@ -80,7 +80,7 @@ class BallsPosterior(nbv.surfaces.SurfacePosterior):
 
 
 def test_other_models_are_meshed_too_less_pieces_on_which_no_points_lie():
-    """The cloud's sphere cuts the ball at the left, and passes the other one by."""
+    """The cloud's sphere cuts the left ball, and passes the other one."""
     with pytest.warns(UserWarning, match="left out 1 piece of the mesh with hardly any points"):
         mesh = mean_mesh(Balls(), sphere_cloud(), nbv.Grid(30))
     (part,) = mesh.to_trimesh().split()
@@ -89,7 +89,7 @@ def test_other_models_are_meshed_too_less_pieces_on_which_no_points_lie():
 
 @pytest.mark.parametrize(("points", "kept"), [(3, 1), (4, 2)])
 def test_a_piece_stays_with_four_points_on_it(points, kept):
-    """All points on one ball, and few on the other."""
+    """All points are on one ball, or a few on the other."""
     left = 0.5 * CENTRES + [-0.6, 0.0, 0.0]
     right = 0.3 * CENTRES[:: len(CENTRES) // points][:points] + [0.6, 0.3, 0.0]
     cloud = nbv.PointCloud.from_arrays(np.concatenate([left, right]), np.ones((len(left) + points, 3)) / np.sqrt(3))
@@ -101,7 +101,7 @@ def test_a_piece_stays_with_four_points_on_it(points, kept):
 
 
 def test_what_was_seen_empty_is_not_meshed():
-    """One of the model's two balls is there, and the camera sees past it through the other."""
+    """One of the model's two balls is real. The camera sees past it through the other."""
     seen = nbv.SDFSurface(Sphere(0.5).translate((-0.6, 0.0, 0.0)))
     camera, pose = nbv.Camera(fov=1.3, height=60, width=60), nbv.look_at((0.0, 0.0, 2.5))
 

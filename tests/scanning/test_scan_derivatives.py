@@ -1,9 +1,9 @@
-"""Derivatives of hits and normals in the camera's pose: against differences and loops, one by one and in batches.
+"""Derivatives of hits and normals in the camera's pose, against differences and loops, one by one and in batches.
 
 A scan is smooth in its pose as long as every ray meets the same piece of the surface. It jumps where a ray crosses a
-silhouette or an edge where two parts of a solid meet; on a grid its derivative jumps where a hit crosses from one cell
-into the next; and where a ray grazes the surface the derivative is bounded on purpose. There no derivative equals a
-difference: such rays are left out, and they must be few.
+silhouette or an edge between two parts of a solid. On a grid its derivative jumps where a hit crosses a cell's border.
+Where a ray grazes the surface the derivative is bounded on purpose. There no derivative equals a difference. Such rays
+are left out, and must be few.
 """
 
 import functools
@@ -23,9 +23,9 @@ SPACE = nbv.search.FreePoses()
 
 
 def is_grazing(surface, points, normals, directions):
-    """Whether the slope along a ray is, but for a little, below what it is held at.
+    """Whether the slope along a ray is near or below its lower bound.
 
-    On a solid a sine of 0.05; on a grid 0.03 of the spread of f over the corners of the hit's cell.
+    On a solid the bound is a sine of 0.05, on a grid 0.03 of the spread of f over the corners of the hit's cell.
     """
     if isinstance(surface, nbv.SDFSurface):
         return -np.sum(normals * directions, axis=-1) < 0.055
@@ -53,7 +53,7 @@ def moves(start, parameters, step, h):
 @functools.partial(jax.vmap, in_axes=(None, 0, 0))
 @functools.partial(jax.vmap, in_axes=(None, 0, 0))
 def looks(surface, pose, moved):
-    """Points, normals, mask and rays; and the derivatives, forwards, of the first two for a pose that is moved."""
+    """Points, normals, mask and rays, with forward derivatives of points and normals for a pose that moves."""
 
     def look(pose):
         cloud = nbv.scan(surface, CAMERA, pose)
@@ -74,7 +74,7 @@ def test_scans_as_functions_of_a_pose_against_central_differences(name, x64):
     points, normals = (np.asarray(value) for value in values)
     masks, hit = np.asarray(masks), np.asarray(masks[0])
     grazing = hit & is_grazing(surface, points[0], normals[0], np.asarray(rays[0]))
-    # Edges turn a normal at once; curvature, by no more than some hundred times the step.
+    # An edge changes a normal at once. Curvature changes it by at most some hundred times the step.
     kept = (masks == hit).all(axis=0) & (np.abs(normals - normals[0]).max(axis=(0, -1)) < 1e-3)
     if name != "solid":
         cells = np.floor((points + GRID.half_extent) / GRID.spacing)
@@ -93,7 +93,7 @@ def test_scans_as_functions_of_a_pose_against_central_differences(name, x64):
 
 @pytest.mark.parametrize("name", ["solid", "grid"])
 def test_grazing_and_missed_rays(name):
-    """A ball of 0.9: slopes as great as the rays graze but bounded, and zero, to the last bit, beside it."""
+    """A ball of 0.9. Slopes are bounded and as great as the rays graze. They are exactly zero beside the ball."""
     surface = nbv.SDFSurface(Sphere(0.9)) if name == "solid" else grid_surface(Sphere(0.9), GRID)
     # The ball on the grid is smaller by up to 1.2e-3.
     miss = 0.9 + np.linspace(-4e-3, 1e-3, 200)
@@ -110,7 +110,7 @@ def test_grazing_and_missed_rays(name):
     reverse, _ = jax.jit(jax.vmap(jax.jacrev(trace, (0, 1), has_aux=True)))(origins, directions)
     mask = np.asarray(mask)
     assert 0.5 < mask.mean() < 0.9
-    # |dt| is at most 1 / 0.05 or 1 / 0.03 of what moves: the origin, or the hit, which is 4 away from it at most.
+    # |dt| is at most 1 / 0.05 or 1 / 0.03 times the motion of the origin, or of the hit, which is at most 4 away.
     bound = 1 + (20 if name == "solid" else 34)
     for jacobian in (forward, reverse):
         for (by_origin, by_direction), curvature in zip(jacobian, (1.0, 2 / 0.9), strict=True):
@@ -140,7 +140,7 @@ def test_every_way_to_batch_fields_and_rays_equals_a_loop(axes, x64):
         rays + 0.05 * RNG.normal(size=(4, 30, 3)) for rays in random_rays(RNG, 30, spread=0.7, dtype=float)
     )
     weights = jnp.asarray(RNG.normal(size=(2, 30, 3)))
-    # What is not batched is the first of the batch.
+    # Arguments without a batch axis are the first of the batch.
     given = [
         batch if axis == 0 else jax.tree.map(lambda leaf: leaf[0], batch)
         for batch, axis in zip((small_surfaces(RNG, 4), origins, directions), axes, strict=True)

@@ -1,5 +1,5 @@
-"""The scanner: rows, batches of poses, noise of sensors by its law and by statistics, depth images; where a camera
-stands so that an object fits."""
+"""The scanner: rows, batches of poses, sensor noise by its law and by statistics, depth images, and the distance at
+which an object fits into the image."""
 
 import dataclasses
 import math
@@ -36,7 +36,7 @@ def test_batched_poses_equal_single_ones(name):
 
 
 def test_a_camera_in_other_units_is_told():
-    """Where it sees nothing; a large world of its own is scanned as before."""
+    """A scan that sees nothing warns. A large world that is visible does not."""
     camera = nbv.Camera(height=4, width=4)
     far = nbv.look_at([[0.0, 0.0, 2500.0], [0.0, 0.0, 2.5]])
     with pytest.warns(UserWarning, match="sees nothing: a camera stands 2500 scene units .* Frame.to_scene"):
@@ -71,15 +71,15 @@ def test_noise_has_the_stated_statistics():
     noisy = nbv.SensorNoise(points=0.02, normals=0.05)(clean, jax.random.key(0))
     points, turned = noisy.to_numpy()
     error = points - [0.3, -0.2, 0.5]
-    # Five standard errors: sigma / sqrt(n) of a mean, sigma / sqrt(2 n) of a standard deviation.
+    # Five standard errors: sigma / sqrt(n) for a mean, sigma / sqrt(2 n) for a standard deviation.
     assert (np.abs(error.mean(axis=0)) < 5 * 0.02 / np.sqrt(n)).all()
     assert (np.abs(error.std(axis=0) - 0.02) < 5 * 0.02 / np.sqrt(2 * n)).all()
     assert (np.abs(np.corrcoef(error.T) - np.eye(3)) < 5 / np.sqrt(n)).all()
     np.testing.assert_allclose(np.linalg.norm(turned, axis=1), 1.0, atol=1e-5)
-    # A point's error tells nothing of its normal's.
+    # Errors of points and normals are independent.
     together = np.corrcoef(error.T, (turned - normals).T)[:3, 3:]
     assert (np.abs(together) < 5 / np.sqrt(n)).all()
-    # Across the normal, n + eps over its length keeps the deviation but for a factor 1 - O(sigma^2).
+    # Across the normal, n + eps divided by its length keeps the deviation up to a factor 1 - O(sigma^2).
     across = turned @ np.array([[1.0, 0.0, 0.0], [0.0, 0.8, -0.6]]).T
     assert (np.abs(across.std(axis=0) / 0.05 - 1) < 5 / np.sqrt(2 * n) + 2 * 0.05**2).all()
     assert not np.asarray(noisy.points)[n:].any()
@@ -95,7 +95,7 @@ def test_normals_of_a_batch_of_noisy_scans_are_unit():
 
 @pytest.mark.parametrize("batch", [False, True])
 def test_the_ranges_of_a_noisy_scan_are_those_of_its_points(batch):
-    """Else an observer would read off exact ranges."""
+    """Exact ranges would reveal the true points."""
     pose = nbv.look_at([[0.0, 0.0, 2.5], [2.5, 0.0, 0.0]] if batch else [0.0, 0.3, 2.5])
     camera = nbv.Camera(height=12, width=12)
     clean = nbv.scan(SURFACES["sdf"], camera, pose)
@@ -107,14 +107,14 @@ def test_the_ranges_of_a_noisy_scan_are_those_of_its_points(batch):
     error = (np.asarray(noisy.sight) - np.asarray(clean.sight))[mask]
     assert 0.01 < error.std() < 0.03
     assert np.isinf(np.asarray(noisy.sight)[~mask]).all()
-    # A ray that ended at what is no point of the cloud saw as far as it did.
+    # A ray that ends at a masked point saw as far as before.
     ended = dataclasses.replace(clean, mask=clean.mask & False)
     again = nbv.SensorNoise(0.02)(ended, jax.random.key(0), camera, pose)
     np.testing.assert_array_equal(again.sight, clean.sight)
 
 
 def seen_share(setting, reach):
-    """Share of points of a sphere about the origin that every candidate's image holds."""
+    """Share of points of a sphere about the origin that the image of every candidate contains."""
     points = np.random.default_rng(0).normal(size=(2000, 3))
     points *= reach / np.linalg.norm(points, axis=1, keepdims=True)
     inside = np.ones(len(points), bool)
@@ -135,7 +135,7 @@ def test_all_of_an_object_is_seen_from_everywhere_and_hardly_more(setting):
 
 
 def test_from_further_away_the_same_ball_stands_under_the_angle_of_the_sine():
-    """A ray along the silhouette touches the ball: its angle with the axis is arcsin(reach / radius)."""
+    """A ray along the silhouette touches the ball at the angle arcsin(reach / radius) to the axis."""
     found = fit_distance(USUAL_SETTING, 1.0)
     edge = nbv.look_at((0.0, 0.0, found.radius))
     a = 0.5 * found.camera.fov
@@ -152,15 +152,15 @@ COUNT = 20_000
     ("noise", "at_a_metre", "step"),
     [
         (nbv.DepthNoise.kinect_v1(), 1.425e-3, 2.85e-3),
-        # 0.08 pixels, and a 32nd of one, of 424 pixels x 0.05 m.
+        # 0.08 pixels, and 1/32 of a pixel, for 424 pixels x 0.05 m.
         (nbv.DepthNoise.realsense_d435(), 0.08 / 21.2, 1 / 32 / 21.2),
     ],
 )
 def test_noise_and_steps_grow_with_the_square_of_the_depth(noise, at_a_metre, step):
     for depth in (0.7, 2.0, 4.0):
         found = np.asarray(noise.apply(jnp.full(COUNT, depth), KEY), np.float64)
-        # Rounding adds a twelfth of its square. The deviation of so many has a standard error of 0.5 %, its mean of
-        # 0.7 % of the deviation; 1/z is not linear, which adds (deviation / z)^2 of z to the mean.
+        # Rounding adds a twelfth of its square. The deviation has a standard error of 0.5 %, and its mean one of 0.7 %
+        # of the deviation. 1/z is not linear, which adds (deviation / z)^2 z to the mean.
         spread = depth**2 * np.hypot(at_a_metre, step / np.sqrt(12.0))
         assert found.std() == pytest.approx(spread, rel=0.06)
         assert found.mean() == pytest.approx(depth, abs=0.05 * spread + 2.0 * spread**2 / depth)
@@ -183,7 +183,7 @@ def test_a_noisy_scan_is_an_image_of_the_same_rays():
     np.testing.assert_array_equal(noisy.missed, seen.missed)
     both = np.asarray(noisy.mask)
     assert not np.any(both & ~np.asarray(seen.mask))
-    # All but the limb, where a pixel has no plane.
+    # All except the limb, where a pixel has no plane.
     assert both.sum() > 0.8 * int(seen.count)
     outward = np.asarray(noisy.points)[both] / np.linalg.norm(np.asarray(noisy.points)[both], axis=1, keepdims=True)
     angle = np.degrees(np.arccos(np.clip(np.sum(outward * np.asarray(noisy.normals)[both], axis=1), -1.0, 1.0)))

@@ -1,4 +1,4 @@
-"""Signed distance functions against dense samplings of their surfaces, and sets of them against membership."""
+"""Signed distances against dense samplings of their surfaces, and set operations against membership."""
 
 import itertools
 import math
@@ -20,7 +20,7 @@ gradients = eqx.filter_jit(lambda sdf, x: jax.vmap(jax.grad(sdf))(x))
 
 
 def revolve(profile):
-    """A dense sampling of the surface that the polyline `profile` (n, 2), of (radius, y), sweeps about the y axis."""
+    """A dense sampling of the surface of revolution of the polyline `profile` (n, 2), with columns radius and y."""
     ends = itertools.pairwise(profile)
     line = np.concatenate([np.linspace(a, b, math.ceil(np.linalg.norm(b - a) / 0.006) + 1) for a, b in ends])
     angle = np.linspace(0, 2 * np.pi, 600, endpoint=False)
@@ -86,7 +86,7 @@ def test_exact_distance_equals_that_to_a_dense_sampling(name):
     nearest, _ = cKDTree(surface).query(x)
     value = np.asarray(values(sdf, x))
     far = nearest > 0.05
-    # A sampling of spacing s overestimates a distance d by at most s^2 / (2 d); s < 0.012 here.
+    # A sampling of spacing s overestimates a distance d by at most s^2 / (2 d). Here s < 0.012.
     np.testing.assert_allclose(np.abs(value[far]), nearest[far], atol=2e-3)
     assert (np.abs(value) <= nearest + 2e-5).all()
 
@@ -100,13 +100,14 @@ def test_exact_distance_is_negative_inside_only(name):
     gradient = np.asarray(gradients(sdf, jnp.asarray(surface[::37])))
     smooth = np.abs(np.linalg.norm(gradient, axis=1) - 1) < 1e-3
     inward = surface[::37][smooth] - 0.02 * gradient[smooth]
-    # Samples on a sharp edge may step along a face, or out.
+    # Near a sharp edge a sample may move along a face, or outwards.
     assert (np.asarray(values(sdf, inward)) < -0.01).mean() > 0.8
 
 
 @pytest.mark.parametrize("name", BOUNDS)
 def test_bounds_never_overestimate(name):
-    """Slopes of at most one between random points, near and far, and a change of sign at the surface, imply it."""
+    """This follows from slopes of at most one between random points, near and far, and a change of sign at the
+    surface."""
     sdf = BOUNDS[name]
     x = RNG.uniform(-1.6, 1.6, (20_000, 3))
     y = x + RNG.normal(size=x.shape) * 10.0 ** RNG.uniform(-2, 0.3, (len(x), 1))

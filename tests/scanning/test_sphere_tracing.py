@@ -43,13 +43,13 @@ def test_hits_equal_closed_forms(name, inside):
     hits = nbv.SDFSurface(sdf).trace(o, d)
     t = expected(o.astype(float), d.astype(float))
     mask = np.asarray(hits.mask)
-    # Only rays that skim the silhouette may differ: 0.2 % of them.
+    # Only rays near the silhouette may differ: 0.2 % of them.
     assert (mask != np.isfinite(t)).mean() <= 0.002
     both = mask & np.isfinite(t)
     assert both.sum() > 500
     error = np.linalg.norm(np.asarray(hits.points) - (o + t[:, None] * d), axis=1)[both]
     facing = -np.sum(np.asarray(hits.normals) * d, axis=1)[both]
-    # Rounding of the distance, 4e-7, over the sine of the angle between ray and surface.
+    # The rounding of the distance, 4e-7, divided by the sine of the angle between ray and surface.
     error = (error * facing)[facing > 0.02]
     assert np.quantile(error, 0.995) < 2e-6
     assert error.max() < 1e-4  # The last chord may end on the wrong side of a sharp edge.
@@ -63,7 +63,7 @@ def test_normals_of_the_sphere_are_radial_and_turned_to_the_sensor():
     o, d = random_rays(RNG, 2000)
     outer = nbv.SDFSurface(Sphere(0.9)).trace(o, d)
     mask = np.asarray(outer.mask)
-    # A normal is taken 1e-5 before its hit, which turns a grazing ray's by as much.
+    # The normal is taken 1e-5 before the hit, which turns a grazing ray's normal by as much.
     np.testing.assert_allclose(outer.normals[mask], outer.points[mask] / 0.9, atol=2e-5)
     inner = nbv.SDFSurface(Sphere(0.9)).trace(np.zeros_like(o), d)
     assert bool(inner.mask.all())
@@ -90,7 +90,7 @@ def test_vmapped_scenes_equal_single_scenes():
 
 
 def test_normals_on_flat_faces_survive_compilation():
-    """On a face the slopes of a box come from one of two cases; rounding must not lose both (nor the unit length)."""
+    """On a face the slopes of a box come from one of two cases. Rounding must lose neither both nor the unit length."""
     surface = nbv.SDFSurface(Sphere(0.7) | Cuboid([0.4, 0.3, 0.8]).translate([0.3, 0.2, 0.0]))
     seen = jax.jit(lambda pose: nbv.scan(surface, nbv.Camera(height=16, width=16), pose))(
         nbv.look_at(nbv.geometry.fibonacci_sphere(12, 2.5))

@@ -1,4 +1,4 @@
-"""Points that are spread over surfaces, and which of them poses see, against closed forms."""
+"""Points spread over surfaces, and their visibility from poses, against closed forms."""
 
 import dataclasses
 
@@ -18,7 +18,7 @@ CAMERA = Camera(1.2, 40, 40)
 
 
 def surface_of(distance):
-    """The surface where a function of the nodes' places is zero."""
+    """The surface where a function of the nodes' coordinates is zero."""
     return GridSurface.from_values(distance(NODES).astype(np.float32), 0.0, GRID)
 
 
@@ -31,17 +31,17 @@ def test_points_stand_for_equal_areas_of_a_ball(count):
     middle = np.array([0.1, -0.05, 0.2])
     points, normals, areas = map(np.asarray, spread_points(surface_of(ball(middle, 0.9)), count))
     outward = (points - middle) / 0.9
-    # Linear between nodes: h^2 / (8 R) too low at most, of R.
+    # Linear interpolation is too low by at most h^2 / (8 R), relative to R.
     np.testing.assert_allclose(np.linalg.norm(outward, axis=1), 1.0, atol=GRID.spacing**2 / (7.0 * 0.9**2))
     assert np.sum(outward * normals, axis=1).min() > 0.999
     assert areas.sum() == pytest.approx(4.0 * np.pi * 0.9**2, rel=0.01)
     weights = areas / areas.sum()
-    # Of 1,024 points, none near to its neighbour: a percent.
+    # The sum over 1,024 well separated points is accurate to a percent.
     np.testing.assert_allclose(weights @ outward, 0.0, atol=0.01)
     np.testing.assert_allclose((weights * outward.T) @ outward, np.eye(3) / 3.0, atol=0.01)
     cap = weights[outward @ np.array([0.48, 0.6, 0.64]) > 0.5].sum()
     assert cap == pytest.approx(0.25, abs=0.01)
-    # Edges are met most often where the normal is oblique to all axes: without their areas points crowd there.
+    # Rays meet cells most often where the normal is oblique to all axes. Without weights points would crowd there.
     oblique = np.abs(normals).sum(axis=1) > 1.5
     drawn = np.random.default_rng(1).normal(size=(200_000, 3))
     truly = np.mean(np.abs(drawn).sum(axis=1) / np.linalg.norm(drawn, axis=1) > 1.5)
@@ -59,7 +59,7 @@ def seen_of(surface, poses, points, **limits):
 
 
 def test_a_pose_sees_what_faces_it_and_nothing_hides():
-    """Of two balls in a row, by the cosine and the way of a ray past the other ball, in float64."""
+    """Two balls in a row, by the cosine and the distance of a ray to the other ball, in float64."""
     middles, radii = np.array([[0.0, 0.0, 0.7], [0.0, 0.1, -0.6]]), (0.4, 0.6)
     both = surface_of(lambda x: np.minimum(*(ball(m, r)(x) for m, r in zip(middles, radii, strict=True))))
     poses = look_at([(0.0, 0.0, 4.0), (4.0, 0.0, 0.0), (0.0, -2.0, 3.0)])
@@ -76,7 +76,7 @@ def test_a_pose_sees_what_faces_it_and_nothing_hides():
         along = np.sum((other - origin) * direction, axis=1)
         past = np.linalg.norm(other - origin - along[:, None] * direction, axis=1)
         hidden = (past < reach) & (along < away)
-        # A cell's width at the borders of what is hidden, and at grazing angles, may fall to either side.
+        # Points within a cell of the border of the hidden part, or at grazing angles, may differ.
         clear = (np.abs(past - reach) > GRID.spacing) & (np.abs(cosine - 0.2) > 0.05)
         expected = (cosine >= 0.2) & ~hidden
         assert 0.1 < expected.mean() < 0.6
@@ -103,12 +103,12 @@ def test_a_point_is_seen_within_the_sensors_limits(limits, within):
     inside = within(depth, cosine, np.abs(offset[:, :2]).max(axis=1) / depth)
     (everything,), (limited,) = seen_of(surface, pose, points), seen_of(surface, pose, points, **limits)
     assert 0 < limited.sum() < everything.sum()
-    # Normals of differences are as good as the grid.
+    # Normals from differences are as accurate as the grid.
     assert np.mean(limited != (everything & inside)) < 0.01
 
 
 def test_what_is_behind_an_obstacle_is_not_seen():
-    """Where the upper half of the image ends at a wall."""
+    """The upper half of the image ends at a wall."""
     surface, poses = surface_of(ball((0.0, 0.0, 0.0), 0.9)), look_at([(0.0, 0.0, 3.2), (3.2, 0.0, 0.0)])
     points = spread_points(surface, 1000)
     wall = jnp.where(jnp.arange(CAMERA.num_rays) < CAMERA.num_rays // 2, 1.0, jnp.inf)
@@ -132,7 +132,7 @@ def test_no_ray_sees_what_is_void():
 
 
 def test_rays_of_a_batch_are_those_of_each():
-    """More poses than are taken together."""
+    """More poses than are processed together."""
     surface = surface_of(ball((0.1, 0.0, 0.0), 0.7))
     points = SurfacePoints(*(rows[:50] for rows in spread_points(surface, 400)))
     poses = look_at(jax.random.normal(jax.random.key(0), (40, 3)) + jnp.array([0.0, 0.0, 4.0]))
