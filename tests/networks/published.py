@@ -1,4 +1,4 @@
-"""PointNet++ as it was published, in NumPy: random tensors under its names, and what it makes of them."""
+"""The published PointNet++ in NumPy: random tensors under its names, and its outputs."""
 
 import itertools
 
@@ -22,8 +22,8 @@ def layers(rng, *widths):
 
 
 def random_state(rng, kind, sampling, inputs, head):
-    """A narrow network's tensors; `head` gives names, widths and kernel of each layer after the levels, by the widths
-    of these."""
+    """Tensors of a narrow network. `head` gives names, widths and kernels of the layers after the levels, from their
+    widths."""
     state = {}
 
     def put(linear, norm, a, b, kernel=(1, 1)):
@@ -49,7 +49,8 @@ def random_state(rng, kind, sampling, inputs, head):
 
 
 def classifier_state(rng, kind, inputs):
-    """A narrow classifier's tensors: four classes of points, or of points with normals where there are six inputs."""
+    """Tensors of a narrow classifier with four classes, for points, or for points with normals if there are six
+    inputs."""
     head = [("fc1", "bn1", 12, 8, ()), ("fc2", "bn2", 8, 7, ()), ("fc3", None, 7, 4, ())]
     return random_state(rng, kind, CLASSIFIERS[kind], inputs, lambda widths: head)
 
@@ -75,8 +76,8 @@ def perceptron(state, x, linear, norm):
 
 
 def encode(state, kind, sampling, points, features):
-    """Points and features of each level, and the features of all, layer for layer with concatenations and batch
-    normalisations."""
+    """Points and features of each level, and the global features, layer by layer with concatenations and batch
+    normalisation."""
     stages = []
     for level, (count, radii, members) in enumerate(sampling, start=1):
         chosen, distance = [0], np.full(len(points), np.inf)
@@ -100,7 +101,7 @@ def encode(state, kind, sampling, points, features):
 
 
 def near_sphere(rng, n):
-    """Points on the unit sphere, and unit normals near to theirs."""
+    """Points on the unit sphere, and unit normals near to the true ones."""
     points = rng.normal(size=(n, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     normals = points + 0.3 * rng.normal(size=(n, 3))

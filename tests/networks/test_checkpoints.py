@@ -1,4 +1,4 @@
-"""Networks from checkpoints: read or refused."""
+"""Networks from checkpoints are read or refused."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""The small part segmenter: what it depends on, its gradients, its file; the shipped weights on new objects."""
+"""The small part segmenter: its invariances, gradients and file; the shipped weights on new objects."""
 
 import equinox as eqx
 import jax
@@ -23,7 +23,7 @@ def network():
 
 
 def cloud(count=COUNT):
-    """Points of a box's faces with the outward normals."""
+    """Points on the faces of a box, with outward normals."""
     axis, sign = RNG.integers(0, 3, count), RNG.choice([-1.0, 1.0], count)
     points, normals = RNG.uniform(-0.8, 0.8, (count, 3)), np.zeros((count, 3))
     points[np.arange(count), axis] = 0.8 * sign
@@ -35,7 +35,7 @@ def test_it_gives_log_probabilities_and_is_small(network):
     log_p = segment(network, *cloud(), CHAIR, np.ones(COUNT, bool))
     assert log_p.shape == (COUNT, 50)
     np.testing.assert_allclose(np.exp(log_p).sum(axis=1), 1.0, atol=1e-5)
-    # Nothing of a random network is constant over the object.
+    # No output of a random network is constant over the object.
     assert np.ptp(log_p, axis=0).min() > 1e-3
     assert 80_000 < sum(leaf.size for leaf in jax.tree.leaves(network)) < 130_000
 
@@ -48,7 +48,7 @@ def test_masked_rows_do_not_matter_whatever_they_hold_and_wherever_they_stand(ne
     for rows in worse:
         rows[~mask] = np.nan
     np.testing.assert_array_equal(segment(network, *worse, CHAIR, mask)[mask], found[mask])
-    # The first row stays, since farthest point sampling starts there; the others change places with the padding.
+    # The first row stays, since farthest point sampling starts there. The others change places with the padding.
     order = np.concatenate([[0], 1 + RNG.permutation(COUNT - 1)])
     moved = segment(network, points[order], normals[order], CHAIR, mask[order])
     np.testing.assert_allclose(moved[mask[order]], found[order][mask[order]], atol=2e-4)
@@ -87,7 +87,7 @@ def test_gradients_are_finite_and_those_of_finite_differences(network, x64):
         for h in (step, -step)
     )
     assert float(high - low) / (2 * step) == pytest.approx(expected, rel=1e-4)
-    # Rows that are repeated, and a cloud of a single point.
+    # Repeated rows, and a cloud of a single point.
     points[100:] = points[:1]
     for mask in (np.ones(COUNT, bool), np.arange(COUNT) < 1):
         for slope in value_and_gradient(double, points, normals, mask, weights)[1]:
@@ -105,10 +105,10 @@ def predicted(segmenter, found):
 
 @pytest.mark.slow
 def test_the_shipped_weights_know_the_parts_of_objects_that_they_were_not_trained_on(computes):
-    """Two objects of each procedural category, numbers of the test split that the training never saw."""
+    """Two test objects of each procedural category. Training uses none of them."""
     found = scanned_clouds(part_scene, Split.TEST, range(5000, 5026), setting=PART_SETTING)
     fed, said = jax.tree.map(np.asarray, predicted(part_segmenter("chair", num_points=1024), found))
-    # Farthest point samples of farthest point samples are themselves, in their order.
+    # Farthest point sampling of its own result returns it in the same order.
     np.testing.assert_array_equal(fed.points, found.clouds.points)
     mask, labels = np.asarray(found.clouds.mask), np.asarray(found.point_labels)
     for category, rows, there in zip(np.asarray(found.labels), said, mask, strict=True):

@@ -1,4 +1,4 @@
-"""The invariant network, and the one that sees the points that tell the class alone: what does not matter to it, its
+"""The invariant network, and the one that sees only the points that tell the class: their invariances and
 derivatives."""
 
 import equinox as eqx
@@ -12,12 +12,12 @@ import jaxnbv as nbv
 from jaxnbv.networks import CloudClassifier, InvariantClassifier
 
 RNG = np.random.default_rng(0)
-# Of most clouds, so that one program answers them.
+# Points of most clouds, which then share one program.
 COUNT = 300
 
 
 def network():
-    """An untrained network whose answers differ from cloud to cloud by some tenths."""
+    """An untrained network whose outputs differ between clouds by some tenths."""
     net = InvariantClassifier(5, jax.random.key(0))
     return eqx.tree_at(lambda n: n.temperature, net, net.temperature * 0.02)
 
@@ -39,7 +39,8 @@ def answer(net, points, normals, mask=None):
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-9), (np.float32, 2e-2)])
 def test_rotations_and_translations_do_not_matter(x64, dtype, tolerance):
-    """Nor to the choices of rows, which compare distances: random points have no ties that rounding could break."""
+    """The choice of rows by distances is invariant too, because random points have no ties that rounding could
+    break."""
     net = jax.tree.map(lambda leaf: leaf.astype(dtype), network())
     points, normals = oriented(COUNT)
     still = answer(net, points.astype(dtype), normals.astype(dtype))
@@ -59,7 +60,7 @@ def test_rotations_and_translations_do_not_matter(x64, dtype, tolerance):
 
 
 def test_masked_rows_and_the_capacity_do_not_matter(x64):
-    """Wherever the masked rows stand and whatever they hold, as long as the filled ones keep their order."""
+    """Masked rows may be anywhere and hold anything, as long as the filled rows keep their order."""
     net, count = network(), 40
     points, normals = oriented(count)
     still = answer(net, points, normals)
@@ -73,9 +74,9 @@ def test_masked_rows_and_the_capacity_do_not_matter(x64):
 
 
 def test_the_order_of_rows_after_the_first_does_not_matter_where_no_ball_is_overfull(x64):
-    """The sampling starts at the first row, and a ball that is overfull takes the first 24 rows in it.
+    """The sampling starts at the first row, and an overfull ball takes its first 24 rows.
 
-    Balls of centres are filled in the order of sampling, which is that of the points and not of the rows.
+    Balls of centres are filled in the order of sampling, which depends on the points and not on the rows.
     """
     net = network()
     points, normals = oriented(COUNT)
@@ -93,7 +94,7 @@ def test_the_order_of_rows_after_the_first_does_not_matter_where_no_ball_is_over
 
 @pytest.mark.parametrize("count", [30, COUNT])
 def test_gradients_against_central_differences(x64, count):
-    """Normals are turned, not stretched: all points alone in their balls tie, with equal slopes for unit normals."""
+    """Normals are rotated, not stretched. Points alone in their balls all tie, with equal slopes for unit normals."""
     net = network()
     points, normals = (jnp.asarray(a) for a in oriented(count))
 
@@ -159,7 +160,7 @@ MOST = 320
 
 
 def focused(bias=None):
-    """Untrained, and not undecided; with a bias all points are chosen, or none."""
+    """An untrained network that is not undecided. With a bias it chooses all points, or none."""
     net = InvariantClassifier(4, jax.random.key(0), focused=True)
     net = eqx.tree_at(lambda n: n.temperature, net, 0.02 * net.temperature)
     return net if bias is None else eqx.tree_at(lambda n: n.focus.head[1].bias, net, jnp.array([bias]))
@@ -186,7 +187,7 @@ def test_what_tells_the_class_does_not_depend_on_how_the_object_is_turned(x64):
 
 
 def test_the_network_is_fed_the_first_points_that_tell_the_class():
-    """Of odds that divide the points into halves, found by moving the bias to their median."""
+    """The bias is moved to the median of the odds, so that half of the points are chosen."""
     net = focused()
     points, normals = (jnp.asarray(array, jnp.float32) for array in oriented(900))
     mask = jnp.asarray(RNG.random(900) < 0.8)

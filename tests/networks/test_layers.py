@@ -69,7 +69,7 @@ def test_interpolation_against_a_loop(x64, m):
 
 
 def test_gradients_are_bounded_however_close_the_coarse_points_are():
-    """Single precision, where the weights span eight orders of magnitude; two coarse points coincide."""
+    """In single precision, with weights that span eight orders of magnitude. Two coarse points coincide."""
     coarse = jnp.asarray([[0.0, 0, 0], [0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]])
     features = jnp.asarray([[1.0], [1.0], [2.0], [3.0]])
     both = jax.jit(jax.value_and_grad(lambda x, y: interpolate(x, y, features)[0, 0], argnums=(0, 1)))

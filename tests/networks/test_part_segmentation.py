@@ -1,4 +1,5 @@
-"""Part segmentation against published-layout reference outputs and a plain NumPy network; checkpoints; clouds."""
+"""Part segmentation against reference outputs in the published layout and a plain NumPy network; checkpoints;
+clouds."""
 
 import itertools
 
@@ -30,7 +31,7 @@ segment = eqx.filter_jit(lambda network, *arguments: network(*arguments))
 
 
 def small_network():
-    """Few centres and narrow layers; sixteen categories and fifty parts."""
+    """A network with few centres and narrow layers, sixteen categories and fifty parts."""
     return PointNet2PartSegmenter(
         (
             SetAbstraction((PooledMLP(layers(RNG, 9, 8, 9)),), (0.6,), (8,), 12),
@@ -52,7 +53,7 @@ def rows(n):
 
 
 def random_state(kind, inputs, categories=16, parts=50):
-    """`inputs` counts coordinates twice, as the first level does."""
+    """`inputs` counts coordinates twice, like the first level."""
 
     def head(widths):
         below = 12
@@ -99,7 +100,7 @@ def test_log_probabilities_are_those_of_the_reference(shared):
 
 @pytest.mark.parametrize(("kind", "inputs", "n"), [("ssg", 6, 60), ("msg", 9, 560)])
 def test_against_a_plain_network(x64, tmp_path, kind, inputs, n):
-    """Both layouts, with normals and without, and fewer points than centres, which are then repeated."""
+    """Both layouts, with and without normals, and with fewer points than centres, which are then repeated."""
     state = random_state(kind, inputs)
     save_file(state, tmp_path / "net.safetensors")
     network = load_checkpoint(tmp_path / "net.safetensors")
@@ -189,7 +190,7 @@ def test_a_cloud_segmenter_gives_probabilities_of_the_categorys_parts():
     assert not p[30:].any()
     assert not p[:, :47].any()
     np.testing.assert_allclose(p[:30].sum(axis=1), 1.0, atol=1e-6)
-    # The network's own answer, to the points in the order they are fed in, at its scale, given the category.
+    # The network's own answer for the points in the order that it gets, at its scale, given the category.
     log_p = segment(network, 0.5 * fed.points, fed.normals, jnp.asarray(15), fed.mask)
     given = np.exp(np.asarray(log_p, np.float64))[:30, 47:]
     np.testing.assert_allclose(p[:30, 47:], given / given.sum(axis=1, keepdims=True), atol=1e-5)

@@ -1,4 +1,4 @@
-"""PointNet++ against published-layout reference outputs, a plain NumPy network, and finite differences."""
+"""PointNet++ against reference outputs in the published layout, a plain NumPy network, and finite differences."""
 
 import equinox as eqx
 import jax
@@ -22,7 +22,7 @@ def call(network, *arguments):
 
 
 def small_network(inputs=6, members=(8, 16), centers=10):
-    """Two radii, then one; few centres; groups as large as asked for."""
+    """Two radii, then one, with few centres and groups of the given sizes."""
     first = tuple(PooledMLP(layers(RNG, inputs, 8, 9)) for _ in members)
     second = (PooledMLP(layers(RNG, 3 + 18, 10, 10, 12)),)
     return PointNet2Classifier(
@@ -65,10 +65,10 @@ def test_log_probabilities_are_those_of_the_reference(shared, kind):
     [("ssg", 3, 540, 0), ("msg", 6, 540, 100), ("ssg", 6, 60, 0), ("msg", 3, 60, 0)],
 )
 def test_against_a_plain_network(x64, tmp_path, kind, inputs, n, repeated):
-    """Both layouts, with normals and without, and fewer points than centres, or only when duplicates are not counted.
+    """Both layouts, with and without normals, and fewer points than centres, counted with or without duplicates.
 
-    The reference then returns to the first centre where farthest point sampling here goes through the duplicates; the
-    maximum over a group is the same.
+    The reference then returns to the first centre, whereas farthest point sampling here goes through the duplicates.
+    The maximum over a group is the same.
     """
     state = published.classifier_state(RNG, kind, inputs)
     save_file(state, tmp_path / "net.safetensors")

@@ -1,4 +1,4 @@
-"""PyTorch files written by hand: read as they are meant, or refused; nothing in them is run."""
+"""PyTorch files written by hand are read as intended, or refused. Nothing in them is executed."""
 
 import pickle
 import resource
@@ -103,14 +103,14 @@ def test_whatever_else_a_file_asks_for_is_not_run(tmp_path, module, name, layout
 
 
 def test_the_attack_would_have_worked(tmp_path):
-    """Else the test above could not fail."""
+    """Without this the test above could not fail."""
     mark = tmp_path / "mark"
     pickle.loads(dumps(call(named("os", "system"), f"touch {mark}")))
     assert mark.exists()
 
 
 def test_what_a_training_run_left_beside_its_model_is_passed_over(tmp_path, state):
-    """A NumPy number, settings of a class of its own, and a function, in the ways that pickles make them."""
+    """A NumPy number, settings of an own class, and a function, in the forms that pickles have."""
     kind = Op(b"b", call(named("numpy", "dtype"), "f8", False, True), (3, "<", None, None, None, -1, -1, 0))
     text = call(named("_codecs", "encode"), struct.pack("<d", 0.875).decode("latin1"), "latin1")
     others = {
@@ -176,7 +176,7 @@ def test_storages_that_an_older_file_does_not_fill_are_refused(tmp_path, state):
 
 
 def copies(count, step):
-    """Many dictionaries of the same entries: memo 1 makes one, 2 has the pairs, 3 has them as a dictionary."""
+    """Many dictionaries with the same entries: memo 1 makes one, 2 has the pairs, 3 has them as a dictionary."""
     pairs = [(f"k{index:05d}", 1) for index in range(count)]
     head = b"\x80\x02ccollections\nOrderedDict\nq\x01" + program([list(pair) for pair in pairs]) + b"q\x02"
     return head + program(dict(pairs)) + b"q\x03" + b"(" + step * count + b"l."
@@ -224,7 +224,7 @@ def test_memory_is_bounded_by_the_size_of_the_file(tmp_path, name, layout):
 
 
 def test_a_file_of_ten_bytes_takes_no_gigabyte(tmp_path):
-    """Python's own reader would: memory that NumPy and Python do not trace counts too."""
+    """Python's own reader would allocate it. Memory that NumPy and Python do not trace counts too."""
     file = tmp_path / "net.pth"
     file.write_bytes(b"\x80\x02]r\x00\x00\x00\x04.")
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -260,7 +260,7 @@ def test_a_storage_that_many_tensors_share_is_read_once(tmp_path):
 
 
 def test_long_lists_and_deep_settings_are_read(tmp_path, state):
-    """As older protocols write them, one item at a time; deep, but not too deep."""
+    """Older protocols write one item at a time. The nesting is deep, but not too deep."""
     deep = ()
     for _ in range(300):
         deep = (deep,)

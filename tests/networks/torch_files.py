@@ -18,7 +18,7 @@ STORAGES = {
 
 
 class Op:
-    """A piece of pickle program: its parts, and what is done with them."""
+    """A piece of a pickle program: its parts, and the opcodes that combine them."""
 
     def __init__(self, code, *parts):
         self.code, self.parts = code, parts

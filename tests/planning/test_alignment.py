@@ -1,4 +1,4 @@
-"""Views that disagree since poses are off, against the errors that were put in: points and planes in float64."""
+"""Alignment of views with wrong poses, against the simulated errors: points and planes in float64."""
 
 import re
 import warnings
@@ -32,7 +32,7 @@ def random_motion(seed, degrees, length):
 
 
 def views_of_a_box(errors, noise=0.0, eyes=EYES, roll=True):
-    """What cameras see of a box of 24 x 40 x 30 cm, and where they are said to be, which is off by the errors."""
+    """Scans by cameras of a box of 24 x 40 x 30 cm, and the reported poses, which have the errors."""
     clouds, poses = [], []
     for number, (eye, error) in enumerate(zip(eyes, errors, strict=True)):
         random = np.random.default_rng(number)
@@ -53,7 +53,7 @@ def views_of_a_box(errors, noise=0.0, eyes=EYES, roll=True):
 
 
 def apart(one, other):
-    """How far two motions differ: degrees, and lengths."""
+    """Difference of two motions: degrees and length."""
     change = np.linalg.inv(one) @ other
     return np.degrees(Rotation.from_matrix(change[:3, :3]).magnitude()), np.linalg.norm(change[:3, 3])
 
@@ -68,7 +68,7 @@ def test_the_error_of_the_mount_is_found(seed, degrees, length):
     assert alignment.is_determined
     assert alignment.disagrees
     angle, shift = apart(error, alignment.corrections[0])
-    # What is told least is taken for smaller than it is, by a few percent.
+    # The least determined component is underestimated by a few percent.
     assert angle < 0.1
     assert shift < 0.0015
     np.testing.assert_array_equal(alignment.corrections, alignment.corrections[:1].repeat(len(EYES), axis=0))
@@ -87,7 +87,7 @@ def test_exact_poses_stay_as_they_are():
 
 def test_the_error_of_a_single_pose_is_its_own():
     errors = len(EYES) * [np.eye(4)]
-    # It sees three faces that others see too: what it is off by is told.
+    # It sees three faces that other views see too, which determines its error.
     errors[1] = random_motion(5, 1.5, 0.008)
     alignment = align_views(*views_of_a_box(errors, noise=0.0005))
     assert not alignment.is_mount
@@ -99,7 +99,7 @@ def test_the_error_of_a_single_pose_is_its_own():
 
 
 def test_a_single_pose_is_corrected_as_small_gicp_does():
-    """It moves the view's points onto all others by generalised ICP, which knows nothing of mounts."""
+    """small_gicp moves the view's points onto all others by generalised ICP, without a model of the mount."""
     errors = len(EYES) * [np.eye(4)]
     errors[1] = random_motion(5, 1.5, 0.008)
     clouds, poses = views_of_a_box(errors, noise=0.0005)
@@ -118,13 +118,13 @@ def test_a_single_pose_is_corrected_as_small_gicp_does():
     ours = said @ alignment.corrections[1] @ np.linalg.inv(said)
     corrected, oracle = (source @ motion[:3, :3].T + motion[:3, 3] for motion in (ours, result.T_target_source))
     moved = np.linalg.norm(corrected - source, axis=1)
-    # Points that were moved by 1 cm are put to the same place, to a tenth of that.
+    # The errors move points by 1 cm. Both methods move them to the same place, to a tenth of that.
     assert moved.mean() > 0.008
     assert np.linalg.norm(corrected - oracle, axis=1).mean() < 0.1 * moved.mean()
 
 
 def test_views_that_only_shift_do_not_tell_a_shift_of_the_mount():
-    """All cameras look the same way, so that a shift of the mount shifts all that they see alike."""
+    """All cameras have the same orientation, so that a shift of the mount shifts all scans alike."""
     ahead = np.asarray(look_at(EYES[0]).to_matrix(), np.float64)[:3, :3]
     (cloud, *_), _ = views_of_a_box([np.eye(4)], eyes=EYES[:1])
     matrices = np.tile(np.eye(4), (4, 1, 1))
@@ -188,13 +188,13 @@ PLACES = [around(angle, elevation) for angle, elevation in ((0.2, 0.5), (0.9, 0.
 
 
 def off_the_sphere(session):
-    """The median distance of the points from the sphere that is scanned."""
+    """The median distance of the points from the scanned sphere."""
     points, _ = session.cloud.to_numpy()
     return np.median(np.abs(np.linalg.norm(points - np.array([0.3, 0.2, 0.101]), axis=1) - 0.1))
 
 
 def test_a_session_warns_of_its_mount_once_and_corrects_it_where_that_is_asked_for(tmp_path):
-    """Rolled cameras, since the scene is round: without a turn the shift is not told."""
+    """The cameras are rolled, because a round scene determines no shift without a rotation."""
     rolls = [Rotation.from_rotvec([0.0, 0.0, 0.7 * n]).as_matrix() for n in range(4)]
     true = [place.copy() for place in PLACES]
     for matrix, roll in zip(true, rolls, strict=True):
@@ -209,16 +209,16 @@ def test_a_session_warns_of_its_mount_once_and_corrects_it_where_that_is_asked_f
     for matrix in true:
         corrected.add(shot(matrix), matrix @ np.linalg.inv(ERROR), depth_scale=1e-3)
     assert off_the_sphere(corrected) < 0.5 * off_the_sphere(plain)
-    # The folder has poses as they were given.
+    # The folder holds the poses that were passed in.
     again = type(corrected).load(tmp_path)
     np.testing.assert_allclose(again.cloud.points, corrected.cloud.points, atol=1e-5)
-    # What the camera is sent to is off by as much as the mount is.
+    # The proposed pose includes the error of the mount.
     sent, planned = corrected.next().matrix, corrected.frame.to_world(corrected.next().proposal.pose).to_matrix()
     np.testing.assert_allclose(sent @ corrected.alignment.corrections[0], planned, atol=1e-5)
 
 
 def test_comparing_views_says_nothing_twice():
-    """Pixels of 10 m are a mark, of which each image that has them is warned of once."""
+    """Pixels of 10 m mark missing values, which is warned of once for each image."""
     session = session_of()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

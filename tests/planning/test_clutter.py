@@ -1,4 +1,4 @@
-"""What stands around the box of a session, by its images."""
+"""Clutter around the box of a session, from its images."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from jaxnbv.scanning.sdf import Cuboid, Sphere
 
 EYE = Camera(fov=1.0, height=240, width=320)
 SMALL = Box((-0.3,) * 3, (0.3,) * 3)
-# Half a metre before the box, seen from the camera's side.
+# Half a metre in front of the box, as seen from the camera.
 POST = Cuboid([0.03, 0.03, 0.3]).translate([0.3, -0.1, 0.15])
 
 
@@ -40,7 +40,7 @@ def test_cells_of_a_wall_are_at_its_distance(wall):
     assert cell == pytest.approx(4.0 / 48)
     points = np.random.default_rng(0).uniform([-1.0, -1.0, -0.9], [1.0, 1.0, 1.9], (200, 3))
     distance = np.asarray(solid(points), np.float64)
-    # The layer's near face is half a cell before the wall, and the faces of cells are met to half a cell.
+    # The near face of the layer is half a cell before the wall, and hits on faces of cells are accurate to half a cell.
     assert np.abs(distance - (points[:, 2] + 1.04 - 0.5 * cell)).max() < 0.6 * cell
     assert (np.asarray(solid(np.array([[0.0, 0.0, -1.04], [0.5, 0.3, -1.04]]))) < 0).all()
 
@@ -49,12 +49,12 @@ def test_what_a_later_image_sees_through_is_free(wall):
     clutter, pose = wall
     assert (clutter.votes[12:36, 12:36, 11] == 1).all()
     behind = voted(clutter, np.full((240, 320), 3.5), pose)
-    # Away from the border of the image, cells of the first wall are as free as they are occupied, and the second is at
-    # z = -1.5.
+    # Away from the border of the image, cells of the first wall have as many votes for free as for occupied. The second
+    # wall is at z = -1.5.
     assert (behind.votes[12:36, 12:36, 11] == 0).all()
     assert ((behind.votes[12:36, 12:36] > 0).sum(axis=2) <= 2).all()
     assert ((behind.votes[12:36, 12:36, 5:7] > 0).any(axis=2)).all()
-    # No measurement says nothing.
+    # Pixels without a measurement give no votes.
     nothing = voted(clutter, np.zeros((240, 320)), pose)
     np.testing.assert_array_equal(nothing.votes, clutter.votes)
 
@@ -80,7 +80,7 @@ def shot_of(world, matrix):
 
 WORLD = Sphere(0.1).translate([0.3, 0.2, 0.101]) | Cuboid([1.0, 1.0, 0.02]).translate([0.3, 0.2, -0.021]) | POST
 BESIDE = around(-0.9, 0.5, 0.7)
-# At the post's face, and behind it as seen from the object.
+# At the face of the post, and behind the post as seen from the object.
 AT_POST = np.asarray(look_at((0.335, -0.1, 0.25), CENTER, up=(0.0, 0.0, 1.0)).matrix, np.float64)
 BEHIND = np.asarray(look_at((0.3, -0.4, 0.16), CENTER, up=(0.0, 0.0, 1.0)).matrix, np.float64)
 
@@ -97,7 +97,7 @@ def test_a_post_beside_the_box_hides_it_and_keeps_cameras_away(is_robot):
     clutter = session.planner.obstacles.clutter
     values = np.asarray(session.next().proposal.values)
     if is_robot:
-        # All of the post was taken for the robot.
+        # All of the post is ignored as the robot.
         assert clutter is None
         assert np.isfinite(values).all()
         return
@@ -106,7 +106,7 @@ def test_a_post_beside_the_box_hides_it_and_keeps_cameras_away(is_robot):
     at_face, beside, far = np.asarray(clutter(places), np.float64) / scale
     cell = session._intake.clutter.spacing / scale
     assert at_face < 0.5 * cell
-    # By the solid's own distances, to a cell.
+    # By the distances of the solid itself, to a cell.
     for distance, place in ((beside, [0.5, -0.1, 0.2]), (far, FIRST[:3, 3])):
         assert distance == pytest.approx(float(POST(np.asarray(place))), abs=1.5 * cell)
     assert values[0] == -np.inf

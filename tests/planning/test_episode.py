@@ -1,4 +1,4 @@
-"""The simulated episode: equal to asking and telling by hand, and to one jitted function."""
+"""The simulated episode equals ask and tell by hand, and one jitted function."""
 
 import equinox as eqx
 import jax
@@ -30,7 +30,7 @@ def episode():
 
 
 def test_simulate_is_the_loop_of_ask_and_tell(episode):
-    """View i draws from fold_in(key, i): one half to choose it, one for the sensor's noise."""
+    """View i draws from fold_in(key, i): one half chooses the view, and one is the sensor's noise."""
     pose, observations = FIRST, None
     for index in range(4):
         choose_key, noise_key = jax.random.split(jax.random.fold_in(KEY, index))
@@ -83,7 +83,7 @@ def test_a_view_depends_on_the_key_and_its_number_alone(episode):
 
 
 def test_a_whole_episode_as_one_jitted_function(episode):
-    """Fusion may round otherwise, so numbers agree to rounding and choices exactly."""
+    """Fusion may round differently, so numbers agree up to rounding, and choices exactly."""
 
     @jax.jit
     def run(key, position):
@@ -111,7 +111,7 @@ def test_a_whole_episode_as_one_jitted_function(episode):
         np.testing.assert_allclose(values[index], view.proposal.values, rtol=0.02, atol=0.02)
     np.testing.assert_array_equal(observations.cloud.mask, episode.cloud.mask)
     assert int(observations.cloud.count) == 128, "farthest points were taken"
-    # Where two points tie to rounding, farthest point sampling may swap them: compare as sets.
+    # Farthest point sampling may swap two points that tie up to rounding, so compare sets.
     distance = np.linalg.norm(
         np.asarray(observations.cloud.points)[:, None] - np.asarray(episode.cloud.points), axis=-1
     )
@@ -129,8 +129,8 @@ def test_an_episode_over_a_mesh_runs_outside_jit():
 
 
 def test_what_views_found_of_a_ball():
-    """From the other side nearly all of the cap that a sensor sees there, 2 pi r^2 (1 - r / d), of which what is
-    steeper than 60 degrees counts for less; from beside the first pose nearly nothing."""
+    """A view from the other side adds nearly all of the visible cap, 2 pi r^2 (1 - r / d), where surface steeper than
+    60 degrees counts less. A view beside the first pose adds nearly nothing."""
     radius, away = 0.8, 4.0
     poses = nbv.look_at([(0.0, 0.0, away), (0.0, 0.0, -away), (0.05, 0.0, away)])
     camera = nbv.Camera(height=40, width=40)

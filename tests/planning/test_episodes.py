@@ -1,4 +1,4 @@
-"""Whole episodes in one program: those of `simulate`, one by one, to the last bit."""
+"""Whole episodes in one program equal those of `simulate`, one by one, to the last bit."""
 
 import subprocess
 import sys
@@ -18,7 +18,7 @@ from jaxnbv.scanning import GridSurface, mesh_from_sdf
 from jaxnbv.scanning.sdf import Capsule, Cuboid, Sphere
 from jaxnbv.surfaces import FreeRotation
 
-# Without optimisation, on one LLVM module, XLA rounds a part otherwise by what else is in the module.
+# Without optimisation and with one LLVM module, XLA's rounding of a part depends on the rest of the module.
 COMPUTES = True
 BALLS = [Sphere(radius) | Capsule([0.2, 0.3, -0.4], [0.5, 0.6, 0.9], 0.3) for radius in (0.7, 0.8, 0.6)]
 KEYS = jax.random.split(jax.random.key(7), 3)
@@ -33,7 +33,7 @@ def by_height(cloud):
 
 
 def by_octant(cloud):
-    """Parts by the largest coordinate."""
+    """Parts by the largest coordinate of the point."""
     return jnp.where(cloud.mask[:, None], jax.nn.softmax(5.0 * cloud.points, axis=1), 0.0)
 
 
@@ -67,14 +67,14 @@ def assert_equal(together, alone, acquisition):
 
 
 def test_episodes_are_those_of_simulate(compilations):
-    """From a first pose each, and from one for all; any number of views by one program."""
+    """With a first pose for each episode or one for all. One program runs any number of views."""
     together = nbv.episodes(COVERAGE, BALLS, POSES, 3, KEYS)
     assert_equal(together, one_by_one(COVERAGE, BALLS, POSES, 3, KEYS), COVERAGE.acquisition)
     assert len(np.unique(np.asarray(together.poses.position).reshape(-1, 3), axis=0)) > 5
     keys = jax.random.split(jax.random.key(8), 3)
     del compilations[:]
     more = nbv.episodes(COVERAGE, BALLS[::-1], FIRST, 4, keys)
-    # The pose along an axis, and slices of another length: no program of an episode.
+    # The pose along an axis, and slices of another length. None of these is the program of an episode.
     assert len(compilations) < 10
     assert_equal(more, one_by_one(COVERAGE, BALLS[::-1], 3 * [FIRST], 4, keys), COVERAGE.acquisition)
 
@@ -107,7 +107,7 @@ def test_scenes_on_a_grid_with_a_leading_axis():
 
 
 def test_several_at_once_choose_the_same_views():
-    """Two, and the third by itself."""
+    """Two together, and the third by itself."""
     planner = planner_of(nbv.FarthestView(12))
     alone = stacked([each.cloud for each in one_by_one(planner, BALLS, POSES, 3, KEYS)])
     together = nbv.episodes(planner, BALLS, POSES, 3, KEYS, batch_size=2)
@@ -207,7 +207,7 @@ PROGRAM = """
 
 @pytest.mark.parametrize("search", ["FarthestView", pytest.param("DiscreteSearch", marks=pytest.mark.slow)])
 def test_two_devices_give_the_same_arrays(search, tmp_path, monkeypatch):
-    """In a process of its own, before whose start the devices are counted, compiled as users' programs are."""
+    """In its own process, because devices are counted before it starts. It compiles as users' programs do."""
     for name in ("XLA_FLAGS", "JAX_DISABLE_MOST_OPTIMIZATIONS"):
         monkeypatch.delenv(name, raising=False)
     program = tmp_path / "program.py"

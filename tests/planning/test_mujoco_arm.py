@@ -1,4 +1,4 @@
-"""The loop with an arm and a camera of MuJoCo."""
+"""The loop with an arm and a camera in MuJoCo."""
 
 import importlib
 import itertools
@@ -19,7 +19,7 @@ MUG = arm_simulator.on_a_table()
 
 
 def points_of(depth, matrix):
-    """By the equations of a pinhole, in NumPy: the points of an image in the world."""
+    """Points of an image in the world, by the pinhole equations in NumPy."""
     (fx, _, cx), (_, fy, cy), _ = arm_simulator.Arm(MUG).camera.intrinsics
     rows, columns = np.indices(depth.shape)
     local = np.stack([(columns - cx) / fx * depth, (rows - cy) / fy * depth, depth], axis=-1)[depth > 0]
@@ -37,7 +37,7 @@ def test_depth_images_show_mug_and_table_where_they_are():
     depth = arm.depth()
     points = points_of(depth, arm.matrix())
     assert len(points) > 0.9 * depth.size
-    # Noise of half a millimetre at half a metre, over thousands of points.
+    # The noise is half a millimetre at half a metre, over thousands of points.
     away = away_from_scene(points[::7])
     assert np.median(away) < 5e-4
     assert away.max() < 3e-3
@@ -62,7 +62,7 @@ def test_the_arm_holds_the_camera_where_it_is_sent_within_its_joints_limits():
     np.testing.assert_allclose(arm.matrix(), goal, atol=2e-3)
     low, high = arm.model.jnt_range.T
     assert all(((low <= posture) & (posture <= high)).all() for posture in way)
-    # The score of a motion: the joint that turns farthest at a radian a second, between neighbouring postures.
+    # The duration of a motion: between neighbouring postures the joint that turns farthest moves at a radian a second.
     seconds = sum(np.abs(b - a).max() for a, b in itertools.pairwise(way))
     assert score == pytest.approx(1 / (1 + seconds))
     assert arm.seconds == pytest.approx(seconds)
@@ -87,7 +87,7 @@ def test_three_views_of_a_mug():
     session = scan.session
     assert len(session.views) == len(ways) == 3
     assert scan.proposals == 2
-    # It ends where the last view was taken, and each way begins where the one before it ended.
+    # The arm ends where the last view was taken, and each motion begins where the previous one ended.
     np.testing.assert_array_equal(ways[-1][-1], arm.joints)
     np.testing.assert_array_equal(ways[1][-1], ways[2][0])
     point, normal = plane_of(session.planner.obstacles, session.frame)

@@ -1,4 +1,4 @@
-"""The planner: ask and tell, compilation, overflow, bad input."""
+"""The planner: ask and tell, compilation, overflow and bad input."""
 
 import dataclasses
 import warnings
@@ -52,7 +52,7 @@ def test_nothing_recompiles_after_the_second_view(name, compilations):
 
 
 def test_simulated_episodes_do_not_recompile_either(planner, compilations):
-    """A whole second episode, of another seed, first view and noise draw, compiles nothing."""
+    """A whole second episode with another seed, first view and noise compiles nothing."""
     other = look_at((-0.8, 0.9, 2.2))
     simulate(planner, SCENE, FIRST, 3, jax.random.key(0), progress=False)
     before = len(compilations)
@@ -110,7 +110,8 @@ def test_beyond_its_capacity_the_cloud_is_thinned_by_farthest_points(planner, ob
 
 @pytest.mark.parametrize(("partners", "kept"), [(0, 0), (1, 2)])
 def test_a_point_that_lies_alone_where_another_view_looked_through_goes(partners, kept):
-    """It is what thinning would take first. With a neighbour it stays: it may be a thin part that the view missed."""
+    """Thinning would keep such a point first. With a neighbour it stays, since it may be a thin part that the view
+    missed."""
     camera, stray = Camera(fov=1.3, height=48, width=48), np.array([0.0, 1.0, -1.0])
     planner = dataclasses.replace(planner_of(capacity=400), camera=camera)
     first = scan(SCENE, camera, FIRST)
@@ -189,7 +190,7 @@ def test_a_singular_covariance_is_named():
 
 
 def test_points_far_apart_are_told_of_with_the_remedy():
-    """Beyond 2.5 lengthscales; a long one of several is enough."""
+    """Points farther apart than 2.5 lengthscales. One long lengthscale among several is enough."""
     points = np.asarray(fibonacci_sphere(60))
     cloud = PointCloud.from_arrays(points, points)
 
@@ -205,7 +206,7 @@ def test_points_far_apart_are_told_of_with_the_remedy():
 
 
 def test_parts_thinner_than_a_cell_are_told_of_with_the_remedy():
-    """A slab whose two sides were seen, on a grid that is too coarse for it and on one that is not."""
+    """Both sides of a slab were scanned. One grid is too coarse for it, and one is not."""
     axis = np.linspace(-0.5, 0.5, 12)
     x, y = (side.ravel() for side in np.meshgrid(axis, axis))
     above, below = (np.stack([x, y, np.full_like(x, z)], axis=1) for z in (0.04, -0.04))

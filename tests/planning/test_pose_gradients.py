@@ -1,9 +1,9 @@
-"""Derivatives of the acquisitions in the camera's pose against central differences, in double precision.
+"""Derivatives of the acquisitions in the camera's pose, against central differences in double precision.
 
-The derivative is pathwise: every ray stays on the part of the surface that it hits. Where one leaves the surface, or
-comes to another part of it, the value jumps, and no derivative tells of it. Where one grazes the surface the derivative
-is held back, and where a hit passes from one cell of the grid to the next it bends. The tests tell these pairs of a
-pose and a direction apart, count them, and compare all the others.
+The derivative is pathwise: every ray stays on the part of the surface that it hits. Where a ray leaves the surface, or
+moves to another part of it, the value jumps, and the derivative does not include that. Where a ray grazes the surface
+the derivative is bounded, and where a hit moves to another cell of the grid it has a kink. The tests detect such pairs
+of a pose and a direction, count them, and compare all others.
 """
 
 from typing import NamedTuple
@@ -31,7 +31,7 @@ NUM_DIRECTIONS, NUM_SPHERE, NUM_FREE = 3, 3, 9
 
 
 def smooth(cloud):
-    """Log-probabilities of three classes by features that are averaged, without corners."""
+    """Log-probabilities of three classes from averages of smooth features."""
     rows = jnp.concatenate([cloud.points, cloud.normals], axis=-1)
     weights = jnp.asarray(np.random.default_rng(4).normal(size=(6, 8)))
     features = jnp.where(cloud.mask[:, None], jnp.tanh(rows @ weights), 0.0)
@@ -40,7 +40,7 @@ def smooth(cloud):
 
 
 def spread(cloud):
-    """A utility: log det of the moments of points and normals."""
+    """A utility: log det of the second moments of points and normals."""
     rows = jnp.where(cloud.mask[:, None], jnp.concatenate([cloud.points, cloud.normals], axis=-1), 0.0)
     return jnp.linalg.slogdet(0.1 * jnp.eye(6) + rows.T @ rows)[1]
 
@@ -56,7 +56,7 @@ ACQUISITIONS = {
 
 
 class OneOf(Acquisition):
-    """One of several acquisitions, by its weight, so that all share one compilation."""
+    """One of several acquisitions, selected by a weight, so that all share one compilation."""
 
     members: list[Acquisition]
     weights: jax.Array
@@ -70,7 +70,8 @@ class OneOf(Acquisition):
 
 
 def surfaces_of(kind):
-    """Two samples, on the nodes: balls that fill the image, blobs that end within it, and rough fields with holes."""
+    """Two samples by their values at nodes: balls that fill the image, blobs within the image, and rough fields with
+    holes."""
     rng = np.random.default_rng(["filling", "blob", "rough"].index(kind))
     x = nodes(GRID.axis)
     radius, height = {"filling": (1.1, 0.3), "blob": (0.6, 0.5), "rough": (0.5, 2.5)}[kind]
@@ -80,7 +81,7 @@ def surfaces_of(kind):
 
 
 def move(start, parameters):
-    """A pose moved on the sphere by the first parameters, and freely from there by the others."""
+    """A pose that moves on the sphere by the first parameters, and then freely by the others."""
     return FreePoses().retract(SpherePoses().retract(start, parameters[:NUM_SPHERE]), parameters[NUM_SPHERE:])
 
 
@@ -98,21 +99,21 @@ def slopes_at(score, cloud, surfaces, starts, parameters):
 
 
 class Pairs(NamedTuple):
-    """Starts, parameters and directions of the pairs; a row of parameters and some directions a start."""
+    """Starts, parameters and directions of the pairs. Each start has a row of parameters and some directions."""
 
     starts: Pose
     parameters: np.ndarray
     directions: np.ndarray
 
     def moved(self, step):
-        """All pairs' poses at a step along their directions, one batch."""
+        """Poses of all pairs at a step along their directions, as one batch."""
         far = self.parameters[:, None] + step * self.directions
         starts = jax.tree.map(lambda leaf: jnp.repeat(leaf, far.shape[1], axis=0), self.starts)
         return jax.jit(jax.vmap(move))(starts, jnp.asarray(far.reshape(-1, NUM_SPHERE + NUM_FREE)))
 
 
 def pairs_of(space, count=15):
-    """Poses about the object: on the sphere, or off it with their axis off the centre."""
+    """Poses around the object: on the sphere, or off it with an axis that misses the centre."""
     rng = np.random.default_rng(11)
     positions = np.asarray(fibonacci_sphere(count, 2.5)) + rng.uniform(-0.1, 0.1, (count, 3))
     parameters = np.zeros((count, NUM_SPHERE + NUM_FREE))
@@ -126,7 +127,7 @@ def pairs_of(space, count=15):
 
 
 class Events(NamedTuple):
-    """Whether, for each pair, between the two ends of a step some ray jumps or changes cell, or grazes at one end."""
+    """Whether, for each pair, a ray jumps or changes its cell between the two ends of a step, or grazes at one end."""
 
     jumps: np.ndarray
     crosses: np.ndarray
@@ -141,7 +142,7 @@ def events(surfaces, pairs, step):
     ends = [scan_samples(surfaces, CAMERA, pairs.moved(sign * step)) for sign in (1, -1)]
     masks, points = zip(*[(np.asarray(seen.mask), np.asarray(seen.points)) for seen in ends], strict=True)
     both = masks[0] & masks[1]
-    # A hit that does not jump moves by at most 34 times as much as its ray, which is some 3 times the step.
+    # A hit that does not jump moves by at most 34 times as much as its ray, which moves by three times the step.
     jumps = (masks[0] != masks[1]) | (both & (np.linalg.norm(points[0] - points[1], axis=-1) > 200 * step))
     places = [(p + GRID.half_extent) / GRID.spacing for p in points]
     crosses = both & (np.floor(places[0]) != np.floor(places[1])).any(axis=-1)
@@ -169,13 +170,13 @@ def random_cloud():
 
 
 def compare(score, surfaces, pairs, step=STEP):
-    """Derivatives along the pairs' directions, the central differences, and the gradients' lengths."""
+    """Derivatives along the pairs' directions, central differences, and lengths of the gradients."""
     cloud = random_cloud()
     slope = np.asarray(slopes_at(score, cloud, surfaces, pairs.starts, jnp.asarray(pairs.parameters)))
     assert np.isfinite(slope).all()
     found = np.einsum("pdk,pk->pd", pairs.directions, slope).ravel()
     ahead, behind = (values_at(score, cloud, surfaces, pairs.moved(sign * step)) for sign in (1, -1))
-    # The gradient in the parameters that the directions move.
+    # The gradient in the parameters that the directions change.
     length = np.linalg.norm(np.where((pairs.directions != 0).any(axis=1), slope, 0.0), axis=-1)
     return found, np.asarray(ahead - behind) / (2 * step), np.repeat(length, pairs.directions.shape[1])
 
@@ -209,7 +210,8 @@ def test_derivatives_are_those_of_central_differences(kind, space, x64):
 
 
 def test_a_jump_is_not_in_the_derivative(x64):
-    """At a thousandth, silhouettes pass over some pixels: differences there are of another order than elsewhere."""
+    """With a step of a thousandth, silhouettes pass over some pixels. Differences there are much larger than
+    elsewhere."""
     surfaces, pairs, step = surfaces_of("blob"), pairs_of("free"), 1e-3
     seen = events(surfaces, pairs, step)
     weight = jnp.eye(len(ACQUISITIONS))[0]
@@ -221,7 +223,7 @@ def test_a_jump_is_not_in_the_derivative(x64):
 
 @pytest.mark.slow
 def test_derivatives_through_a_network(x64):
-    """A network bends at every unit that switches and wherever it picks other points; almost everywhere it agrees."""
+    """A network has kinks where a unit switches and where it picks other points. Almost everywhere the two agree."""
     network = CloudClassifier(InvariantClassifier(3, jax.random.key(0)), 96)
     surfaces, pairs = surfaces_of("blob"), pairs_of("free", 6)
     seen = events(surfaces, pairs, STEP)

@@ -1,4 +1,4 @@
-"""Parts of a program have the bits of programs of their own, with XLA's optimisations on."""
+"""Parts of a program have the same bits as separate programs, with XLA's optimisations on."""
 
 import equinox as eqx
 import jax
@@ -14,7 +14,7 @@ X, Y, Z = jax.random.normal(jax.random.key(0), (3, 500, 3))
 
 @jax.jit
 def turned(x, y):
-    """Laid out by columns within the program."""
+    """The layout within the program is by columns."""
     return jnp.stack([x[:, 0] * y[:, 1], x[:, 1] / 3.0, jnp.exp(y[:, 2])]).T
 
 
@@ -24,7 +24,7 @@ def lengths(x):
 
 
 def chain(x, y, z):
-    """Fused, a product and a sum are rounded once."""
+    """When fused, a product and a sum are rounded once."""
     return lengths(turned(x * y + z, y)) * x[:, 0] + z[:, 0] / 3.0
 
 
@@ -35,7 +35,7 @@ def test_a_program_has_the_bits_of_its_parts(compiled):
 
 
 def test_what_does_not_change_in_a_loop_keeps_its_bits():
-    """Moved out of the loop, the product would be rounded by itself."""
+    """XLA would move the product out of the loop and round it by itself."""
     step = jax.jit(lambda total, x, y: x * y + total)
 
     def add(index, total):

@@ -1,4 +1,4 @@
-"""Proposals that an arm can reach, and those that it refuses."""
+"""Proposals that an arm can reach, and poses that it refuses."""
 
 import dataclasses
 
@@ -21,20 +21,20 @@ def begun(**changes):
 
 @pytest.fixture(scope="module")
 def free():
-    """What is proposed where all can be reached: the numbers of the poses, those of most value first."""
+    """Indices of the poses by value, the highest first, when all can be reached."""
     session = begun()
     return np.argsort(-np.asarray(session.next().proposal.values), kind="stable")
 
 
 def number_of(matrix):
-    """Which of the poses it is, whatever its roll."""
+    """Index of a pose, whatever its roll."""
     away = np.abs(POSES[:, :3, 3] - matrix[:3, 3]).max(axis=1)
     assert away.min() < 1e-5
     return int(away.argmin())
 
 
 def test_the_best_pose_that_can_be_reached_is_proposed_in_the_world(free):
-    """Matrices in metres: all but the third best are too far from the arm's shoulder."""
+    """Matrices in metres. All poses but the third best are too far from the arm's shoulder."""
     third = POSES[free[2], :3, 3]
     asked = []
 
@@ -47,13 +47,13 @@ def test_the_best_pose_that_can_be_reached_is_proposed_in_the_world(free):
     np.testing.assert_allclose(view.matrix, POSES[free[2]], atol=1e-5)
     assert view.refusals == {"joint limit": 2}
     assert view.value == pytest.approx(float(session.frame.length_to_world(view.proposal.values[free[2]], 2)), rel=1e-5)
-    # In batches: each of the two that were refused was asked about with other rolls, none of all the others.
+    # Calls are batches. Other rolls are tried only for the two refused poses.
     assert [len(matrices) for matrices in asked] == [8, 7, 7]
     assert session.next() is view
 
 
 def test_a_camera_may_be_turned_about_its_optical_axis(free):
-    """The arm holds it with the image turned by a right angle alone."""
+    """The arm can hold the camera only with the image rotated by a right angle."""
     best = POSES[free[0]]
 
     def reachable(matrices):
@@ -75,7 +75,7 @@ def test_a_proposal_that_is_refused_is_not_made_again(free, tmp_path):
     assert number_of(session.next().matrix) == free[1]
     assert session.next().refusals == {"cable": 1}
     assert session._loop.inputs() is samples
-    # No camera was there, and a session that is read goes on.
+    # No camera was there, and a session that is loaded continues.
     assert len(session.views) == int(session.observations.num_views) == 1
     again = Session.load(tmp_path)
     assert number_of(again.next().matrix) == free[1]
@@ -86,7 +86,7 @@ def test_a_proposal_that_is_refused_is_not_made_again(free, tmp_path):
 
 
 def test_a_gradient_search_ends_at_a_pose_that_holds():
-    """Above a height, where its own best is not."""
+    """Only poses above a height are allowed, and the best pose of the search is below."""
     planner, places = planner_of(GradientSearch(num_starts=2, iterations=3, num_candidates=12)), []
     free = begun(planner=planner, poses=None).next().matrix
     limit = float(free[2, 3]) + 0.02
@@ -97,7 +97,7 @@ def test_a_gradient_search_ends_at_a_pose_that_holds():
 
     view = begun(planner=planner, poses=None, reachable=reachable).next()
     assert view.matrix[2, 3] > limit
-    # It still looks at the middle of the box.
+    # The camera still looks at the middle of the box.
     ahead = CENTER - view.matrix[:3, 3]
     assert view.matrix[:3, 2] @ ahead / np.linalg.norm(ahead) > 0.999
     assert view.refusals["not reachable"] >= 1
@@ -121,7 +121,7 @@ def test_what_cannot_be_reached_at_all_is_told():
 
 
 def test_a_score_is_multiplied_by_the_value(free):
-    """The choice is that of most value times score, though not all poses are asked about."""
+    """The choice has the highest product of value and score, although not all poses are checked."""
     order = np.argsort(-free_values(), kind="stable")
     scores = np.random.default_rng(0).uniform(0.3, 1.0, len(POSES))
     scores[order[3]] = 0.0
@@ -137,7 +137,7 @@ def test_a_score_is_multiplied_by_the_value(free):
     assert best != free[0]
     assert number_of(view.matrix) == best
     assert float(view.proposal.value) == pytest.approx(values[best], rel=1e-6)
-    # One batch more than needed at most, and seven rolls of the pose with the score zero.
+    # At most one batch more than needed, and seven rolls of the pose with score zero.
     can_win = int((values > scores[best] * values[best]).sum())
     assert len(set(asked)) <= 8 * (can_win // 8 + 1)
 
@@ -147,7 +147,7 @@ def free_values():
 
 
 def test_a_turned_image_that_is_not_square_is_imagined_again(free):
-    """The wide image, turned by a right angle, is worth what the planner says of that pose."""
+    """The value of the wide image after a rotation by a right angle is the planner's value of that pose."""
 
     def reachable(matrices):
         return np.abs(matrices[:, 2, 0]) > 0.9

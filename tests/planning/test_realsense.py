@@ -1,4 +1,4 @@
-"""The example for RealSense cameras, with librealsense's software device: its pipeline, profiles and frames are those
+"""The example for RealSense cameras, with librealsense's software device. Its pipeline, profiles and frames are those
 of a camera, and the test supplies the pixels."""
 
 import ctypes
@@ -39,7 +39,7 @@ POSES = [
 
 
 def distance_to_object(points):
-    """From points to the nearest surface of the ball or the block, in metres."""
+    """Distance from points to the nearest surface of the ball or the block, in metres."""
     to_ball = np.linalg.norm(points - BALL, axis=1) - RADIUS
     beyond = np.abs(points - BLOCK) - HALF_SIZES
     to_block = np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0)
@@ -47,7 +47,7 @@ def distance_to_object(points):
 
 
 def depth_image(matrix, unit):
-    """What a depth camera measures from a pose: whole multiples of a unit in metres, 0 where it measures nothing."""
+    """The image of a depth camera from a pose: whole multiples of a unit in metres, 0 without a measurement."""
     pose = nbv.Pose.from_matrix(matrix)
     view = scan(WORLD, CAMERA, pose)
     depth = (np.asarray(view.points, np.float64) - np.asarray(pose.position)) @ np.asarray(pose.forward, np.float64)
@@ -74,7 +74,7 @@ class SoftwareCamera:
         self.sensor.add_read_only_option(rs.option.depth_units, unit)
         depth = self.add_stream(rs.stream.depth, rs.format.z16, 2, coefficients, model)
         self.profile = depth.as_video_stream_profile()
-        # As real cameras have it: a second stream, which is on by default.
+        # Real cameras have a second stream, which is on by default.
         self.add_stream(rs.stream.infrared, rs.format.y8, 1, (), model)
 
     def add_stream(self, kind, pixel_format, num_bytes, coefficients, model):

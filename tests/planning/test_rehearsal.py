@@ -1,4 +1,4 @@
-"""Programs that are compiled before the first image."""
+"""Compilation before the first image."""
 
 import threading
 
@@ -26,7 +26,7 @@ def test_the_image_is_of_a_ball_on_a_table():
     on_table = np.abs(points[:, 1] + 1.0) < 1e-4
     assert (on_ball | on_table).all()
     assert min(on_ball.sum(), on_table.sum()) > 30
-    # Nothing is seen through the ball: by the distance of each ray from its middle.
+    # No ray passes through the ball: by the distance of each ray from its centre.
     rays = points - np.asarray(pose.position)
     unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     past = np.linalg.norm(np.cross(-np.asarray(pose.position), unit), axis=1)
@@ -34,14 +34,14 @@ def test_the_image_is_of_a_ball_on_a_table():
 
 
 def sizes():
-    """How many programs were compiled of each function that takes long to compile."""
+    """Number of compiled programs of each function that takes long to compile."""
     functions = planner_module._propose, sampler_module._sample, depth_image._oriented
     return [function._jitted._cached._cache_size() for function in functions]
 
 
 @pytest.fixture(scope="module")
 def rehearsed():
-    """Of an image size that no other test has."""
+    """A session with an image size that no other test has."""
     planner = planner_of(DiscreteSearch(14), num_samples=2, capacity=390)
     session = session_of(planner=planner, obstacles=None, poses=None)
     return session, session.rehearse()
@@ -64,14 +64,14 @@ def test_a_session_is_as_before_and_compiles_little_afterwards(rehearsed):
     with pytest.warns(UserWarning, match="taken for a table"):
         again.add(shot(FIRST), FIRST, depth_scale=1e-3)
     np.testing.assert_array_equal(again.next().matrix, first.matrix)
-    # All is compiled.
+    # Everything is compiled.
     assert session.rehearse().programs == 0
 
 
 def test_an_image_waits_until_a_rehearsal_ends():
     session = session_of(poses=POSES, box=BOX)
     adding = threading.Thread(target=session.add, args=(shot(FIRST), FIRST, 1e-3))
-    # As in `rehearse`.
+    # Hold the lock of `rehearse`.
     with session._rehearsing:
         adding.start()
         adding.join(0.3)

@@ -14,7 +14,7 @@ import jaxnbv as nbv
 TYPES = get_typestore(Stores.ROS2_HUMBLE)
 FULL = np.array([[300.0, 0.0, 158.6], [0.0, 305.0, 122.3], [0.0, 0.0, 1.0]])
 FULL_WIDTH, FULL_HEIGHT = 320, 240
-# Moves pixels in the corners by 20.
+# Moves pixels in the corners by 20 pixels.
 LENS = (-0.25, 0.08, 0.002, -0.003, 0.01)
 # Left, top, width, height.
 WHOLE, REGION = (0, 0, 0, 0), (40, 20, 240, 200)
@@ -124,7 +124,7 @@ def rotate(quaternion, vectors):
 def test_ros_images_are_read_to_the_pixel(encoding, unit, is_big, from_bag):
     image = shot(FIRST, unit).astype(np.uint16 if unit > 1 else np.float32)
     if unit == 1.0:
-        # As of REP 118: not measured, too far, too near.
+        # Values of REP 118: not measured, too far, too near.
         image[3, :3] = np.nan, np.inf, -np.inf
     (message,) = from_bag(image_message(image, encoding, padding=3, is_big=is_big))
     depth, scale = ros.image_of(message)
@@ -248,7 +248,7 @@ def test_a_cloud_through_a_lens_lies_on_the_object(roi, binning, encoding, tmp_p
     pixels, scale = ros.image_of(messages["depth/image"])
 
     def distances():
-        """From the points of the cloud to the surface of the ball or the table."""
+        """Distance from the points of the cloud to the surface of the ball or the table."""
         camera = ros.camera_of(messages["depth/camera_info"])
         cloud = nbv.PointCloud.from_depth(pixels, camera, pose, scale, box=nbv.Box((0.1, 0.0, -0.05), (0.5, 0.4, 0.3)))
         points, _ = cloud.to_numpy()

@@ -1,4 +1,4 @@
-"""A live session at a simulated sensor."""
+"""A live session with a simulated sensor."""
 
 import dataclasses
 import warnings
@@ -73,7 +73,7 @@ def test_its_matrices_are_those_that_were_given(finished):
     assert distance.min() < 1e-5
     index = int(np.argmax(np.asarray(proposed.proposal.values)))
     assert int(distance.argmin()) == index
-    # Its value is an area: of the box, 0.24 m wide, the scene is 2.5 wide.
+    # The value is an area. The box is 0.24 m wide, and 2.5 in the scene.
     unit = (2.5 / max(np.subtract(BOX[1], BOX[0]))) ** 2
     assert proposed.value * unit == pytest.approx(float(proposed.proposal.values[index]))
     assert proposed.standard_error * unit == pytest.approx(float(proposed.proposal.standard_errors[index]))
@@ -90,7 +90,7 @@ def test_its_cloud_lies_on_the_object_in_the_world(finished):
 
 
 def test_the_expected_depth_is_near_what_is_then_seen(finished):
-    """In metres, at the planner's resolution: by the sensor's pixels at its rays, where both see the ball."""
+    """In metres at the planner's resolution, by the sensor's pixels on its rays where both see the ball."""
     proposed, expected = finished.next(), finished.expected_depth()
     assert expected.shape == (12, 16)
     camera = CAMERA.resized(12, 16)
@@ -109,7 +109,7 @@ def test_metres_and_millimetres_and_both_conventions_tell_the_same(convention, u
     session.add(shot(FIRST, unit), FIRST @ axes, depth_scale=1.0 / unit)
     first = finished.episode.views[1].proposal
     np.testing.assert_allclose(session.next().matrix @ axes, finished.frame.to_world(first.pose).matrix, atol=1e-5)
-    # Points that are rounded to millimetres are other points, of other value.
+    # Points that are rounded to millimetres differ, and so do the values.
     if unit > 1:
         assert float(session.next().proposal.value) == pytest.approx(float(first.value), rel=1e-4)
 
@@ -145,7 +145,7 @@ def test_nothing_recompiles_after_the_second_image(compilations):
 
 
 def test_where_the_sensor_could_not_be_held_is_not_proposed_again():
-    """The user took the image from elsewhere; then all others are proposed once, and there is nothing left."""
+    """The user takes the image from elsewhere. Then all other poses are proposed once, and no pose is left."""
     session = session_of(planner=planner_of(FarthestView()), poses=POSES[:4])
     proposed = []
     for angle in (0.2, 1.2, 2.2, 3.2):
@@ -179,7 +179,7 @@ def test_a_wrong_image_is_named_and_changes_nothing(given, message, tmp_path):
 
 
 def test_an_image_beside_the_box_is_warned_of():
-    """It may be meant, but for the first one."""
+    """It may be intended, except for the first image."""
     session = session_of()
     inverse = np.linalg.inv(FIRST)
     problem = r"none of the \d+ points .* lies in the box .* Is the pose from camera to world"
@@ -192,7 +192,7 @@ def test_an_image_beside_the_box_is_warned_of():
 
 @pytest.mark.parametrize("unit", [1.0, 1000.0])
 def test_an_image_of_an_earlier_moment_than_its_pose_is_refused(unit, tmp_path):
-    """Also by a session that was read from its folder; from the same pose it may be added again."""
+    """Also by a session that is loaded from its folder. From the same pose the image may be added again."""
     stale = shot(FIRST, unit)
     session_of(tmp_path).add(stale, FIRST, depth_scale=1.0 / unit)
     session = session_of(tmp_path)
@@ -250,7 +250,7 @@ def test_bad_input_is_named(make, message):
 
 
 def test_the_box_is_the_volume_of_the_model_and_of_the_carving():
-    """What was given another volume keeps it."""
+    """A model with an explicit volume keeps it."""
     own = Box.cube(2.0)
     sampler = SurfaceSampler(ScreenedSPSR(values=(OutsideBoundary(), OutsideBoundary(own))))
     fitted = session_of(planner=Planner(Coverage(), camera=Camera(height=12, width=16), sampler=sampler)).planner
@@ -263,7 +263,7 @@ def test_the_box_is_the_volume_of_the_model_and_of_the_carving():
 
 
 def test_a_rim_about_the_box_is_modelled_and_not_given(finished):
-    """Beside and above it, but not below, where the table is."""
+    """Beside and above the box, but not below it, where the table is."""
     box, world = Box(*BOX), finished.frame.to_world(finished.observations.cloud)
     beyond = np.asarray(world.points)[np.asarray(world.mask)]
     assert (beyond[:, 2] >= BOX[0][2] - 1e-6).all()
@@ -273,7 +273,7 @@ def test_a_rim_about_the_box_is_modelled_and_not_given(finished):
 
 
 def test_a_box_that_cuts_the_object_is_told_once_a_face():
-    """Two centimetres of the ball are beyond it at +x, and nothing anywhere else."""
+    """Two centimetres of the ball are beyond the box at +x, and nothing at the other faces."""
     session = session_of(box=(BOX[0], (0.38, 0.32, 0.24)))
     with pytest.warns(UserWarning, match=r"go on beyond the box at \+x: \d+ % of the points .* larger box") as told:
         session.add(shot(FIRST), FIRST, depth_scale=1e-3)
@@ -284,7 +284,7 @@ def test_a_box_that_cuts_the_object_is_told_once_a_face():
 
 
 def test_travel_counts_from_where_the_camera_was(finished):
-    """Not from where it was to be; in metres about the middle of the box."""
+    """Not from the proposed pose. In metres about the middle of the box."""
     plain, priced = session_of(), session_of(planner=dataclasses.replace(planner_of(), cost=ValuePerCost(fixed=0.5)))
     taken = around(3.0, 0.7)
     for session in (plain, priced):
@@ -303,7 +303,7 @@ def test_travel_counts_from_where_the_camera_was(finished):
 
 
 def test_distances_are_metres_to_cameras_that_were_there():
-    """The proposal that was not followed is not proposed again, but no camera stood there."""
+    """A proposal that was not followed is not proposed again, but no camera stood there."""
     session = session_of(planner=planner_of(FarthestView()))
     session.add(shot(FIRST), FIRST, depth_scale=1e-3)
     refused, taken = session.next().matrix, around(3.3, 0.4)
@@ -338,7 +338,7 @@ def test_done_and_next_share_their_samples(monkeypatch, tmp_path):
 
 
 def test_what_a_rule_looked_at_was_not_proposed(tmp_path):
-    """An image that the user takes after asking `done` alone follows no proposal, live and read again."""
+    """After a call of `done` alone, an image of the user's follows no proposal, live and after loading."""
     session = session_of(tmp_path, until=ValueBelow(0.0))
     session.add(shot(FIRST), FIRST, depth_scale=1e-3)
     assert session.done() is None
@@ -347,7 +347,7 @@ def test_what_a_rule_looked_at_was_not_proposed(tmp_path):
     again = Session.load(tmp_path, progress=False)
     assert session.views[1].proposal is again.views[1].proposal is None
     np.testing.assert_array_equal(session.next().proposal.values, again.next().proposal.values)
-    # What was proposed is there when the folder is read again.
+    # The proposal is there when the folder is loaded.
     resumed = Session.load(tmp_path, progress=False)
     np.testing.assert_array_equal(resumed.next_view.matrix, session.next().matrix)
     assert resumed.next_view.value == session.next().value
@@ -378,7 +378,7 @@ def test_its_episode_is_stored_in_the_world(finished, tmp_path):
 
 
 def test_a_session_proposes_as_a_simulation_does(monkeypatch):
-    """The same scans, where the world is the scene: the same poses bit for bit."""
+    """Equal scans with the world as the scene give equal poses, bit for bit."""
     search = DiscreteSearch(SphereCandidates(12, min_elevation=-1.0))
     planner = dataclasses.replace(planner_of(search), obstacles=Obstacles())
     scene, first, key = SDFSurface(Sphere(0.9)), look_at((0.8, 0.9, 2.2)), jax.random.key(4)
@@ -427,19 +427,19 @@ BELOW = np.array([[around(angle, -0.4), around(angle, 0.6)] for angle in (0.5, 2
 
 
 def test_the_table_is_found_told_of_and_kept_clear_of():
-    """The box reaches two centimetres into it; half of the poses are below it."""
+    """The box reaches two centimetres into the table. Half of the poses are below the table."""
     session = session_of(box=((0.18, 0.08, -0.02), BOX[1]), poses=BELOW, obstacles=None)
     with pytest.warns(UserWarning, match=r"stands on a plane through \[.*, -0\.00.*Obstacles\(\) to keep it"):
         session.add(shot(FIRST), FIRST, depth_scale=1e-3)
     points, _ = session.cloud.to_numpy()
-    # What is left of the table is nearer to the ball than the margin.
+    # The rest of the table is nearer to the ball than the margin.
     assert (points[:, 2] > 0.001).mean() > 0.98
     assert np.isneginf(np.asarray(session.next().proposal.values)[::2]).all()
     assert session.next().matrix[2, 3] > 0.1
 
 
 def test_a_room_scanned_from_inside_needs_poses_inside():
-    """It says so at the first image from inside, and no more."""
+    """The warning comes once, at the first image from inside."""
     half, place = np.array([2.0, 1.5, 1.2]), np.array([0.3, -0.2, 0.1])
     images = []
     for target in ((2.0, 0.5, 0.0), (-2.0, 0.5, 0.0)):
@@ -461,7 +461,7 @@ def test_a_room_scanned_from_inside_needs_poses_inside():
 
 @pytest.mark.parametrize("up", ["y", "-y", "x", "-x", "-z"])
 def test_a_wrong_up_is_told_by_the_table(up):
-    """Once, with the axis that is right."""
+    """The warning comes once, with the right axis."""
     session = session_of(box=((0.18, 0.08, -0.02), BOX[1]), obstacles=None, up=up)
     with pytest.warns(UserWarning, match="no table is found") as told:
         session.add(shot(FIRST), FIRST, depth_scale=1e-3)

@@ -1,4 +1,4 @@
-"""Sessions on disk: what is stored, and what goes on from it."""
+"""Sessions on disk: their files, and how they continue."""
 
 import json
 import signal
@@ -15,7 +15,7 @@ from jaxnbv.checks import InputError
 
 
 def test_a_session_goes_on_from_its_folder(tmp_path):
-    """After an image, and after a proposal, whose file is read and not made again."""
+    """After an image, and after a proposal, whose file is read and not computed again."""
     session = session_of(tmp_path)
     session.add(shot(FIRST), FIRST, depth_scale=1e-3)
     session = session_of(tmp_path)
@@ -77,7 +77,7 @@ record(sys.argv[1])
 
 
 def record(folder):
-    """Three images, where they were asked for, and the next question."""
+    """Three images at the proposed poses, and the next proposal."""
     session = session_of(folder)
     while len(session.views) < 3:
         matrix = FIRST if len(session.views) == 0 else session.next().matrix

@@ -1,4 +1,4 @@
-"""Images of which some pixels show the object, and others things beside it."""
+"""Images in which some pixels show the object, and others show things beside it."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ def left_half(image):
 
 
 def test_points_are_those_of_the_mask(tmp_path):
-    """The cloud of a mask is that of the whole image where the mask is true; a stored session is the same."""
+    """A mask gives the points of the whole image where it is true. A stored session is the same."""
     planner = planner_of(capacity=4000)
     whole, masked = session_of(planner=planner), session_of(tmp_path, planner=planner)
     image = shot(FIRST)
@@ -28,18 +28,18 @@ def test_points_are_those_of_the_mask(tmp_path):
         (points @ pose[:3, :3].T + pose[:3, 3])[:, :2] / (points @ pose[:3, :3].T + pose[:3, 3])[:, 2:]
     )[:, 0]
     kept = np.asarray(masked.cloud.to_numpy()[0], np.float64)
-    # Points are fitted planes' and may cross the middle by less than a pixel.
+    # Points come from fitted planes, and may cross the middle by less than a pixel.
     expected = int(np.sum(np.asarray(column) < 34.0))
     assert len(kept) == pytest.approx(expected, abs=4)
     assert 0 < len(kept) < len(points)
-    # Where others are, the rays have ended all the same.
+    # Rays to other things end all the same.
     assert np.array_equal(np.asarray(masked.observations.looks.sight), np.asarray(whole.observations.looks.sight))
     again = nbv.Session.load(tmp_path, progress=False)
     assert np.array_equal(again.cloud.to_numpy()[0], masked.cloud.to_numpy()[0])
 
 
 def test_what_is_to_be_ignored_is_no_part_of_the_object():
-    """One half of the world is said to be the robot's."""
+    """One half of the world counts as the robot."""
 
     def is_robot(points):
         return points[:, 0] > 0.3
@@ -48,18 +48,18 @@ def test_what_is_to_be_ignored_is_no_part_of_the_object():
     plain.add(image, FIRST, 1e-3)
     session.add(image, FIRST, 1e-3)
     points, kept = plain.cloud.to_numpy()[0], session.cloud.to_numpy()[0]
-    # A pixel is 7 mm there, and a point is that of a fitted plane.
+    # A pixel is 7 mm there, and points come from fitted planes.
     assert kept[:, 0].max() < 0.307
     inside = points[points[:, 0] < 0.293]
     assert np.abs(inside[:, None] - kept[None]).max(axis=-1).min(axis=1).max() < 1e-6
-    # Where it is, the rays have ended all the same.
+    # Rays to the robot end all the same.
     assert np.array_equal(np.asarray(session.observations.looks.sight), np.asarray(plain.observations.looks.sight))
     with pytest.raises(nbv.InputError, match=r"ignore returned .* points: return a bool for each"):
         session_of(ignore=lambda points: points).add(image, FIRST, 1e-3)
 
 
 def test_the_robot_is_where_it_was_when_the_image_was_taken(tmp_path):
-    """Images that are added again, by a session that is read or by corrected poses, show it where it was."""
+    """Images that are added again, after loading or with corrected poses, show the robot at its place at that time."""
     edge = [0.3]
     session = session_of(tmp_path, ignore=lambda points: points[:, 0] > edge[0])
     session.add(shot(FIRST), FIRST, 1e-3)
@@ -92,7 +92,7 @@ def test_a_planner_without_parts_names_none():
 
 @pytest.mark.parametrize("k1", [0.2, -0.15])
 def test_masks_and_robots_are_seen_through_the_lens(k1):
-    """The mask and the robot are the ball's pixels of the raw image, by rays that are undistorted in NumPy."""
+    """The mask and the robot are the ball's pixels in the raw image, by rays that NumPy undistorts."""
     lens = (k1, 0.02, 0.001, -0.001, 0.0)
     camera = nbv.Camera(fov=1.0, height=120, width=160, distortion=lens)
     (fx, _, cx), (_, fy, cy), _ = camera.intrinsics
@@ -113,7 +113,7 @@ def test_masks_and_robots_are_seen_through_the_lens(k1):
 
     cloud = image.cloud(camera, pose, 1)
     ball = only_where(cloud, on_ball, camera, 1)
-    # Pixels at its border may be of either.
+    # Pixels at the border may show either.
     assert (away(ball) > 0.01).mean() < 0.03
     assert (away(ball) < 0.01).sum() > 0.97 * (away(cloud) < 0.01).sum()
     without = image.with_robot(

@@ -1,4 +1,4 @@
-"""Several objects on a table: which pixels are whose, and a session for each."""
+"""Several objects on a table: the pixels of each, and a session for each."""
 
 import functools
 import warnings
@@ -56,7 +56,7 @@ def names_of(sessions):
 
 @pytest.fixture(scope="module")
 def looked(tmp_path_factory):
-    """From the front and from behind: from there other faces of both are seen."""
+    """Views from the front and from behind, which shows other faces of both objects."""
     folder = tmp_path_factory.mktemp("sessions")
     sessions = sessions_of(folder=folder)
     sessions.add(image(FRONT), at(FRONT))
@@ -104,7 +104,7 @@ def test_an_object_s_box_is_a_cube_that_holds_it(looked):
 def test_the_next_view_is_worth_most_to_all(looked):
     sessions, _, _ = looked
     each = list(sessions.objects.values())
-    # Their information needs no samples, so that keys do not matter.
+    # The information needs no samples, so that keys do not matter.
     proposals = [session.planner.propose(session.observations, jax.random.key(0)) for session in each]
     counted = [p for p, session in zip(proposals, each, strict=True) if session.done() is None] or proposals
     best = int(np.argmax(sum(np.asarray(proposal.values, np.float64) for proposal in counted)))
@@ -128,9 +128,9 @@ def test_they_go_on_from_their_folder(looked):
 
 
 def test_labels_say_whose_each_pixel_is(looked):
-    """The numbers are the caller's; zero is none."""
+    """The numbers are the caller's. Zero means no object."""
     _, first, _ = looked
-    # Which pixels show them, by the true scene.
+    # The pixels of each object, by the true scene.
     pose = nbv.Pose.from_matrix(at(FRONT))
     points = np.asarray(nbv.scan(WORLD, CAMERA, pose).points).reshape(CAMERA.height, CAMERA.width, 3)
     above = points[..., 2] > 0.004
@@ -145,7 +145,7 @@ def test_labels_say_whose_each_pixel_is(looked):
 
 
 def test_a_second_object_compiles_nothing(compilations):
-    """Whose box is another."""
+    """The second object has another box."""
     pose = nbv.Pose.from_matrix(at(FRONT))
     points = np.asarray(nbv.scan(WORLD, CAMERA, pose).points).reshape(CAMERA.height, CAMERA.width, 3)
     left = (points[..., 2] > 0.004) & (points[..., 0] < 0)
@@ -185,7 +185,7 @@ def test_without_a_table_it_says_so():
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 5))
 def test_clusters_against_single_linkage(seed, count):
-    """Points on lines that lie two gaps apart, shuffled; steps along a line are half a gap."""
+    """Points on lines two gaps apart, shuffled. Steps along a line are half a gap."""
     draw = np.random.default_rng(seed)
     sizes = draw.integers(2, 30, count)
     lines = [
@@ -195,7 +195,7 @@ def test_clusters_against_single_linkage(seed, count):
     owner = np.repeat(np.arange(count), sizes)
     order = draw.permutation(len(owner))
     found = clusters(np.concatenate(lines)[order], 1.0)
-    # One number a line, and no number twice.
+    # One number for each line, and no number twice.
     pairs = {(int(a), int(b)) for a, b in zip(owner[order], found, strict=True)}
     assert len(pairs) == count == len({b for _, b in pairs})
     assert clusters(np.zeros((0, 3)), 1.0).shape == (0,)

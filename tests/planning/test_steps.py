@@ -1,4 +1,4 @@
-"""Views one by one: those of a simulated episode, and what stands behind each."""
+"""Views one by one, equal to those of a simulated episode, with the inputs of each."""
 
 import gc
 import itertools
@@ -51,7 +51,7 @@ def assert_same(a, b):
 
 
 def test_a_finer_sensor_sees_more_from_the_same_poses():
-    """And nothing is computed of views that nobody asks for."""
+    """Nothing is computed for views that nobody asks for."""
     own = planner(FarthestView(CANDIDATES))
     fine = views_of(own, camera=Camera(height=16, width=16))
     for view, coarse in zip(itertools.islice(fine, 3), views_of(own), strict=False):
@@ -95,7 +95,7 @@ def test_a_step_holds_the_samples_and_the_observations_that_the_next_view_is_cho
 
 
 def test_an_episode_lets_a_posterior_go_before_it_makes_the_next(monkeypatch):
-    """At thousands of points each holds hundreds of megabytes."""
+    """Each posterior holds hundreds of megabytes at thousands of points."""
     made, posterior = [], SurfaceSampler.posterior
 
     def told(sampler, observations):

@@ -1,4 +1,4 @@
-"""When an episode ends: rules on scripted answers, and expected coverage against a count of its own."""
+"""Stop rules on scripted answers, and expected coverage against an independent count."""
 
 import dataclasses
 import functools
@@ -48,13 +48,13 @@ def after(planner, cloud, poses=(FIRST,), seconds=0.0, frame=Frame(), surfaces=N
 
 
 def of_count(cloud, enough):
-    """A class that is certain from so many points on, and open below."""
+    """A class that is certain from `enough` points on, and undecided below."""
     sure = jnp.log(jnp.array([0.99, 0.01]))
     return jnp.where(cloud.count >= enough, sure, jnp.log(jnp.array([0.5, 0.5])))
 
 
 def of_half(cloud):
-    """A class that every half of the points tells, but not always the same one."""
+    """A class that every half of the points tells, but not always the same class."""
     left = jnp.sum(jnp.where(cloud.mask, jnp.sign(cloud.points[:, 0]), 0.0)) > 0
     return jnp.where(left, jnp.log(jnp.array([0.99, 0.01])), jnp.log(jnp.array([0.01, 0.99])))
 
@@ -84,7 +84,7 @@ def test_sure_is_asked_the_probability_that_was_given():
 
 
 def segmenter(counts):
-    """Parts of which so many points are predicted, whatever the cloud."""
+    """Parts with these numbers of predicted points, for any cloud."""
     labels = np.repeat(np.arange(len(counts)), counts)
     return SoftPartCount(lambda cloud: jnp.eye(len(counts))[np.resize(labels, cloud.capacity)])
 
@@ -106,13 +106,13 @@ def test_found_counts_the_points_of_the_parts_that_are_asked_for(parts, points, 
 
 @pytest.mark.parametrize(("points", "size"), [(80, 0.1), (300, 0.05), (80, 0.4)])
 def test_expected_coverage_is_the_share_of_the_area_that_poses_show(points, size):
-    """Of a posterior that holds one ball alone, whose area is drawn in float64."""
+    """For a posterior of a single ball, whose area is sampled in float64."""
     grid = Grid(64)
     ball, planner = balls(grid, [0.8]), planner_of(Coverage())
     upper = np.asarray(fibonacci_sphere(points))
     upper = upper[upper[:, 1] > 0]
     cloud = PointCloud.from_arrays(0.8 * upper, upper, 256)
-    # What is as far as neighbouring points are apart was seen too.
+    # Points as near as neighbouring points are to each other count as seen too.
     apart = np.linalg.norm(0.8 * (upper[:, None] - upper), axis=-1)
     apart = max(size, np.median(np.sort(apart, axis=1)[:, 1]))
     surface = np.random.default_rng(0).normal(size=(20_000, 3))
@@ -129,18 +129,19 @@ def test_expected_coverage_is_the_share_of_the_area_that_poses_show(points, size
     share = float(np.mean(seen[shown]))
     assert 0.05 < share < 0.97
     known = dataclasses.replace(after(planner, cloud, surfaces=ball), observations=Observations.start(cloud, 4))
-    # Of 1,024 points, of which some are one and the same.
+    # From 1,024 points, some of which coincide.
     assert expected_coverage(known, NewSurface(size)) == pytest.approx(share, abs=0.03)
     assert Covered(share - 0.04, size).after(known) is not None
     assert Covered(min(share + 0.04, 1.0), size).after(known) is None
-    # The size is a length of the world.
+    # The size is a length in the world.
     small = dataclasses.replace(known, frame=Frame(10.0))
     assert Covered(share - 0.04, 0.1 * size).after(small) == Covered(share - 0.04, size).after(known)
 
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_what_is_near_to_measured_surface_but_faces_no_view_is_unseen(count):
-    """After one view of a ball from afar less than half of it, after one from the other side as well less than all."""
+    """After one view of a ball from afar less than half of it is seen. After a second view from the other side a part
+    remains."""
     camera, poses = Camera(height=60, width=60), look_at([(0.0, 0.0, 5.0), (0.0, 0.0, -5.0)])
     planner, fine = planner_of(NewSurface(), DiscreteSearch(40)), Grid(64)
     planner = dataclasses.replace(planner, camera=camera, sampler=dataclasses.replace(planner.sampler, grid=fine))
@@ -148,7 +149,7 @@ def test_what_is_near_to_measured_surface_but_faces_no_view_is_unseen(count):
     known = dataclasses.replace(
         after(planner, observations.cloud, surfaces=balls(fine, [0.8])), observations=observations
     )
-    # A ring that the views meet at a cosine of less than 0.2 remains: where cos = (5 n_z - 0.8) / |5 - 0.8 n|.
+    # A ring remains that the views see at a cosine below 0.2, where cos = (5 n_z - 0.8) / |5 - 0.8 n|.
     heights = np.linspace(-1.0, 1.0, 20_001)
     shown = (5.0 * heights - 0.8) / np.sqrt(25.0 - 8.0 * heights + 0.64) >= 0.2
     share = count * shown.mean()
@@ -157,7 +158,7 @@ def test_what_is_near_to_measured_surface_but_faces_no_view_is_unseen(count):
 
 
 def test_what_no_sensor_can_measure_need_not_be_covered():
-    """Of two samples, the ball that was measured and a larger one that every view looked through."""
+    """Two samples: the ball that was measured, and a larger ball that every view looked through."""
     camera, poses = Camera(height=50, width=50), look_at([(0.0, 0.0, 5.0), (5.0, 0.0, 0.0)])
     planner, fine = planner_of(NewSurface(), DiscreteSearch(poses)), Grid(64)
     planner = dataclasses.replace(planner, camera=camera, sampler=dataclasses.replace(planner.sampler, grid=fine))
@@ -167,7 +168,8 @@ def test_what_no_sensor_can_measure_need_not_be_covered():
     assert expected_coverage(known, NewSurface()) < 0.45
     measurable = observations.looks.without_unmeasured(surfaces, observations.poses)
     covered = expected_coverage(dataclasses.replace(known, surfaces=lambda: measurable), NewSurface())
-    # What of the larger ball is steep to both views may still be there, but for what lies a cell from what is not.
+    # Surface of the larger ball that is steep to both views may exist, except for points within a cell of excluded
+    # ones.
     drawn = np.random.default_rng(2).normal(size=(50_000, 3))
     drawn /= np.linalg.norm(drawn, axis=1, keepdims=True)
     cosines = {}
@@ -176,7 +178,7 @@ def test_what_no_sensor_can_measure_need_not_be_covered():
         cosines[radius] = np.max(np.sum(offset * drawn, axis=-1) / np.linalg.norm(offset, axis=-1), axis=0)
     small, large = 0.64 * np.mean(cosines[0.8] >= 0.2), 1.21 * np.mean((cosines[1.1] >= 0.2) & (cosines[1.1] < 0.5))
     assert small / (small + large) - 0.01 < covered < small / (small + large) + 0.08
-    # Whatever the planner looks for, the rule leaves out what is not there.
+    # The rule leaves out such surface for any acquisition of the planner.
     other = dataclasses.replace(planner, acquisition=Coverage())
     assert expected_coverage(dataclasses.replace(known, planner=other), NewSurface()) == pytest.approx(covered)
 
@@ -198,7 +200,7 @@ def test_value_below_and_budgets_on_scripted_proposals():
 
 
 def test_lengths_are_those_of_the_world():
-    """A world in millimetres, 100 a scene unit: poses are of the scene, costs and values of the world."""
+    """The world is in millimetres, 100 for a scene unit. Poses are in the scene, and costs and values in the world."""
     frame = Frame(0.01, (30.0, -40.0, 50.0), "z")
     planner = planner_of(Coverage())
     east, top, west = (look_at(place) for place in ((2.5, 0.0, 0.0), (0.0, 2.5, 0.0), (-2.5, 0.0, 0.0)))
@@ -206,7 +208,7 @@ def test_lengths_are_those_of_the_world():
     quarter = 250.0 * np.pi / 2.0
     assert Budget(cost=2.01 * quarter).before(way, west, 1.0) is None
     assert "would cost 393, but 196 of" in Budget(cost=1.5 * quarter).before(way, west, 1.0)
-    # A cost of one's own is asked about poses in the world, where z is up: by how much the camera is raised.
+    # A user's own cost gets poses in the world, where z is up. Here it is the height by which the camera rises.
     climb = Budget(cost=260.0, of=lambda start, end: jnp.abs(end.position[2] - start.position[2]))
     assert "would cost 250, but 10 of 260" in climb.before(way, west, 1.0)
     assert "0.3 world units², less than 0.5" in ValueBelow(0.5).before(way, west, 0.3)

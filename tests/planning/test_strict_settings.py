@@ -1,4 +1,4 @@
-"""A step of each task under JAX's strict settings, which are for code of the user's: it is the step without them."""
+"""A step of each task under JAX's strict settings, which are meant for user code, equals the step without them."""
 
 import contextlib
 
@@ -34,7 +34,7 @@ PLANNERS = {
 
 @contextlib.contextmanager
 def strict():
-    """For all threads, as a program sets them: a utility on the host is called in another one."""
+    """For all threads, as a program sets them, because a utility on the host runs in another thread."""
     before = {name: jax.config.values[name] for name in STRICT}
     try:
         for name, value in STRICT.items():
@@ -46,7 +46,7 @@ def strict():
 
 
 def step(planner, key):
-    """Two views, and where the third would be."""
+    """Two views, and the proposal of the third."""
     observations = planner.init(FIRST, nbv.scan(SCENE, planner.camera, FIRST))
     pose = planner.propose(observations, key).pose
     observations = planner.observe(observations, pose, nbv.scan(SCENE, planner.camera, pose))

@@ -1,4 +1,4 @@
-"""What it costs to go from view to view: against closed forms; and how that weighs on a view's value."""
+"""Costs of travel between views, against closed forms, and their effect on a view's value."""
 
 import dataclasses
 
@@ -72,7 +72,7 @@ def test_the_derivative_of_the_way_is_that_of_its_differences():
 
 
 def test_a_cost_that_breaks_its_contract_makes_a_value_of_nothing():
-    """Zero is a cost; less, and what is not finite, is none."""
+    """Zero is a valid cost. Negative and non-finite costs are not."""
     costs = jnp.array([-1.0, 0.0, jnp.inf, jnp.nan, 2.0])
     poses = Pose(jnp.broadcast_to(jnp.eye(3), (5, 3, 3)), jnp.zeros((5, 3)).at[:, 1].set(jnp.arange(5.0)))
     cloud = PointCloud.from_arrays(np.eye(3), np.eye(3))
@@ -109,7 +109,7 @@ def test_values_are_weighed_against_the_way_from_the_last_view(cost, worth, sear
     here = np.asarray(second.position, np.float64)
     angle = np.arccos(np.clip(places @ here / np.linalg.norm(places, axis=1) / np.linalg.norm(here), -1.0, 1.0))
     expected = worth(values, 2.5 * angle)
-    # The others left the rounds of halving early, by other samples.
+    # The other candidates dropped out in the first rounds of halving, which have fewer samples.
     open_ = np.isfinite(values)
     np.testing.assert_allclose(found[open_], expected[open_], rtol=2e-3, atol=5e-3)
 
@@ -124,7 +124,7 @@ def test_standard_errors_are_of_what_is_weighed():
 
 @pytest.mark.slow
 def test_a_search_by_gradient_weighs_the_way_too():
-    """All along its ascents a value is that without cost, by the same samples, over the cost of the way."""
+    """Along its ascents a value is the value without cost, by the same samples, divided by the cost of travel."""
     search = GradientSearch(dof=2, num_starts=2, iterations=6, learning_rate=0.05, num_candidates=6)
     planner = planner_of(search, cost=ValuePerCost(arc_length, fixed=1.0))
     observations = observations_of(planner)

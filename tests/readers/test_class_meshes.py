@@ -1,4 +1,4 @@
-"""Folders of meshes by class, in tiny copies of the layouts of data sets, whole, partial and damaged."""
+"""Folders of meshes by class, as tiny copies of data sets, complete, partial and damaged."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from jaxnbv.studies.scenes import HOUSEHOLD
 
 
 def box_files(folder, *names):
-    """A box of sides 1, 0.5 and 0.25."""
+    """Write boxes of sides 1, 0.5 and 0.25."""
     for name in names:
         file = folder / name
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -25,7 +25,7 @@ def found_in(folder, classes):
 
 
 def test_meshes_of_classes_take_turns_and_other_folders_are_passed_over(tmp_path):
-    """As ModelNet has them, in `test` and with underscores, and in any depth."""
+    """In ModelNet's layout, with `test` and underscores, and at any depth."""
     box_files(
         tmp_path, "bench/a.obj", "chair/b.obj", "chair/a.ply", "Night_Stand/train/a.off", "Night_Stand/test/c.off"
     )

@@ -17,7 +17,7 @@ def write(file, pixels):
 
 
 def test_a_mask_for_each_object_becomes_one_image_of_numbers(tmp_path):
-    """Names in the order of the alphabet, in all frames alike; masks are not zero, whatever they are else."""
+    """Numbers follow the alphabetical order of names, in all frames alike. Any value but zero is part of a mask."""
     write(tmp_path / "0001.mug.png", [[0, 255, 1]])
     write(tmp_path / "0001_bowl.png", [[7, 0, 0]])
     write(tmp_path / "0011.mug.png", [[255, 0, 0]])

@@ -1,4 +1,4 @@
-"""What moves with the camera, told from what only looks the same from everywhere."""
+"""Parts that move with the camera, against things that look the same from every pose."""
 
 import json
 
@@ -17,14 +17,14 @@ GRIPPER, NEAR = (slice(66, 90), slice(80, 120)), 0.08
 
 
 def orbit(count=12, away=0.5):
-    """Poses around the z axis, all at one height."""
+    """Poses around the z axis at one height."""
     turns = 2.0 * np.pi * np.arange(count) / count
     places = away * np.stack([np.cos(turns), np.sin(turns), np.full(count, 0.8)], axis=-1)
     return np.asarray(nbv.look_at(places.astype(np.float32), up=(0.0, 0.0, 1.0)).to_matrix(), float)
 
 
 def seen(matrix):
-    """Depths in metres of a ball on a table, z = 0, by the closed forms of both."""
+    """Depths in metres of a ball on a table at z = 0, in closed form."""
     rays = np.asarray(CAMERA.pixel_directions(), float) @ matrix[:3, :3].T
     place = matrix[:3, 3]
     with np.errstate(divide="ignore"):
@@ -37,7 +37,7 @@ def seen(matrix):
 
 
 def images(matrices, with_gripper):
-    """In units, with errors of 0.3 % and a fifth of the pixels lost."""
+    """Images in units, with errors of 0.3 % and a fifth of the pixels lost."""
     rng, found = np.random.default_rng(0), []
     for matrix in matrices:
         depth = seen(matrix)
@@ -50,8 +50,8 @@ def images(matrices, with_gripper):
 
 @pytest.mark.parametrize("with_gripper", [True, False])
 def test_a_gripper_is_found_and_a_ball_on_the_axis_is_kept(with_gripper):
-    """From a level orbit about them, ball and table look the same in all frames, as the gripper does: its pixels are
-    all that the frames lose."""
+    """From a level orbit, ball and table look the same in all frames, like the gripper. The frames must lose only its
+    pixels."""
     matrices = orbit()
     frames = images(matrices, with_gripper)
     assert np.ptp([seen(matrix)[45, 60] for matrix in matrices]) < 1e-3
