@@ -280,5 +280,5 @@ def _expected_distance(session: Session, points: Float[np.ndarray, "n 3"]) -> fl
     hypotheses, frame = hypotheses_of(session.observations), session.frame
     own = jnp.asarray(frame.to_scene(points), hypotheses.weights.dtype)
     weights = np.asarray(hypotheses.weights, np.float64)[:-1]
-    off = np.abs(np.asarray(distances_to(hypotheses, own)[0], np.float64))
+    off = np.abs(np.asarray(distances_to(hypotheses, own), np.float64))
     return float(frame.length_to_world(np.median(weights @ off / max(weights.sum(), 1e-30))))

@@ -67,28 +67,22 @@ def surface_error(hypotheses: PartHypotheses, observations: Observations) -> flo
     shape = hypotheses.bank.shape(jnp.asarray(part))
     covariance = _covariance(shape, placement, FitTargets.of(observations))
     points = np.asarray(placement.rotation) @ np.asarray(shape.extremes).T + np.asarray(placement.shift)[:, None]
-    off, gradient = (
-        np.asarray(rows, np.float64) for rows in distances_to(hypotheses, jnp.asarray(points.T, jnp.float32))
-    )
+    surface = jnp.asarray(points.T, jnp.float32)
+    off = np.asarray(distances_to(hypotheses, surface), np.float64)
+    _, gradient = values_and_gradients(lambda x: placement.distance(shape.solid, x), surface)
     # Only motion along the normal counts, since motion along the surface leaves the surface in place.
-    rows = np.concatenate([np.cross(gradient[0], points.T - np.asarray(placement.shift)), -gradient[0]], axis=1)
+    normals = np.asarray(gradient, np.float64)
+    rows = np.concatenate([np.cross(normals, points.T - np.asarray(placement.shift)), -normals], axis=1)
     by_points = float(np.mean(np.einsum("ni,ij,nj->n", rows, covariance, rows)))
     by_others = float(np.asarray(hypotheses.weights, np.float64)[:-1] @ np.mean(off**2, axis=1))
     return float(np.sqrt(by_points + by_others))
 
 
 @program
-def distances_to(
-    hypotheses: PartHypotheses, points: Float[Array, "p 3"]
-) -> tuple[Float[Array, "h p"], Float[Array, "h p 3"]]:
-    """Signed distances of points to each hypothesis, and their gradients."""
+def distances_to(hypotheses: PartHypotheses, points: Float[Array, "p 3"]) -> Float[Array, "h p"]:
+    """Signed distances of points to each hypothesis."""
     solids = hypotheses.bank.shape(hypotheses.placed.shape).solid
-
-    def of_part(placed):
-        solid, placement = placed
-        return values_and_gradients(lambda x: placement.distance(solid, x), points)
-
-    return jax.lax.map(of_part, (solids, hypotheses.placed.placement))
+    return jax.lax.map(lambda placed: placed[1].distance(placed[0], points), (solids, hypotheses.placed.placement))
 
 
 def symmetries(shape: Shape) -> Float[np.ndarray, "n 3 3"]:

@@ -143,8 +143,6 @@ def _starts(bank: ShapeBank, prior: Prior, targets: FitTargets, num_starts: int)
         turned = jnp.matmul(shape.extremes, rotation.T, precision="highest")
         own = jnp.matmul(turned, axes.T, precision="highest")
         first, last = most - jnp.max(own, axis=0), least - jnp.min(own, axis=0)
-        # The two ends in order, also for a shape that is smaller than the scan.
-        first, last = jnp.minimum(first, last), jnp.maximum(first, last)
         shift = jnp.matmul(last + share * (first - last), axes, precision="highest")
         inside = jnp.clip(shift, low - jnp.min(turned, axis=0), high - jnp.max(turned, axis=0))
         return Placement(rotation, inside, jnp.ones(3, dtype))

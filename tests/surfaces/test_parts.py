@@ -190,7 +190,13 @@ def test_a_part_is_named_and_placed(seen):
     assert len(pose.alternatives) == 1
     # What it says of its errors is of the size of its errors.
     assert 0.0005 < np.sqrt(np.diag(pose.covariance)).min() < np.sqrt(np.diag(pose.covariance)).max() < 0.05
-    assert surface_error(hypotheses, seen[1]) < 0.03
+    error = surface_error(hypotheses, seen[1])
+    assert error < 0.03
+    # The order of the hypotheses says nothing.
+    turned = jax.tree.map(lambda rows: rows[::-1], (hypotheses.placed, hypotheses.weights[:-1]))
+    weights = jnp.append(turned[1], hypotheses.weights[-1])
+    backwards = dataclasses.replace(hypotheses, placed=turned[0], weights=weights)
+    assert surface_error(backwards, seen[1]) == pytest.approx(error, rel=1e-5)
 
 
 def test_the_pose_is_of_the_world_and_of_the_mesh(seen):
