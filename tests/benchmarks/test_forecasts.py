@@ -1,4 +1,4 @@
-"""Scores of imagined surfaces against closed forms and cases worked by hand."""
+"""Scores of imagined surfaces against closed forms and cases worked out by hand."""
 
 import math
 
@@ -11,13 +11,13 @@ from scipy.stats import norm
 import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Sphere
 
-# Nodes 0.125 apart, one of them at the origin, so that |x| - r is interpolated exactly along the axes.
+# Nodes are 0.125 apart, and one is at the origin, so that |x| - r is interpolated exactly along the axes.
 GRID = nbv.Grid(25, 1.5)
 VOLUME = nbv.Box()
 
 
 def test_crps_of_three_samples_by_hand():
-    # mean |x - y| = (1 + 0 + 2) / 3 = 1; the pairs differ by 1, 3 and 2, by 2 on average, half of which is 1.
+    # mean |x - y| = (1 + 0 + 2) / 3 = 1. The pairs differ by 1, 3 and 2, by 2 on average, half of which is 1.
     assert float(crps(jnp.array([3.0, 0.0, 1.0]), jnp.array(1.0))) == pytest.approx(0.0, abs=1e-6)
     assert float(crps(jnp.array([0.0, 2.0]), jnp.array(5.0))) == pytest.approx(4.0 - 1.0)
     np.testing.assert_allclose(crps(jnp.array([[1.0, 2.0], [1.0, 2.0]]), jnp.array([1.0, 5.0])), [0.0, 3.0])
@@ -69,7 +69,7 @@ def test_share_in_empty_space_asks_the_nearest_node():
     empty = jnp.zeros((25, 25, 25), bool).at[13:].set(True)
     points = jnp.array([[0.07, 0.0, 0.0], [0.05, 0.0, 0.0], [9.0, 0.0, 0.0], [0.5, 0.0, 0.0]])
     mask = jnp.array([True, True, True, False])
-    # 0.07 is nearer to the node at 0.125, 0.05 to the one at 0; beyond the grid its last node is the nearest.
+    # 0.07 is nearer to the node at 0.125, and 0.05 to the one at 0. Beyond the grid the last node is nearest.
     assert float(empty_share(points, mask, empty, GRID)) == pytest.approx(2 / 3)
     assert np.isnan(empty_share(points, mask & False, empty, GRID))
 
@@ -92,7 +92,7 @@ def truth(planner):
 
 
 def _balls(*radii):
-    """Samples that are balls."""
+    """Balls as samples."""
     x, y, z = np.meshgrid(GRID.axis, GRID.axis, GRID.axis, indexing="ij")
     distance = np.sqrt(x**2 + y**2 + z**2)
     return nbv.scanning.GridSurface.from_values(
@@ -101,7 +101,7 @@ def _balls(*radii):
 
 
 def _state(planner):
-    # One point on the right: the ball's left is the farthest from it, its right the nearest.
+    # One point on the right: the ball's left is farthest from it, and its right nearest.
     return planner.init(None, nbv.PointCloud.from_arrays([[1.0, 0.0, 0.0]], [[1.0, 0.0, 0.0]]))
 
 
@@ -120,9 +120,9 @@ def test_the_true_surface_is_imagined_perfectly(planner, truth):
 
 def test_balls_of_other_sizes_are_scored_as_by_hand(planner, truth):
     record = judge(planner, _state(planner), _balls(0.5, 0.75), truth, NOTHING)
-    # Errors of depth 0.5 and 0.25 that differ by 0.25, the same along all three rays.
+    # Errors of depth of 0.5 and 0.25, which differ by 0.25, along all three rays alike.
     assert record.crps == pytest.approx(0.375 - 0.125, abs=1e-3)
-    # Nodes of the volume, [-1.25, 1.25]^3, by distance: forecasts 1, 1/2 and 0 where the truth is inside.
+    # Nodes of the volume [-1.25, 1.25]^3 by distance: forecasts of 1, 1/2 and 0 where the truth is inside.
     axis = np.arange(-10, 11) * 0.125
     distance = np.sqrt(sum(plane**2 for plane in np.meshgrid(axis, axis, axis)))
     half, missed = ((low <= distance) & (distance < high) for low, high in ((0.5, 0.75), (0.75, 1.0)))
@@ -134,7 +134,7 @@ def test_balls_of_other_sizes_are_scored_as_by_hand(planner, truth):
 
 
 def test_only_unseen_nodes_are_judged_and_hits_in_seen_space_counted(planner, truth):
-    # Seen empty right of x = 0.25: nothing is left to judge there, and one of the three rays ends there.
+    # Right of x = 0.25 everything was seen to be empty. Nothing is judged there, and one of the three rays ends there.
     seen = NOTHING.copy()
     seen[15:] = True
     record = judge(planner, _state(planner), _balls(0.5, 0.5), truth, seen)

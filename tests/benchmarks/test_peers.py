@@ -1,4 +1,4 @@
-"""What a scan covers, and where what was seen ends, by shapes of which both are known."""
+"""Coverage of scans and boundaries of scanned surface, on shapes with known answers."""
 
 import math
 from pathlib import Path
@@ -46,7 +46,7 @@ def test_views_of_a_boundary_look_at_it_from_above_and_from_both_sides():
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1.0, atol=1e-9)
     tilt = np.degrees(np.arccos(directions[:, 2]))
     outward = np.sum(directions * targets / np.linalg.norm(targets, axis=1, keepdims=True), axis=1)
-    # One after the other -45, 0 and 45 degrees about the rim.
+    # In turn -45, 0 and 45 degrees about the rim.
     np.testing.assert_allclose(tilt, np.array([45.0, 0.0, 45.0] * 7)[:20], atol=1e-6)
     assert np.all(outward[::3] * np.resize(outward[2::3], len(outward[::3])) < 0)
 
@@ -72,14 +72,14 @@ def test_of_a_ball_a_scan_covers_the_cap_that_the_camera_sees(ball, name):
     side = 2.0 * trial.mesh.bounding_radius * trial.unit
     assert side == pytest.approx(0.3 if name == "pb-nbv" else 0.2 / math.sqrt(3.0), rel=1e-3)
     look = trial.look(trial.poses[0])
-    # In units of the ball's radius. What is seen ends where rays touch.
+    # In units of the ball's radius. The visible cap ends where rays are tangent.
     distance = protocol.distance / (0.5 * side)
     toward = np.asarray(trial.poses[0].position) / np.linalg.norm(trial.poses[0].position)
     height = trial.points @ toward / np.linalg.norm(trial.points, axis=1)
     cosine = (distance * height - 1.0) / np.sqrt(distance**2 - 2.0 * distance * height + 1.0)
     assert not np.any(look.covers[cosine < -2.0 * protocol.tolerance / side - 0.05])
-    # Rays are s apart, s / cosine along the slope: no point is farther from one than half the diagonal, where the ball
-    # is nearest. Means of voxels lie elsewhere by a little.
+    # Rays are s apart, and s / cosine along the slope. No point is farther from a ray than half the diagonal, where the
+    # ball is nearest. Means of voxels deviate a little.
     half = 0.5 * protocol.distance * protocol.stride / protocol.camera.focal_lengths[1]
     near_enough = half / math.sqrt(protocol.tolerance**2 - half**2)
     assert np.mean(look.covers[cosine > near_enough + 0.1]) > (0.97 if protocol.voxel else 0.9999)
@@ -104,5 +104,5 @@ def test_a_view_of_half_known_things_is_worth_more_than_one_of_known_ones_alone(
     toward = np.asarray(trial.poses[0].position)
     side = np.cross(toward, jax.random.normal(jax.random.key(0), (3,)))
     half = (trial.points @ side > 0) & look.covers
-    # Known less than half: the overlap counts, 1 for a half and 0 for all.
+    # Less than half is known, so that the overlap counts: 1 for a half, and 0 for all.
     assert score(trial, look, half) > score(trial, look, look.covers) + 0.1

@@ -1,4 +1,4 @@
-"""Benchmarks and scripts, which run for long and are not run here, use names that exist."""
+"""Benchmarks and scripts, which run too long for a test, use names that exist."""
 
 import runpy
 from pathlib import Path

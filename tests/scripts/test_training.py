@@ -1,4 +1,4 @@
-"""Training learns and is kept in a file; calibration finds what a generator hid."""
+"""Training learns and stores its network; calibration recovers the temperature of a generator."""
 
 import equinox as eqx
 import jax
@@ -28,7 +28,7 @@ class Toy(eqx.Module):
 
 
 def toy_clouds(count):
-    """Clouds about one of three corners; which one is the class."""
+    """Clouds around one of three corners, which is the class."""
     labels = np.arange(count) % 3
     points = (np.eye(3)[labels][:, None] + 0.3 * RNG.normal(size=(count, 6, 3))).astype(np.float32)
     return nbv.PointCloud(jnp.asarray(points), jnp.zeros_like(points), jnp.ones((count, 6), bool)), labels
@@ -45,13 +45,14 @@ def test_training_learns_what_can_be_told_apart_and_is_read_from_its_file(tmp_pa
     log_p = np.asarray(log_probabilities(trained, held_out))
     assert np.mean(log_p.argmax(axis=1) == truth) > 0.95
     assert -log_p[np.arange(90), truth].mean() < 0.3
-    # It is left to calibration.
+    # The temperature is left to `calibrate`.
     assert float(trained.temperature) == 1.0
     assert same(train(Toy(), *data, jax.random.key(2), 1, file=file), trained)
 
 
 def test_one_step_is_adamw_on_the_mean_loss_of_the_drawn_batch():
-    """With every row of the data the same the batch is known; Adam's first step is the learning rate by sign."""
+    """All rows of the data are equal, so that the batch is known. Adam's first step is the learning rate times the
+    sign."""
     clouds, labels = toy_clouds(1)
     before, key = Toy(), jax.random.key(0)
     found = train(before, clouds, labels, key, 1, batch_size=4, learning_rate=0.01, weight_decay=0.1)
@@ -63,7 +64,7 @@ def test_one_step_is_adamw_on_the_mean_loss_of_the_drawn_batch():
 
 @pytest.mark.parametrize(("factor", "start"), [(2.5, 1.0), (0.6, 1.0), (2.5, 0.5)])
 def test_calibration_recovers_a_known_temperature(factor, start):
-    """Labels drawn from softmax(logits / factor); the likelihood's curvature gives the standard error."""
+    """Labels are drawn from softmax(logits / factor). The likelihood's curvature gives the standard error."""
     count = 3000
     points = (2.0 * RNG.normal(size=(count, 1, 3))).astype(np.float32)
     clouds = nbv.PointCloud(jnp.asarray(points), jnp.zeros_like(points), jnp.ones((count, 1), bool))
@@ -83,7 +84,7 @@ def test_calibration_recovers_a_known_temperature(factor, start):
 
 
 def test_calibration_error_of_a_hand_made_example():
-    """Confidences 0.9 (right), 0.78 (wrong), 0.52 and 0.55 (both right); no bin ends at one of them."""
+    """Confidences 0.9 (right), 0.78 (wrong), 0.52 and 0.55 (both right). None of them is a border of a bin."""
     p = np.array([[0.9, 0.1], [0.22, 0.78], [0.52, 0.48], [0.45, 0.55]])
     labels = np.array([0, 0, 0, 1])
     for bins, expected in ((5, (0.1 + 0.78 + 0.48 + 0.45) / 4), (3, (0.48 + 0.45 + 1.68 - 1) / 4), (2, 0.25 / 4)):

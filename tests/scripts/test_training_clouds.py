@@ -1,4 +1,4 @@
-"""Training clouds: what they hold, that they can be made again, and that splits differ."""
+"""Training clouds: their contents, reproducibility, and differences between splits."""
 
 import equinox as eqx
 import jax
@@ -14,7 +14,7 @@ from jaxnbv.studies.sensors import PART_SETTING
 COUNT, POINTS = 24, 200
 MODEL = nbv.GeometricSPSR(lengthscale=0.05, truncation=8)
 PLANNER = nbv.Planner(nbv.Coverage(), sampler=nbv.SurfaceSampler(MODEL, grid=nbv.Grid(20), num_samples=2), capacity=150)
-# A motorbike and a skateboard. Compilation takes nearly all the time of the rest.
+# A motorbike and a skateboard. For more objects compilation would take nearly all the time.
 PARTS, SETTING = (7, 11), PART_SETTING._replace(camera=nbv.Camera(height=24, width=24))
 
 
@@ -49,14 +49,15 @@ def test_scanned_clouds_are_samples_of_their_scenes_with_noise(scanned):
         _, normals = scanned.clouds[row].to_numpy()
         off = distances(pyramid_scene(Split.TRAIN, 5 + row), scanned.clouds.points[row])
         off = np.asarray(off)[scanned.clouds.mask[row]]
-        # Farthest point samples favour what noise moves out: its standard deviation is 0.01 along each axis.
+        # Farthest point sampling prefers points that noise moves outwards. Its standard deviation is 0.01 along each
+        # axis.
         assert np.abs(off).max() < 0.06
         assert 0.004 < off.std() < 0.025
         np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-5)
 
 
 def test_points_that_tell_the_class_lie_in_the_pattern_where_a_view_shows_it(scanned):
-    """In a pyramid's own frame, up to three deviations of the noise; half the pattern's depth is more than that."""
+    """In a pyramid's own frame, up to three deviations of the noise. Half the pattern's depth is more than that."""
     shares = {False: [], True: []}
     tells, mask = np.asarray(scanned.point_labels), np.asarray(scanned.clouds.mask)
     assert not (tells & ~mask).any()
@@ -98,7 +99,7 @@ def test_imagined_clouds_begin_with_what_was_truly_seen(imagined):
     for (points, normals), count in zip(clouds, on_surface, strict=True):
         assert np.isfinite(points).all()
         np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-4)
-        # Some of the points are D's, on the true surface; the sample's are not all.
+        # Some of the points are D's, on the true surface. Some of the sample's points are not on it.
         assert 20 < count <= len(points)
     shared = {tuple(p) for p in clouds[0][0]} & {tuple(p) for p in clouds[1][0]}
     assert 5 < len(shared) < len(clouds[0][0])
@@ -120,7 +121,7 @@ def test_clouds_are_kept_in_the_units_of_the_network(tmp_path, monkeypatch):
 
 @eqx.filter_jit
 def surface_points(solid):
-    """Noiseless hits from many sides, by another camera than the clouds', with their labels."""
+    """Noiseless hits from many sides, by another camera than that of the clouds, with their labels."""
     camera = nbv.Camera(fov=1.0, height=64, width=64)
     hits = jax.lax.map(
         lambda pose: nbv.scan(nbv.SDFSurface(solid), camera, pose), nbv.look_at(nbv.geometry.fibonacci_sphere(16, 2.7))

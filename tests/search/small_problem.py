@@ -1,4 +1,4 @@
-"""One step's question, small: three balls as samples, a few points seen, twelve candidates; and its scores by loops."""
+"""A small problem of one step (three balls as samples, a few points, twelve candidates), and its scores by loops."""
 
 import functools
 
@@ -16,7 +16,7 @@ CAMERA, POSES, KEY = nbv.Camera(height=8, width=8), nbv.SphereCandidates(12).pos
 
 
 def problem_of(surfaces, acquisition=nbv.Coverage(), camera=CAMERA):  # noqa: B008
-    """Room for six views, none of them taken."""
+    """A problem with room for six views, and none so far."""
     rng = np.random.default_rng(0)
     cloud = nbv.PointCloud.from_arrays(rng.uniform(-1, 1, (30, 3)), np.tile([0.0, 1.0, 0.0], (30, 1)), 32)
     inputs = StepInputs(nbv.Observations.start(cloud, 6), None, surfaces)
@@ -30,7 +30,7 @@ def three_balls():
 
 
 def visit(problem, *poses):
-    """The same after views from these poses, and no others."""
+    """The problem after views from exactly these poses."""
     if not poses:
         return problem
     taken = PoseList.empty(6)
@@ -49,7 +49,7 @@ def with_samples(problem, rows):
 
 
 def sample_by_sample(problem, acquisition=nbv.Coverage(), poses=POSES):  # noqa: B008
-    """Scores (samples, candidates), each sample by itself."""
+    """Scores (samples, candidates), computed sample by sample."""
     value = eqx.filter_jit(nbv.expected_value)
     of = [
         value(acquisition, problem.observations.cloud, with_samples(problem, slice(s, s + 1)).surfaces, CAMERA, poses)
@@ -59,7 +59,7 @@ def sample_by_sample(problem, acquisition=nbv.Coverage(), poses=POSES):  # noqa:
 
 
 class Height(nbv.Acquisition):
-    """How high the middle of what a scan shows is, times a factor."""
+    """Height of the mean point of a scan, times a factor."""
 
     factor: float = 1.0
 
@@ -72,7 +72,7 @@ class Height(nbv.Acquisition):
 
 
 class Constant(nbv.Acquisition):
-    """All scans are worth the same."""
+    """An acquisition with the same value for all scans."""
 
     value: float
 

@@ -1,4 +1,4 @@
-"""Gradient searches on acquisitions in closed form: Adam by hand, ties, degenerate starts, bad settings."""
+"""Gradient searches on acquisitions in closed form: Adam by hand, ties, degenerate starts and bad settings."""
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ import jaxnbv as nbv
 
 
 class Known(nbv.search.Problem):
-    """5 - |position - place|^2 - |forward - gaze|^2: an acquisition in closed form, without surfaces."""
+    """An acquisition in closed form without surfaces: 5 - |position - place|^2 - |forward - gaze|^2."""
 
     place: jax.Array
     gaze: jax.Array
@@ -26,7 +26,7 @@ class Known(nbv.search.Problem):
 
 
 def known(kind=Known, *poses):
-    """The problem, with poses that have been visited."""
+    """The problem, with visited poses."""
     problem = problem_of(None)
     place, gaze = jnp.asarray((0.9, -1.1, 1.4)), jnp.asarray((-0.6, 0.0, -0.8))
     return kind(visit(problem, *poses).inputs, nbv.Camera(), nbv.Coverage(), place, gaze)
@@ -52,7 +52,7 @@ def test_it_starts_from_the_poses_it_is_given():
 
 
 class Constant(Known):
-    """Every pose is as good."""
+    """Every pose has the same value."""
 
     def scores(self, poses, samples=slice(None)):
         return jnp.full((1, poses.position.shape[0]), 7.0)

@@ -1,4 +1,4 @@
-"""The three baselines against slow versions written from their definitions."""
+"""The three baselines against slow versions of their definitions."""
 
 import equinox as eqx
 import jax
@@ -18,7 +18,7 @@ CANDIDATES = np.asarray(nbv.geometry.fibonacci_sphere(12, 2.5), dtype=np.float64
 
 
 def problem(visited, surfaces=None):
-    """Five rows for views, the first of them filled; the rest hold poses that must not count."""
+    """Five rows for views, of which only the visited ones count. The others hold arbitrary poses."""
     positions = np.concatenate([visited, np.tile(CANDIDATES[5], (5, 1))])[:5]
     cloud = nbv.PointCloud.from_arrays([[0.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
     observations = nbv.Observations(cloud, PoseList(nbv.look_at(positions), jnp.asarray(len(visited))))
@@ -44,7 +44,7 @@ def test_farthest_view_against_its_definition():
 
 
 def test_random_view_is_uniform_over_what_is_unvisited():
-    """2,000 draws over ten candidates; the chi-square test has size 1e-4."""
+    """2,000 draws over ten candidates. The chi-square test has size 1e-4."""
     search, asked = nbv.RandomView(12), problem(CANDIDATES[[3, 8]])
     draw = eqx.filter_jit(jax.vmap(lambda key: search.propose(asked, key).pose.position))
     chosen = np.asarray(draw(jax.random.split(jax.random.key(0), 2000)))
@@ -56,7 +56,7 @@ def test_random_view_is_uniform_over_what_is_unvisited():
 
 
 def slow_uncertain_length(values, position, step):
-    """Walk the ray through the box and count, step by step, the samples that it has not entered yet."""
+    """Walk along the ray through the box, and count at every step the samples that it has not entered yet."""
     axis, h, g = GRID.axis, GRID.spacing, GRID.resolution
     forward = -position / np.linalg.norm(position)
     still_open, first, last = np.ones(len(values), bool), None, None
@@ -81,7 +81,7 @@ def slow_uncertain_length(values, position, step):
 
 
 def test_uncertainty_against_its_definition():
-    """The slow version walks at an eighth of the library's step, which finds the first end late and the last early."""
+    """The slow version steps by an eighth of the library's step, which finds the first end late and the last early."""
     rng = np.random.default_rng(0)
     surfaces = balls(GRID, [0.9, 0.6, 0.7, 0.3], rng.uniform(-0.5, 0.5, (4, 3)))
     search, values = nbv.search.UncertaintyView(12), np.asarray(surfaces.values, dtype=np.float64)
@@ -100,7 +100,7 @@ def test_uncertainty_against_its_definition():
 
 
 def test_the_threshold_of_the_transmittance_by_thin_rings_of_samples():
-    """Of forty samples one lies far behind the rest: the ray stops counting when two are left, not none."""
+    """One of forty samples lies far behind the rest. The ray stops counting when two are left, not none."""
     radii = np.array([1.0] * 38 + [0.3] * 2)
     value = uncertain_length(problem(np.zeros((0, 3)), balls(GRID, radii)), nbv.look_at(CANDIDATES))
     np.testing.assert_allclose(value, 0.0, atol=1.1 * GRID.spacing)
@@ -110,11 +110,11 @@ def test_the_threshold_of_the_transmittance_by_thin_rings_of_samples():
 
 
 def test_a_ray_that_meets_a_look_on_the_boxes_face_is_still_open():
-    """The first look lies exactly on the face at z = 1, where interpolation has a neighbour only on one side."""
+    """The first look is exactly on the face at z = 1, where interpolation has a neighbour on one side only."""
     grid = nbv.Grid(5, 1.0)
     values = np.broadcast_to(grid.axis + 0.5, (2, 5, 5, 5)).astype(np.float32)
     values = np.stack([values[0], values[1] - 0.75])
     surfaces = nbv.scanning.GridSurface.from_values(values, 0.0, grid)
-    # Surfaces at z = -0.5 and z = 0.25, seen from z = 1.5; looks every quarter, at 1.5, 1.25, 1.0, ...
+    # Surfaces are at z = -0.5 and z = 0.25, seen from z = 1.5, with looks every quarter: 1.5, 1.25, 1.0, ...
     value = uncertain_length(problem(np.zeros((0, 3)), surfaces), nbv.look_at(jnp.array([[0.0, 0.0, 1.5]])))
     np.testing.assert_allclose(value, 0.75, atol=0.26)

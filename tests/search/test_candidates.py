@@ -1,4 +1,4 @@
-"""Candidates as a value: where they stand, how they are turned, and every search with poses of one's own."""
+"""Candidates: places, orientations, and every search with a user's own poses."""
 
 import math
 
@@ -30,7 +30,7 @@ def test_the_whole_sphere_is_the_papers_lattice():
 def test_a_dome_covers_what_is_above_its_elevation_evenly():
     height = positions(DOME)[:, 1] / 2.0
     least = math.sin(math.radians(20.0))
-    # Uniform by area is uniform in height (Archimedes): the k-th of n heights is the middle of its share.
+    # Uniform by area is uniform in height (Archimedes). The k-th of n heights is the middle of its share.
     np.testing.assert_allclose(np.sort(height), least + (1 - least) * (np.arange(50) + 0.5) / 50, atol=1e-6)
 
 
@@ -41,7 +41,7 @@ def test_up_turns_places_and_images():
     assert (np.asarray(poses.position) @ up / 2.0 >= math.sin(math.radians(20.0)) - 1e-6).all()
     # The camera's y axis points down.
     assert (np.asarray(poses.rotation)[:, :, 1] @ up <= 1e-6).all()
-    # And stands as the one about y does: the same distances between places.
+    # The dome has the same distances between places as the one about y.
     plain, turned = positions(DOME), positions(tilted)
     np.testing.assert_allclose(_distances(turned), _distances(plain), atol=1e-5)
     below = nbv.SphereCandidates(50, 2.0, math.radians(20.0), (0.0, -1.0, 0.0))
@@ -76,7 +76,8 @@ def test_an_arm_reaches_between_its_bounds(nearest, more, low, wider):
 
 
 def test_an_arm_s_places_are_even_in_its_volume():
-    """In boxes of equal volume, by height and by the cube of the distance: binomial would be 12.5 +- 3.4."""
+    """Counts in boxes of equal volume, by height and by the cube of the distance. Binomial counts would be 12.5 +-
+    3.4."""
     reach = nbv.Reach(200, 1.0, 3.0, 0.0, math.radians(80.0))
     places = np.asarray(reach.poses().position, np.float64)
     distance = np.linalg.norm(places, axis=1)

@@ -1,4 +1,5 @@
-"""Searches over candidates by their scores: discrete, halving, tie-break against loops over poses, samples, rounds."""
+"""Searches over candidates by their scores (discrete, halving, tie-break) against loops over poses, samples and
+rounds."""
 
 import dataclasses
 
@@ -17,7 +18,7 @@ SEARCH, PROBLEM = nbv.DiscreteSearch(12), three_balls()
 
 
 class Once(nbv.Coverage):
-    """Coverage of which nothing is left at a pose that was taken."""
+    """Coverage with no gain left at visited poses."""
 
     gains_once = True
 
@@ -52,7 +53,7 @@ def test_only_the_same_place_and_direction_counts_as_visited():
     for pose, is_visited in [(best, True), (turned, True), (elsewhere, False), (aside, False)]:
         again = propose(SEARCH, visit(PROBLEM, pose))
         assert bool((again.pose.position != best.position).any()) == is_visited
-    # Rows beyond the views that were taken hold nothing.
+    # Rows beyond the number of views do not count.
     stale = eqx.tree_at(lambda p: p.inputs.observations.poses.count, visit(PROBLEM, best), jnp.asarray(0))
     np.testing.assert_array_equal(propose(SEARCH, stale).pose.position, best.position)
 
@@ -93,8 +94,7 @@ def test_standard_errors_are_those_of_the_scores_sample_by_sample():
 
 @pytest.mark.parametrize("taken", [(), (3,), (3, 8), (0, 3, 8)])
 def test_of_what_is_gained_once_the_farthest_of_those_that_are_level(taken):
-    """A tie is within two standard errors and, from the second view on, the mean of what is expected where cameras
-    were."""
+    """A tie is within two standard errors and, from the second view on, the mean expectation at visited poses."""
     problem = visit(PROBLEM.with_acquisition(Once()), *[POSES[index] for index in taken])
     scores, is_open = sample_by_sample(PROBLEM), ~np.isin(np.arange(12), taken)
     values = np.where(is_open, scores.mean(axis=0), -np.inf)
@@ -152,7 +152,7 @@ def test_rounds_of_halving_recomputed(num_visited, first):
     assert float(proposal.value) == pytest.approx(values[best], rel=1e-4)
 
 
-# The two halves of a search: what it proposes is what it picks by the scores that it asks for.
+# The two halves of a search: it proposes what it picks by the scores that it asks for.
 
 SEARCHES = {
     "discrete": SEARCH,
@@ -235,7 +235,7 @@ def test_the_best_by_the_second_score_of_those_that_are_tied_by_the_first(factor
 def test_where_the_first_tells_nothing_the_second_decides_and_where_it_tells_all_the_first_does():
     told = tie_break(PROBLEM.with_acquisition(Constant(1.0)), nbv.Coverage())
     np.testing.assert_array_equal(told.pose.position, propose(nbv.DiscreteSearch(12), PROBLEM).pose.position)
-    # Samples that are all alike tell all, and a single one too.
+    # Equal samples determine the first score exactly, and so does a single sample.
     for rows in (jnp.zeros(3, int), slice(0, 1)):
         found = tie_break(with_samples(PROBLEM, rows), Height())
         assert float(found.value) == float(found.values.max())
@@ -251,7 +251,7 @@ def test_a_tie_break_does_not_choose_visited_views():
 
 
 def test_the_way_there_counts_among_ties():
-    """Among candidates that are level but for their way the nearest is taken, whatever the second score."""
+    """Among candidates that tie except for travel the nearest one wins, whatever the second score."""
     here, cost = nbv.look_at(jnp.array([0.0, 0.0, 2.5])), nbv.ValuePerCost(nbv.arc_length, fixed=1e-3)
     told = dataclasses.replace(visit(PROBLEM.with_acquisition(Constant(1.0)), here), cost=cost)
     found = tie_break(told, Height())

@@ -1,4 +1,4 @@
-"""Gradient searches: known maxima, bookkeeping, scans that see nothing, Adam by hand, degenerate starts, bad input."""
+"""Gradient searches: closed-form maxima, trajectories, empty scans, Adam by hand, degenerate starts and bad input."""
 
 import equinox as eqx
 import jax
@@ -20,7 +20,7 @@ NODES = nodes(GRID.axis)
 
 
 class Nearness(nbv.Acquisition):
-    """4 - |mean of the hits - target|^2; 0, the least for what lies in the unit ball, where nothing is seen."""
+    """4 - |mean of the hits - target|^2. Without hits 0, the least value for targets in the unit ball."""
 
     target: jax.Array
 
@@ -34,7 +34,7 @@ class Nearness(nbv.Acquisition):
 
 
 def classifier(cloud):
-    """Smooth log-probabilities of three classes, whatever the number of rows."""
+    """Smooth log-probabilities of three classes, for any number of rows."""
     rows = jnp.concatenate([cloud.points, cloud.normals], axis=-1)
     weights = jnp.asarray(np.random.default_rng(2).normal(size=(6, 3)), rows.dtype)
     features = jnp.where(cloud.mask[:, None], jnp.tanh(rows @ weights), 0.0)
@@ -55,7 +55,7 @@ def problem_of(surfaces, acquisition):
 
 
 def rough(seed):
-    """A blob off the centre whose surface is uneven at the scale of two cells."""
+    """A blob off the centre whose surface is rough at the scale of two cells."""
     rng = np.random.default_rng(seed)
     noise = gaussian_filter(rng.normal(size=(2, *NODES.shape[:3])), (0, 2, 2, 2))
     away = [np.linalg.norm(NODES - rng.uniform(-0.2, 0.2, 3), axis=-1) for _ in range(2)]
@@ -83,7 +83,7 @@ def assert_close(a, b, atol=1e-5):
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=0, atol=atol), a, b)
 
 
-# All alike where they can be, so that tests share what was compiled.
+# The same settings wherever possible, so that tests share compiled programs.
 COMMON = {"num_starts": 2, "iterations": 40, "learning_rate": 0.05}
 FEW, LINE = {**COMMON, "num_candidates": 6}, {"rtol": 1e-4, "atol": 1e-4}
 SEARCHES = {
@@ -111,7 +111,7 @@ def mean_hit(radius, distance, gaze=0.0):
 def test_the_known_maximum_is_found(name, direction):
     """The mean of a centred ball's hits lies before the camera, so that facing the target is best.
 
-    Within constraints it comes furthest out at the least distance; free cameras may bring it to the target.
+    With constraints it is farthest out at the least distance. Free cameras may bring it to the target.
     """
     radii = (1.0, 1.0) if name in ("6-DOF", "constrained") else (1.0, 0.9)
     distance = {"6-DOF": 2.2, "constrained": 2.0}.get(name, 2.5)
@@ -129,7 +129,7 @@ def test_the_known_maximum_is_found(name, direction):
     assert float(found.value) > float(found.values[: SEARCHES[name].num_starts].max()) + 0.01
     position = np.asarray(found.pose.position, np.float64)
     if name != "6-DOF":
-        # Within constraints the gaze makes up for a place a little aside.
+        # With constraints the gaze can compensate for a small error of the position.
         angle = {"constrained": 10.0}.get(name, 4.0)
         assert position @ direction / np.linalg.norm(position) > np.cos(np.radians(angle))
         assert np.linalg.norm(position) == pytest.approx(distance, abs=0.15)
@@ -137,7 +137,7 @@ def test_the_known_maximum_is_found(name, direction):
 
 @pytest.mark.parametrize("name", SEARCHES)
 def test_trajectories_hold_every_look_and_the_best_of_all_is_returned(name):
-    """Over uneven surfaces, where steps often lead down."""
+    """Surfaces are uneven, so that steps often lead down."""
     downhill = 0
     for seed in range(3):
         problem = uneven(seed)
@@ -148,7 +148,7 @@ def test_trajectories_hold_every_look_and_the_best_of_all_is_returned(name):
         assert_close(ways.poses[:, 0], found.candidates[jnp.argsort(found.values, descending=True)[:2]])
         poses, values = ways.flat
         np.testing.assert_allclose(values_at(problem, poses), values, rtol=1e-4)
-        # All starts of a step together.
+        # All starts take each step together.
         assert_equal(poses[2 * 17 + 1], ways.poses[1, 17])
         looks = [(found.candidates, found.values), (poses, values)]
         poses, values = jax.tree.map(lambda *rows: jnp.concatenate(rows), *looks)
@@ -171,7 +171,7 @@ def test_visited_poses_are_neither_started_from_nor_answered():
     again = run("2-DOF", visit(problem, *taken))
     assert_close(again.trajectories.poses[:, 0], first.candidates[order[jnp.array([1, 3])]])
     assert bool(jnp.isneginf(again.values[order[jnp.array([0, 2])]]).all())
-    # The second start is on its way as before; only the pose that was taken is shut out of it.
+    # The second start moves as before. Only the visited pose is excluded from it.
     third = run("2-DOF", visit(problem, again.pose))
     for pose, proposal in [(pose, again) for pose in taken] + [(again.pose, third)]:
         assert float(jnp.linalg.norm(pose.position - proposal.pose.position)) > 1e-3
@@ -187,7 +187,7 @@ def test_the_key_alone_decides():
 
 
 def test_a_view_of_nothing_is_worth_nothing_and_not_chosen():
-    """Cameras may fly and turn freely; some of the starts look away from the object."""
+    """Cameras may move and turn freely, and some starts look away from the object."""
     problem = problem_of(rough(0), nbv.Coverage())
     away = nbv.look_at(jnp.asarray([[0.0, 0.0, 2.5], [2.5, 0.0, 0.0]]), target=(0.0, 9.0, 9.0))
     towards = nbv.look_at(jnp.asarray([[1.5, -2.0, 0.3]]))

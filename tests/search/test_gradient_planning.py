@@ -1,4 +1,4 @@
-"""Gradient searches within a planner: compilation, episodes on disk, scores that have no gradient."""
+"""Gradient searches within a planner: compilation, episodes on disk, and scores without a gradient."""
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +26,7 @@ PLANNER = planner_of(nbv.GradientSearch(dof=2, **SMALL))
 
 
 def test_a_planner_compiles_the_search_once(compilations):
-    """The whole search is one compiled function: a second episode of another seed and first view compiles nothing."""
+    """The whole search is one compiled function. A second episode with another seed and first view compiles nothing."""
     episode = nbv.simulate(PLANNER, SCENE, FIRST, 3, KEY, progress=False)
     before = len(compilations)
     assert before > 0
@@ -115,7 +115,7 @@ def test_a_score_without_gradient_is_refused_at_once(score):
     ],
 )
 def test_a_derivative_that_is_not_a_number_is_reported(space):
-    """The square root's value at zero is finite, its slope is not."""
+    """The square root has a finite value at zero, but no finite slope."""
     score = nbv.ExpectedUtilityImprovement(lambda cloud: jnp.sqrt(0.0 * jnp.sum(cloud.points**2)) + 1.0 * cloud.count)
     planner = planner_of(nbv.GradientSearch(space=space, **SMALL), score)
     observations = planner.init(FIRST, nbv.scan(SCENE, planner.camera, FIRST))

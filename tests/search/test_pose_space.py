@@ -1,6 +1,7 @@
-"""Retractions: zeros stay, spheres and constraints hold whatever the parameters, derivatives are those of differences.
+"""Retractions: zero parameters change nothing, spheres and constraints hold for any parameters, and derivatives agree
+with differences.
 
-Rounding is tried where it is worst: starts that look straight away from the origin, steps to the far side of it.
+Rounding is tested at its worst: starts that look straight away from the origin, and steps to its far side.
 """
 
 import math
@@ -24,7 +25,7 @@ RETRACT = {name: jax.jit(space.retract) for name, space in SPACES.items()}
 RETRACT_MANY = {name: jax.jit(jax.vmap(space.retract)) for name, space in SPACES.items()}
 JACOBIAN = {name: jax.jit(jax.jacfwd(space.retract, argnums=1)) for name, space in SPACES.items()}
 FLAT = jax.jit(lambda start, parameters: flat(SPHERE.retract(start, parameters)))
-# Of all batches alike, so that they share what was compiled.
+# The same size for all batches, so that they share compiled programs.
 MANY = 3000
 FREEDOMS = {"sphere": 2, "free": 6, "constrained": 6}
 
@@ -39,7 +40,8 @@ def units(count):
 
 
 def starts_inside(count, radius=None):
-    """On the sphere of 2.5 looking at its centre, or, without a radius, in the shell with the origin in view."""
+    """Poses on the sphere of 2.5 that look at its centre, or without a radius poses in the shell with the origin in
+    view."""
     at_centre = LOOK_AT(real((radius or RNG.uniform(2.1, 2.9, (count, 1))) * units(count)))
     turn = 0.0 if radius else RNG.uniform(-0.1, 0.1, (count, 3))
     turn = Rotation.from_rotvec(np.broadcast_to(turn, (count, 3)) * [1, 1, 10]).as_matrix()
@@ -55,7 +57,7 @@ def flat(pose):
 
 
 def jacobian(name, start, parameters):
-    """Of the rotation's nine entries and the position, by the parameters."""
+    """Derivative of the nine entries of the rotation and of the position in the parameters."""
     columns = JACOBIAN[name](start, real(parameters))
     return np.concatenate([columns.rotation.reshape(9, -1), columns.position])
 
@@ -68,7 +70,8 @@ def assert_rotation(rotation):
 
 
 def angle_to_origin(pose):
-    """Between the optical axis and the direction to the origin, from sine and cosine: exact also at small angles."""
+    """Angle between the optical axis and the direction to the origin, from sine and cosine, so that small angles are
+    exact."""
     to_origin, forward = -np.asarray(pose.position, np.float64), np.asarray(pose.forward, np.float64)
     sine = np.linalg.norm(np.cross(to_origin, forward), axis=-1)
     return np.arctan2(sine, np.sum(to_origin * forward, axis=-1))
@@ -118,7 +121,7 @@ def test_sphere_reaches_every_direction_and_does_not_roll():
     before = np.asarray(start.position, np.float64) / 2.5
     end = RETRACT_MANY["sphere"](start, real(wanted - before))
     np.testing.assert_allclose(end.position, 2.5 * wanted, atol=2e-6)
-    # The least turn: its axis is orthogonal to the directions that it joins.
+    # The least rotation: its axis is orthogonal to both directions.
     turn = np.asarray(end.rotation, np.float64) @ np.swapaxes(np.asarray(start.rotation, np.float64), 1, 2)
     axis = Rotation.from_matrix(turn).as_rotvec()
     assert np.abs(np.sum(axis * before, axis=1)).max() < 1e-4
@@ -127,7 +130,7 @@ def test_sphere_reaches_every_direction_and_does_not_roll():
 
 @pytest.mark.parametrize("name", ["sphere", "constrained"])
 def test_steps_to_the_far_side(name):
-    """To the antipode, or as near to it as rounding allows, the turn is one of many; it must still be one."""
+    """Near the antipode the rotation is one of many. It must still be a rotation."""
     start = starts_inside(MANY, 2.5)
     before = np.asarray(start.position / 2.5)
     for miss in (0.0, 1e-7, 1e-5, 1e-3):
@@ -143,13 +146,13 @@ def test_steps_to_the_far_side(name):
 @pytest.mark.parametrize("offset", [0.0, 1e-6])
 @pytest.mark.parametrize("pole", [-1.0, 1.0])
 def test_nothing_happens_at_the_poles(pole, offset, x64):
-    """The derivative of the rotation is as at any other place: a turn of the camera by as much as it moves."""
+    """The derivative of the rotation is the same as elsewhere: the camera turns by as much as it moves."""
     start = nbv.look_at(jnp.asarray([offset, pole * 2.5, 0.5 * offset]))
     move = np.cross(np.asarray(start.position) / 2.5, units(1)[0])
     slope = jacobian("sphere", start, np.zeros(3)) @ move
     central = (FLAT(start, jnp.asarray(1e-5 * move)) - FLAT(start, jnp.asarray(-1e-5 * move))) / 2e-5
     np.testing.assert_allclose(slope, central, atol=1e-8)
-    # A turn by the angle v has |dR| = sqrt(2) v in the norm of Frobenius.
+    # A rotation by the angle v has |dR| = sqrt(2) v in the Frobenius norm.
     speed = np.linalg.norm(move)
     np.testing.assert_allclose(np.linalg.norm(slope[:9]), math.sqrt(2) * speed, rtol=1e-5)
     np.testing.assert_allclose(np.linalg.norm(slope[9:]), 2.5 * speed, rtol=1e-5)
@@ -182,7 +185,7 @@ def test_every_start_and_all_parameters_obey(position, quaternion, parameters):
 
 
 def test_starts_that_look_straight_away_are_turned_to_the_origin():
-    """The origin is behind them, but for rounding: which way they are turned is open."""
+    """The origin is behind them up to rounding, so that the direction of the rotation is arbitrary."""
     at_centre = LOOK_AT(real(RNG.uniform(0.5, 4.0, (MANY, 1)) * units(MANY)))
     away = nbv.Pose(at_centre.rotation * real([1.0, -1.0, -1.0]), at_centre.position)
     for parameters in (np.zeros((MANY, 8)), RNG.normal(size=(MANY, 8))):
@@ -190,7 +193,7 @@ def test_starts_that_look_straight_away_are_turned_to_the_origin():
 
 
 def test_constrained_poses_fill_their_range():
-    """Distances from end to end, and the origin anywhere in the cone, reach all that is allowed and no more."""
+    """Distances from end to end, and directions all over the cone, reach exactly the allowed range."""
     space = nbv.search.ConstrainedPoses(1.5, 4.0, math.radians(25.0))
     start = nbv.look_at((0.0, 0.0, 2.0))
     parameters = np.zeros((2, 8))

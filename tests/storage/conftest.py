@@ -1,4 +1,4 @@
-"""Five views of the small episode in a folder, made once."""
+"""Five views of the small episode in a folder, written once."""
 
 import pytest
 from small_episode import run

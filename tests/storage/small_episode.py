@@ -1,4 +1,4 @@
-"""A small episode, run into a folder."""
+"""A small episode, and its run into a folder."""
 
 from pathlib import Path
 
@@ -17,5 +17,5 @@ def run(folder, views=3, **changes):
 
 
 def contents(folder):
-    """Of all files but the lock."""
+    """Contents of all files except the lock."""
     return {file.name: file.read_bytes() for file in sorted(Path(folder).iterdir()) if file.name != ".lock"}

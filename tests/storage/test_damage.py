@@ -1,4 +1,4 @@
-"""Records and views that are not what was written are refused by name."""
+"""Damaged or foreign records and views are refused by name."""
 
 import json
 import shutil
@@ -60,7 +60,7 @@ def config_of(episode):
 
 @pytest.mark.slow
 def test_no_turned_bit_of_a_view_passes(finished, tmp_path):
-    """Any one bit: the file is refused by name, or its arrays are the same (bits that mean nothing)."""
+    """For any single bit the file is refused by name, or its arrays are the same (some bits have no meaning)."""
     episode, folder = finished
     config = config_of(episode)
     copy = shutil.copytree(folder, tmp_path / "copy", ignore=shutil.ignore_patterns("view_0[2-9].npz"))

@@ -1,4 +1,4 @@
-"""What a record says of the settings: the same for the same, another for any other."""
+"""Descriptions of settings in records: equal for equal settings, and different for any others."""
 
 import functools
 import importlib
@@ -84,7 +84,7 @@ def test_a_description_of_a_function_is_the_same_in_every_process(tmp_path):
 
 
 def write_module(folder, monkeypatch, name, text):
-    """A module of the user's, imported."""
+    """Write and import a user's module."""
     (folder / f"{name}.py").write_text(text)
     monkeypatch.syspath_prepend(folder)
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
@@ -94,7 +94,7 @@ def write_module(folder, monkeypatch, name, text):
 
 
 class Net:
-    """Weights that nothing here can see, as of a network of another library."""
+    """Weights that the description cannot see, as in a network of another library."""
 
     def __init__(self, weight):
         self.weight = weight

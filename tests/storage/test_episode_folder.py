@@ -1,4 +1,4 @@
-"""What an episode's folder holds, that it reads back exactly, continues, and belongs to one configuration."""
+"""The folder of an episode: its contents, exact reading, continuation, and its one configuration."""
 
 import json
 import shutil
@@ -123,7 +123,7 @@ def test_a_folder_with_other_files_is_refused(tmp_path):
 def test_leftover_parts_do_not_matter(finished, tmp_path):
     for name in (".0123456789abcdef.partial", ".00000000000000ff.partial"):
         (tmp_path / name).write_bytes(b"half a fi")
-    # Not one of ours, and so not touched.
+    # It is not a file of the package, and so is not touched.
     (tmp_path / "mine.partial").write_bytes(b"half a thesis")
     run(tmp_path, views=5)
     assert contents(tmp_path) == contents(finished[1]) | {"mine.partial": b"half a thesis"}
@@ -160,7 +160,7 @@ def test_a_first_view_that_fails_does_not_bind_its_folder(tmp_path, finished):
 
 
 def test_a_record_without_views_binds_nobody(tmp_path, finished):
-    """A run that was killed between the two files."""
+    """As after a run that was killed between the two files."""
     run(tmp_path, views=1, key=jax.random.key(9))
     for name in ("view_00.npz", "end_00.npz", "cloud.ply"):
         (tmp_path / name).unlink()
@@ -169,7 +169,7 @@ def test_a_record_without_views_binds_nobody(tmp_path, finished):
 
 
 def test_every_view_is_told_when_it_is_done(tmp_path):
-    """Its file is there, and that of the next is not; those of the folder are told too."""
+    """The view's file exists then, and the next one's does not. Views from the folder are passed too."""
     told = []
 
     def each(step):

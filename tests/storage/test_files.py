@@ -1,4 +1,4 @@
-"""Files that are whole or not there, on disks that are full, folders that are closed, and with many writers."""
+"""Files are complete or absent, on full disks, in closed folders, and with many writers."""
 
 import subprocess
 import sys
@@ -71,7 +71,7 @@ def test_places_that_cannot_be_written_are_named(tmp_path):
 
 @pytest.mark.slow
 def test_writers_of_one_file_do_not_meet(tmp_path):
-    """Each file that a reader finds is one writer's whole."""
+    """Each file that a reader finds is complete and from one writer."""
     script = (
         "import sys\nfrom pathlib import Path\nfrom jaxnbv.storage.files import write_text\n"
         "for _ in range(150):\n    write_text(Path(sys.argv[1]), sys.argv[2] * 50000)\n"

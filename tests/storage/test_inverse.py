@@ -1,4 +1,4 @@
-"""What is loaded is what was saved: episodes, sessions and studies."""
+"""Loaded episodes, sessions and studies equal the saved ones."""
 
 import dataclasses
 
@@ -52,7 +52,7 @@ PLANNERS = st.builds(
 
 
 def scan_of(shift):
-    """A cloud of the image's size, of which some rays met nothing."""
+    """A cloud of the image's size. Some rays have no return."""
     there = SPHERE[:, 2] > shift
     rows = [jnp.asarray(np.where(there[:, None], part, 0.0), jnp.float32) for part in (0.9 * SPHERE, SPHERE)]
     return nbv.PointCloud(*rows, jnp.asarray(there), jnp.asarray(~there))
@@ -81,12 +81,12 @@ def test_an_episode_is_loaded_as_it_was_saved(tmp_path_factory, planner, stop_re
     folder = tmp_path_factory.mktemp("episode")
     episode.save(folder)
     assert_same(nbv.Episode.load(folder), episode)
-    # It can be saved again, and a view more makes the end another.
+    # It can be saved again. A further view changes the stop reason.
     nbv.Episode.load(folder).save(folder)
 
 
 def test_what_cannot_be_made_again_is_given(tmp_path):
-    """A utility without a name: the folder says that it is the same, not what it is."""
+    """A utility without a name. The folder recognises it, but cannot make it again."""
     planner = nbv.Planner(lambda cloud: cloud.count * 1.0, nbv.FarthestView(9), nbv.Camera(height=8, width=8))
     episode = nbv.simulate(planner, nbv.sdf.Sphere(0.9), nbv.look_at((0.0, 0.0, 2.5)), 2, jax.random.key(0))
     episode.save(tmp_path)

@@ -1,4 +1,4 @@
-"""Killed and started again; and two processes in one folder."""
+"""Processes that are killed and started again, and two processes in one folder."""
 
 import os
 import shutil
@@ -58,7 +58,7 @@ def start(folder, stage="none", view=0):
 
 
 def kill_once(process, reached):
-    """SIGKILL as soon as `reached()`; the process must still have been running."""
+    """Send SIGKILL as soon as `reached()`. The process must still be running then."""
     deadline = time.monotonic() + 300
     while not reached():
         if process.poll() is not None:
@@ -72,9 +72,10 @@ def kill_once(process, reached):
 
 @pytest.mark.slow
 def test_killed_at_any_moment_and_started_again_it_ends_with_the_same_files(tmp_path):
-    """Once when the first view appears, once half way through writing the second, once while the third is scanned."""
+    """Once when the first view appears, once half-way through writing the second, and once while the third is
+    scanned."""
     folder, stalled = tmp_path / "killed", tmp_path / "killed.stalled"
-    # It leaves compiled programs to the others, which are killed while nothing is written there.
+    # This run compiles the programs for the others, which are then killed while nothing is compiled.
     uninterrupted = start(tmp_path / "whole")
     assert uninterrupted.wait(timeout=300) == 0, uninterrupted.stderr.read().decode()
     kill_once(start(folder), (folder / "view_00.npz").exists)

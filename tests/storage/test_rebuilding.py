@@ -1,4 +1,4 @@
-"""A configuration that is read from a folder is the one that was stored, and reading it runs nothing."""
+"""A configuration from a folder equals the stored one, and reading it runs no code."""
 
 import enum
 import functools
@@ -139,7 +139,7 @@ def test_everything_public_is_made_again():
 
 
 def as_arrays(thing):
-    """A mesh without its tree, which is one of its own."""
+    """The mesh without its tree, which differs between objects."""
     return (thing.vertices, thing.faces, thing.frame) if isinstance(thing, nbv.TriangleMesh) else thing
 
 

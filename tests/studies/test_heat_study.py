@@ -1,4 +1,4 @@
-"""The heat study on a small scale, and its measures of records made by hand."""
+"""The heat study on a small scale, and its measures on records made by hand."""
 
 import functools
 import json
@@ -20,7 +20,7 @@ from jaxnbv.studies.scenes import heat_scene
 from jaxnbv.tasks import coldest_point
 from jaxnbv.tasks import heat as heat_task
 
-# The other planners are put together in the same way, and compile as long again.
+# The other planners have the same structure, and each would compile as long again.
 RUN = ("heat", "heat-halving", "farthest")
 CANDIDATES, VIEWS = 12, 3
 
@@ -41,7 +41,7 @@ def small_study(**settings):
 @pytest.fixture(autouse=True)
 def coarse_truth(monkeypatch):
     monkeypatch.setattr(heat_task, "_LONGEST_EDGE", 0.1)
-    # No worker processes.
+    # Without worker processes.
     monkeypatch.setenv("LOKY_MAX_CPU_COUNT", "1")
 
 
@@ -99,7 +99,7 @@ def test_the_coldest_points_are_those_within_a_hundredth_of_the_range():
 
 
 def test_halving_finds_the_second_view_of_the_full_search(record):
-    """Both start from the same view, so that it is chosen from the same observations and samples."""
+    """Both start from the same view, and choose from the same observations and samples."""
     second = [np.round(record["methods"][method]["views"][1]["position"], 4).tolist() for method in RUN[:2]]
     assert second[0] == second[1]
 
@@ -117,7 +117,7 @@ def test_the_picture_shows_every_cloud_beside_the_truth(record, tmp_path):
     assert path.name == "scene_0000.png"
     image = np.asarray(Image.open(path).convert("RGB")).astype(int)
     assert image.std() > 5
-    # The green star of the true coldest point, in the truth and in all three views of both methods that are shown.
+    # The green star of the true coldest point, in the truth and in the three views of both methods.
     green = np.abs(image - [0x00, 0x9E, 0x73]).sum(axis=-1) < 30
     assert green.sum() > 7 * 20
 
@@ -132,7 +132,7 @@ def test_a_folder_of_meshes_gives_the_scenes(tmp_path):
         assert 1.22 < np.linalg.norm(scene.task) < 1.26
     assert not np.allclose(scenes[0].task, scenes[1].task)
     truth = study.truth(scenes[0])
-    # Of a ball heated at one place the other end is coldest.
+    # The coldest end of a ball is opposite to the heated one.
     opposite = -np.asarray(scenes[0].task)
     assert np.linalg.norm(truth.coldest - opposite) < 0.3
     with pytest.raises(InputError, match="no scene 2"):
@@ -140,7 +140,7 @@ def test_a_folder_of_meshes_gives_the_scenes(tmp_path):
 
 
 def test_measures_are_of_the_estimates():
-    """Those among warmed points are a tenth nearer, and as warm."""
+    """Estimates among warmed points are a tenth nearer and equally warm."""
     run = {
         "steps": [{"value": 0.5, "seconds": 10.0}, {"value": 0.0, "seconds": 12.0}],
         "estimates": {
@@ -152,8 +152,8 @@ def test_measures_are_of_the_estimates():
     of = {measure.name: measure.of for measure in HeatStudy.measures}
     assert of["distance, all"](record, "heat") == [1.0, 0.4]
     assert of["distance, reached"](record, "heat") == pytest.approx([0.9, 0.3])
-    # An error is an error above or below.
+    # An error counts in either direction.
     assert of["error, all"](record, "random") == pytest.approx([0.8, 0.1])
-    # Steps without a view of any value are counted where cold is sought.
+    # Steps without a view of positive value are counted for methods that seek cold.
     assert (of["saturated"](record, "heat"), of["saturated"](record, "random")) == ({2: 0.0, 3: 1.0}, {})
     assert of["seconds"](record, "heat") == {"median": 12.0}

@@ -1,4 +1,4 @@
-"""The study of identification: how parts lie, what is measured, and a small run."""
+"""The study of identification: placements of parts, measures, and a small run."""
 
 import dataclasses
 import json
@@ -29,7 +29,7 @@ SMALL = {"num_candidates": 12, "num_samples": 2, "grid_resolution": 32, "capacit
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Three parts in metres, of which two have the same name."""
+    """Three parts in metres. Two of them have the same name."""
     folder = tmp_path_factory.mktemp("parts")
     block = trimesh.creation.box((0.10, 0.06, 0.04))
     block.export(folder / "block.ply")
@@ -98,7 +98,7 @@ def test_a_part_lies_as_its_setup_says(folder, setup):
         if task.obstacles is not None:
             distance = np.asarray(task.obstacles.distance(task.mesh.vertices.astype(np.float32)))
             assert -1e-5 < distance.min() < 1e-5
-            # It stands on three points at least.
+            # It stands on at least three points.
             assert (distance < 0.01).sum() >= 3
             assert (np.asarray(poses.position)[:, 1] > 0).all()
 
@@ -143,7 +143,7 @@ def test_methods_hold_the_same_bank_and_differ_in_their_views(folder):
 
 
 def hypotheses_of(task, part, turn=None, none=0.0):
-    """All weight but that of none of these on a part that lies as the true one does, turned in its own frame."""
+    """All weight except that of "none of these" on a part in the true placement, turned in its own frame."""
     rotation = task.rotation if turn is None else task.rotation @ turn
     placement = Placement(*(jnp.asarray(row, jnp.float32)[None] for row in (rotation, task.shift, np.ones(3))))
     placed = Hypotheses(jnp.asarray([part]), placement, jnp.zeros(1), jnp.ones(1, bool))
@@ -202,7 +202,7 @@ def test_a_record_is_json_and_holds_what_is_measured(record):
         run = record["methods"][method]
         assert all(name == record["name"] for name, right in zip(run["named"], run["right"], strict=True) if right == 1)
         assert all(placed <= right for placed, right in zip(run["placed"], run["right"], strict=True))
-    # Three parts as unlike as these are told apart.
+    # Three parts as different as these are identified.
     assert record["methods"][IDENTIFY]["right"][-1] == 1
     first = [record["methods"][method]["p_true"][0] for method in RUN]
     assert first[0] == first[1]

@@ -1,4 +1,4 @@
-"""The reconstruction study on a small scale, and its measures of records made by hand."""
+"""The reconstruction study on a small scale, and its measures on records made by hand."""
 
 import json
 
@@ -23,7 +23,7 @@ from jaxnbv.studies.engine.results import results, summary
 from jaxnbv.studies.engine.run import replay, run_scene
 from jaxnbv.studies.reconstruction import MEAN, POISSON, ReconstructionStudy, reconstruct
 
-# Those that draw no samples compile in a fraction of the time; all planners are of the same make.
+# Methods without samples compile in a fraction of the time. All planners have the same structure.
 RUN = ("farthest", "random")
 CANDIDATES = 10
 HAS_POISSON = has_poisson()
@@ -31,7 +31,7 @@ HAS_POISSON = has_poisson()
 
 @pytest.fixture(scope="module")
 def meshes(tmp_path_factory):
-    """A folder with two objects and files that belong to them."""
+    """A folder with two objects and their additional files."""
     folder = tmp_path_factory.mktemp("meshes")
     trimesh.creation.torus(1.0, 0.4, 40, 20).export(folder / "b_torus.OBJ", file_type="obj")
     trimesh.creation.box((1.0, 2.0, 3.0)).export(folder / "a_box.ply")
@@ -153,7 +153,7 @@ def test_the_pictures_show_something(record, meshes, tmp_path, monkeypatch):
     folder = tmp_path / "pictures"
     (picture,) = write_pictures([record], small_study(meshes), folder, pixels=80)
     assert picture.name == "scene_0001.png"
-    # The truth and two methods, side by side.
+    # The truth and two methods side by side.
     image = np.asarray(Image.open(picture).convert("L"))
     assert image.std() > 5
     for strip in np.array_split(image[:, 100:], 3, axis=1):

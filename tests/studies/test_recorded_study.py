@@ -1,4 +1,5 @@
-"""Recorded sequences: three layouts of one small recording, broken ones, and what the study counts, counted anew."""
+"""Recorded sequences: three layouts of one small recording, broken ones, and independent counts of the study's
+measures."""
 
 import json
 
@@ -19,7 +20,7 @@ COUNT = 9
 
 
 def recorded():
-    """A ball of 0.3 m at (1, 2, 0.5), seen from a half circle about it: depths in mm and matrices in metres."""
+    """A ball of 0.3 m at (1, 2, 0.5), seen from a half circle around it: depths in mm, and matrices in metres."""
     center, depths, matrices = np.array([1.0, 2.0, 0.5]), [], []
     for angle in np.linspace(0.0, np.pi, COUNT):
         eye = center + 1.2 * np.array([np.cos(angle), np.sin(angle), 0.3])
@@ -44,7 +45,7 @@ def save(path, depth):
 def seven_scenes(folder, depths, matrices):
     for index, (depth, matrix) in enumerate(zip(depths, matrices, strict=True)):
         hole = depth.copy()
-        # The data set's own mark of what was not measured.
+        # The data set's own mark of a missing depth.
         hole[depth == 0] = 65535
         save(folder / f"frame-{index:06d}.depth.png", hole)
         np.savetxt(folder / f"frame-{index:06d}.pose.txt", matrix, delimiter="\t")
@@ -59,7 +60,7 @@ def tum(folder, depths, matrices):
         images.append(f"{time:.6f} depth/{index}.png")
         quaternion = Rotation.from_matrix(matrix[:3, :3]).as_quat()
         track.append(" ".join(f"{x:.9f}" for x in [time + 0.004, *matrix[:3, 3], *quaternion]))
-    # Of this one nobody knows where it was taken.
+    # This image has no pose.
     images.append("1305031109.000000 depth/0.png")
     (folder / "depth.txt").write_text("\n".join(images))
     (folder / "groundtruth.txt").write_text("\n".join(track))
@@ -77,14 +78,14 @@ LAYOUTS = (seven_scenes, tum, plain)
 
 
 def known_sensor(layout, folder, sequence):
-    """A folder that says its intrinsics."""
+    """A folder that states its intrinsics."""
     layout(folder, *sequence)
     np.savetxt(folder / "camera-intrinsics.txt", INTRINSICS)
 
 
 FOUR = "40 40 23.5 17.5"
 OPEN3D = {"width": 48, "height": 36, "intrinsic_matrix": INTRINSICS.T.reshape(-1).tolist()}
-# Where a folder, or its parent, says the intrinsics; in the parent those of other sensors, which do not count.
+# Folders in which the intrinsics of the recording stand, or in the parent those of other sensors, which must not count.
 STORED = {
     "3DMatch, in the parent": lambda folder: np.savetxt(folder.parent / "camera-intrinsics.txt", INTRINSICS),
     "in the folder before the parent": lambda folder: [
@@ -108,7 +109,7 @@ STORED = {
 
 
 def check_points(frames, sequence):
-    """Every frame's points lie on the ball, by a pinhole of our own."""
+    """Every frame's points lie on the ball, by an independent pinhole."""
     for index, depth in enumerate(sequence[0]):
         z = frames.depth_scale * frames.depth(index)
         np.testing.assert_allclose(z, depth / UNIT, atol=1e-9)
@@ -155,7 +156,7 @@ def test_no_layout_has_intrinsics_of_its_own(layout, sequence, tmp_path):
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("units", [1, 4, 5, 10])
 def test_the_unit_is_the_one_with_which_frames_agree(layout, units, sequence, tmp_path):
-    """Thousands a metre, and in the layout of TUM, which the helper writes at 5,000, a fifth of them more."""
+    """Thousands for a metre, and in the layout of TUM, which the helper writes at 5,000, a fifth more."""
     depths, matrices = sequence
     layout(tmp_path, depths // 5 * units if layout is tum else depths * units, matrices)
     frames = nbv.readers.RecordedFrames(tmp_path, intrinsics=INTRINSICS)
@@ -163,7 +164,7 @@ def test_the_unit_is_the_one_with_which_frames_agree(layout, units, sequence, tm
 
 
 def test_a_unit_that_nothing_tells_is_asked_for(sequence, tmp_path):
-    """One frame, and a camera that stays where it is, agree with themselves in any unit."""
+    """One frame, and a camera that does not move, agree with themselves in any unit."""
     depths, matrices = sequence
     for name, still in (("one", slice(0, 1)), ("still", [0, 0, 0])):
         (tmp_path / name).mkdir()
@@ -214,7 +215,7 @@ def test_a_lost_row_of_a_track_is_left_out(lost, sequence, tmp_path):
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_poses_to_three_digits_are_rotations(layout, sequence, tmp_path):
-    """To within what is lost by rounding; exactly orthonormal."""
+    """To within rounding, and exactly orthonormal."""
     depths, matrices = sequence
     known_sensor(layout, tmp_path, (depths, np.round(matrices, 3)))
     frames = nbv.readers.RecordedFrames(tmp_path)
@@ -250,7 +251,7 @@ def test_a_world_is_turned_upright(sequence, tmp_path):
     turned[:, :3, :] = tilt @ matrices[:, :3, :]
     known_sensor(plain, tmp_path, (depths, turned))
     frames = nbv.readers.RecordedFrames(tmp_path, up=tuple((3.0 * tilt[:, 2]).tolist()))
-    # Heights are those before the world was tilted, and so are all distances.
+    # Heights and all distances are those before the world was tilted.
     np.testing.assert_allclose(frames.matrices[:, 2, 3], matrices[:, 2, 3], atol=1e-9)
     steps = [np.diff(m[:, :3, 3], axis=0) for m in (frames.matrices, matrices)]
     np.testing.assert_allclose(*(np.linalg.norm(step, axis=1) for step in steps), atol=1e-9)
@@ -258,12 +259,12 @@ def test_a_world_is_turned_upright(sequence, tmp_path):
 
 
 def rewritten(file, change):
-    """Another text in place of a file's."""
+    """Change the text of a file."""
     return lambda folder: (folder / file).write_text(change((folder / file).read_text()))
 
 
 def said(change):
-    """Another object in place of that of frames.json."""
+    """Change the object in frames.json."""
     return rewritten("frames.json", lambda text: json.dumps(json.loads(text) | change))
 
 
@@ -277,14 +278,14 @@ def coloured(folder):
 
 
 def doubled(folder):
-    """Matrices of a similarity."""
+    """Make the matrices similarities."""
     content = json.loads((folder / "frames.json").read_text())
     for frame in content["frames"]:
         frame["pose"] = (np.diag([2.0, 2.0, 2.0, 1.0]) @ frame["pose"]).tolist()
     (folder / "frames.json").write_text(json.dumps(content))
 
 
-# A layout, what is done to it, and what is said of that.
+# A layout, a change of it, and words of the error.
 BROKEN = {
     "empty": (lambda *_: None, lambda folder: None, "holds no recorded sequence"),
     "other times": (tum, rewritten("depth.txt", lambda _: "17.0 depth/0.png"), "no image has a pose within"),
@@ -332,7 +333,7 @@ def study(sequence, tmp_path_factory):
 
 
 def voxels_of(study, depth, matrix):
-    """Those in the box that a depth image shows, by its pixels, in float64."""
+    """Voxels in the box that a depth image shows, from its pixels in float64."""
     row, column = np.nonzero(depth)
     z = depth[row, column] / UNIT
     (fx, _, cx), (_, fy, cy), _ = INTRINSICS
@@ -343,7 +344,7 @@ def voxels_of(study, depth, matrix):
 
 
 def test_its_voxels_are_those_that_three_frames_have_seen(study, sequence):
-    """By all pixels; a few lie in the next voxel by rounding."""
+    """From all pixels. By rounding, a few are in the next voxel."""
     seen = [voxels_of(study, *frame) for frame in zip(*sequence, strict=True)]
     often = {place for place in set().union(*seen) if sum(place in one for one in seen) >= 3}
     shown = study.recording.is_shown
@@ -418,7 +419,7 @@ def test_a_frame_that_looks_away_shows_nothing(sequence, tmp_path):
 def test_a_box_with_room_is_found_about_what_was_seen(sequence, tmp_path):
     known_sensor(plain, tmp_path, sequence)
     box = RecordedStudy.configured("screened", VIEWS, quick=True, folder=tmp_path)[""].box
-    # All of the ball but what faces away from all cameras.
+    # The whole ball, except for the side that faces away from all cameras.
     np.testing.assert_allclose(box.high, [1.33, 2.33, 0.83], atol=0.03)
     np.testing.assert_allclose(box.low[:2], [0.67, 1.92], atol=0.15)
     assert (np.array(box.high) > [1.299, 2.299, 0.799]).all()

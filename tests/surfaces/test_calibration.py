@@ -1,6 +1,7 @@
 """Samples have the posterior's distribution: moments against weight space, and simulation-based calibration.
 
-Seeds are fixed. Thresholds are 4.5 standard errors (7e-6) a number, and a probability of 1e-4 a chi-square statistic.
+Seeds are fixed. Thresholds are 4.5 standard errors (7e-6) for a number, and a probability of 1e-4 for a chi-square
+statistic.
 """
 
 import jax
@@ -17,7 +18,7 @@ SETTINGS = {"lengthscale": 0.15, "variance": 1.0, "noise": 0.3, "nu": 1.5, "trun
 
 
 def padded(points, normals, rows, capacity):
-    """Data in the given rows, garbage in the others."""
+    """Data in the given rows, and garbage in the others."""
     rng = np.random.default_rng(99)
     arrays = rng.uniform(-1.5, 1.5, (2, *points.shape[:-2], capacity, 3))
     mask = np.zeros((*points.shape[:-2], capacity), bool)
@@ -27,8 +28,8 @@ def padded(points, normals, rows, capacity):
 
 @pytest.mark.parametrize("noise", [0.3, 0.05])
 def test_sample_mean_and_joint_covariance_equal_weight_space(noise):
-    """24,000 samples at four data points and six others. Whitened by the exact moments, the 10 means and the 45
-    correlations have standard error N^-1/2 and the 10 variances (2 / N)^1/2; the sums of squares are chi-square with
+    """24,000 samples at four data points and six others. After whitening by the exact moments, the 10 means and the 45
+    correlations have standard error N^-1/2, and the 10 variances (2 / N)^1/2. The sums of squares are chi-square with
     10 and 55 degrees of freedom."""
     settings = SETTINGS | {"noise": noise}
     rng = np.random.default_rng(0)
@@ -50,10 +51,10 @@ def test_sample_mean_and_joint_covariance_equal_weight_space(noise):
 
 @pytest.mark.slow
 def test_posterior_is_calibrated():
-    """Simulation-based calibration (Talts et al. 2018). 1,200 problems drawn from the prior in weight space: normals of
-    f with noise at 10 random points, conditioned on in float32, 31 samples. The rank of the true f among the samples
-    is uniform on 0, ..., 31: chi-square over 8 bins of 150 expected, for f at two data points and at three unseen
-    ones, two differences, and the minimum over all five points, which depend on the joint distribution."""
+    """Simulation-based calibration (Talts et al. 2018): 1,200 problems from the prior in weight space. Each has normals
+    of f with noise at 10 random points, conditioned on in float32, and 31 samples. The rank of the true f among the
+    samples is uniform on 0, ..., 31: chi-square over 8 bins of 150 expected, for f at two data points and at three
+    others, two differences, and the minimum over all five points. The last depends on the joint distribution."""
     settings = SETTINGS | {"noise": 1.0}
     problems, count, samples, bins = 1200, 10, 31, 8
     oracle, rng = WeightSpace(**settings), np.random.default_rng(3)

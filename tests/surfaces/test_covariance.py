@@ -1,4 +1,4 @@
-"""The Matern spectrum and prior covariances against sums over the whole lattice, and the kernel of the line."""
+"""The Matern spectrum and prior covariances against sums over the whole lattice, and the one-dimensional kernel."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +19,7 @@ Y[0] = X[0]
 
 
 def brute_force(x, y, spectrum):
-    """k_vv (n, m), k_fv (3, n, m) and k_ff (n, m), a term for each of the (2 L + 1)^3 frequencies."""
+    """k_vv (n, m), k_fv (3, n, m) and k_ff (n, m), with a term for each of the (2 L + 1)^3 frequencies."""
     n = lattice(len(spectrum) - 1)
     s = spectrum[np.abs(n)].prod(axis=1)
     squared = (n**2).sum(axis=1)
@@ -43,7 +43,7 @@ def test_covariances_equal_lattice_sums(x64, nu, lengthscale, truncation):
 
 
 def test_covariances_equal_lattice_sums_in_float32_at_the_default_settings():
-    """L = 50 and ell = 0.005: a million frequencies; errors relative to the largest value of each kernel."""
+    """L = 50 and ell = 0.005, a million frequencies. Errors are relative to the largest value of each kernel."""
     spectrum = lattice_spectrum(1.5, 0.005, 0.2, 50)
     x, y = X[:2], Y[:2]
     expected = brute_force(x, y, spectrum)
@@ -75,7 +75,7 @@ def test_spectrum_is_normalised_by_the_sum_over_all_integers(x64, nu, lengthscal
 @pytest.mark.parametrize("lengthscale", [0.02, 0.3])
 def test_kernel_is_the_matern_kernel_of_the_line_wrapped_around_the_circle(x64, nu, lengthscale):
     """sum_n s1(n) cos(n t) = variance sum_k m(t / 2 pi + k) / sum_k m(k), by Poisson summation. At the small length
-    scale one turn is the whole sum. The 2e-5 is what nu = 1/2 leaves beyond 200,000 frequencies."""
+    scale the term k = 0 is the whole sum. 2e-5 is the remainder for nu = 1/2 beyond 200,000 frequencies."""
     truncation, variance = 200_000, 0.7
     spectrum = np.asarray(circle_spectrum(nu, lengthscale, variance, truncation))
     t = np.array([0.0, 0.03, 0.2, 0.7, 2.0, np.pi])

@@ -1,4 +1,4 @@
-"""Conjugate gradients against the factorisation, and what they refuse."""
+"""Conjugate gradients against the factorisation, and refused methods."""
 
 import equinox as eqx
 import jax
@@ -17,14 +17,14 @@ POINTS, NORMALS, QUERIES = RNG.uniform(-1.3, 1.3, (30, 3)), RNG.standard_normal(
 
 
 def cloud(capacity: int) -> nbv.PointCloud:
-    """Rows that are not filled hold what is not a number."""
+    """Rows that are not filled hold NaN."""
     rows = (np.pad(a, ((0, capacity - 30), (0, 0)), constant_values=np.nan) for a in (POINTS, NORMALS))
     return nbv.PointCloud(*map(jnp.asarray, rows), jnp.arange(capacity) < 30)
 
 
 @pytest.fixture
 def few(monkeypatch):
-    """Capacities above 36 are not factorised; those here are the file's own, since what is compiled is kept."""
+    """Capacities above 36 are not factorised. No other file has these capacities, because compiled programs stay."""
     monkeypatch.setattr(solver, "MOST_FACTORISED", 36)
 
 
@@ -50,7 +50,7 @@ def test_all_that_is_offered_equals_the_factorisation_and_weight_space(x64, few)
 
 @pytest.mark.parametrize("capacity", [35, 46], ids=("factorised", "by conjugate gradients"))
 def test_a_traced_point_outside_the_scene_gives_no_number(few, capacity):
-    """With its value known it is refused."""
+    """A known value outside the scene is refused."""
     outside = eqx.tree_at(lambda c: c.points, cloud(capacity), cloud(capacity).points.at[3, 1].set(2.2))
     model = nbv.GeometricSPSR(**SETTINGS)
     with pytest.raises(ValueError, match=r"coordinate of 2\.2, outside the scene's cube"):
@@ -60,7 +60,7 @@ def test_a_traced_point_outside_the_scene_gives_no_number(few, capacity):
 
 
 def test_float32_is_exact_to_a_ten_thousandth(monkeypatch):
-    """500 points of a sphere, as dense as 2,000 of one of radius 1, at the default noise, against float64."""
+    """500 points on a sphere, as dense as 2,000 on one of radius 1, at the default noise, against float64."""
     points = RNG.standard_normal((500, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     queries = 0.65 * points[::5]
@@ -73,7 +73,7 @@ def test_float32_is_exact_to_a_ten_thousandth(monkeypatch):
 
 
 def test_what_does_not_converge_is_refused(few, monkeypatch):
-    """Two steps for thirty points; of a capacity of its own, so that it is compiled so."""
+    """Two steps for thirty points, with a capacity that no other test compiles."""
     monkeypatch.setattr(solver, "_MOST_PRODUCTS", 2)
     with pytest.raises(ValueError, match=r"singular in float32: raise the noise"):
         nbv.GeometricSPSR(0.1, 0.8, 4, noise=0.01).condition(cloud(41))

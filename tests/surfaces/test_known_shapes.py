@@ -1,4 +1,4 @@
-"""Known shapes as the prior: registered, weighted, and sampled about."""
+"""Known shapes as the prior: registration, weights and samples."""
 
 import dataclasses
 
@@ -24,9 +24,9 @@ GRID = nbv.Grid(40)
 
 
 class Corner(SignedDistance):
-    """Two boxes that meet: a solid without any symmetry.
+    """Two boxes that meet: a solid without symmetry.
 
-    - `arm`: half the length of the second.
+    - `arm`: half the length of the second box.
     """
 
     arm: Float[Array, ""]
@@ -45,7 +45,7 @@ BANK = nbv.ShapeBank.of([corner(arm) for arm in ARMS], [f"arm {arm}" for arm in 
 
 
 def filling(arm, rotation):
-    """The solid turned so, as large as the box has room for and in its middle, by its corners; its scale and shift."""
+    """The rotated solid, as large as its box allows and centred by its corners; its scale and shift."""
     boxes = np.array([[0.0, 0.0, 0.0], [0.6, 0.5, 0.1]]), np.array([[0.9, 0.3, 0.4], [0.2, arm, 0.25]])
     signs = np.array(list(np.ndindex(2, 2, 2))) * 2.0 - 1.0
     turned = (boxes[0][:, None] + signs * boxes[1][:, None]).reshape(-1, 3) @ rotation.as_matrix().T
@@ -56,12 +56,12 @@ def filling(arm, rotation):
     return nbv.SDFSurface(placed.scale(scale).translate(shift)), scale, shift
 
 
-# Nearly none, which is a rotation too.
+# Nearly the identity, but a rotation all the same.
 UPRIGHT = Rotation.from_rotvec([0.0, 1e-6, 0.0])
 
 
 def model(bank=BANK, **changed):
-    """Alike in most tests, which then share what was compiled."""
+    """The same model in most tests, which then share compiled programs."""
     return nbv.surfaces.KnownShapes(bank, RESIDUAL, model_of_none=QUICK, num_starts=2048, **changed)
 
 
@@ -82,7 +82,7 @@ AROUND = ((0.5, 1.0, 3.2), (2.8, 1.2, -1.2), (-2.5, -1.5, -1.5))
 
 @pytest.fixture(scope="module")
 def planted():
-    """Eight poses of one shape of the bank, seen from three sides, and what was found."""
+    """Eight poses of one shape of the bank, seen from three sides, and the registered shapes."""
     found = []
     for seed in range(8):
         rotation, index = Rotation.random(random_state=seed), seed % len(ARMS)
@@ -102,7 +102,7 @@ def test_planted_poses_are_recovered(planted):
         moved.append(np.linalg.norm(np.asarray(found.placement.shift[0]) - shift))
     assert np.median(turned) < 3.0
     assert np.median(moved) < 0.02
-    # The shape itself fits best.
+    # The true shape fits best.
     assert sum(int(found.shape[0]) == index for index, *_, found in planted) >= 7
 
 
@@ -117,7 +117,7 @@ def test_modes_of_one_shape_are_far_apart(planted):
 
 
 def test_a_symmetric_shape_stands_in_all_the_ways_that_look_alike():
-    """A bar that was seen from above: it may be turned by half a turn."""
+    """A bar seen from above may be rotated by half a turn."""
     bank = nbv.ShapeBank.of([Cuboid([1.2, 0.3, 0.4])])
     seen = FitTargets.of(observations_of(nbv.SDFSurface(Cuboid([1.25, 0.31, 0.42])), ((0.5, 3.0, 1.5),)))
     found = register(bank, Prior(nbv.surfaces.Upright(), nbv.Box()), seen, 512)
@@ -166,12 +166,12 @@ def test_without_shapes_the_model_is_the_unknown_one_to_the_bit():
 
 
 def test_of_one_exact_shape_samples_are_that_shape_to_the_noise():
-    """On the sides that no view has seen too: points of the true surface lie within the noise of each sample's."""
+    """Also on sides that no view has seen: points of the true surface lie within the noise of each sample's surface."""
     surface, _, _ = filling(0.65, UPRIGHT)
     truth = nbv.mesh_from_sdf(surface.sdf, nbv.Grid(100, 1.4))
     points = jnp.asarray(truth.frame.to_world(truth.sample_points(jax.random.key(1), 400)), jnp.float32)
     posterior = model().condition(observations_of(surface, AROUND[:2]))
-    # Held for certain, in the best of the ways that it was found to stand.
+    # Its weight is one, in the best of its registered placements.
     best = int(np.flatnonzero(np.asarray(posterior.fits.shape) == 2)[0])
     certain = jnp.zeros_like(posterior.weights).at[best].set(1.0)
     posterior = eqx.tree_at(lambda p: p.weights, posterior, certain)
@@ -179,7 +179,7 @@ def test_of_one_exact_shape_samples_are_that_shape_to_the_noise():
     fields = posterior.sample(jax.random.key(0), 4)
     slope = jnp.linalg.norm(fields.gradient(points), axis=-1)
     away = np.abs(np.asarray(fields(points) / slope))
-    # The scale and shift are estimated from noise of 0.005; the residual's own deviation is of that order.
+    # Scale and shift are estimated with a noise of 0.005. The residual's own deviation is of that order.
     assert np.median(away) < 0.015
     assert np.quantile(away, 0.9) < 0.05
 

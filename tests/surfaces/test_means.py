@@ -1,4 +1,4 @@
-"""Posteriors about prior mean functions: against regression in weight space of the data less what the means say.
+"""Posteriors with prior mean functions, against regression in weight space on the data minus the means.
 
 The means are sums of Gaussians and a quadratic, neither band-limited nor periodic, differentiated by hand in NumPy.
 """
@@ -52,7 +52,7 @@ def exact(s, x):
 
 
 class Given(nbv.surfaces.ValueSource):
-    """Values at the points of the tests; the last row is not filled."""
+    """Values at points of the test. The last row is not filled."""
 
     def rows(self, observations):
         arrays = (jnp.asarray(a, observations.cloud.points.dtype) for a in (AT, VALUES, VALUE_NOISE))
@@ -84,7 +84,7 @@ def regression(posterior, scales, s, x, noise=0.2):
 
 
 def mean_about(posterior, means):
-    """Without noise; the key does not matter."""
+    """Without noise. The key does not matter."""
     return posterior.sample_about(means, jax.random.key(7), 0)
 
 
@@ -103,7 +103,7 @@ def test_mean_about_functions_equals_regression_of_the_data_less_them(x64, kind,
 
 @pytest.mark.parametrize("kind", [pytest.param("geometric", marks=pytest.mark.slow), "screened"])
 def test_samples_about_functions_have_their_mean_and_the_scaled_covariance(x64, kind):
-    """1,536 samples at twelve points, 512 about each of three functions with three scales. Whitened by the exact
+    """1,536 samples at twelve points, 512 about each of three functions with three scales. After whitening by the exact
     moments, z' z of the sample mean is chi-square, and the covariance is the identity within 4.5 standard errors."""
     posterior, scales = make(kind, "two scales").condition(cloud()), np.array([0.3, 1.0, 2.0])
     means = jax.tree.map(lambda leaf: jnp.repeat(leaf, 512, axis=0), bumps())
@@ -146,7 +146,8 @@ def test_means_of_zero_give_the_very_numbers_of_samples_about_none(kind, scale):
 
 
 def test_gradients_and_grids_of_samples_about_functions_are_those_of_their_values(x64):
-    """Gradients against central differences, h^2 / 6 of a third derivative of order L^2; nodes against points."""
+    """Gradients against central differences, with an error of h^2 / 6 times a third derivative of order L^2. Nodes
+    against points."""
     posterior = make("screened", "two scales").condition(cloud())
     fields = posterior.sample_about(bumps(), jax.random.key(0), 0.3)
     gradient, h = np.asarray(fields.gradient(QUERIES)), 1e-4
@@ -169,7 +170,7 @@ class Balls(nbv.surfaces.Fields):
 
 @BOTH
 def test_rows_that_hold_nothing_do_not_reach_the_derivatives_of_a_mean(x64, kind):
-    """These rows are zeros, at which the distance to the origin has no gradient."""
+    """Empty rows are zeros, and the distance to the origin has no gradient there."""
     posterior = make(kind, "one scale").condition(cloud())
 
     def total(radius, turned):

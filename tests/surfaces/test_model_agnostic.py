@@ -1,4 +1,4 @@
-"""A surface model of the user's own, with any sampler, drives the planner and the simulated episode."""
+"""A user's own surface model, with any sampler, drives the planner and the simulated episode."""
 
 import jax
 import jax.numpy as jnp
@@ -44,7 +44,7 @@ def planner():
 
 @pytest.mark.slow
 def test_proposed_view_is_the_best_by_chamfer_distance_to_exact_scans_of_the_samples():
-    """Each sample is a sphere: its scan in closed form, then the mean over samples of the sum of squared distances."""
+    """Each sample is a sphere. Its scan in closed form gives the mean over samples of the sum of squared distances."""
     plan, key = planner(), jax.random.key(1)
     first = nbv.look_at((0.8, 0.9, 2.2))
     cloud = nbv.scan(BALL, CAMERA, first)

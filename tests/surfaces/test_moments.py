@@ -1,4 +1,5 @@
-"""Moments and the probability of being inside: closed forms against samples, and estimates against sums of samples."""
+"""Moments and the probability of being inside: closed forms against samples, and estimates against sums over
+samples."""
 
 import equinox as eqx
 import jax
@@ -42,7 +43,7 @@ def test_the_probability_of_being_inside_is_that_of_weight_space(x64):
 
 
 class Shifted(nbv.surfaces.Fields):
-    """a_s x + b_s."""
+    """The functions a_s x + b_s."""
 
     slopes: Float[Array, " s"]
     offsets: Float[Array, " s"]
@@ -73,7 +74,7 @@ def test_moments_without_closed_forms_are_those_of_64_samples_under_a_fixed_key(
 
 
 class LinesOfKnownMean(Lines):
-    """They know their mean, x + 0.5 say, and nothing else."""
+    """Lines whose posterior knows its mean, x + 0.5, and nothing else."""
 
     def mean(self, x):
         return jnp.asarray(x)[:, 0] + 0.5

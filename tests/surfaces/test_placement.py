@@ -1,4 +1,4 @@
-"""Placements of known shapes, and the rotations at which a search for them starts."""
+"""Placements of known shapes, and the initial rotations of their search."""
 
 import math
 
@@ -26,7 +26,7 @@ def test_points_of_the_shape_are_where_the_formula_says():
 
 
 def test_a_placed_solid_of_one_scale_has_exact_distances():
-    """Against the same solid, scaled, turned and moved as solids are."""
+    """Against the same solid, scaled, rotated and moved as a solid."""
     rotation = Rotation.from_rotvec([0.3, -0.5, 0.2])
     placed = Placement(jnp.asarray(rotation.as_matrix(), jnp.float32), jnp.array([0.1, 0.2, -0.3]), jnp.full(3, 0.7))
     solid = Cuboid([0.5, 0.3, 0.2])
@@ -53,7 +53,7 @@ def test_a_step_has_derivatives_where_nothing_is_turned():
 
 
 def test_free_rotations_leave_no_gap():
-    """Uniform rotations of as many numbers would leave holes; the spiral's nearest one is within 15 degrees."""
+    """As many random rotations would leave gaps. The spiral has a rotation within 15 degrees of any other."""
     rotations = nbv.surfaces.FreeRotation().rotations(4096)
     np.testing.assert_allclose(
         rotations @ np.swapaxes(rotations, 1, 2), np.broadcast_to(np.eye(3), (4096, 3, 3)), atol=1e-12

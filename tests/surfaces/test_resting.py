@@ -1,4 +1,4 @@
-"""Parts on a table: the sides that they can lie on."""
+"""Parts on a table: the sides on which they can lie."""
 
 import numpy as np
 import pytest
@@ -9,12 +9,12 @@ from jaxnbv.surfaces import Resting
 
 
 def heights(solid_sides, rotations):
-    """How high a box is in each rotation: the sum of its sides along the vertical."""
+    """Height of a box in each rotation: the sum of its sides along the vertical."""
     return np.abs(np.asarray(rotations))[:, 1] @ (2.0 * np.asarray(solid_sides))
 
 
 def test_a_brick_lies_on_its_six_sides():
-    """It is as high as one of its sides; where it is widest it is likeliest to lie."""
+    """Its height is one of its sides. It most likely lies on the widest side."""
     sides = np.array([1.0, 0.6, 0.3])
     bank = nbv.ShapeBank.of([Cuboid(sides), Cuboid(sides[::-1].copy())], is_true_size=True)
     poses = Resting.of(bank)
@@ -26,7 +26,7 @@ def test_a_brick_lies_on_its_six_sides():
 
 
 def test_turns_are_about_the_vertical():
-    """All starts of a part keep one of its stable poses' directions upward, evenly turned."""
+    """All starts of a part keep the upward direction of a stable pose, with even rotations about it."""
     bank = nbv.ShapeBank.of([Cuboid(np.array([1.0, 0.6, 0.3]))], is_true_size=True)
     poses = Resting.of(bank)
     starts = np.asarray(poses.rotations_of(1, 60)[0])
@@ -43,7 +43,7 @@ def test_what_topples_is_no_pose():
     )
     bank = nbv.ShapeBank.of([tower], is_true_size=True)
     stable = np.asarray(Resting.of(bank).stable)[0]
-    # Upside down, what is upward in the part is its own -y.
+    # Upside down, the upward axis is the part's own -y.
     assert stable[:, 1, 1].min() > -0.9
     assert stable[0, 1, 1] == pytest.approx(1.0, abs=1e-3)
 

@@ -1,4 +1,4 @@
-"""Scans of parts are laid on their meshes from anywhere; which side of a mesh is outside."""
+"""Rigid registration of scans to meshes from any start; the outside of a mesh."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ RNG = np.random.default_rng(0)
 
 
 def bracket():
-    """An L of two plates, 60 x 40 x 30, with a block on one: no motion leaves it as it is."""
+    """An L of two plates, 60 x 40 x 30, with a block on one, without symmetry."""
     foot, wall = trimesh.creation.box((60, 40, 6)), trimesh.creation.box((6, 40, 24))
     foot.apply_translation((30, 20, 3))
     wall.apply_translation((3, 20, 18))
@@ -22,7 +22,7 @@ def bracket():
 
 
 def shaft_with_flat():
-    """A round shaft of radius 10 and length 40 that is cut flat at x = 8."""
+    """A round shaft of radius 10 and length 40, cut flat at x = 8."""
     mesh = trimesh.creation.cylinder(10.0, 40.0, sections=240)
     mesh.vertices = np.minimum(mesh.vertices, [8.0, np.inf, np.inf])
     return mesh
@@ -36,7 +36,7 @@ def motion(rng):
 
 
 def scanned(mesh, ahead, rng, noise=0.0, count=3000):
-    """Points of a mesh whose normals look ahead, and nothing lies before them."""
+    """Points of a mesh whose normals face `ahead`, and which nothing hides."""
     points, rows = trimesh.sample.sample_surface(mesh, count, seed=1)
     points, normals = np.asarray(points), mesh.face_normals[rows]
     direction = np.asarray(ahead) / np.linalg.norm(ahead)
@@ -50,7 +50,7 @@ def moved(matrix, points, normals):
 
 
 def off(mesh, change):
-    """Mean distance from a mesh of points of it that were moved."""
+    """Mean distance from a mesh of its own points after a motion."""
     points = trimesh.transform_points(mesh.sample(2000, seed=2), change)
     return float(trimesh.proximity.closest_point_naive(mesh, points)[1].mean())
 
@@ -69,7 +69,7 @@ def test_a_partial_noisy_scan_is_laid_on_its_part_from_anywhere(ahead):
 def test_a_start_is_refined_and_its_neighbourhood_kept():
     mesh, is_solid = orient_outward(trimesh.creation.box((60, 40, 30)))
     points, normals = scanned(mesh, (1, 2, 3), RNG)
-    # The box looks the same turned by 180 degrees.
+    # The box looks the same after a rotation by 180 degrees.
     for truth in (np.eye(4), trimesh.transformations.rotation_matrix(np.pi, (0, 0, 1))):
         near = trimesh.transformations.rotation_matrix(0.15, (1, 2, 0), (5, 0, 0)) @ truth
         result = register_scan(points, normals, mesh, is_solid, near)

@@ -1,4 +1,4 @@
-"""Values beside normals: against one regression of both in weight space, and what each kind of value says."""
+"""Values with normals, against one regression on both in weight space; the effect of each kind of value."""
 
 import equinox as eqx
 import jax
@@ -18,7 +18,7 @@ ONE = {"lengthscale": 0.1, "variance": 0.8}
 
 
 class Given(nbv.surfaces.ValueSource):
-    """Values at points of the test's choice; the last row is not filled, whatever stands there."""
+    """Values at points of the test's choice. The last row is not filled, and may hold anything."""
 
     points: jax.Array
     values: jax.Array
@@ -59,7 +59,7 @@ def test_posterior_equals_one_regression_of_normals_and_values(x64, hyperparamet
     ],
 )
 def test_rows_of_a_source_of_ones_own_are_checked(where, number, message):
-    """The first of two filled rows; where it cannot be checked, no number comes of a point outside."""
+    """The first of two filled rows. If it cannot be checked, a point outside gives NaN."""
     rows = {
         "points": np.full((3, 3), 0.9, np.float32),
         "values": np.ones(3, np.float32),
@@ -79,7 +79,7 @@ def test_the_unit_of_values_is_half_the_rise_of_the_mean_across_the_data():
     posterior = nbv.ScreenedSPSR(base, offset=0.2).condition(data)
     mean, (points, normals) = base.condition(data).mean, data.to_numpy()
     rise = np.asarray(mean(points + 0.2 * normals) - mean(points - 0.2 * normals))
-    # 256 rows are taken of 60, so some four and some five times.
+    # 256 rows are drawn from 60, so that each occurs four or five times.
     assert 0.5 * np.quantile(rise, 0.4) < float(posterior.half_jump) < 0.5 * np.quantile(rise, 0.6)
 
 
@@ -98,8 +98,8 @@ def test_values_are_reached_where_they_are_said_to_be():
 
 
 def test_what_was_seen_empty_is_likelier_to_be_outside_and_so_is_what_is_near():
-    """Nodes half a unit to the side of a scanned ball; a tenth of a unit from them, and far away. The corners of the
-    grid, which lie outside the scene, were seen too."""
+    """Nodes half a unit to the side of a scanned ball, places a tenth of a unit from them, and places far away. The
+    corners of the grid lie outside the scene, and were seen too."""
     data, grid = ball(RNG, 80), nbv.Grid(20)
     axis = np.asarray(grid.axis)
     nodes = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)

@@ -1,4 +1,4 @@
-"""Banks of known shapes: of solids, and of meshes as they come."""
+"""Banks of known shapes, from solids and from mesh files."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +12,7 @@ from jaxnbv.surfaces import mesh_shapes
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path, monkeypatch):
-    """A cache of the test's own."""
+    """A cache for this test."""
     monkeypatch.setattr(mesh_shapes.platformdirs, "user_cache_path", lambda name: tmp_path / "cache")
     return tmp_path / "cache" / "shapes"
 
@@ -45,7 +45,7 @@ def test_a_bank_gives_back_its_shapes_and_names():
 
 @pytest.mark.parametrize("inverted", [False, True])
 def test_a_closed_mesh_has_the_distances_of_its_solid(tmp_path, inverted):
-    """A ball of radius 1.25 in scene units; a mesh whose faces are wound the other way is the same solid."""
+    """A ball of radius 1.25 in scene units. A mesh with inverted winding is the same solid."""
     bank = bank_of(ball(tmp_path / "ball.ply", inverted))
     x = nodes()
     found = bank.shape(jnp.asarray(0)).solid(x)

@@ -51,7 +51,7 @@ def test_order_padding_and_the_values_of_masked_rows_change_nothing(x64):
 
 
 def test_float32_posterior_is_near_that_of_float64():
-    """120 points on a sphere; errors relative to the largest value of each."""
+    """120 points on a sphere. Errors are relative to the largest value of each."""
     points = RNG.standard_normal((120, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     settings = {"lengthscale": 0.03, "truncation": 9, "noise": 0.05}
@@ -76,7 +76,7 @@ def relative(actual, expected):
 
 
 def test_reference_formula_from_these_covariances(x64, shared):
-    """The reference's mean and variance, assembled as it does: k(X, X) of all frequencies (here up to 400) in A, the
+    """Mean and variance by the reference's formula: k(X, X) over all frequencies (here up to 400) in A, with the
     cross-covariance and the prior variance of f truncated at L = 20. Equal to 1e-4."""
     data, model, x, queries = reference_problem(shared, 20)
     untruncated = nbv.GeometricSPSR(model.lengthscale, model.variance, 400, model.noise)
@@ -100,7 +100,7 @@ PARAMETERS = ("points", "normals", "queries", "lengthscale", "variance", "noise"
 
 
 def test_posterior_is_differentiable_in_data_queries_and_hyperparameters(x64):
-    """A scalar of mean, variance and level, and the log marginal likelihood, against differences of weight space."""
+    """A scalar of mean, variance and level, and the log marginal likelihood, against differences in weight space."""
     keep = {"nu": 1.5, "truncation": 3}
     values = dict(zip(PARAMETERS, (POINTS, NORMALS, QUERIES, 0.1, 0.8, 0.2), strict=True))
     functional = np.random.default_rng(1).standard_normal((2, len(QUERIES)))
@@ -175,7 +175,7 @@ def test_points_where_functions_only_repeat_are_refused():
 
 @pytest.mark.parametrize("count", [1, 10, 11, 29, 40])
 def test_a_large_capacity_gives_what_its_filled_rows_give(x64, monkeypatch, count):
-    """Of a capacity above the limit a share of the rows is worked on, the leading ones: a quarter of 40 are 10."""
+    """Above the capacity limit only the leading share of the rows is processed: a quarter of 40 is 10."""
     monkeypatch.setattr("jaxnbv.surfaces.solver._ALWAYS_WHOLE", 30)
     rng = np.random.default_rng(count)
     points, normals = rng.uniform(-1.3, 1.3, (count, 3)), rng.standard_normal((count, 3))

@@ -15,14 +15,14 @@ POINTS = np.random.default_rng(1).uniform(-np.pi, np.pi, (20, 3))
 
 
 def direct(coefficients, x):
-    """The documented basis, one function of one variable at a time."""
+    """The documented basis, as a product of functions of one variable."""
     phi = [[np.cos(a * t) if a >= 0 else np.sin(-a * t) for a in range(-L, L + 1)] for t in x.T]
     return np.einsum("sabc,an,bn,cn->sn", coefficients, *np.array(phi))
 
 
 @pytest.mark.parametrize("chunk", [1 << 24, 500])
 def test_values_at_points_equal_the_direct_sum(x64, monkeypatch, chunk):
-    """The small chunk takes the 20 points in several pieces, the last one not full."""
+    """The small chunk splits the 20 points into pieces, and the last one is not full."""
     monkeypatch.setattr("jaxnbv.surfaces.trigonometric._CHUNK_VALUES", chunk)
     fields = TrigonometricFields(jnp.asarray(COEFFICIENTS[0]))
     np.testing.assert_allclose(fields(POINTS), direct(COEFFICIENTS[0], POINTS), atol=1e-11)
@@ -51,7 +51,7 @@ def test_ways_to_the_gradient_agree(x64):
 
 
 def test_poisson_solution_has_the_divergence_as_laplacian_and_mean_zero(x64):
-    """Laplacian f = div v at points, the derivatives by central differences of values; h^2 L^2 / 12 is 1.3e-6."""
+    """Laplacian f = div v at points, with derivatives by central differences of values. h^2 L^2 / 12 is 1.3e-6."""
     v = COEFFICIENTS[:1]
     f = np.asarray(solve_poisson(jnp.asarray(v)))
     h, points = 1e-3, POINTS[:6]
@@ -80,8 +80,8 @@ def relative(actual, expected):
 @pytest.mark.parametrize("truncation", [1, 4, 20])
 @pytest.mark.parametrize(("dtype", "tolerance"), [(np.float32, 1e-5), (np.float64, 1e-10)])
 def test_transform_and_adjoint_equal_direct_sums(truncation, dtype, tolerance):
-    """White coefficients, so that the highest frequencies count as much as the lowest; corners of the scene and points
-    on the transform's own nodes included. Relative errors, in the norm and, ten times as large, at the worst point."""
+    """White coefficients, so that high frequencies count as much as low ones, and points that include corners of the
+    scene and nodes of the transform. Relative errors, in the norm and, ten times as large, at the worst point."""
     modes = 2 * truncation + 1
     points = points_with_borders(60).astype(dtype)
     points[10:20] = -np.pi / 2 + np.pi / (2 * truncation) * RNG.integers(0, modes, (10, 3))
@@ -112,7 +112,7 @@ def test_transform_and_adjoint_equal_direct_sums(truncation, dtype, tolerance):
 
 
 def test_the_transform_beyond_the_scene_is_exact_or_nan(x64):
-    """One grid step beyond pi/2, 0.39 here, windows still lie within the grid."""
+    """One grid step beyond pi/2, here 0.39, windows still lie within the grid."""
     places = np.array([-3.1, -2.4, -1.6, -1.5, 0.3, 1.5, 1.7, 2.2, 3.1, np.nan, np.inf])
     points = np.stack([places, np.full(11, 0.2), np.full(11, -0.4)], axis=1)
     points = np.concatenate([np.roll(points, axis, axis=1) for axis in range(3)])
@@ -135,7 +135,7 @@ def test_a_gpu_spreads_as_a_cpu_does(monkeypatch):
 
 
 def test_gradients_on_nodes_and_borders_are_those_of_the_function():
-    """A point on a node has a window that ends exactly on its last node, where the square root starts."""
+    """The window of a point on a node ends exactly on its last node, where the square root starts."""
     nodes = -np.pi / 2 + np.pi / 12 * np.arange(13)
     points = jnp.asarray(np.stack([nodes, nodes[::-1], nodes], axis=1), jnp.float32)
     coefficients = jnp.asarray(RNG.standard_normal((1, 13, 13, 13)), jnp.float32)

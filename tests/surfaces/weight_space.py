@@ -1,10 +1,11 @@
 """The oracle of these tests: the surface prior as a Bayesian linear regression in weight space, in NumPy float64.
 
-Over the half H of the integer lattice whose first component that is not zero is positive, and with w_d ~ N(0, I),
+Over the half H of the integer lattice whose first nonzero component is positive, and with w_d ~ N(0, I),
 
     v_d(x) = sqrt(s(0)) w_d0 + sum_{n in H} sqrt(2 s(n)) (w_dn cos(n.x) + w'_dn sin(n.x)),   f(x) = sum_d Psi_d(x) w_d
 
-where Psi_d solves Laplacian f = dv_d/dx_d mode by mode. Shares no code, basis or kernel with the package. And clouds.
+where Psi_d solves Laplacian f = dv_d/dx_d mode by mode. It shares no code, basis or kernel with the package. The module
+also has clouds for the tests.
 """
 
 import functools
@@ -17,14 +18,14 @@ import jaxnbv as nbv
 
 
 def cloud(points, normals, capacity=None, dtype=None):
-    """Normals as they are: `from_arrays` would scale them to unit length."""
+    """A cloud with normals of any length. `from_arrays` would scale them to unit length."""
     pad = ((0, (capacity or len(points)) - len(points)), (0, 0))
     arrays = (jnp.asarray(np.pad(a, pad), dtype) for a in (points, normals))
     return nbv.PointCloud(*arrays, jnp.arange(capacity or len(points)) < len(points))
 
 
 def ball(rng, count):
-    """Points of a ball of 0.7, in a cloud with rows to spare."""
+    """Points of a ball of radius 0.7, in a cloud with spare rows."""
     points = rng.standard_normal((count, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     return nbv.PointCloud.from_arrays(0.7 * points, points, capacity=count + 16)
@@ -32,7 +33,7 @@ def ball(rng, count):
 
 @functools.cache
 def lattice_spectrum(nu, lengthscale, variance, truncation):
-    """s1(0), ..., s1(L), the normalising sum taken term by term to 10^6 and beyond it by the midpoint rule."""
+    """s1(0), ..., s1(L). The normalising sum is term by term to 10^6, and beyond by the midpoint rule."""
     terms, power = 10**6, nu + 0.5
     weight = (2 * nu / lengthscale**2 + (2 * np.pi * np.arange(terms + 1.0)) ** 2) ** -power
     tail = (2 * np.pi) ** (-2 * power) * (terms + 0.5) ** (1 - 2 * power) / (2 * power - 1)
@@ -92,9 +93,10 @@ class WeightSpace:
 
 
 class JointWeightSpace:
-    """Normals and values in one regression: weights of all three components and of the level c, coupled by the values.
+    """Normals and values in one regression: weights of all three components and of the level c, which the values
+    couple.
 
-    `scales` are `WeightSpace`s of independent priors that are added up; g = f - c, c ~ N(0, level_deviation^2).
+    `scales` are `WeightSpace`s of independent priors, which are added. g = f - c, c ~ N(0, level_deviation^2).
     """
 
     def __init__(self, scales, level_deviation):
@@ -106,7 +108,7 @@ class JointWeightSpace:
         return np.concatenate([*parts, np.full((len(x), 1), -self.level_deviation)], axis=1)
 
     def normal_features(self, x):
-        """(3 n, k): the components of v one behind the other."""
+        """(3 n, k): the three components of v one after the other."""
         parts = [np.kron(np.eye(3), scale.normal_features(x)) for scale in self.scales]
         return np.concatenate([*parts, np.zeros((3 * len(x), 1))], axis=1)
 

@@ -18,7 +18,7 @@ CAMERA, GRID = nbv.Camera(height=6, width=7), nbv.Grid(20)
 
 
 def first_point(cloud):
-    """Three probabilities that are the coordinates of D's first point; a union's are those of its last."""
+    """The coordinates of D's first point are three probabilities. For a union they come from its last point."""
     return jnp.log(jnp.where(cloud.mask[-1], cloud.points[-1], cloud.points[0]))
 
 
@@ -27,7 +27,7 @@ def random_cloud(count, capacity, center=(0.0, 0.0, 0.0)):
 
 
 def one_point(p):
-    """A cloud that `first_point` takes for the probabilities p."""
+    """A cloud for which `first_point` gives the probabilities p."""
     return nbv.PointCloud.from_arrays(np.array([p]), np.array([[0.0, 0.0, 1.0]]))
 
 
@@ -136,7 +136,7 @@ def test_thinning_is_that_by_hand_and_happens_once_before_scans_are_added(x64):
 
 
 def test_thinning_to_what_the_utility_looks_at_leaves_its_value(x64):
-    """Farthest point samples of farthest point samples are the same points in the same order."""
+    """Farthest point sampling of its own result gives the same points in the same order."""
     data = random_cloud(60, 80)
 
     def utility(cloud):
@@ -213,5 +213,5 @@ def test_what_is_no_log_probability_is_named_at_the_first_scan(classifier, messa
     sampler = nbv.SurfaceSampler(nbv.GeometricSPSR(lengthscale=0.05, truncation=8), carving=None)
     with pytest.raises(nbv.InputError, match=message):
         nbv.Planner(nbv.CrossEntropy(classifier), nbv.DiscreteSearch(7), camera, sampler).init(None, data)
-    # Asked for nothing, it says nothing.
+    # Without a call there is no error.
     nbv.Planner(nbv.CrossEntropy(classifier), nbv.FarthestView(7), camera, sampler).init(None, data)

@@ -22,14 +22,14 @@ RADIUS, AWAY = 0.5, math.dist((0, 0, 0), (0.4, 1.1, 2.2))
 
 
 def looked_at(height=24, width=24):
-    """A ball in a camera of so many pixels."""
+    """A ball in a camera with this number of pixels."""
     camera = nbv.Camera(height=height, width=width, aspect=height / width)
     return nbv.scan(nbv.SDFSurface(Sphere(RADIUS)), camera, POSE), camera
 
 
 def ball_area(sharpest: float) -> float:
-    """Area of the ball that is seen, less what lies at a cosine of incidence below the sharpest: there a pixel counts
-    cos / sharpest of its area."""
+    """Area of the visible part of the ball. A pixel at a cosine of incidence below the sharpest counts as cos /
+    sharpest of its area."""
 
     def strip(angle):
         distance = math.sqrt(AWAY**2 + RADIUS**2 - 2 * AWAY * RADIUS * math.cos(angle))
@@ -44,7 +44,7 @@ def test_the_area_of_a_ball_is_its_integral(height, width):
     seen, camera = looked_at(height, width)
     for steepest in (0.2, 0.5):
         area = float(jnp.sum(pixel_area(seen, camera, POSE, steepest)))
-        # A pixel of the limb is seen or not: a share of about one in a hundred of the area.
+        # A pixel at the limb is a hit or a miss, which is about one in a hundred of the area.
         assert area == pytest.approx(ball_area(steepest), rel=0.02)
 
 
@@ -53,7 +53,7 @@ def test_the_area_of_a_slanted_face_does_not_depend_on_the_rays_or_the_distance(
     for pixels, away in ((120, 1.0), (200, 1.0), (200, 1.6)):
         camera, pose = nbv.Camera(height=pixels, width=pixels, fov=1.0), nbv.look_at((away, 0.3 * away, 1.5 * away))
         area = float(jnp.sum(pixel_area(nbv.scan(face, camera, pose), camera, pose, 0.2)))
-        # Its border is known to a pixel: a share of 2 / 120 * (1 / 1.0 + 1 / 0.8) of the face, most of it by chance.
+        # The border is accurate to a pixel: a share of 2 / 120 * (1 / 1.0 + 1 / 0.8) of the face, most of it by chance.
         assert area == pytest.approx(1.0 * 0.8, rel=0.03)
 
 
@@ -73,16 +73,16 @@ def test_the_score_is_the_area_weighed_by_how_far_it_is_to_d():
 
     points, mask = np.asarray(seen.points, np.float64), np.asarray(seen.mask)
     distance = np.linalg.norm(points[:, None] - data[None], axis=-1).min(axis=1)
-    # Where a pixel is steeper than 60 degrees it counts for less.
+    # A pixel steeper than 60 degrees counts less.
     area = np.asarray(pixel_area(seen, camera, POSE, 0.5), np.float64)
     expected = float(np.sum(area[mask] * np.clip(distance[mask] / 0.15 - 1.0, 0.0, 1.0)))
     assert 0.1 * area.sum() < expected < 0.9 * area.sum()
-    # Between nodes a distance is wrong by a small part of their spacing, here 0.026, and to both sides.
+    # Between nodes a distance has a small error relative to their spacing, here 0.026, of either sign.
     assert found == pytest.approx(expected, rel=0.03)
 
 
 def test_between_the_points_of_a_sparse_cloud_nothing_is_new():
-    """As many points as are 0.1 apart, all over the ball that is looked at: by the size alone half of it were new."""
+    """Points 0.1 apart all over the visible ball. By the size alone half of the ball would be new."""
     seen, camera = looked_at()
     cloud = cloud_of(RADIUS * np.asarray(nbv.geometry.fibonacci_sphere(300)))
     acquisition = nbv.NewSurface(0.02)
@@ -95,8 +95,8 @@ def score_new(observations, view):
 
 
 def observed(points, capacity):
-    """Observations after one view of some points, of which few are kept."""
-    # Of pixels so small that hits are points.
+    """Observations after one view of some points, few of which are kept."""
+    # The pixels are so small that hits are points.
     camera, pose = nbv.Camera(fov=0.1, height=80, width=80), nbv.look_at((0.0, 0.0, 2.5))
     own = cloud_of(points, camera.num_rays)
     scan = nbv.PointCloud(own.points, own.normals, own.mask, jnp.zeros(6400, bool), jnp.zeros(6400))
@@ -105,7 +105,8 @@ def observed(points, capacity):
 
 
 def test_what_is_new_does_not_depend_on_the_points_that_are_kept():
-    """Hits all over the ball that is looked at, but for a hole: its area is new, though D is too sparse to tell."""
+    """Hits all over the visible ball except for a hole. The area of the hole is new, although D is too sparse to
+    tell."""
     seen, camera = looked_at(120, 120)
     view = ImaginedView(seen, camera, POSE)
     everywhere = np.asarray(nbv.geometry.fibonacci_sphere(6000), np.float64)
@@ -114,15 +115,15 @@ def test_what_is_new_does_not_depend_on_the_points_that_are_kept():
     hits = RADIUS * everywhere[everywhere @ toward < math.cos(radius)]
     observations = observed(hits, 60)
     new, by_d = (float(score_new(one, view)) for one in (observations, observations.cloud))
-    # What lies between one and two spacings of the grid, 0.062, from a hit counts in part, on average a half.
+    # Surface between one and two spacings of the grid (0.062) from a hit counts in part, on average one half.
     whole, rim = (2 * math.pi * RADIUS**2 * (1 - math.cos(radius - margin / RADIUS)) for margin in (0.062, 0.123))
     assert rim < new < whole
     assert by_d < 0.1 * new
 
 
 def test_between_the_rays_of_a_coarse_sensor_nothing_is_new():
-    """A ball that 14 x 14 pixels saw, looked at again from there by six times as many a side. Hits by themselves are
-    almost two spacings of the grid apart, which leaves a twelfth of the area new."""
+    """A ball seen by 14 x 14 pixels, and again from there by six times as many on a side. Hits alone are almost two
+    spacings of the grid apart, which would leave a twelfth of the area new."""
     seen, camera = looked_at(14, 14)
     start = nbv.Observations.start(limit_capacity(seen, 60), 2, nbv.Grid(40, 1.2))
     observations = start.add_view(POSE, seen, camera, nbv.Carving(), None)
@@ -136,7 +137,7 @@ def test_between_the_rays_of_a_coarse_sensor_nothing_is_new():
 
 @pytest.mark.slow
 def test_it_can_be_climbed(x64):
-    """The derivative in the pose is that by central differences, for a small step, of the smooth part of it."""
+    """For a small step the derivative in the pose is the central difference of its smooth part."""
     surfaces, camera = balls(nbv.Grid(32), [0.7]), nbv.Camera(height=16, width=16)
     cloud = cloud_of([[0.0, 0.0, 0.7]])
 
@@ -185,7 +186,7 @@ def test_the_acquisition_against_brute_force_over_all_scans():
 
 
 def test_gradient_in_the_scan(x64):
-    """d/dx min_y |x - y|^2 = 2 (x - y*); masked rows and normals have none."""
+    """d/dx min_y |x - y|^2 = 2 (x - y*). Masked rows and normals have zero derivatives."""
     rng = np.random.default_rng(3)
     data, seen = drawn_cloud(rng, 15, 20), drawn_cloud(rng, 6, 9)
     score = nbv.Coverage()

@@ -1,4 +1,4 @@
-"""Heat diffusion against closed forms on the sphere and the plate, matrix exponentials, and balances of heat."""
+"""Heat diffusion against closed forms on the sphere and the plate, matrix exponentials, and heat balances."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ def sphere_points(count, radius=1.0):
 
 
 def plate(across, along, width=1.0, height=0.5):
-    """A triangulated rectangle; its inner vertices are moved about at random."""
+    """A triangulated rectangle whose inner vertices are moved at random."""
     index = np.arange(across * along).reshape(across, along)
     x, y = np.meshgrid(np.linspace(0, width, across), np.linspace(0, height, along), indexing="ij")
     vertices = np.stack([x, y, np.zeros_like(x)], axis=-1)
@@ -93,7 +93,7 @@ def test_heat_is_conserved_and_grows_by_what_the_source_gives():
 
 
 def test_halving_the_time_step_halves_the_error():
-    """Against du/dt = -M^-1 L u + f solved exactly, as a linear system with one more unknown that stays 1."""
+    """Against the exact solution of du/dt = -M^-1 L u + f, as a linear system with one more unknown that stays 1."""
     points = sphere_points(60)
     laplacian = cloud_laplacian(points)
     start, heating = RNG.uniform(size=60), np.where(points[:, 2] > 0.7, 2.0, 0.0)
@@ -140,12 +140,12 @@ def test_the_source_warms_the_share_of_a_disc_within_its_radius():
     shares = heat.heating(points, np.full(6, small)) / 4.0
     np.testing.assert_allclose(shares, [1.0, 1.0, 0.5, 0.25, 0.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(heat.heating(points, np.full(6, large))[[0, 5]], [4.0, 1.0], atol=1e-12)
-    # Of points that hardly stand for any area each is within or not.
+    # Points with almost no area are either within or not.
     np.testing.assert_array_equal(heat.heating(points[[1, 3]], np.full(2, 1e-30)), [4.0, 0.0])
 
 
 def test_points_without_triangles_keep_what_they_get():
-    """Lines, pairs and single points conduct nothing: u0 + T power where the source is, u0 elsewhere."""
+    """Lines, pairs and single points conduct nothing: u0 + T power at the source, and u0 elsewhere."""
     line = np.linspace(0.0, 1.0, 40)[:, None] * np.array([1.0, 2.0, -1.0])
     heat = nbv.tasks.HeatProblem(line[0], radius=1e-3, power=2.0, duration=3.0, initial=1.0)
     for points in (line, line[:1], line[:2], np.tile(line[:1], (35, 1)), np.concatenate([line, line + 7.0])):
@@ -155,7 +155,7 @@ def test_points_without_triangles_keep_what_they_get():
         np.testing.assert_allclose(values, 1.0 + gained, rtol=1e-9)
         np.testing.assert_array_equal(reached, gained > 0)
         assert reached[(points == line[0]).all(axis=1)].all()
-    # A line beside a body, which the library would tie to zero degrees.
+    # A line beside a body, which the library would fix at zero degrees.
     both = np.concatenate([line, sphere_points(60) + 9.0])
     values, reached = cloud_temperature(both, heat)
     assert values[0] > 3.0
@@ -167,7 +167,8 @@ def test_points_without_triangles_keep_what_they_get():
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 45), st.integers(0, 40), st.sampled_from([1.0, 1e-3, 0.0]))
 def test_any_cloud_has_a_temperature(seed, count, copies, flatness):
-    """Few points, flat clouds, lines, copies: within bounds, whatever the order, and alike for points that coincide."""
+    """Few points, flat clouds, lines and copies give temperatures within bounds, in any order, and equal for equal
+    points."""
     rng = np.random.default_rng(seed)
     points = rng.normal(size=(count, 3)) * [1.0, flatness, flatness]
     order = np.concatenate([np.arange(count), rng.integers(0, count, copies)])
@@ -187,7 +188,7 @@ def test_heat_crosses_the_seams_of_a_soup():
     heat = nbv.tasks.HeatProblem(np.asarray(ball.vertices[0]), radius=0.4)
     whole = mesh_temperature(np.asarray(ball.vertices), np.asarray(ball.faces), heat)
     soup = np.asarray(ball.vertices)[ball.faces].reshape(-1, 3)
-    # With a triangle that is a point, and a vertex that no triangle uses.
+    # The soup includes a triangle that is a point, and an unused vertex.
     soup = np.concatenate([soup, np.tile(soup[:1], (3, 1)), NOWHERE[None]])
     corners = np.arange(len(soup) - 1).reshape(-1, 3)
     apart = mesh_temperature(soup, corners, heat)
@@ -233,7 +234,7 @@ def test_bad_input_is_told():
 
 
 def test_three_points_are_a_triangle():
-    """By the cotangent formula; a line of three conducts nothing."""
+    """By the cotangent formula. A line of three points conducts nothing."""
     points = np.array([[0.0, 0.0, 0.3], [2.0, 0.0, 0.3], [0.5, 1.0, 0.3]])
     found = cloud_laplacian(points)
     a, b, c = points

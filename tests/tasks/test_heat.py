@@ -1,4 +1,4 @@
-"""The heat utility against a dense solve in NumPy, across processes, in the acquisition, and where no heat gets."""
+"""The heat utility against a dense solve in NumPy, across processes, in the acquisition, and where no heat arrives."""
 
 import dataclasses
 
@@ -34,8 +34,8 @@ def utility_of(heat, reached_only=False, workers=None):
 
 
 def least_in_numpy(points, heat):
-    """Coldest of a connected cloud by dense solves of the paper's (I - h Delta) u_{k+1} = u_k + h f."""
-    # The library's Laplacian depends a little on the order of the points; ours are sorted.
+    """The coldest point of a connected cloud by dense solves of the paper's (I - h Delta) u_{k+1} = u_k + h f."""
+    # The library's Laplacian depends slightly on the order of the points, so sort them.
     points = points[np.lexsort(points.T[::-1])]
     weak, mass = robust_laplacian.point_cloud_laplacian(points, n_neighbors=30)
     delta = -np.linalg.inv(mass.toarray()) @ weak.toarray()
@@ -72,7 +72,7 @@ def test_neither_workers_nor_the_order_of_the_points_change_a_bit():
     points = np.stack([sphere(90) for _ in range(11)])
     clouds = nbv.PointCloud(jnp.asarray(points), jnp.asarray(points), jnp.asarray(RNG.uniform(size=(11, 90)) < 0.7))
     turned = jax.tree.map(lambda rows: rows[:, ::-1], clouds)
-    # Of the shared pool of processes, which a second call finds as it was.
+    # Use the shared pool of processes twice. The second call must not find it changed.
     values = [np.asarray(jax.vmap(utility_of(HEAT, workers=w))(c)) for w, c in ((1, clouds), (2, clouds), (2, turned))]
     np.testing.assert_array_equal(values[1], values[0])
     np.testing.assert_array_equal(values[2], values[0])
@@ -98,12 +98,12 @@ def test_what_the_source_does_not_reach(x64):
     both = cloud_of(np.concatenate([near, far]))
     assert float(everything(both)) == -0.5
     assert float(reached(both)) == pytest.approx(alone, rel=1e-9)
-    # The least there can be, u0 + T power, where there is nothing to take the minimum over.
+    # The least possible value, u0 + T power, if there is no point for the minimum.
     assert float(everything(cloud_of(far))) == -0.5
     assert float(reached(cloud_of(far))) == -8.5
     assert float(everything(nothing(5))) == float(reached(nothing(5))) == -8.5
     single = cloud_of(POLE[None])
-    # All of the power goes in that falls on its disc: at the disc's middle more than half.
+    # All power on the source's disc counts. The middle of the disc gets more than half.
     assert -8.5 <= float(everything(single)) < -4.5
 
 
@@ -117,7 +117,7 @@ def test_gradients_are_refused():
 
 
 def test_the_coldest_point_of_a_mesh_and_of_a_scan_of_it():
-    """A bar that is heated at one end is coldest at the other."""
+    """A bar heated at one end is coldest at the other."""
     bar = trimesh.creation.box((2.5, 0.15, 0.15))
     mesh = nbv.TriangleMesh.from_arrays(np.asarray(bar.vertices), np.asarray(bar.faces))
     heat = nbv.tasks.HeatProblem([-1.25, 0.0, 0.0], radius=0.2)

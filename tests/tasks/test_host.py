@@ -1,4 +1,4 @@
-"""Classifiers and segmenters on the host against the same in JAX."""
+"""Classifiers and segmenters on the host, against the same in JAX."""
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ def random_cloud(count, capacity):
 
 
 class Host:
-    """`linear` in NumPy, on batches; it counts its calls."""
+    """`linear` in NumPy for batches. It counts its calls."""
 
     def __init__(self):
         self.shapes = []
@@ -49,7 +49,7 @@ def test_a_host_classifier_equals_the_one_in_jax_in_one_call_a_batch():
 
 
 def test_a_host_classifier_of_a_large_batch_comes_back():
-    """Callbacks of JAX have been known to wait for ever for their own arguments on few cores."""
+    """On few cores, callbacks of JAX have waited forever for their own arguments."""
     cloud = nbv.PointCloud(jnp.ones((120, 3500, 3)), jnp.ones((120, 3500, 3)), jnp.ones((120, 3500), bool))
     host = nbv.HostClassifier(lambda points, normals, mask: np.log([0.25, 0.75]) * points[:, :2, 0] * mask[:, :2], 2)
     expected = np.tile(np.log([0.25, 0.75]), (120, 1))
@@ -76,7 +76,7 @@ def test_a_host_classifier_has_no_gradient():
 
 
 def in_numpy(weight, calls):
-    """`Linear` on the host, which says something of masked rows too."""
+    """`Linear` on the host, which returns values for masked rows too."""
 
     def function(points, normals, mask):
         calls.append(len(mask))

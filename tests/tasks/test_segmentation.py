@@ -1,4 +1,4 @@
-"""The soft part count: against its formula in NumPy, central differences, and its limits."""
+"""The soft part count against its formula in NumPy, central differences, and its limits."""
 
 from typing import ClassVar
 
@@ -22,7 +22,7 @@ def make_cloud(filled, capacity):
 
 
 def by_hand(cloud, weight, target):
-    """Point by point, part by part."""
+    """The count point by point and part by part."""
     total = np.zeros(weight.shape[1])
     for point, normal in zip(*cloud.to_numpy(), strict=True):
         e = np.exp(np.concatenate([point, normal]).astype(np.float64) @ weight)
@@ -36,7 +36,7 @@ def test_the_formula_with_masked_rows(x64, target):
     cloud = make_cloud(17, 25)
     utility = nbv.SoftPartCount(Linear(jnp.asarray(weight)), target)
     assert float(utility(cloud)) == pytest.approx(by_hand(cloud, weight, target), rel=1e-12)
-    # What stands in empty rows must not count.
+    # Contents of empty rows must not count.
     dirty = eqx.tree_at(lambda c: c.points, cloud, jnp.where(cloud.mask[:, None], cloud.points, 9.0))
     assert float(utility(dirty)) == float(utility(cloud))
 
@@ -57,13 +57,13 @@ def test_its_gradient_against_central_differences(x64):
                 rows[argument] = rows[argument].at[row, axis].add(step)
                 ends.append(float(value(*rows)))
             assert float(slope[row, axis]) == pytest.approx((ends[1] - ends[0]) / 2e-6, rel=1e-6, abs=1e-9)
-    # The last row is masked: nothing there may pull.
+    # The last row is masked, and must have no gradient.
     assert not np.asarray(slopes[0])[9:].any()
     assert np.asarray(slopes[0])[:9].any()
 
 
 def certain(part):
-    """A segmenter that is sure of everything."""
+    """A segmenter that is certain of one part for all points."""
     return lambda cloud: jnp.where(cloud.mask[:, None], jax.nn.one_hot(jnp.full(cloud.capacity, part), PARTS), 0.0)
 
 
@@ -74,7 +74,7 @@ def test_it_saturates_for_a_part_that_is_found():
 
     gains = [gain(seen) for seen in (1, 60, 200, 600)]
     assert gains[0] > gains[1] > gains[2] > gains[3]
-    # tanh(31 / 60) - tanh(1 / 60), and within one in a million of 1 - 1.
+    # tanh(31 / 60) - tanh(1 / 60), and less than a millionth away from 1 - 1.
     assert gains[0] == pytest.approx(np.tanh(31 / 60) - np.tanh(1 / 60), rel=1e-5)
     assert gains[3] < 1e-6
 

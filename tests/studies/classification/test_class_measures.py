@@ -1,4 +1,4 @@
-"""Hits on hand-made sequences, and diagnostics of a step against counts by hand."""
+"""Hits in hand-made sequences, and diagnostics of a step against counts by hand."""
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +29,7 @@ def test_hits_by_view_of_hand_made_sequences(correct, first, stable):
     correct, first, stable = (np.array([[letter == "1" for letter in word]]) for word in (correct, first, stable))
     np.testing.assert_array_equal(first_hits(correct), first)
     np.testing.assert_array_equal(stable_hits(correct), stable)
-    # Each sequence by itself.
+    # Each sequence counts by itself.
     np.testing.assert_array_equal(first_hits(np.concatenate([correct, ~correct]))[:1], first)
     np.testing.assert_array_equal(stable_hits(np.concatenate([~correct, correct]))[1:], stable)
 
@@ -51,7 +51,7 @@ def measured(record, name):
 
 
 def test_measures_of_a_hand_made_record():
-    """Of random search they are means over its runs; the pattern is seen in one view, not in their sum."""
+    """For random search they are means over its runs. The pattern is seen in a single view, not in the sum of views."""
     record = made("random", [run(0, 1, 0), run(0, 0, 1)], [[0, 149, 149], [0, 150, 0]])
     np.testing.assert_array_equal(measured(record, "first"), [0.0, 0.5, 1.0])
     np.testing.assert_array_equal(measured(record, "stable"), [0.0, 0.0, 0.5])
@@ -89,7 +89,7 @@ def test_roughness_counts_the_samples_cells_per_cell_of_the_mean():
     mean = np.asarray(posterior.mean_field.on_grid(grid.axis))
     once = GridSurface.from_values(jnp.asarray(mean), posterior.level, grid)
     assert roughness(sampler, StepInputs(observations, posterior, once)) == pytest.approx(1.0)
-    # A second sample, far inside, that crosses as many cells as one node has around it.
+    # A second sample, far inside, that crosses as many cells as surround one node.
     speck = np.full_like(mean[0], 1.0)
     speck[5, 5, 5] = -1.0
     both = GridSurface.from_values(jnp.stack([mean[0] - posterior.level, jnp.asarray(speck)]), 0.0, grid)

@@ -1,4 +1,4 @@
-"""The studies of trucks, household objects and scans on a small scale: what they record beside the pyramids'."""
+"""The studies of trucks, household objects and scans on a small scale: their records beyond those of pyramids."""
 
 import dataclasses
 import json
@@ -26,7 +26,7 @@ SCENE = 4
 
 @pytest.mark.parametrize("kind", [HouseholdStudy, PyramidStudy])
 def test_the_first_view_can_be_one_after_which_the_classifier_is_wrong(kind):
-    """Of all such views the first in the order in which any view is drawn; of a pyramid none that shows the pattern."""
+    """It is the first such view in the random order of candidates. For a pyramid it must not show the pattern."""
     study = small_study(kind=kind, first=FirstView.MISCLASSIFIED)
     for index in range(3):
         scene = study.scene(index)
@@ -49,7 +49,7 @@ def test_first_views_of_trucks_are_random_and_told_apart_by_what_they_show():
 
 @pytest.mark.parametrize("kind", [HouseholdStudy, pytest.param(TruckStudy, marks=pytest.mark.slow)])
 def test_records_tables_charts_and_pictures(kind, tmp_path):
-    """Where all of the object tells its class no pixels are counted."""
+    """If the whole object tells its class, no pixels are counted."""
     found = json.loads(json.dumps(run_scene(small_study(kind=kind), SCENE), allow_nan=False))
     assert list(found["methods"]) == list(kind.methods)
     assert found["label"] == SCENE % len(kind.objects.classes)
@@ -80,7 +80,7 @@ def test_meshes_in_place_of_procedural_objects(tmp_path):
     assert (found["label"], found["name"]) == (HOUSEHOLD.index("desk"), "desk b")
     assert len({tuple(view["position"]) for view in found["methods"]["coverage"]["views"]}) == 3
     seen = study.scene(1).task.scans[found["first"]].to_numpy()[0]
-    # A box of sides 2.5, 1.25 and 0.625; the noise is 0.01.
+    # A box of sides 2.5, 1.25 and 0.625, with noise of 0.01.
     away = np.abs(np.abs(seen) - [1.25, 0.625, 0.3125]).min(axis=1)
     assert away.max() < 0.06
     (picture,) = write_pictures([found], study, tmp_path, pixels=24)

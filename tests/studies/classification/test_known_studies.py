@@ -1,4 +1,4 @@
-"""Studies by who has seen other objects of the kind, beside who has not."""
+"""Studies with known shapes, compared with methods without them."""
 
 import dataclasses
 
@@ -41,7 +41,7 @@ def choices(*methods):
     return [(method, view) for method in methods for view in (1, 2)]
 
 
-# Here one by who knows shapes and one by who does not; each compiles a planner.
+# One method with known shapes and one without, since each compiles a planner.
 FEW = [("cross-entropy", 2), ("uncertainty-screened", 2)]
 
 
@@ -70,7 +70,7 @@ def test_the_models_of_studies_are_known_and_those_of_the_library():
     assert methods_of(PyramidStudy, None, KNOWN)[-2:] == ("coverage-screened", "uncertainty-screened")
 
 
-# Known parts are a bank of their own.
+# Known parts have their own bank.
 OF_BANKS = [name for name, entry in studies().items() if entry.model == KNOWN and "parts" not in entry.options]
 
 

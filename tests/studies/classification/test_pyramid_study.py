@@ -27,7 +27,7 @@ CAMERA = Camera(height=24, width=24)
 
 
 class Linear(eqx.Module):
-    """An opinion from the means of points and normals."""
+    """A classifier of the means of points and normals."""
 
     count: int = eqx.field(static=True, default=5)
 
@@ -51,21 +51,21 @@ def whole_record():
 
 
 def observations_of(study, planner, scene, candidates):
-    """What a planner knows after the true scans from some candidates."""
+    """Observations of a planner after the true scans from some candidates."""
     poses, scans = study.candidates.poses(), scene.task.scans
     *_, observations = planner.replay((poses[index], scans[index]) for index in candidates)
     return observations
 
 
 def step_key(study, view, run=None):
-    """The key of a step of an episode: of its samples and its search."""
+    """The key of a step of an episode, for its samples and its search."""
     key = study.key(SCENE, "episode")
     key = key if run is None else jax.random.fold_in(key, run)
     return jax.random.split(jax.random.fold_in(key, view))[0]
 
 
 def without_time(record):
-    """All but seconds, at any depth."""
+    """The record without seconds, at any depth."""
     if isinstance(record, list):
         return [without_time(one) for one in record]
     if isinstance(record, dict):
@@ -93,7 +93,7 @@ def test_a_record_is_json_and_holds_every_method():
 
 
 def chosen(study, method):
-    """The candidates of a method's first run."""
+    """Candidates of a method's first run."""
     places = np.asarray(study.candidates.poses().position)
     return [int(np.linalg.norm(places - view["position"], axis=1).argmin()) for view in method["views"]]
 
@@ -123,7 +123,7 @@ def test_diagnostics_of_every_method_are_by_the_view_that_was_chosen():
 
 
 def test_every_choice_is_the_one_that_the_planner_proposes_with_the_same_key():
-    """Each method's planner alone, by `propose`, at each view of its run; of random search the first run."""
+    """Each method's planner by `propose` alone, at each view of its run. For random search, the first run."""
     study, record = small_study(), whole_record()
     scene, places = study.scene(SCENE), np.asarray(study.candidates.poses().position)
     for method, held in record["methods"].items():

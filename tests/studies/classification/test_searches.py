@@ -1,4 +1,4 @@
-"""Searches of the studies of classes on a small scale: what must hold between those that look at the same samples."""
+"""Searches of the studies of classes on a small scale: relations between searches on the same samples."""
 
 import functools
 import json
@@ -15,7 +15,7 @@ from jaxnbv.studies.engine.run import replay, run_scene
 
 SCENE, VIEWS = 3, 3
 SEARCHES = ("cross-entropy", *PyramidStudy.extra_methods)
-# One record of all searches, each a program of its own.
+# One record of all searches, each with its own program.
 pytestmark = pytest.mark.slow
 
 
@@ -31,7 +31,7 @@ def record():
 
 
 def test_a_search_that_climbs_from_the_candidates_finds_no_less_and_one_with_fewer_samples_no_more():
-    """At the second view, where all look at the same samples."""
+    """At the second view all have the same samples."""
     value = {method: held["steps"][0]["value"] for method, held in record()["methods"].items()}
     assert {*value} == {*SEARCHES}
     assert value["halving"] <= value["cross-entropy"] + 1e-5

@@ -1,4 +1,4 @@
-"""Trials that fail, in a module of their own: the processes that run them load nothing else of the tests."""
+"""Trials that fail, in a separate module, so that the processes that run them load nothing else of the tests."""
 
 import os
 import signal
@@ -6,7 +6,8 @@ import time
 
 
 class Trial:
-    """Trials that note their beginnings: number 2 kills its process the first time, 3 raises, 4 kills its process."""
+    """Trials that note their starts. Number 2 kills its process the first time, 3 raises, and 4 always kills its
+    process."""
 
     def __init__(self, folder):
         self.folder = folder
@@ -25,7 +26,7 @@ class Trial:
 
 
 class Stalling(Trial):
-    """Trials that note their beginnings. Number 2 does not end the first time."""
+    """Trials that note their starts. Number 2 does not end the first time."""
 
     def __call__(self, index):
         first = not self.beginnings(index)

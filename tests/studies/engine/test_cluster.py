@@ -1,4 +1,4 @@
-"""The trials of a study on a cluster of Dask's: a scheduler and two processes on this machine."""
+"""Trials of a study on a Dask cluster: a scheduler and two processes on this machine."""
 
 import contextlib
 import functools
@@ -43,7 +43,7 @@ def blas_threads(pools):
 
 @contextlib.contextmanager
 def dask(folder, workers):
-    """A scheduler with workers, which Dask starts anew when they die: the scheduler's process and address."""
+    """A scheduler with workers, which Dask restarts when they die: the scheduler's process and address."""
     scheduler = start_dask("scheduler", "--host", "127.0.0.1", "--port", "0", "--scheduler-file", "here", cwd=folder)
     wait_until((folder / "here").exists)
     address = json.loads((folder / "here").read_text())["address"]
@@ -115,7 +115,7 @@ def test_what_a_worker_cannot_import_is_named(address, monkeypatch, tmp_path):
 
 @pytest.fixture
 def threads():
-    """A function that starts a cluster of one worker in this process."""
+    """A function that starts a cluster with one worker in this process."""
     clusters = []
 
     def start(count=1):

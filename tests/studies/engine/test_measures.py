@@ -1,4 +1,4 @@
-"""Numbers of hand-made records: means, errors, intervals, leads; tables, charts and verdicts on them."""
+"""Numbers from hand-made records: means, errors, intervals and leads, and their tables, charts and verdicts."""
 
 import io
 
@@ -42,14 +42,14 @@ def test_rows_are_means_with_errors_intervals_and_leads():
     found = results(RECORDS, ToyStudy)
     assert {*found["group"]} == {"all", "even", "odd"}
     ours, theirs = (row_of(found, "points", 2, method) for method in ("farthest", "random"))
-    # Of 3,500 and 3,100: a standard deviation of 400 / sqrt(2), over sqrt(2).
+    # Points of 3,500 and 3,100: a standard deviation of 400 / sqrt(2), divided by sqrt(2).
     assert (ours["mean"], ours["standard_error"], ours["scenes"], ours["by"]) == (
         3300.0,
         pytest.approx(200.0),
         2,
         "view",
     )
-    # Four resamples of two scenes, a quarter of them each scene twice.
+    # Two scenes have four resamples, each of one scene twice in a quarter of them.
     assert (ours["low"], ours["high"]) == (3100.0, 3500.0)
     assert (theirs["lead"], theirs["lead_low"], theirs["lead_high"]) == (1000.0, 500.0, 1500.0)
     assert row_of(found, "many", 3, "random")["mean"] == 0.5
@@ -67,10 +67,10 @@ def test_scenes_without_a_value_are_left_out_of_a_number():
         RECORDS, measuring(Measure("gaps", "Gaps", gaps), Measure("none", "None", lambda r, m: [None]), ODD)
     )
     assert {row_of(found, "gaps", 1, method)["scenes"] for method in ("farthest", "random")} == {2}
-    # Compared over the scene that both have.
+    # The comparison uses the one scene that both have.
     two = [row_of(found, "gaps", 2, method) for method in ("farthest", "random")]
     assert [(row["scenes"], row["mean"]) for row in two] == [(1, 3.0)] * 2
-    # A method that never has a value has no row.
+    # A method without values has no row.
     assert [*found[(found["quantity"] == "odd") & (found["group"] == "all")]["method"]] == ["random"]
     assert "none" not in {*found["quantity"]}
 
@@ -81,7 +81,7 @@ def test_tables_show_shares_errors_and_leads():
     assert "Points of a ball: 2 scenes" in lines
     assert "farthest 900.0 +- 100.0* 3300.0 +- 200.0* 4500.0 +- 500.0*" in lines
     assert "random 900.0 +- 100.0* 2300.0 +- 300.0 2800.0 +- 300.0" in lines
-    # Not of the view that all share.
+    # The first view is the same for all, and has no row.
     assert "random +1000.0 [+500.0, +1500.0]* +1700.0 [+1500.0, +1900.0]*" in lines
     assert "random 0 [0, 0]* 0 [0, 0] 50 [0, 100]" in lines
     assert "random +100 [+100, +100]* +50 [+0, +100]" in lines
@@ -123,8 +123,8 @@ ROWS = [
 
 
 def test_a_claim_holds_where_the_interval_lies_on_its_side():
-    """Less may be better; of all scenes alone; a method that knows no shapes counts too; a claim of which nothing tells
-    is left out."""
+    """Less may be better. A claim may be about all scenes only. Methods without known shapes count too. Claims without
+    data are left out."""
     said = measuring(
         Measure("right", "Right", lambda record, method: [], unit="%"),
         Measure("away", "Away", lambda record, method: [], less=True, digits=1),

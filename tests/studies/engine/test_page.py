@@ -1,4 +1,4 @@
-"""The page of studies, of folders with records made by hand."""
+"""The page of studies, from folders with records made by hand."""
 
 import base64
 import re
@@ -16,7 +16,7 @@ CONFIG = {"study": {"type": ToyStudy.__qualname__, "views": 2, "odd": "<b>|"}, "
 
 
 def written(folder):
-    """A study of three scenes with a picture, and a chart of when it had fewer."""
+    """A study of three scenes with a picture, and a chart of an earlier state with fewer scenes."""
 
     def run(index):
         methods = {name: {"points": of[index]} for name, of in POINTS.items()}

@@ -99,7 +99,7 @@ def test_records_of_several_folders_are_joined(tmp_path):
         records = joined.collect(range(5), lambda index: asked.append(index) or record(index), progress=False)
     assert records == [record(0), record(1), record(2), record(3, 2.0), record(4)]
     assert asked == [4]
-    # To join one once more changes nothing.
+    # Joining a folder again changes nothing.
     joined.join([tmp_path / "a"])
     assert joined.collect(range(5), asked.append, progress=False) == records
 

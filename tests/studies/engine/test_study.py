@@ -1,4 +1,4 @@
-"""The engine, with a study as small as can be."""
+"""The engine of studies, with a minimal study."""
 
 import dataclasses
 import json
@@ -31,7 +31,7 @@ def small(kind=ToyStudy, **settings):
 
 
 def without_time(record):
-    """All but seconds, at any depth."""
+    """The record without seconds, at any depth."""
     if isinstance(record, list):
         return [without_time(one) for one in record]
     if isinstance(record, dict):
@@ -63,13 +63,13 @@ def test_the_same_views_are_scanned_again_from_a_record():
     assert [int(observations.cloud.count) for _, observations in seen] == run["points"]
     scans = [scan for scan, _ in seen]
     assert int(scans[0].count) + int(scans[1].count) == run["points"][1]
-    # The noise is there.
+    # The scans have noise.
     distance = np.abs(np.linalg.norm(scans[0].to_numpy()[0], axis=1) - 1.0)
     assert 1e-4 < distance.mean() < 0.05
 
 
 def test_a_study_takes_the_views_of_a_simulation():
-    """Bit for bit, as a session does (`test_a_session_proposes_as_a_simulation_does`): there is one loop."""
+    """Bit for bit. Sessions have the same loop (`test_a_session_proposes_as_a_simulation_does`)."""
     study = small()
 
     def discrete(study, scene) -> Planner:

@@ -1,4 +1,4 @@
-"""A study as small as can be."""
+"""A minimal study."""
 
 from typing import ClassVar
 
@@ -10,7 +10,7 @@ from jaxnbv.tasks import Coverage
 
 
 class ToyStudy(Study):
-    """How many points are seen of a ball."""
+    """Number of points seen of a ball."""
 
     title: ClassVar[str] = "Points of a ball"
     explanation: ClassVar[str] = "More is better."

@@ -1,4 +1,4 @@
-"""What the part study measures, against times made by hand."""
+"""Measures of the part study against times made by hand."""
 
 import numpy as np
 from hypothesis import given
@@ -15,8 +15,8 @@ def record(scene=0, views=3, **counts):
     return {"scene": scene, "study_views": views, "methods": methods}
 
 
-# Two scenes of three views. T_discovery by N_target = 20, 40, 60, 80, 100, with 4 for "not found":
-# discrete 1 2 2 3 3 and 1 1 1 1 1 (it stopped at once), farthest 2 3 4 4 4 and 3 3 3 3 4.
+# Two scenes of three views. T_discovery for N_target = 20, 40, 60, 80, 100, with 4 for "not found": discrete 1 2 2 3 3
+# and 1 1 1 1 1 (it stopped at once), farthest 2 3 4 4 4 and 3 3 3 3 4.
 RECORDS = [
     record(0, discrete=[[25, 39], [60, 70], [100, 120]], farthest=[[0, 90], [20, 90], [59, 95]]),
     record(1, discrete=[[100, 101, 200]], farthest=[[0, 0, 0], [0, 200, 0], [99, 200, 80]]),
@@ -44,7 +44,7 @@ def test_discovery_is_the_first_view_with_enough_of_every_part(counts, target):
     else:
         assert enough[found - 1]
         assert not any(enough[: found - 1])
-        # More points asked for are not found sooner, and what follows does not matter.
+        # A higher target is not reached sooner, and later views do not matter.
         later = discovery_time(np.array(counts), target + 10)
         assert later is None or later >= found
         assert discovery_time(np.array(counts[:found]), target) == found

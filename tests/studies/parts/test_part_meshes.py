@@ -1,4 +1,4 @@
-"""The study of parts on meshes, on a table that the test builds."""
+"""The study of parts on meshes, with a table that the test builds."""
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from jaxnbv.studies.parts.discovery import NearestPart
 from jaxnbv.studies.parts.study import MeshPartStudy, PartStudy
 from jaxnbv.surfaces import GeometricSPSR
 
-# Scene coordinates: the longest side is 2.5 and the box around all is centred. What is hidden stands within the post.
+# In scene coordinates: the longest side is 2.5, and the box around all is centred. The hidden box is within the post.
 BOXES = {
     "hidden": ((0.0, -0.4, 0.0), (0.2, 0.2, 0.2)),
     "post": ((0.0, -0.35, 0.0), (0.6, 1.3, 0.6)),
@@ -104,7 +104,7 @@ def test_it_asks_for_the_parts_that_can_be_seen_and_counts_their_points(folder, 
     for run in record["methods"].values():
         for counts, (_, observations) in zip(run["counts"], replay(study, scene, run), strict=True):
             points, _ = observations.cloud.to_numpy()
-            # The slab is all that lies above 0.3; noise is 0.01.
+            # All surface above 0.3 is the slab's. Noise is 0.01.
             slab = (points[:, 1] > 0.25).sum()
             assert abs(counts[1] - slab) <= 0.03 * len(points)
             assert sum(counts) == len(points)

@@ -1,4 +1,4 @@
-"""The part study on a small scale, against scans, counts and scores of its own."""
+"""The part study on a small scale, against independent scans, counts and scores."""
 
 import functools
 import json
@@ -31,12 +31,12 @@ from jaxnbv.tasks import Coverage
 # A rocket.
 SCENE, CANDIDATES, VIEWS = 10, 12, 3
 CAMERA = Camera(height=32, width=32)
-# The others differ from these in their search or score alone.
+# The other methods differ from these only in search or score.
 RUN = ("discrete", "farthest", "random")
 
 
 class Pointwise(eqx.Module):
-    """An opinion on each point by itself; once `enough` points are there, the parts take turns."""
+    """A segmenter of each point by itself. From `enough` points on, the parts alternate."""
 
     enough: jax.Array
 
@@ -71,7 +71,7 @@ def noisy_scan(solid, pose, key):
 
 
 def scans(record, method):
-    """What the sensor showed, from the recorded poses and the study's key."""
+    """The sensor's scans, from the recorded poses and the study's key."""
     solid = part_scene(Split.TEST, record["scene"]).solid
     key = small_study().key(record["scene"], "episode")
     for index, view in enumerate(record["methods"][method]["views"]):
@@ -147,7 +147,7 @@ def test_counts_are_those_of_the_segmenter_on_all_that_was_seen():
 
 
 def test_a_run_stops_once_every_part_has_the_largest_target():
-    """With a segmenter that is even-handed once there are more points than the first view shows."""
+    """With a segmenter that gives the parts equal shares once there are more points than in the first view."""
     first = int(next(scans(whole_record(), "farthest")).count)
     study = small_study(first + 1, capacity=4096)
     study = eqx.tree_at(lambda s: s.segmenter, study, CloudSegmenter(study.segmenter.network, 0, 2048, scale=0.8))

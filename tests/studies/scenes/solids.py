@@ -1,4 +1,4 @@
-"""Procedural solids as meshes, for tests of what they look like."""
+"""Procedural solids as meshes, for tests of their shape."""
 
 import equinox as eqx
 import jax
@@ -26,7 +26,8 @@ def mesh_of(solid):
 
 
 def check_whole(mesh):
-    """In one piece, but for small cavities between primitives, which nothing sees and whose volume is negative."""
+    """Check that a mesh is in one piece, except for small cavities between primitives, which are invisible and have
+    negative volume."""
     volumes = [piece.volume for piece in mesh.split(only_watertight=False)]
     assert sum(volume > 0 for volume in volumes) == 1
     assert sum(abs(volume) for volume in volumes if volume < 0) < 0.01 * max(volumes)
@@ -39,12 +40,12 @@ def check_fills_its_box(mesh):
 
 
 def thinnest(solid):
-    """The least thickness of a primitive of the solid."""
+    """The least thickness of the solid's primitives."""
     halves = []
     for k in np.flatnonzero(np.asarray(solid.labels) >= 0):
         half = np.asarray(solid.half_size[k])
         if solid.revolved[k] and solid.radius[k] == 0:
-            # A cone's thinner end.
+            # The thinner end of a cone.
             half = half[:2] - [abs(float(solid.slant[k])) * half[1], 0.0]
         halves.append(half.min())
     return 2 * min(halves)

@@ -1,4 +1,4 @@
-"""The banks of known shapes that ship."""
+"""The shipped banks of known shapes."""
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,7 @@ def test_the_command_line_lists_the_banks_that_ship():
 
 @pytest.mark.parametrize("name", RECIPES)
 def test_a_bank_holds_the_objects_of_the_training_split(name):
-    """To the sixteen bits that are stored."""
+    """Up to the sixteen stored bits."""
     bank, (number, kinds, shape) = shape_bank(name), RECIPES[name]
     assert len(bank) == number
     for index in (0, 1, number - 1):
@@ -39,9 +39,9 @@ def test_extremes_lie_on_the_shapes_and_bound_them(name):
     picked = jnp.arange(0, len(bank), max(1, len(bank) // 8))
     some, points = jax.tree.map(lambda rows: rows[picked], (solids, extremes))
     away = jax.vmap(lambda solid, x: solid(x))(some, points)
-    # A voxel of a mesh; elsewhere sixteen bits, and strides along bounds that fall short.
+    # Up to a voxel for meshes, and otherwise up to sixteen bits and bounds that fall short of the distance.
     assert np.quantile(np.abs(away), 0.9) < 0.05
-    # Shapes are stored 2.5 long, so that nothing of them is farther out than their extremes.
+    # Shapes are stored with a length of 2.5, so that nothing is farther out than their extremes.
     np.testing.assert_allclose(np.ptp(np.asarray(extremes), axis=1).max(axis=1), 2.5, atol=0.08)
 
 
@@ -55,7 +55,7 @@ def test_real_shapes_are_named_by_their_class_and_stand_upright():
 
 @pytest.mark.parametrize(("scene", "axis"), [(pyramid_scene, 2), (truck_scene, 1)])
 def test_scenes_of_a_split_are_those_of_the_bank_turned(scene, axis):
-    """A scene and its level twin are one object: their distances agree once it is turned back, moved and scaled."""
+    """A scene and its level twin are one object: after rotation, translation and scaling their distances agree."""
     turned, level = scene(Split.TRAIN, 3), scene(Split.TRAIN, 3, turned=False)
     one, other = (np.reshape(thing.solid.rotation, (-1, 3, 3))[0] for thing in (turned, level))
     rotation = one @ other.T

@@ -1,4 +1,4 @@
-"""Sets of parts that look alike: how far apart they are, from how many directions that shows, and mirror images."""
+"""Sets of similar parts: their distances, the share of directions that tell them apart, and mirror images."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,14 +14,14 @@ from jaxnbv.studies.scenes.confusable import (
     confusable_meshes,
 )
 
-# Scene units: least distance between the surfaces of two parts; ranges that differ by more are told apart, far beyond
-# the noise of 0.015; and so many pixels must.
+# Least distance between the surfaces of two parts in scene units; difference of ranges that tells them apart, far
+# beyond the noise of 0.015; and number of pixels with such a difference.
 APART, TOLD, PIXELS = 0.04, 0.05, 8
 CAMERA, POSES = nbv.Camera(), nbv.SphereCandidates(60, 5.0).poses()
 
 
 def ranges_of(mesh):
-    """What 60 directions show of a mesh, as ranges."""
+    """Ranges of a mesh from 60 directions."""
     scans = nbv.scan(mesh, CAMERA, POSES)
     return np.where(scans.mask, scans.sight, 9.0)
 
@@ -49,7 +49,7 @@ def test_parts_with_a_hidden_cue_look_the_same_from_most_directions(name):
         for a in range(PARTS_OF_SET)
         for b in range(a)
     ]
-    # From somewhere each is told from each, but from a fifth of the directions at most.
+    # Each pair is told apart from some directions, but from a fifth of them at most.
     assert 0 < min(shares) <= max(shares) <= 0.2
 
 

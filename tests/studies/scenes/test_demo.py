@@ -1,4 +1,4 @@
-"""The demonstration object: its size, its parts, and what can be seen of it."""
+"""The demonstration object: its size, parts and visible features."""
 
 import numpy as np
 import pytest

@@ -39,7 +39,7 @@ def points(count=4000, reach=1.6):
 
 
 def random_solid(count=CAPACITY, size=0.4):
-    """Boxes and revolved rectangles in turn, some of them steep, each with a label of its own."""
+    """Alternating boxes and revolved rectangles, some of them steep, each with its own label."""
     primitives = []
     for label in range(count):
         centre, axis = RNG.uniform(-1, 1, (2, 3))
@@ -55,7 +55,7 @@ def random_solid(count=CAPACITY, size=0.4):
 
 
 def oracle(solid, x):
-    """Distances to the primitives, infinite for slots not in use: from the nearest point of a core that is inflated."""
+    """Distances to the primitives from the nearest point of an inflated core, infinite for unused slots."""
     centre, rotation, half, rounding, radius, slant, revolved, labels = (
         np.asarray(getattr(solid, name), np.float64) for name in FIELDS
     )
@@ -83,7 +83,7 @@ def test_distances_are_those_of_the_formulas(x64):
         assert (expected.min(axis=1) < 0).any()
 
 
-# In units of the object, whose longest side says how `assemble` scales it; none is off its centre.
+# In units of the object, whose longest side determines the scale of `assemble`. All are centred.
 CLOSED = {
     "ball": ([ball(3, (1, 2, 3), 0.8)], Sphere(0.8), 1.6),
     "box": ([box(3, (1, 2, 3), (0.7, 0.5, 0.9), 0.2)], Cuboid([0.7, 0.5, 0.9], 0.2), 1.8),
@@ -132,7 +132,7 @@ def test_gradients_are_those_of_finite_differences(x64):
     expected = np.stack([(after - before) / (2 * step) for after, before in ends], axis=-1)
     x = x.at[:12].set(solid.centre[:12])
     gradient = np.asarray(slopes_of(solid, x))
-    # Across a crease the difference is that of two faces.
+    # Across a crease the difference mixes two faces.
     assert (np.abs(gradient - expected)[12:].max(axis=1) > 1e-6).mean() < 0.01
     assert np.isfinite(gradient).all()
 

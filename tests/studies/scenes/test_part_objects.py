@@ -1,4 +1,4 @@
-"""Procedural part-labelled objects: every part shows, stands where it belongs, and hangs together with the rest."""
+"""Procedural part-labelled objects: every part is visible, in its place, and connected to the rest."""
 
 import functools
 

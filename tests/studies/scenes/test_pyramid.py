@@ -31,7 +31,7 @@ def arms():
     return np.concatenate([quarter @ np.array([[c, s], [-s, c]]) for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))])
 
 
-# Outlines, each a closed polygon's corners; the second of the ring is its hole.
+# Corners of each outline, a closed polygon. The second outline of the ring is its hole.
 OUTLINES = {
     "cross": [arms()],
     "ring": [polar(0.98, np.arange(0, 360, 0.25)), polar(0.5, np.arange(0, 360, 0.25))],
@@ -80,7 +80,7 @@ def test_patterns_against_polygons(x64, name):
     distance = distance_to_outline(name, points)
     np.testing.assert_array_equal((value < 0)[distance > tolerance], is_inside(name, points)[distance > tolerance])
     assert (np.abs(value) <= distance + tolerance).all()
-    # A bound, but not a lazy one: half of the distance at least, or what a tip of 49 degrees leaves of it.
+    # The bound is tight: half of the distance at least, or its share at a tip of 49 degrees.
     assert (np.abs(value) >= 0.4 * distance - tolerance).all()
     edge = on_outline(name, 500)
     assert np.abs(np.asarray(pattern_distance(label, *jnp.asarray(edge.T)))).max() < tolerance
@@ -93,7 +93,7 @@ def to_scene(pyramid, own):
 
 
 def of_pattern(pyramid, flat):
-    """From the pattern's plane to the base's."""
+    """From the plane of the pattern to the plane of the base."""
     turn, size = float(pyramid.solid.turn), float(pyramid.solid.size)
     c, s = np.cos(turn), np.sin(turn)
     return size * flat @ np.array([[c, s], [-s, c]]) + np.asarray(pyramid.solid.place, np.float64)
@@ -147,7 +147,7 @@ def scenes(split, count, framing=Framing.CLOSE_UP):
 
 
 def test_no_pattern_breaks_through_a_side_and_none_reaches_the_apex():
-    """The prism's upper rim, where the sides are nearest, over many scenes; the wall is at least 0.01 of the base."""
+    """The upper rim of the prism is nearest to the sides. Over many scenes the wall is at least 0.01 of the base."""
     pyramids = scenes(Split.TRAIN, 2000)
     for index in range(2000):
         pyramid = jax.tree.map(lambda leaf, index=index: np.asarray(leaf)[index], pyramids)
@@ -159,13 +159,13 @@ def test_no_pattern_breaks_through_a_side_and_none_reaches_the_apex():
 
 
 def clear_of_outline(name, local, count, points=None):
-    """The first of the points, given in the pattern's frame too, that are not near its outline."""
+    """The first of the points, also given in the pattern's frame, that are not near its outline."""
     some = slice(5 * count)
     return (local if points is None else points)[some][distance_to_outline(name, local[some]) > 0.03][:count]
 
 
 def faces(pyramid, count=400):
-    """Points in the pyramid's own frame on floor, wall, base and sides, none of them within 0.01 of an edge."""
+    """Points in the pyramid's own frame on floor, wall, base and sides, none within 0.01 of an edge."""
     name, height, depth = name_of(pyramid), float(pyramid.solid.height), float(pyramid.solid.depth)
     flat = RNG.uniform(-1, 1, (20 * count, 2))
     floor = clear_of_outline(name, flat[is_inside(name, flat)], count)
@@ -245,7 +245,7 @@ def test_a_hidden_view_does_not_show_the_pattern():
             )
             own = (seen - offset) @ rotation / scale
             assert len(own) > 100
-            # Only base or sides: whatever is seen above the base lies on a slanted plane.
+            # Only base or sides are visible: all hits above the base lie on a slanted plane.
             above = own[own[:, 2] > 5e-3]
             side = (np.abs(above[:, :2]).max(axis=1) - 1) * float(pyramid.solid.height) + above[:, 2]
             assert np.abs(side).max(initial=0.0) < 2e-2
@@ -255,7 +255,7 @@ def test_bad_input_is_refused():
     pyramid = pyramid_scene(Split.TEST, 0)
     with pytest.raises(InputError, match="number is -1"):
         pyramid_scene(Split.TEST, -1)
-    # Turned until its base looks at the one candidate.
+    # The base faces the only candidate.
     outward = np.asarray(sphere_candidates(1, 1.0).position)[0]
     across = np.cross(outward, np.roll(outward, 1))
     across /= np.linalg.norm(across)

@@ -1,4 +1,4 @@
-"""A truck and what stands on its bed."""
+"""A truck and the cargo on its bed."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -25,13 +25,13 @@ def distances(solid, x):
 
 
 def alone(scene, wanted):
-    """The primitives whose labels are wanted."""
+    """The primitives with these labels."""
     labels = jnp.where(wanted(scene.solid.labels), scene.solid.labels, -1)
     return eqx.tree_at(lambda solid: solid.labels, scene.solid, labels)
 
 
 def up_of(scene):
-    """The truck's vertical: its first primitive is the floor of the bed, a box that stands upright in it."""
+    """The vertical of the truck: its first primitive is the floor of the bed, an upright box."""
     return np.asarray(scene.solid.rotation[0][:, 1])
 
 

@@ -1,4 +1,4 @@
-"""Trucks and cargo from meshes, on a truck of boxes whose bed is known."""
+"""Trucks and cargo from meshes, on a truck of boxes with a known bed."""
 
 import igl
 import jax
@@ -11,8 +11,8 @@ from jaxnbv.scanning import TriangleMesh, scan
 from jaxnbv.studies.classification.objects import TruckStudy
 from jaxnbv.studies.scenes.truck_meshes import bed_of, loaded_truck
 
-# Longest side 2.5 and centred: scene coordinates are these. The bed's room: x -1.15 to 0.35, y -0.2 to 0.5, z -0.45 to
-# 0.45.
+# The longest side is 2.5 and the truck is centred, so these are scene coordinates. The room on the bed is x -1.15 to
+# 0.35, y -0.2 to 0.5, z -0.45 to 0.45.
 TRUCK = {
     "chassis": ((0.0, -0.35, 0.0), (2.5, 0.3, 1.0)),
     "cab": ((0.8, 0.15, 0.0), (0.9, 0.7, 1.0)),
@@ -20,7 +20,7 @@ TRUCK = {
     "right": ((-0.45, 0.0, 0.475), (1.6, 0.4, 0.05)),
     "tail": ((-1.2, 0.0, 0.0), (0.1, 0.4, 1.0)),
 }
-# Stands on a foot that is narrower than its top.
+# The foot is narrower than the top.
 CARGO = {"foot": ((0.0, 0.2, 0.0), (0.3, 0.4, 0.3)), "top": ((0.0, 0.5, 0.0), (0.8, 0.2, 0.6))}
 
 
@@ -56,11 +56,11 @@ def test_the_cargo_stands_on_the_bed_and_tells_the_class(seed):
     np.testing.assert_allclose(np.ptp(corners, axis=0).max(), 2.5)
     own, others = corners[len(truck.vertices) :], corners[: len(truck.vertices)]
     np.testing.assert_allclose(own, thing.part.vertices, atol=1e-9)
-    # Turned and scaled as one: all distances by the same number, of truck and of cargo.
+    # Truck and cargo are rotated and scaled together: all distances change by the same factor.
     for before, after in ((truck.vertices, others), (cargo.vertices, own)):
         ratio = np.linalg.norm(after[1:] - after[0], axis=1) / np.linalg.norm(before[1:] - before[0], axis=1)
         np.testing.assert_allclose(ratio, ratio[0])
-    # Some of it touches the floor, and nothing of it is within the truck.
+    # The cargo touches the floor, and no part of it is within the truck.
     distance = np.sqrt(igl.point_mesh_squared_distance(own, others, truck.faces)[0])
     assert distance.min() < 0.01
     inside = igl.fast_winding_number(others, truck.faces, own + 1e-3 * (own.mean(axis=0) - own))
@@ -79,14 +79,14 @@ def test_the_study_counts_the_rays_that_hit_the_cargo(tmp_path):
     scene = study.scene(0)
     assert scene.name == "table one"
     assert scene.task.label == study.objects.classes.index("table")
-    # The truck alone: what lies before it, or where it is not, is cargo.
+    # With the truck alone: hits in front of it, or beside it, are on the cargo.
     faces = scene.surface.faces[: len(boxes(TRUCK).faces)]
     alone = TriangleMesh(scene.surface.vertices, faces, scene.surface.frame)
     poses = study.candidates.poses()
     both, empty = (scan(surface, study.camera, poses) for surface in (scene.surface, alone))
     nearer = np.linalg.norm(np.asarray(both.points) - np.asarray(empty.points), axis=-1) > 3e-3
     counts = (np.asarray(both.mask) & (nearer | ~np.asarray(empty.mask))).sum(axis=1)
-    # Where cargo meets the floor a ray may be of either.
+    # Where cargo meets the floor a ray may hit either.
     np.testing.assert_allclose(scene.task.pixels, counts, atol=8)
     assert counts.max() > 150
     with pytest.raises(InputError, match=r"there is no folder .*trucks"):
