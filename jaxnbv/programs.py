@@ -83,7 +83,7 @@ class _Program:
         return jax.tree.map(lambda x: outputs[x.index] if isinstance(x, _Slot) else x, executable.result)
 
     def _executable(self, folder: Path, static: Any, tree: Any, leaves: list, kinds: tuple) -> _Executable | None:
-        """The program for these arguments, read or else compiled and written; None if it cannot be kept."""
+        """The program for these arguments, read or else compiled; None if code of others is part of it."""
         function = self._function.__module__, self._function.__qualname__
         try:
             description = _pickled(
@@ -99,7 +99,8 @@ class _Program:
                 return _Executable(_loaded(payload, leaves, num_outputs), result)
         return self._compiled(entry, static, tree, leaves)
 
-    def _compiled(self, entry: Path, static: Any, tree: Any, leaves: list) -> _Executable | None:
+    def _compiled(self, entry: Path, static: Any, tree: Any, leaves: list) -> _Executable:
+        """The program for these arguments, traced anew; compiled and written unless it is there by another name."""
         result = None
 
         def of_arrays(leaves: list) -> list:
@@ -115,7 +116,7 @@ class _Program:
         code = lowered.as_text()
         # A call back to Python holds an address of this process.
         if "callback" in code:
-            return None
+            return _Executable(lowered.compile(), result)
         # Another program may be the same one: after an edit of the package, or where the arguments differ in name only.
         name = hashlib.sha256(repr((_without_names(code), _settings(), _machine())).encode()).hexdigest()
         num_outputs = len(jax.tree.leaves(lowered.out_info))
