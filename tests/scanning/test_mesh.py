@@ -86,8 +86,8 @@ def test_hits_of_a_box_equal_the_closed_form():
 
 @pytest.mark.usefixtures("tracer")
 def test_few_rays_slip_through_edges_of_small_triangles():
-    """Rays from the middle of a ball of 327,680 faces to its corners and the middles of its edges. Embree loses 0.2
-    %."""
+    """Rays from the middle of a ball of 327,680 faces to its corners and the middles of its edges. Embree loses a
+    fifth of a percent."""
     ball = trimesh.creation.icosphere(7, 1.25)
     mesh = nbv.TriangleMesh(ball.vertices, ball.faces, nbv.Frame())
     targets = np.concatenate([mesh.vertices, mesh.vertices[ball.edges_unique].mean(axis=1)])[::7]

@@ -1,4 +1,4 @@
-"""Parts at true size: their bank, how well they explain rays, which of them it is, and where it lies."""
+"""Parts at true size: their bank, misfits of rays, identity and pose."""
 
 import dataclasses
 
@@ -25,7 +25,7 @@ GRID = nbv.Grid(48)
 
 
 def lamp(arm):
-    """Two boxes and a ball, without any symmetry."""
+    """Two boxes and a ball, without symmetry."""
     boxes = Union(
         Cuboid(np.array([0.9, 0.3, 0.4])), Translated(Cuboid(np.array([0.2, arm, 0.25])), np.array([0.6, 0.5, 0.1]))
     )
@@ -67,7 +67,7 @@ def meshes(tmp_path_factory):
 
 
 def test_a_bank_keeps_true_sizes(meshes):
-    """Vertices of a mesh in millimetres lie on its shape, in metres, and in a scene at the scene's scale."""
+    """Vertices of a mesh in millimetres lie on its shape in metres, and in a scene at the scene's scale."""
     bank = nbv.ShapeBank.from_meshes(meshes, resolution=24, progress=False, scale="mm")
     assert bank.names == ("ball", "box")
     assert bank.is_true_size
@@ -87,17 +87,18 @@ def test_a_bank_keeps_true_sizes(meshes):
 
 
 def bracket(hole, middle=(0.0, 0.0, 0.0)):
-    """A block of 40 x 60 x 100 with a pocket at one end, so deep, that no mirror keeps."""
+    """A block of 40 x 60 x 100 with a pocket of depth `hole` at one end, without mirror symmetry."""
     block = trimesh.creation.box((40.0, 60.0, 100.0))
     cut = trimesh.creation.box((20.0, 30.0, hole)).apply_translation((6.0, 5.0, 50.0 - hole / 2.0 + 1e-3))
     corners = np.concatenate([block.vertices, cut.vertices])
-    # Open where it was cut out: the lid of the cut lies in the face of the block.
+    # A pocket is open: the lid of the cut lies in the face of the block.
     faces = np.concatenate([block.faces, len(block.vertices) + cut.faces[:, ::-1]])
     return trimesh.Trimesh(corners, faces).apply_translation(middle)
 
 
 def test_parts_that_are_the_same_are_told():
-    """Moved or drawn along other axes; but not a smaller one, one with a deeper hole, or a mirror image."""
+    """A part that is moved or drawn along other axes is the same. A smaller one, one with a deeper hole and a mirror
+    image are not."""
     own = bracket(30.0)
     turned = own.copy().apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, (0, 1, 0), (7.0, 1.0, 2.0)))
     mirrored = own.copy()
@@ -117,7 +118,7 @@ def test_other_units_are_refused(meshes, scale):
 
 
 def test_misfit_of_rays_to_a_ball():
-    """Hits of a ball lie 0.04 from the surface of a larger one, and pass through it by as much: a closed form."""
+    """Hits of a ball lie 0.04 from the surface of a larger ball, and pass through it by as much, in closed form."""
     observations = observations_of(nbv.SDFSurface(Sphere(0.8)), [(0.0, 0.0, 3.0)], noise=0.0)
     rays = Rays.of(observations, nbv.Box())
     bank = nbv.ShapeBank.of([Sphere(0.8), Sphere(0.84), Sphere(0.76)], is_true_size=True)
@@ -126,7 +127,7 @@ def test_misfit_of_rays_to_a_ball():
     each = float(np.log1p(0.04**2 / (2 * 0.03**2)))
     assert met > 20
     assert float(misfits[0]) == pytest.approx(0.0, abs=1e-3 * met)
-    # The smaller ball is only missed; the larger is gone through as well, up to tau before the hit.
+    # The smaller ball only misses points. Rays also pass through the larger ball, up to tau before the hit.
     assert float(misfits[2]) == pytest.approx(each * met, rel=0.02)
     assert each * met < float(misfits[1]) < 2.0 * each * met + 0.1 * met
     assert float(none) == pytest.approx(0.25 * met, rel=0.01)
@@ -134,8 +135,8 @@ def test_misfit_of_rays_to_a_ball():
 
 @pytest.mark.parametrize("noise", [0.0, 0.01, 0.05])
 def test_errors_of_points_are_those_of_the_sensor(noise):
-    """tau is two standard deviations of the sights, to an eighth (a quartile of 1,500 is right to 4 %), and a ball
-    is no other object for its noise."""
+    """tau is two standard deviations of the points along the rays, to an eighth (the quartile of 1,500 has an accuracy
+    of 4 %). Noise alone makes a ball no other object."""
     pose = nbv.look_at((0.0, 0.0, 3.0))
     camera = nbv.Camera(height=80, width=80, fov=1.0)
     scan = nbv.scan(nbv.SDFSurface(Sphere(0.8)), camera, pose)
@@ -165,7 +166,7 @@ def test_silence_is_no_evidence_against_a_part():
 
 @pytest.fixture(scope="module")
 def seen():
-    """The second lamp from two sides, and what is thought of it after each view."""
+    """The second lamp from two sides, and the hypotheses after each view."""
     turned = lamp(ARMS[1]).rotate(TURN.as_rotvec(), float(np.linalg.norm(TURN.as_rotvec()))).translate(SHIFT)
     sampler = nbv.SurfaceSampler(grid=GRID).with_bank(BANK, nbv.surfaces.FreeRotation())
     surface = nbv.SDFSurface(turned)
@@ -188,7 +189,7 @@ def test_a_part_is_named_and_placed(seen):
     assert np.degrees(off) < 2.0
     assert pose.matrix[:3, 3] == pytest.approx(SHIFT, abs=0.02)
     assert len(pose.alternatives) == 1
-    # What it says of its errors is of the size of its errors.
+    # The stated errors are of the size of the true errors.
     assert 0.0005 < np.sqrt(np.diag(pose.covariance)).min() < np.sqrt(np.diag(pose.covariance)).max() < 0.05
     error = surface_error(hypotheses, seen[1])
     assert error < 0.03
@@ -200,7 +201,7 @@ def test_a_part_is_named_and_placed(seen):
 
 
 def test_the_pose_is_of_the_world_and_of_the_mesh(seen):
-    """In a world that is turned, shifted and scaled, the same matrix follows by composition."""
+    """In a rotated, shifted and scaled world the same matrix follows by composition."""
     frame = nbv.Frame(scale=5.0, center=(1.0, 2.0, 3.0), up="z")
     in_scene = object_pose(seen[1].hypotheses, seen[1], nbv.Frame())
     in_world = object_pose(seen[1].hypotheses, seen[1], frame)
@@ -223,7 +224,7 @@ def test_hypotheses_are_kept_and_the_same_by_the_same_views(seen):
 
 
 def housing(x, z, radius):
-    """A block with a pocket, in which a pin stands."""
+    """A block with a pocket that holds a pin."""
     block = Difference(
         Cuboid(np.array([0.75, 1.25, 0.55])),
         Translated(Cuboid(np.array([0.42, 0.7, 0.3])), np.array([0.15, 0.75, 0.0])),
@@ -232,7 +233,7 @@ def housing(x, z, radius):
 
 
 def test_where_one_part_lies_all_that_look_alike_may():
-    """From below, where no view shows the pin: a search that can find no placement has the true one of one part."""
+    """From below no view shows the pin. A part without a placement of its own gets the true placement of the other."""
     pins = [(-0.25, 0.0, 0.12), (0.25, 0.0, 0.12), (0.0, 0.15, 0.12), (0.0, -0.15, 0.12), (0.0, 0.0, 0.22)]
     bank, box = nbv.ShapeBank.of([housing(*pin) for pin in pins], is_true_size=True), nbv.Box.cube(2.9)
     turn = TURN.as_matrix().astype(np.float32)
@@ -270,7 +271,7 @@ def test_none_of_these():
     ids=["cube", "brick", "square bar", "cylinder", "lamp"],
 )
 def test_symmetries(solid, number):
-    """The rotation groups of these solids; a cylinder's at steps of five degrees, either way up."""
+    """The rotation groups of these solids. A cylinder has steps of five degrees, either way up."""
     directions = np.asarray(Rotation.random(64, random_state=0).as_matrix())[:, :, 0]
     turns = symmetries(Shape(solid, jnp.asarray(1.5 * directions)))
     assert len(turns) == number
@@ -278,13 +279,13 @@ def test_symmetries(solid, number):
 
 
 def test_covariance_of_a_ball():
-    """Nothing says how a ball is turned; its place is known as by so many points, each along its normal."""
+    """Nothing determines the rotation of a ball. Its position is determined by the points, each along its normal."""
     observations = observations_of(nbv.SDFSurface(Sphere(0.8)), [(0.0, 0.0, 3.0), (0.0, 0.0, -3.0)], noise=0.02)
     bank = nbv.ShapeBank.of([Sphere(0.8)], is_true_size=True)
     hypotheses = PartHypotheses(bank, placed([0], [still()]), jnp.array([1.0, 0.0]), jnp.asarray(0.03))
     covariance = object_pose(hypotheses, observations, nbv.Frame()).covariance
     assert np.diag(covariance)[:3] == pytest.approx(np.pi**2 / 3.0, rel=1e-3)
-    # Least squares by the normals of the points. Farthest point sampling prefers those that err most.
+    # Least squares by the normals of the points. Farthest point sampling prefers points with large errors.
     points = np.asarray(FitTargets.of(observations).points)
     normals = points / np.linalg.norm(points, axis=1, keepdims=True)
     expected = np.linalg.inv(normals.T @ normals / 0.02**2)
