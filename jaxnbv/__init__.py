@@ -9,13 +9,21 @@ from typing import Any
 
 import lazy_loader
 
-from jaxnbv.errors import explained_imports
+from jaxnbv.errors import explained_imports, suggestion
 from jaxnbv.version import check_jax
 
 check_jax(importlib.metadata.version("jaxlib"))
 
 _named, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-__getattr__ = explained_imports()(_named)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        problem = f"module {__name__!r} has no attribute {name!r}."
+        # Without an object, Python adds no second suggestion to the message.
+        raise AttributeError(f"{problem}{suggestion(name, __all__)}", name=name, obj=None)
+    with explained_imports():
+        return _named(name)
 
 
 # Classes that notebooks show as a small picture with a line of facts.

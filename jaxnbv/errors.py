@@ -1,7 +1,8 @@
 """Errors that users can fix, and imports of optional dependencies."""
 
+import difflib
 import importlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -29,6 +30,13 @@ def install(extra: str) -> str:
 
 class InputError(ValueError):
     """An input from the user that cannot be used. The message names the value and the remedy."""
+
+
+def suggestion(name: str, names: Iterable[str]) -> str:
+    """The question whether the nearest of some names was meant, with a space before it; "" if none is near."""
+    by_lower = {one.lower(): one for one in names}
+    near = difflib.get_close_matches(name.lower(), by_lower, n=1)
+    return f" Did you mean {by_lower[near[0]]!r}?" if near else ""
 
 
 @contextmanager

@@ -49,6 +49,14 @@ for words, code in ANSWERED.items():
     assert jaxnbv.__version__ == importlib.metadata.version("jaxnbv")
 
 
+def test_a_misspelt_name_suggests_the_nearest():
+    for wrong, right in (("Covrage", "Coverage"), ("coverage", "Coverage"), ("sessions", "Session")):
+        with pytest.raises(AttributeError, match=f"no attribute '{wrong}'. Did you mean '{right}"):
+            getattr(nbv, wrong)
+    with pytest.raises(AttributeError, match=r"no attribute 'quaternions'\.$"):
+        nbv.quaternions  # noqa: B018
+
+
 def test_a_session_at_a_robot_loads_no_pictures_studies_or_networks():
     """Nor does an episode, until it is drawn; what needs an extra that is not installed says how it is. JAX is loaded
     when a name is used."""

@@ -3,8 +3,10 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxnbv.checks import require
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 
@@ -68,6 +70,25 @@ class Proposal(eqx.Module):
             return None
         best, bias = jnp.max(self.values), 0.0 if self.value_at_visited is None else self.value_at_visited
         return (self.values == best) | (best - self.values <= errors * self.difference_errors + bias)
+
+    def best(self, count: int, apart: float = 30.0) -> Pose:
+        """A batch of the best candidates from different directions, best first.
+
+        Takes the candidates by falling value, and skips each that the origin sees within `apart` degrees of one that
+        was taken. The batch is shorter than `count` if no candidate is left. Excluded ones are never taken.
+
+        **Raises:** `ValueError` for a count below 1, or an angle outside [0, 180].
+        """
+        require(count >= 1, f"the count is {count}: give the number of candidates, at least 1")
+        require(0.0 <= apart <= 180.0, f"apart is {apart}: give an angle in degrees, from 0 to 180")
+        values, positions = np.asarray(self.values), np.asarray(self.candidates.position, np.float64)
+        directions = positions / np.maximum(np.linalg.norm(positions, axis=-1, keepdims=True), 1e-30)
+        least, chosen = np.cos(np.radians(apart)), list[int]()
+        for index in np.argsort(-values, stable=True).tolist():
+            near = directions[chosen] @ directions[index] > least
+            if values[index] > -np.inf and not near.any() and len(chosen) < count:
+                chosen.append(index)
+        return self.candidates[np.array(chosen, int)]
 
     @property
     def num_tied(self) -> int | None:

@@ -192,6 +192,10 @@ def entropy(weights: Float[Array, "*n c"]) -> Float[Array, "*n"]:
 def _as_group(names: Sequence[str] | None) -> tuple[str, ...] | None:
     if names is None:
         return None
+    require(
+        not isinstance(names, str),
+        f"the group is the text {names!r}: give a list with a class name for each part, such as ['left', 'right']",
+    )
     group = tuple(names)
     require(
         all(isinstance(name, str) for name in group),

@@ -1,4 +1,4 @@
-"""Information about which part it is: of views that tell, and of views that do not."""
+"""Information about the identity of a part, from informative and uninformative views."""
 
 import jax
 import jax.numpy as jnp
@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jaxnbv as nbv
+from jaxnbv.checks import InputError
 from jaxnbv.observations import Observations
 from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning.sdf import Cuboid, Translated, Union
@@ -19,7 +20,7 @@ GRID = nbv.Grid(48)
 
 
 def block(height, side):
-    """A block with a boss on top, to either side."""
+    """A block with a boss on top, at either side."""
     boss = Translated(Cuboid(np.array([0.25, height, 0.25])), np.array([side, 0.4 + height, 0.0]))
     return Union(Cuboid(np.array([1.0, 0.4, 0.8])), boss)
 
@@ -53,7 +54,7 @@ def information(acquisition, weights, poses, **changed):
 
 
 def test_a_view_is_worth_what_it_tells():
-    """From below the blocks are equal; from above a view tells them apart: all of the entropy, in nats."""
+    """From below the blocks are equal. From above a view tells them apart, which is worth the whole entropy in nats."""
     above, below = information(nbv.Identify(), (0.5, 0.5, 0.0), (ABOVE, BELOW))
     assert above == pytest.approx(np.log(2.0), rel=0.02)
     assert below == pytest.approx(0.0, abs=1e-3)
@@ -62,8 +63,13 @@ def test_a_view_is_worth_what_it_tells():
     assert below == pytest.approx(0.0, abs=1e-3)
 
 
+def test_a_text_is_no_group():
+    with pytest.raises(InputError, match="the group is the text 'abc': give a list"):
+        nbv.Identify(group="abc")
+
+
 def test_names_poses_and_groups():
-    """A block that may be turned end to end is the other one for its name, not for its pose."""
+    """A block that may be turned end for end is the other block for its name, but not for its pose."""
     half_turn = np.array([np.eye(3), np.diag([-1.0, 1.0, -1.0]), np.eye(3)])
     weights, shapes = (0.4, 0.4, 0.2), (0, 0, 1)
     by_pose, by_name, by_group = (
@@ -75,14 +81,14 @@ def test_names_poses_and_groups():
         )
     )
     names = float(entropy(jnp.array([0.8, 0.2])))
-    # What is told about the pose beyond the name counts a tenth.
+    # Information about the pose beyond the name counts a tenth.
     assert by_pose == pytest.approx(names + 0.1 * (float(entropy(jnp.array(weights))) - names), rel=0.02)
     assert by_name == pytest.approx(names, rel=0.02)
     assert by_group == pytest.approx(0.0, abs=1e-3)
 
 
 def test_derivative_in_the_pose():
-    """Information changes smoothly where a boss comes into sight, as finite differences say."""
+    """Information changes smoothly where a boss comes into sight, in agreement with finite differences."""
     inputs = step((0.5, 0.5, 0.0))
     context = nbv.Identify().context(inputs)
 
@@ -104,7 +110,7 @@ def test_what_it_needs():
 
 
 def test_an_episode_ends_once_the_part_is_known():
-    """The planner, its proposal, and the rules, in a simulation."""
+    """The planner, its proposal and the stop rules in a simulation."""
     planner = nbv.Planner.for_parts(BANK)
     scene = nbv.SDFSurface(block(0.3, 0.4))
     until = nbv.Identified(0.9) | nbv.Placed(0.001)
