@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 import types
+import warnings
 import weakref
 from pathlib import Path
 from unittest import mock
@@ -22,6 +23,7 @@ from commands import run_command, run_process
 from jaxnbv.cli import app, play
 from jaxnbv.cli.tasks import TASKS
 from jaxnbv.planning.loop import Step
+from jaxnbv.studies.registry import studies
 from jaxnbv.viz import Sketches
 
 
@@ -51,10 +53,42 @@ def test_demo_leaves_an_episode_and_a_report(finished):
 
 
 def test_an_option_for_several_folders_takes_all_words_up_to_the_next():
-    words = ["pyramid", "--join", "a", "b", "--quick", "--join", "c", "--workers", "2"]
-    values = typer.main.get_command(app).commands["study"].make_context("study", words).params
+    words = ["--join", "a", "b", "--quick", "--join", "c", "--workers", "2"]
+    values = typer.main.get_command(app).commands["study"].commands["pyramid"].make_context("pyramid", words).params
     assert values["join"] == [Path("a"), Path("b"), Path("c")]
-    assert (values["name"], values["quick"], values["workers"]) == ("pyramid", True, 2)
+    assert (values["quick"], values["workers"]) == (True, 2)
+
+
+def test_the_help_of_studies_is_an_overview_and_that_of_a_study_has_its_options_alone(tmp_path):
+    overview = run_command("study", "--help", cwd=tmp_path).stdout
+    lines = {words[1]: line for line in overview.splitlines() if len(words := line.split()) > 2}
+    assert all(lines[name].rstrip("│ ").endswith("?") for name in studies())
+    assert "--scenes" not in overview
+    assert len(overview.splitlines()) < 35
+    own = {name: run_command("study", name, "--help", cwd=tmp_path).stdout for name in ("pyramid", "recorded")}
+    assert all("--capacity" in text for text in own.values())
+    assert ["--framing" in text for text in own.values()] == [True, False]
+    assert ["--depth-scale" in text for text in own.values()] == [False, True]
+
+
+def test_equal_warnings_are_printed_once_with_their_number(tmp_path, monkeypatch):
+    def play(*arguments, **settings):
+        for place in ("here", "there", "here", "here"):
+            warnings.warn(f"the mesh is {place}", stacklevel=2)
+            # What libraries do, after which Python's own filter prints all again.
+            with warnings.catch_warnings():
+                warnings.simplefilter("always")
+
+    monkeypatch.setattr("jaxnbv.cli.play.play", play)
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        result = run_command("demo", "--task", "coverage", cwd=tmp_path)
+    lines = [line for line in result.stderr.splitlines() if "the mesh is" in line]
+    assert lines == [
+        "warning: the mesh is here",
+        "warning: the mesh is there",
+        "warning, 3 times in all: the mesh is here",
+    ]
 
 
 @pytest.mark.slow
@@ -134,6 +168,15 @@ def test_run_takes_a_mesh_each_search_and_each_model(search, model, tmp_path):
         (("demo", "--task", "coverage", "--until", "sure=0.9"), ("NewSurface", "classifier")),
         (("demo", "--vews", "3"), ("--vews", "--views")),
         (("demo", "--search", "best"), ("best", "discrete")),
+        (("demo", "--search", "halvng"), ("halvng", "Did you mean 'halving'?")),
+        (("demo", "--task", "covrage"), ("covrage", "Did you mean 'coverage'?")),
+        (("demo", "--task", "coverage", "--model", "papr"), ("papr", "Did you mean 'paper'?")),
+        (("demo", "--model", "paper", "--known", "truck"), ("--known truck", "no known shapes", "--model screened")),
+        (("study", "pyramyd"), ("pyramyd", "Did you mean 'pyramid'?")),
+        (("study", "pyramid", "--meshes", "occupied"), ("--meshes",)),
+        (("study", "recorded"), ("FOLDER",)),
+        (("study", "recorded", "occupied", "--candidates", "9"), ("--candidates 9", "frames of the recording")),
+        (("study", "pyramid", "--quick", "--settings", "paper"), ("--quick and --settings paper",)),
         (("demo", "--task", "coverage", "--out", "occupied"), ("occupied", "other files")),
         (("run", "ball.obj", "--task", "parts"), ("--category",)),
         (("run", "ball.obj", "--task", "parts", "--category", "teapot"), ("teapot", "mug")),

@@ -54,7 +54,7 @@ def test_a_study_is_declared_in_full(name):
     # Settings, or what else it is configured by.
     taken = {*inspect.signature(study).parameters, *inspect.signature(study.configured).parameters}
     assert {*entry.options} <= taken - {"model", "views", "quick", "options"}
-    assert {*study.quick} <= {*inspect.signature(study).parameters}
+    assert {*study.quick, *study.paper} <= {*inspect.signature(study).parameters}
     seeds = [other.load().seed for other in studies().values()]
     assert len({*seeds}) == len(seeds)
 
@@ -119,8 +119,10 @@ def own_package(tmp_path, monkeypatch):
 def test_a_study_of_an_installed_package_stands_in_the_help_and_one_that_fails_is_named(own_package):
     result = run_process("study", "--help", cwd=own_package)
     assert result.returncode == 0, result.stderr
-    assert "dents (3 scenes, 2 views, --size): How much of a dented ball is seen?" in " ".join(result.stdout.split())
-    assert "Radius of the dents." in result.stdout
+    assert "dents How much of a dented ball is seen?" in " ".join(result.stdout.split())
+    own = " ".join(run_process("study", "dents", "--help", cwd=own_package).stdout.split())
+    assert "The default is 3 scenes with 2 views each." in own
+    assert "Radius of the dents." in own
     assert "the study lost is left out: dents.nothing:LOST fails" in result.stderr
     assert "lost" not in result.stdout
 

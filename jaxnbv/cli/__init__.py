@@ -1,4 +1,4 @@
-"""The command line. Commands are typer functions, the entry points of the group `jaxnbv.commands`."""
+"""The command line. Commands are typer functions or apps, the entry points of the group `jaxnbv.commands`."""
 
 import sys
 from importlib.metadata import EntryPoint, entry_points
@@ -9,7 +9,7 @@ import typer
 import jaxnbv
 from jaxnbv.cli.background import end_process, is_working
 from jaxnbv.cli.options import Command
-from jaxnbv.cli.streams import write_readable
+from jaxnbv.cli.streams import each_warning_once, write_readable
 from jaxnbv.compiled import keep_compiled
 from jaxnbv.errors import InputError, explained_imports
 
@@ -55,11 +55,18 @@ def _is_own(point: EntryPoint) -> bool:
 
 
 def _add_commands() -> None:
-    """Add the commands of this package, then those of other packages under names that are free."""
+    """Add the commands of this package, then those of other packages under names that are free.
+
+    An entry point names a function, or a `typer.Typer` for a command with commands of its own.
+    """
     named = {point.name: point for point in sorted(entry_points(group="jaxnbv.commands"), key=_is_own)}
     for point in sorted(named.values(), key=lambda point: (not _is_own(point), point.name)):
         try:
-            app.command(point.name, cls=Command)(point.load())
+            loaded = point.load()
+            if isinstance(loaded, typer.Typer):
+                app.add_typer(loaded, name=point.name)
+            else:
+                app.command(point.name, cls=Command)(loaded)
         # Modules of other packages can fail in any way at import.
         except (Exception, SystemExit) as error:
             package = point.dist.name if point.dist else point.module
@@ -77,7 +84,7 @@ def answer() -> None:
     """
     write_readable()
     try:
-        with explained_imports():
+        with explained_imports(), each_warning_once():
             app()
     except InputError as error:
         typer.echo(f"error: {error}", err=True)

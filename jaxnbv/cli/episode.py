@@ -3,27 +3,20 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias, TypeVar
+from typing import Annotated, TypeVar
 
-from jaxnbv.cli.options import Position, asking, finding, imagining, listed, running, seeing
+from jaxnbv.cli.options import Position, asking, finding, imagining, listed, one_of, running, seeing
 from jaxnbv.cli.registry import BANKS, MODELS, SEARCHES, STOPS
 from jaxnbv.cli.tasks import TASKS
 from jaxnbv.cli.tasks.base import Task
 
 T = TypeVar("T")
 
-# Literals are built at run time, so type checkers see plain strings.
-if TYPE_CHECKING:
-    TaskName: TypeAlias = str
-    SearchName: TypeAlias = str
-    ModelName: TypeAlias = str
-else:
-    TaskName, SearchName, ModelName = (Literal[tuple(names)] for names in (TASKS, SEARCHES, MODELS))
-
 TaskOption = Annotated[
-    TaskName, asking(metavar="TASK", help=listed((name, task.about) for name, task in TASKS.items()))
+    str,
+    asking(parser=one_of(TASKS), metavar="TASK", help=listed((name, task.about) for name, task in TASKS.items())),
 ]
-SearchOption = Annotated[SearchName, finding(metavar="SEARCH", help=listed(SEARCHES.items()))]
+SearchOption = Annotated[str, finding(parser=one_of(SEARCHES), metavar="SEARCH", help=listed(SEARCHES.items()))]
 SeedOption = Annotated[
     int, running(metavar="N", min=0, max=2**63 - 1, help="Seed of the sensor's noise and of the samples.")
 ]
@@ -31,8 +24,8 @@ KnownOption = Annotated[
     str | None,
     imagining(
         metavar="BANK",
-        help=f"Known shapes: a folder of upright meshes, one of {', '.join(BANKS)}, or none.",
-        show_default="none; for demo the bank of the object's kind, unless --model paper",
+        help=f"Known shapes: a folder of upright meshes, one of {', '.join(BANKS)}, or none. Not with --model paper.",
+        show_default="none; for demo the bank of the object's kind; none with --model paper",
     ),
 ]
 
@@ -73,7 +66,7 @@ class EpisodeOptions:
         ),
     ] = None
     noise: Annotated[float, seeing(metavar="X", help="Standard deviation of points and normals.")] = 0.01
-    model: Annotated[ModelName, imagining(metavar="MODEL", help=listed(MODELS.items()))] = "screened"
+    model: Annotated[str, imagining(parser=one_of(MODELS), metavar="MODEL", help=listed(MODELS.items()))] = "screened"
     known: KnownOption = None
     search: SearchOption
     seed: SeedOption = 0

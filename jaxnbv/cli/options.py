@@ -2,12 +2,15 @@
 
 import dataclasses
 import inspect
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import partial
-from typing import Any, TypeAlias, TypeVar, get_type_hints
+from typing import Any, TypeAlias, TypeVar, get_args, get_type_hints
 
 import typer
 from typer.core import TyperCommand
+from typer.models import ArgumentInfo
+
+from jaxnbv.errors import suggestion
 
 Position: TypeAlias = tuple[float, float, float]
 T = TypeVar("T")
@@ -18,6 +21,7 @@ seeing = partial(typer.Option, rich_help_panel="Sensor")
 imagining = partial(typer.Option, rich_help_panel="Imagined surfaces")
 finding = partial(typer.Option, rich_help_panel="Search")
 running = partial(typer.Option, rich_help_panel="Run")
+planning = partial(typer.Option, rich_help_panel="Planner")
 
 
 def listed(choices: Iterable[tuple[str, str]]) -> str:
@@ -25,10 +29,22 @@ def listed(choices: Iterable[tuple[str, str]]) -> str:
     return "; ".join(f"{name}: {about}" for name, about in choices) + "."
 
 
+def one_of(names: Collection[str]) -> Callable[[str], str]:
+    """A parser of an option that takes one of some names. Its error suggests the nearest one."""
+
+    def parse(text: str) -> str:
+        if text not in names:
+            raise typer.BadParameter(f"{text!r} is not one of {', '.join(names)}.{suggestion(text, names)}")
+        return text
+
+    return parse
+
+
 def command(options: type[T], more: Mapping[str, Any] = {}) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Decorator: make a typer command from a function that takes a dataclass of options.
 
-    - `more`: annotations of further options by name. They are passed by keyword, None for those that are not given.
+    - `more`: annotations of further options by name. They are passed by keyword, None for those that are not given. A
+      `typer.Argument` is required.
     """
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
@@ -41,7 +57,10 @@ def command(options: type[T], more: Mapping[str, Any] = {}) -> Callable[[Callabl
             _parameter(one.name, hints[one.name], _EMPTY if one.default is dataclasses.MISSING else one.default)
             for one in fields
         ]
-        parameters += [_parameter(name, hint, None) for name, hint in more.items()]
+        parameters += [
+            _parameter(name, hint, _EMPTY if isinstance(get_args(hint)[-1], ArgumentInfo) else None)
+            for name, hint in more.items()
+        ]
         call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         call.__name__, call.__doc__ = function.__name__, function.__doc__
         return call

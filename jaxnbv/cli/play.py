@@ -149,8 +149,13 @@ def play(options: EpisodeOptions, subject: Subject, setting: Setting, sizes: Siz
         sizes = QUICK
     if subject.note:
         typer.echo(subject.note)
-    # The paper's model has no known shapes.
-    bank = options.known or ("none" if options.model == "paper" else subject.bank)
+    bank = options.known or subject.bank
+    if options.model == "paper":
+        require(
+            options.known in (None, "none"),
+            f"--known {options.known}: the paper's model has no known shapes: leave it out, or give --model screened",
+        )
+        bank = "none"
     sampler = dataclasses.replace(imagined(options.model, options.quick, bank), grid=subject.grid or Grid())
     planner, rival = (
         planner_of(setting, subject.acquisition, search, sampler, sizes) for search in (options.search, "farthest")

@@ -18,6 +18,11 @@ MODELS = {
 
 STUDY_MODELS = {"known": "screened, with a bank of other objects of the kind", **MODELS}
 
+STUDY_SETTINGS = {
+    "usual": "the study's own, smaller than the paper's",
+    "paper": "those of the paper, with its model, which take hours",
+}
+
 BANKS = ("pyramid", "truck", "household", "parts", "heat", "household-real")
 """The banks of known shapes that ship."""
 

@@ -26,32 +26,37 @@ from jaxnbv.studies.engine.records import RecordFolder
 from jaxnbv.studies.engine.results import results, summary
 from jaxnbv.studies.engine.run import Factory, methods_of, run_scene
 from jaxnbv.studies.engine.study import Study
-from jaxnbv.studies.registry import Entry, studies
+from jaxnbv.studies.registry import studies
 
 
-def run_study(options: StudyOptions, **of_studies: Any) -> None:
+def run_study(name: str, options: StudyOptions, **settings: Any) -> None:
     """Run all parts of a study and write the results.
 
-    - `of_studies`: options of single studies, None for those that are not given.
+    - `settings`: values of the study's own options, None for those that are not given.
 
-    **Raises:** `ValueError` for no scenes, unknown methods, an option that the study does not take, or a user's method
-    that cannot be imported. Also if scenes failed, after all results are written.
+    **Raises:** `ValueError` for no scenes, unknown methods, options that exclude each other, or a user's method that
+    cannot be imported. Also if scenes failed, after all results are written.
     """
-    entry = studies()[options.name]
-    settings = _settings(options.name, entry, of_studies)
+    entry = studies()[name]
     kind: type[Study] = entry.load()
-    model = options.model or entry.model
+    is_paper = options.settings == "paper"
+    usual_model = "paper" if is_paper else entry.model
+    model = options.model or usual_model
     names = None if options.methods is None else [name.strip() for name in options.methods.split(",")]
     methods, own = methods_of(kind, names, model), {text: _own(text) for text in options.own or ()}
-    scenes = _scenes(str(entry.scenes) if options.scenes is None else options.scenes)
-    of_model = "" if model == entry.model else f"-{model}"
-    folder = options.out or Path("runs") / f"study-{options.name}{of_model}{'-quick' if options.quick else ''}"
+    scenes = _scenes(
+        str(kind.quick_scenes if options.quick else entry.scenes) if options.scenes is None else options.scenes
+    )
+    changes = f"{'' if model == usual_model else f'-{model}'}{'-paper-settings' if is_paper else ''}"
+    folder = options.out or Path("runs") / f"study-{name}{changes}{'-quick' if options.quick else ''}"
     if options.quick:
         typer.echo("--quick: small settings and few scenes. This is not the full study. Leave it out for that.")
-        scenes = scenes[: kind.quick_scenes]
     failures: dict[str, str] = {}
     count = 0
-    studies_by_part = kind.configured(model, options.views or entry.views, options.quick, **settings)
+    given = {option: value for option, value in settings.items() if value is not None}
+    planned = _planned(kind, options)
+    views = options.views or planned.pop("views", entry.views)
+    studies_by_part = kind.configured(model, views, options.quick, **planned | given)
     sources = _sources(options.join or (), studies_by_part)
     with _executor(options) as executor:
         for part, study in studies_by_part.items():
@@ -104,20 +109,20 @@ def _sources(folders: Iterable[Path], parts: Iterable[str]) -> dict[str, list[Pa
     return sources
 
 
-def _settings(name: str, entry: Entry, of_studies: dict[str, Any]) -> dict[str, Any]:
-    """The options that were given.
+def _planned(kind: type[Study], options: StudyOptions) -> dict[str, Any]:
+    """Settings of the study that replace its own: those of `--settings`, and then single ones.
 
-    **Raises:** `ValueError` for an option that the study does not take, or for a missing argument.
+    **Raises:** `ValueError` for the paper's settings in a quick run.
     """
-    settings = {option: value for option, value in of_studies.items() if value is not None}
-    for option in settings:
-        takers = {other: one for other, one in studies().items() if option in one.options}
-        flag = next(iter(takers.values())).flag(option)
-        require(option in entry.options, f"the study {name} takes no {flag}: it is for {', '.join(takers)}")
-    for option in entry.arguments:
-        flag = entry.flag(option)
-        require(option in settings, f"the study {name} needs a {option}: jaxnbv study {name} {flag}")
-    return settings
+    is_paper = options.settings == "paper"
+    require(not (is_paper and options.quick), "--quick and --settings paper exclude each other: leave one out")
+    single = {
+        "num_candidates": options.candidates,
+        "num_samples": options.samples,
+        "grid_resolution": options.grid,
+        "capacity": options.capacity,
+    }
+    return (dict(kind.paper) if is_paper else {}) | {name: value for name, value in single.items() if value is not None}
 
 
 def _scenes(text: str) -> Sequence[int]:

@@ -1,8 +1,15 @@
-"""Output for any encoding, since the system's encoding of redirected output may lack characters."""
+"""Output for any encoding, since the system's encoding of redirected output may lack characters; and warnings."""
 
 import codecs
 import io
 import sys
+import warnings
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import typer
 
 _READABLE = str.maketrans(
     {
@@ -46,3 +53,29 @@ def write_readable() -> None:
         # Streams of tests and notebooks have another type, and take all characters.
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="readable")
+
+
+@contextmanager
+def each_warning_once() -> Iterator[None]:
+    """Context manager: print each different warning once, and at the end how often it came if that was repeatedly.
+
+    Python's own filter forgets what was printed whenever a library changes the filters.
+    """
+    counts: Counter[str] = Counter()
+    usual = warnings.showwarning
+
+    def show(message: Warning | str, category: type[Warning], filename: str, lineno: int, *_: Any, **__: Any) -> None:
+        is_ours = issubclass(category, UserWarning)
+        text = str(message) if is_ours else warnings.formatwarning(message, category, filename, lineno).strip()
+        counts[text] += 1
+        if counts[text] == 1:
+            typer.echo(f"warning: {text}", err=True)
+
+    warnings.showwarning = show
+    try:
+        yield
+    finally:
+        warnings.showwarning = usual
+        for text, count in counts.items():
+            if count > 1:
+                typer.echo(f"warning, {count} times in all: {text}", err=True)

@@ -1,34 +1,47 @@
 """`jaxnbv study NAME`: the runs behind the paper's tables and figures, and studies of the user's."""
 
+import dataclasses
 from typing import Any
 
-from jaxnbv.cli.options import command
+import typer
+
+from jaxnbv.cli.options import Command, command
 from jaxnbv.cli.study_options import StudyOptions
 from jaxnbv.studies.registry import Entry, studies
 
-_OF_STUDIES = {name: hint for entry in studies().values() for name, hint in entry.options.items()}
-"""Annotations of the studies' own options."""
+study = typer.Typer(
+    help="""Measure a claim of the paper on many scenes.
 
-
-@command(StudyOptions, _OF_STUDIES)
-def study(options: StudyOptions, **of_studies: Any) -> None:
-    from jaxnbv.checks import check_device
-
-    check_device()
-    from jaxnbv.cli.run_study import run_study
-
-    run_study(options, **of_studies)
-
-
-def _about(name: str, entry: Entry) -> str:
-    details = ", ".join([f"{entry.scenes} scenes, {entry.views} views", *map(entry.flag, entry.options)])
-    return f"**{name}** ({details}): {entry.question}"
-
-
-study.__doc__ = "\n\n".join(
-    [
-        "Measure a claim of the paper on many scenes, with the same scenes, first views and noise for all methods.",
-        "Writes a record of each scene, tables, a chart and pictures. An interrupted run continues where it stopped.",
-        *(_about(name, entry) for name, entry in studies().items()),
-    ]
+    All methods have the same scenes, first views and noise. A study writes a record of each scene, tables, a chart and
+    pictures. Repeat the command of an interrupted study, and it continues.
+    """,
+    epilog="`jaxnbv study NAME --help` lists the options of a study. `jaxnbv report` makes one page of all that ran.",
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    subcommand_metavar="NAME [OPTIONS]",
 )
+
+
+def _add(name: str, entry: Entry) -> None:
+    """Add the command of a study."""
+    common = {field.name for field in dataclasses.fields(StudyOptions)}
+    own = {option: hint for option, hint in entry.options.items() if option not in common}
+
+    @command(StudyOptions, own)
+    def run(options: StudyOptions, **settings: Any) -> None:
+        from jaxnbv.checks import check_device
+
+        check_device()
+        from jaxnbv.cli.run_study import run_study
+
+        run_study(name, options, **settings)
+
+    usual = f"The default is {entry.scenes} scenes with {entry.views} views each."
+    question = entry.question.partition("?")[0]
+    study.command(
+        name, cls=Command, help=f"{entry.question}\n\n{usual}", short_help=f"{question}?", rich_help_panel="Studies"
+    )(run)
+
+
+for _name, _entry in studies().items():
+    _add(_name, _entry)

@@ -2,26 +2,16 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
+from typing import Annotated
 
 import typer
 
-from jaxnbv.cli.options import listed, running
-from jaxnbv.cli.registry import STUDY_MODELS
-from jaxnbv.studies.registry import studies
-
-if TYPE_CHECKING:
-    StudyName: TypeAlias = str
-    StudyModel: TypeAlias = str
-else:
-    StudyName, StudyModel = Literal[tuple(studies())], Literal[tuple(STUDY_MODELS)]
+from jaxnbv.cli.options import listed, one_of, planning, running
+from jaxnbv.cli.registry import STUDY_MODELS, STUDY_SETTINGS
 
 
 @dataclass(frozen=True, kw_only=True)
 class StudyOptions:
-    name: Annotated[
-        StudyName, typer.Argument(metavar="NAME", help=f"One of {', '.join(studies())}.", show_default=False)
-    ]
     scenes: Annotated[
         str | None,
         typer.Option(
@@ -45,19 +35,41 @@ class StudyOptions:
             show_default=False,
         ),
     ] = None
+    settings: Annotated[
+        str,
+        planning(
+            parser=one_of(STUDY_SETTINGS),
+            metavar="SETTINGS",
+            help="Settings of the planner and number of views. " + listed(STUDY_SETTINGS.items()),
+        ),
+    ] = "usual"
+    candidates: Annotated[
+        int | None, planning(min=2, help="Number of candidate poses.", show_default="that of the settings")
+    ] = None
+    samples: Annotated[
+        int | None, planning(min=1, help="Number of posterior samples.", show_default="that of the settings")
+    ] = None
+    grid: Annotated[
+        int | None,
+        planning(min=2, help="Nodes of the samples' grid along each axis.", show_default="that of the settings"),
+    ] = None
+    capacity: Annotated[
+        int | None, planning(min=1, help="Number of points to keep in D.", show_default="that of the settings")
+    ] = None
     model: Annotated[
-        StudyModel | None,
-        typer.Option(
+        str | None,
+        planning(
+            parser=one_of(STUDY_MODELS),
             metavar="MODEL",
             help="Model of the imagined surfaces. " + listed(STUDY_MODELS.items()),
-            show_default="known if the study has known shapes",
+            show_default="known if the study has known shapes; with --settings paper: paper",
         ),
     ] = None
     out: Annotated[
         Path | None,
         running(
             help="Output folder. Scenes that it already has are not run again.",
-            show_default="runs/study-NAME[-MODEL][-quick]",
+            show_default="runs/study-NAME[-MODEL][-quick]; with --settings paper: runs/study-NAME-paper-settings",
         ),
     ] = None
     quick: Annotated[

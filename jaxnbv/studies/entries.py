@@ -36,7 +36,7 @@ FRAMING = {
 }
 RECORDING = {
     "folder": Annotated[
-        Path | None, typer.Argument(help="The folder of a recording, for the study recorded.", show_default=False)
+        Path | None, typer.Argument(metavar="FOLDER", help="The folder of a recording.", show_default=False)
     ],
     "box": Annotated[
         tuple[float, float, float, float, float, float] | None,
@@ -86,7 +86,7 @@ KNOWN_PARTS = {
 
 PYRAMID = Entry(
     "jaxnbv.studies.classification.objects:PyramidStudy",
-    "How many views does each method need to find the pattern on a pyramid's base, which tells its class?",
+    "Which pattern is on a pyramid's base? How many views does each method need to find it?",
     scenes=100,
     views=5,
     model="known",
@@ -94,8 +94,8 @@ PYRAMID = Entry(
 )
 TRUCK = Entry(
     "jaxnbv.studies.classification.objects:TruckStudy",
-    "How many views does each method need to tell the class of a truck's cargo, which most views do not show? The "
-    "paper's Truck-ModelNet10, on procedural trucks and cargo, or on meshes: a folder `trucks` and one per class.",
+    "What does a truck carry? Most views do not show it. The paper's Truck-ModelNet10, on procedural trucks and "
+    "cargo, or on meshes: a folder `trucks` and one per class of cargo.",
     scenes=100,
     views=5,
     model="known",
@@ -103,8 +103,8 @@ TRUCK = Entry(
 )
 HOUSEHOLD = Entry(
     "jaxnbv.studies.classification.objects:HouseholdStudy",
-    "Do all methods do equally well on classes that differ in global shape? The paper's ModelNet10, on procedural "
-    "objects, or on meshes in one folder per class.",
+    "Which household object is it? The classes differ in global shape. The paper's ModelNet10, on procedural objects, "
+    "or on meshes in one folder per class.",
     scenes=100,
     views=5,
     model="known",
@@ -112,15 +112,15 @@ HOUSEHOLD = Entry(
 )
 OMNIOBJECT3D = Entry(
     "jaxnbv.studies.classification.objects:OmniObject3DStudy",
-    "How many views does each method need to tell fruits that differ in small details? The paper's OmniObject3D, "
-    "on your meshes in one folder per class, with your classifier.",
+    "Which fruit is it? The classes differ in small details. The paper's OmniObject3D, on your meshes in one folder "
+    "per class, with your classifier.",
     scenes=100,
     views=5,
     options=MESHES | CLASSES,
 )
 PARTS = Entry(
     "jaxnbv.studies.parts.study:PartStudy",
-    "How many views until all parts of an object are found? The paper's Table 1, on procedural objects, or on "
+    "How many views until all parts are found? The paper's Table 1, on procedural objects, or on "
     "meshes whose nodes are their parts, in one folder per class.",
     scenes=80,
     views=6,
@@ -129,8 +129,8 @@ PARTS = Entry(
 )
 HEAT = Entry(
     "jaxnbv.studies.heat:HeatStudy",
-    "How near is the coldest point of the scanned cloud to that of the object? On procedural objects whose coldest "
-    "point few views show, or on your meshes, heated at one place.",
+    "Where is a heated object coldest? On procedural objects whose coldest point few views show, or on your meshes, "
+    "heated at one place.",
     scenes=24,
     views=6,
     model="known",
@@ -138,14 +138,14 @@ HEAT = Entry(
 )
 RECONSTRUCTION = Entry(
     "jaxnbv.studies.reconstruction:ReconstructionStudy",
-    "How near is the surface reconstructed from each method's views to the true one? The supplement's table.",
+    "How near is the reconstructed surface to the true one? The supplement's table.",
     scenes=32,
     views=5,
     options=MESHES,
 )
 RECORDED = Entry(
     "jaxnbv.studies.recorded:RecordedStudy",
-    "Which frames of a recorded sequence show the most of a box? On a folder of 7-Scenes, of TUM RGB-D, or with a "
+    "Which frames of a recording show the most of a box? On a folder of 7-Scenes, of TUM RGB-D, or with a "
     "frames.json (see RecordedFrames).",
     scenes=6,
     views=6,
@@ -153,7 +153,7 @@ RECORDED = Entry(
 )
 IDENTIFICATION = Entry(
     "jaxnbv.studies.identification:IdentificationStudy",
-    "Which of the known parts is the object, and in which pose? On your own parts, or on parts that look alike.",
+    "Which known part is it, and how does it lie? On your own parts, or on parts that look alike.",
     scenes=40,
     views=4,
     model="known",

@@ -129,6 +129,14 @@ class HeatStudy(Study):
     radius: ClassVar[float] = HEAT_SETTING.radius
     quick: ClassVar[Mapping[str, Any]] = {**Study.quick, "num_candidates": 24, "num_points": 512}
     quick_scenes: ClassVar[int] = 3
+    paper: ClassVar[Mapping[str, Any]] = {
+        **Study.paper,
+        "views": 10,
+        "num_candidates": 100,
+        "capacity": 4096,
+        "num_points": 4096,
+        "imagined_rays": 50,
+    }
 
     views: int = eqx.field(static=True, default=6)
     num_candidates: int = eqx.field(static=True, default=32)

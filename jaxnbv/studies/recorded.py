@@ -149,6 +149,7 @@ class RecordedStudy(Study):
     )
     seed: ClassVar[int] = 17
     quick: ClassVar[Mapping[str, Any]] = {"num_samples": 4, "grid_resolution": 48, "capacity": 1000}
+    paper: ClassVar[Mapping[str, Any]] = {"num_samples": 16, "grid_resolution": 100, "capacity": 8192}
 
     folder: str = eqx.field(static=True, kw_only=True)
     box: Box = eqx.field(kw_only=True)
@@ -164,7 +165,14 @@ class RecordedStudy(Study):
         - `folder`, `up`, `intrinsics`, `depth_scale`: as in the study.
         - `box`: its two corners, six numbers; default: `bounds_of` the recording. A voxel's side is an eightieth of the
           box's longest side.
+        - `num_samples`, `grid_resolution`, `capacity`: as in the study.
+
+        **Raises:** `ValueError` for a model with known shapes, or for a number of candidates.
         """
+        require(
+            "num_candidates" not in options,
+            f"--candidates {options.get('num_candidates')}: the candidates are the frames of the recording: leave it out",
+        )
         require(model in MODELS, f"a recording has no known shapes: give one of the models {', '.join(MODELS)}")
         folder = str(Path(options["folder"]).resolve())
         sensor: dict[str, Any] = {name: options.get(name) for name in ("up", "intrinsics", "depth_scale")}
@@ -173,6 +181,7 @@ class RecordedStudy(Study):
         box = Box(corners[:3], corners[3:])
         longest = float(np.max(box.high - box.low))
         settings = dict(cls.quick) if quick else {"num_samples": 8, "grid_resolution": 100, "capacity": 2000}
+        settings |= {name: options[name] for name in settings.keys() & options.keys()}
         study = cls(
             views=views,
             num_candidates=len(frames),

@@ -10,9 +10,7 @@ import warnings
 from collections.abc import Mapping
 from importlib.metadata import entry_points
 from types import MappingProxyType
-from typing import Any, NamedTuple, get_args
-
-from typer.models import ArgumentInfo
+from typing import Any, NamedTuple
 
 GROUP = "jaxnbv.studies"
 
@@ -25,7 +23,7 @@ class Entry(NamedTuple):
     - `scenes`, `views`: default numbers of scenes and views.
     - `model`: default model of surfaces; "known" for a study that has a `bank` or is about known parts.
     - `options`: typer annotations of the study's own options, by the names of its settings. Their default is None. A
-      `typer.Argument` is required.
+      `typer.Argument` is required. Options that all studies have, such as `capacity`, are left out.
     """
 
     study: str
@@ -38,15 +36,6 @@ class Entry(NamedTuple):
     def load(self) -> Any:
         """Import and return the class of the study."""
         return pkgutil.resolve_name(self.study)
-
-    @property
-    def arguments(self) -> tuple[str, ...]:
-        """Names of the required options."""
-        return tuple(name for name, hint in self.options.items() if isinstance(get_args(hint)[-1], ArgumentInfo))
-
-    def flag(self, option: str) -> str:
-        """An option as it is written on the command line."""
-        return option.upper() if option in self.arguments else f"--{option.replace('_', '-')}"
 
 
 @functools.cache

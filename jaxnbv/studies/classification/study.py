@@ -129,6 +129,7 @@ class ClassificationStudy(Study):
     )
     quick: ClassVar[Mapping[str, Any]] = {**Study.quick, "num_candidates": 40}
     quick_scenes: ClassVar[int] = 6
+    paper: ClassVar[Mapping[str, Any]] = {**Study.paper, "num_points": 1024, "imagined_classifier": None}
 
     objects: eqx.AbstractClassVar[ClassSet]
     cue: ClassVar[str] = ""
@@ -160,9 +161,9 @@ class ClassificationStudy(Study):
             classifier, imagined = (cls._classifier(file, framing.longest_side, count) for count in cls.network_points)
             sampler = study_sampler(model, cls.bank, (), framing.longest_side, quick, cls.solid)
             settings: dict[str, Any] = {"classifier": classifier, "imagined_classifier": imagined, "framing": framing}
-            settings |= options
+            settings |= (dict(cls.quick) if quick else {}) | options
             name = framing.value if len(cls.framings) > 1 else ""
-            studies[name] = cls(views=views, sampler=sampler, **settings | (dict(cls.quick) if quick else {}))
+            studies[name] = cls(views=views, sampler=sampler, **settings)
         return studies
 
     @classmethod

@@ -32,11 +32,16 @@ _SPACES: dict[str, Callable[[float], PoseSpace]] = {
     "gradient-6dof": FreePoses,
     "gradient-constrained": lambda radius: ConstrainedPoses(radius - 0.3, radius + 0.3),
 }
-_LEARNING_RATE = 0.03
 
 
 def search_of(
-    method: str, candidates: Candidates, num_candidates: int, radius: float, num_starts: int, iterations: int
+    method: str,
+    candidates: Candidates,
+    num_candidates: int,
+    radius: float,
+    num_starts: int,
+    iterations: int,
+    learning_rate: float = 0.03,
 ) -> Search:
     """The search that a method is named after, or `DiscreteSearch` over all candidates for any other name.
 
@@ -44,7 +49,7 @@ def search_of(
     `num_starts`.
     """
     if method in _SPACES:
-        settings = num_starts, iterations, _LEARNING_RATE, max(num_candidates // 2, num_starts)
+        settings = num_starts, iterations, learning_rate, max(num_candidates // 2, num_starts)
         return GradientSearch(None, _SPACES[method](radius), *settings)
     if method == "hybrid":
         return HybridSearch(space=SpherePoses(radius), candidates=candidates)

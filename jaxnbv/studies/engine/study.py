@@ -52,7 +52,7 @@ class Study(eqx.Module):
     - `num_candidates`: candidates on the sphere of `radius` (scene units). Gradient searches start with half as many.
     - `sampler`, `capacity`: as in `Planner`; `num_samples` and `grid_resolution` replace those of the sampler.
     - `camera`: the sensor; a planner may imagine fewer rays, see `imagined_camera`.
-    - `num_starts`, `iterations`: settings of searches by gradient.
+    - `num_starts`, `iterations`, `learning_rate`: settings of searches by gradient.
     - `meshes`: mesh files, one per scene; without any, scenes are procedural.
 
     Class attributes:
@@ -62,6 +62,7 @@ class Study(eqx.Module):
     - `extra_methods`: methods that run only if a command names them; `pictured`: methods in pictures, default: all.
     - `measures`: quantities in tables and the chart; `claims`: the paper's claims about the study.
     - `quick`: settings of a quick run; `quick_scenes`: its number of scenes.
+    - `paper`: settings of the paper and its code. `views` may be one of them.
     - `seed`: seed of first views, noise and samples.
     - `bank`: name of the bank of known shapes, see `shape_bank`; "" for none.
     - `without_bank`: methods that run a second time without known shapes, as "METHOD-screened".
@@ -87,6 +88,15 @@ class Study(eqx.Module):
         "iterations": 3,
     }
     quick_scenes: ClassVar[int] = 4
+    paper: ClassVar[Mapping[str, Any]] = {
+        "num_candidates": 120,
+        "num_samples": 16,
+        "grid_resolution": 100,
+        "capacity": 8192,
+        "num_starts": 6,
+        "iterations": 20,
+        "learning_rate": 0.01,
+    }
     bank: ClassVar[str] = ""
     without_bank: ClassVar[tuple[str, ...]] = ("coverage", "uncertainty")
 
@@ -99,6 +109,7 @@ class Study(eqx.Module):
     camera: Camera = Camera()
     num_starts: int = eqx.field(static=True, default=4)
     iterations: int = eqx.field(static=True, default=8)
+    learning_rate: float = eqx.field(static=True, default=0.03)
     meshes: tuple[MeshFile, ...] = eqx.field(static=True, default=())
 
     def __check_init__(self):
@@ -112,8 +123,8 @@ class Study(eqx.Module):
     def configured(cls, model: str, views: int, quick: bool, **options: Any) -> "dict[str, Study]":
         """The studies of one command, by the names of their folders; "" for a single study.
 
-        - `options`: the study's own settings. `meshes` is a folder, see `files_in`. With the model `known`, the bank
-          for each mesh holds all the other meshes.
+        - `options`: settings, which replace those of `quick`. `meshes` is a folder, see `files_in`. With the model
+          `known`, the bank for each mesh holds all the other meshes.
 
         **Raises:** `ValueError` as `files_in` and `study_sampler` do.
         """
@@ -159,7 +170,7 @@ class Study(eqx.Module):
 
     def search(self, method: str, scene: Scene) -> Search:
         """The search of a method, see `search_of`."""
-        climbs = self.num_starts, self.iterations
+        climbs = self.num_starts, self.iterations, self.learning_rate
         return search_of(method, self.candidates, self.num_candidates, self.radius, *climbs)
 
     def planner(self, method: str, scene: Scene) -> Planner:

@@ -145,6 +145,7 @@ class PartDiscoveryStudy(Study):
     seed: ClassVar[int] = 6
     radius: ClassVar[float] = PART_SETTING.radius
     quick: ClassVar[Mapping[str, Any]] = {**Study.quick, "num_candidates": 24, "num_points": 512}
+    paper: ClassVar[Mapping[str, Any]] = {**Study.paper, "num_points": NETWORK_POINTS, "imagined_rays": 64}
 
     views: int = eqx.field(static=True, default=6)
     num_samples: int = eqx.field(static=True, default=8)

@@ -1,4 +1,4 @@
-"""Where trials are run."""
+"""Trials in this process and in others."""
 
 import functools
 import json
@@ -16,6 +16,7 @@ import psutil
 import pytest
 from deadly import Trial
 from test_study import small, without_time
+from toy import ToyStudy
 
 from jaxnbv.checks import InputError
 from jaxnbv.cli import run_study as command
@@ -45,7 +46,7 @@ def test_no_trial_is_lost_though_some_die(tmp_path):
     assert "died 2 times" in failures[4]
     assert list(records.failures(range(4))) == [3]
     assert "in __call__" in (tmp_path / "records" / "scene_0003.failed").read_text()
-    # The next time those that failed are tried alone.
+    # The next time only the failed ones run.
     asked = []
     again = RecordFolder(tmp_path / "records", {"views": 3})
     assert again.collect(range(6), lambda index: asked.append(index) or {"square": index**2}) == squares(*range(6))
@@ -141,14 +142,15 @@ def test_a_command_writes_what_was_found_and_fails_at_the_end(tmp_path, monkeypa
             raise RuntimeError("lost")
         return {"scene": index, "methods": {name: {"points": [1000, 4000], "views": [0, 1]} for name in methods}}
 
-    def run(out, scenes, meshes=None, **more):
-        options = StudyOptions(name="pyramid", scenes=scenes, views=2, model="paper", out=tmp_path / out, **more)
-        command.run_study(options, meshes=meshes)
+    def run(out, scenes, **more):
+        options = StudyOptions(scenes=scenes, out=tmp_path / out, **{"views": 2, "model": "paper"} | more)
+        command.run_study("pyramid", options)
 
     monkeypatch.setitem(studies(), "pyramid", Entry("toy:ToyStudy", "", 3, 2))
     monkeypatch.setattr(command, "run_scene", fake)
     with pytest.raises(
-        InputError, match=r"^1 of 3 scenes failed.*first scene 1 \(RuntimeError: lost\).*/some has scene_\*\.failed"
+        InputError,
+        match=r"^1 of 3 scenes failed.*first scene 1 \(RuntimeError: lost\).*scene_\*\.failed in .*/some have the reasons",
     ):
         run("some", "3")
     assert "points" in (tmp_path / "some" / "results.csv").read_text()
@@ -162,8 +164,8 @@ def test_a_command_writes_what_was_found_and_fails_at_the_end(tmp_path, monkeypa
     for wrong in ("0", "3:3", "9:7", "-2", "all"):
         with pytest.raises(InputError, match=f"--scenes {wrong} names no scenes"):
             run("wrong", wrong)
-    with pytest.raises(InputError, match="the study pyramid takes no --meshes: it is for heat"):
-        run("wrong", "2", meshes=tmp_path)
+    with pytest.raises(InputError, match=r"belongs to another study; it differs in study\.capacity"):
+        run("some", "3", capacity=77)
     monkeypatch.setattr(command, "run_scene", lambda study, index, **given: fake(study, index + 4, **given))
     run("joined", "3", join=[tmp_path / "some"])
     scenes = [json.loads((tmp_path / "joined" / f"scene_000{index}.json").read_text())["record"] for index in range(3)]
@@ -172,3 +174,32 @@ def test_a_command_writes_what_was_found_and_fails_at_the_end(tmp_path, monkeypa
         run("joined", "2", join=[tmp_path / "some", tmp_path / "nowhere"])
     with pytest.raises(InputError, match=r"--workers 2 and --cluster tcp://here:1 exclude each other"):
         run("wrong", "2", workers=2, cluster="tcp://here:1")
+
+
+def test_settings_of_the_command_replace_those_of_the_study(tmp_path, monkeypatch):
+    planned = {}
+
+    def fake(study, index, methods, own):
+        planned[index] = study, study.planner("farthest", study.scene(index))
+        return {"scene": index, "methods": {name: {"points": [1000, 4000], "views": [0, 1]} for name in methods}}
+
+    def run(**settings):
+        planned.clear()
+        out = tmp_path / str(len(list(tmp_path.iterdir())))
+        command.run_study("pyramid", StudyOptions(out=out, **settings))
+        study, planner = planned[0]
+        sampler = planner.sampler
+        sizes = planner.search.candidates.count, sampler.num_samples, sampler.grid.resolution, planner.capacity
+        return sizes, type(sampler.model).__name__, study.views
+
+    monkeypatch.setitem(studies(), "pyramid", Entry("toy:ToyStudy", "", 3, 4))
+    monkeypatch.setattr(command, "run_scene", fake)
+    assert run(settings="paper") == ((120, 16, 100, 8192), "GeometricSPSR", 4)
+    assert run(settings="paper", samples=3, model="screened", views=2) == ((120, 3, 100, 8192), "ScreenedSPSR", 2)
+    single = {"candidates": 9, "samples": 3, "grid": 20, "capacity": 77}
+    for more in ({}, {"quick": True}):
+        assert run(model="screened", **single, **more)[0] == (9, 3, 20, 77)
+    run(quick=True, model="screened", scenes="6")
+    assert sorted(planned) == [*range(6)]
+    run(quick=True, model="screened")
+    assert sorted(planned) == [*range(ToyStudy.quick_scenes)]
