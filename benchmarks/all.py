@@ -57,8 +57,8 @@ class Bench:
         """Observations after the first view and `views - 1` others around the object."""
         observations, around = None, map(nbv.look_at, nbv.geometry.fibonacci_sphere(views, 2.5))
         for index, pose in enumerate([self.first, *around][:views]):
-            seen = observe_scene(self.scene, planner.camera, pose, nbv.SensorNoise(), jax.random.key(index))
-            observations = planner.observe(observations, pose, seen) if observations else planner.init(pose, seen)
+            cloud = observe_scene(self.scene, planner.camera, pose, nbv.SensorNoise(), jax.random.key(index))
+            observations = planner.observe(observations, pose, cloud) if observations else planner.init(pose, cloud)
         return observations
 
 
@@ -89,18 +89,18 @@ def coverage(bench: Bench) -> None:
     # Coverage reads no normals, and its step computes none.
     points = jax.jit(lambda surfaces: nbv.scanning.scan_samples(surfaces, planner.camera, bench.candidates).points)
     bench.take("coverage: 16 samples scanned from 120 candidates", lambda: points(surfaces), step=step, rival=rival)
-    seen = nbv.scanning.scan_samples(surfaces, planner.camera, bench.candidates)
+    scans = nbv.scanning.scan_samples(surfaces, planner.camera, bench.candidates)
 
     @jax.jit
-    def values(cloud, seen):
+    def values(cloud, scans):
         context = planner.acquisition.context(inputs_of(cloud))
         score = lambda of: scores(planner.acquisition, context, of, planner.camera, bench.candidates)  # noqa: E731
-        return jnp.mean(jax.lax.map(score, seen, batch_size=samples_at_once(planner.camera, bench.candidates)), axis=0)
+        return jnp.mean(jax.lax.map(score, scans, batch_size=samples_at_once(planner.camera, bench.candidates)), axis=0)
 
     # The parts that are timed must give the values of a real step.
     expected = nbv.expected_value(planner.acquisition, observations.cloud, surfaces, planner.camera, bench.candidates)
-    np.testing.assert_allclose(values(observations.cloud, seen), expected, rtol=1e-3)
-    bench.take("coverage: values of the 1,920 scans", lambda: values(observations.cloud, seen), step=step)
+    np.testing.assert_allclose(values(observations.cloud, scans), expected, rtol=1e-3)
+    bench.take("coverage: values of the 1,920 scans", lambda: values(observations.cloud, scans), step=step)
     full = bench.observations(planner, 13)
     bench.take(
         f"coverage: a step at {int(full.cloud.count):,} points", lambda: planner.propose(full, bench.key), step=step
@@ -133,12 +133,14 @@ def cross_entropy(bench: Bench) -> None:
     scans = lambda: nbv.scanning.scan_samples(surfaces, planner.camera, bench.candidates)  # noqa: E731
     bench.take("cross-entropy: 16 samples scanned from 120 candidates", scans, step=step)
     seen = jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), scans())
-    known = planner.acquisition.context(inputs_of(observations))[0]
+    context_cloud = planner.acquisition.context(inputs_of(observations))[0]
 
     @jax.jit
     def thinned(seen):
         def join(scan):
-            return nbv.geometry.farthest_point_subsample(nbv.geometry.concatenate(known, scan), classifier.num_points)
+            return nbv.geometry.farthest_point_subsample(
+                nbv.geometry.concatenate(context_cloud, scan), classifier.num_points
+            )
 
         return jax.lax.map(join, seen)
 
@@ -236,10 +238,10 @@ def main() -> None:
     parser.add_argument("--mesh", help="a mesh file; a mug if left out")
     parser.add_argument("--only", nargs="+", choices=names, default=names)
     parser.add_argument("--out", type=Path, default=Path("runs/all"))
-    asked = parser.parse_args()
-    bench = Bench(asked.mesh)
+    options = parser.parse_args()
+    bench = Bench(options.mesh)
     for stage in STAGES:
-        if stage.__name__ in asked.only:
+        if stage.__name__ in options.only:
             stage(bench)
     # Linux gives kilobytes, macOS bytes.
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e9 if sys.platform == "darwin" else 1e6)
@@ -251,9 +253,9 @@ def main() -> None:
         "peak_memory_gb": peak,
         "stages": bench.rows,
     }
-    asked.out.parent.mkdir(parents=True, exist_ok=True)
-    asked.out.with_suffix(".json").write_text(json.dumps(record, indent=2) + "\n")
-    asked.out.with_suffix(".md").write_text(page(record))
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    options.out.with_suffix(".json").write_text(json.dumps(record, indent=2) + "\n")
+    options.out.with_suffix(".md").write_text(page(record))
     print(page(record))
 
 

@@ -40,10 +40,15 @@ def row_of(mesh: trimesh.Trimesh, views: int, search, error: np.ndarray, correct
     scan = scan_object(arm, box_about(mesh), planner_of(search), views, None, corrects, reachable)
     points = nbv.viz.scanned_cloud(scan.session.episode).to_numpy()[0]
     surface = trimesh.sample.sample_surface(mesh, _POINTS, seed=0)[0]
-    seen = trimesh.PointCloud(points).kdtree.query(surface)[0] < _NEAR
+    is_covered = trimesh.PointCloud(points).kdtree.query(surface)[0] < _NEAR
     refused = sum(scan.refusals.values())
     few = np.random.default_rng(0).choice(len(points), min(len(points), _POINTS), replace=False)
-    return [scan.proposals / (scan.proposals + refused), arm.seconds, seen.mean(), *distances_mm(points[few], mesh)]
+    return [
+        scan.proposals / (scan.proposals + refused),
+        arm.seconds,
+        is_covered.mean(),
+        *distances_mm(points[few], mesh),
+    ]
 
 
 def main() -> None:

@@ -114,15 +114,15 @@ class ClassStudy(Study):
         kinds = np.array(objects_in(self.meshes)[1])
         own, others = kinds[scene.task], kinds[self.others(scene)]
         network = pretrained_classifier("household", _SIDE)
-        held: Mapping[str, list[float]] = {"right": [], "probability": [], "network": []}
+        measures: Mapping[str, list[float]] = {"right": [], "probability": [], "network": []}
         for step in episode:
             weights = np.asarray(step.observations.hypotheses.shape_weights, np.float64)
             share = {kind: weights[others == kind].sum() / max(weights.sum(), 1e-30) for kind in set(others)}
-            held["right"].append(float(max(share, key=lambda kind: share[kind]) == own))
-            held["probability"].append(float(share[own]))
+            measures["right"].append(float(max(share, key=lambda kind: share[kind]) == own))
+            measures["probability"].append(float(share[own]))
             said = HOUSEHOLD[int(np.argmax(network(step.observations.cloud)))].replace(" ", "_")
-            held["network"].append(float(said == own) if own.replace("_", " ") in HOUSEHOLD else np.nan)
-        return dict(held)
+            measures["network"].append(float(said == own) if own.replace("_", " ") in HOUSEHOLD else np.nan)
+        return dict(measures)
 
 
 def main() -> None:

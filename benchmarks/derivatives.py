@@ -57,14 +57,14 @@ def main() -> None:
     parser.add_argument("--mesh", help="a mesh file; the demo object if left out")
     parser.add_argument("--step", type=float, default=0.02)
     parser.add_argument("--seeds", type=int, default=2)
-    asked = parser.parse_args()
-    scene = nbv.load_mesh(asked.mesh) if asked.mesh else demo_object()
+    options = parser.parse_args()
+    scene = nbv.load_mesh(options.mesh) if options.mesh else demo_object()
     for where, fov in FIELDS_OF_VIEW.items():
         for name, acquisition in ACQUISITIONS.items():
             sampler, camera = nbv.SurfaceSampler(num_samples=SAMPLES), nbv.Camera(fov, RAYS, RAYS)
             planner = nbv.Planner(acquisition, nbv.DiscreteSearch(), camera, sampler)
-            found = np.concatenate([cosines(planner, scene, seed, asked.step) for seed in range(asked.seeds)])
-            print(f"{name:12} {where:9} median {np.median(found):5.2f}, least {found.min():5.2f}", flush=True)
+            values = np.concatenate([cosines(planner, scene, seed, options.step) for seed in range(options.seeds)])
+            print(f"{name:12} {where:9} median {np.median(values):5.2f}, least {values.min():5.2f}", flush=True)
 
 
 if __name__ == "__main__":

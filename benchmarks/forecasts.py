@@ -55,8 +55,8 @@ class Truth(eqx.Module):
         """
         inside = _inside(scene, planner.sampler.grid)
         look = _scan if scene.in_jit else scan
-        seen = look(scene, camera, candidates)
-        depths = ray_depths(seen, camera, candidates, volume)[0]
+        scans = look(scene, camera, candidates)
+        depths = ray_depths(scans, camera, candidates, volume)[0]
         return cls(candidates, camera, volume, inside, depths, look(scene, planner.camera, candidates))
 
 
@@ -234,10 +234,10 @@ def _judge(
     camera: Camera,
     acquisition: Acquisition,
 ):
-    seen = jax.lax.map(lambda surface: scan(surface, truth.camera, truth.candidates), surfaces)
-    depths, meets = jax.vmap(lambda s: ray_depths(s, truth.camera, truth.candidates, truth.volume))(seen)
+    scans = jax.lax.map(lambda surface: scan(surface, truth.camera, truth.candidates), surfaces)
+    depths, meets = jax.vmap(lambda s: ray_depths(s, truth.camera, truth.candidates, truth.volume))(scans)
     error = jnp.mean(crps(depths, truth.depths), where=meets[0])
-    share = empty_share(seen.points, seen.mask, empty, surfaces.grid)
+    share = empty_share(scans.points, scans.mask, empty, surfaces.grid)
     inside = jnp.mean(surfaces.values < 0, axis=0)
     expected = expected_value(acquisition, cloud, surfaces, camera, truth.candidates)
     context = acquisition.context(inputs_of(cloud))

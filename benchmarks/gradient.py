@@ -73,8 +73,8 @@ def run_seed(planners: dict[str, nbv.Planner], task: str, mesh: str | None, seed
     first_key, noise_key, sample_key, search_key = jax.random.split(jax.random.key(seed), 4)
     scene, first = scene_and_first(task, mesh, seed, first_key)
     planner = planners["discrete"]
-    seen = observe_scene(scene, planner.camera, first, nbv.SensorNoise(), noise_key)
-    observations = planner.init(first, seen)
+    cloud = observe_scene(scene, planner.camera, first, nbv.SensorNoise(), noise_key)
+    observations = planner.init(first, cloud)
     inputs = planner.step_inputs(observations, sample_key)
     surfaces = inputs.surfaces
     parameters = jnp.zeros((6, 3))
@@ -83,11 +83,11 @@ def run_seed(planners: dict[str, nbv.Planner], task: str, mesh: str | None, seed
         "six values": least_time(lambda: value(planner, observations, surfaces, parameters)),
         "six gradients": least_time(lambda: gradient(planner, observations, surfaces, parameters)),
     }
-    for name, asked in planners.items():
+    for name, candidate_planner in planners.items():
         if not compiled:
-            jax.block_until_ready(asked.choose(inputs, search_key))
+            jax.block_until_ready(candidate_planner.choose(inputs, search_key))
         start = time.perf_counter()
-        proposal = jax.block_until_ready(asked.choose(inputs, search_key))
+        proposal = jax.block_until_ready(candidate_planner.choose(inputs, search_key))
         row[name] = {"value": float(proposal.value), "seconds": time.perf_counter() - start}
     return row
 

@@ -126,10 +126,10 @@ def main() -> None:
         likeliest = [next(iter(belief.items())) for belief in beliefs(study, planner, scene, options)]
         rows.append([(probability, float(said == name)) for said, probability in likeliest])
         print(f"{scene.name:24}", *(f"{said} {probability:.2f}" for said, probability in likeliest), flush=True)
-    held = np.array(rows)
+    table = np.array(rows)
     for title, column in {"right": 1, "probability": 0}.items():
-        print(f"{title:24}", *(f"{100 * value:.0f}" for value in held[..., column].mean(axis=0)))
-    print(f"calibration error {calibration_error(held.reshape(-1, 2)):.3f}")
+        print(f"{title:24}", *(f"{100 * value:.0f}" for value in table[..., column].mean(axis=0)))
+    print(f"calibration error {calibration_error(table.reshape(-1, 2)):.3f}")
 
 
 if __name__ == "__main__":

@@ -85,22 +85,22 @@ def objects_of(arguments: argparse.Namespace) -> dict[str, Callable[[], nbv.scan
     alone = not arguments.mesh
     scenes = (2 if alone else 0) if arguments.scenes is None else arguments.scenes
     parts = (["chair", "mug", "motorbike"] if alone else []) if arguments.parts is None else arguments.parts
-    found: dict[str, Callable[[], nbv.scanning.Surface]] = {}
+    makers: dict[str, Callable[[], nbv.scanning.Surface]] = {}
     for index in range(scenes):
-        found[f"pyramid/{index}"] = lambda i=index: nbv.SDFSurface(pyramid_scene(Split.VALIDATION, i))
+        makers[f"pyramid/{index}"] = lambda i=index: nbv.SDFSurface(pyramid_scene(Split.VALIDATION, i))
     for name in parts:
         index = PART_CATEGORIES.index(name)
-        found[f"parts/{name}"] = lambda i=index: nbv.SDFSurface(part_scene(Split.VALIDATION, i).solid)
+        makers[f"parts/{name}"] = lambda i=index: nbv.SDFSurface(part_scene(Split.VALIDATION, i).solid)
     if alone:
-        found["demo/mug"] = demo_object
+        makers["demo/mug"] = demo_object
     for file in map(Path, arguments.mesh):
-        found[f"{file.resolve().parent.name}/{file.stem}"] = functools.partial(nbv.load_mesh, file)
-    return found
+        makers[f"{file.resolve().parent.name}/{file.stem}"] = functools.partial(nbv.load_mesh, file)
+    return makers
 
 
 def with_bank(planner: nbv.Planner, bank: nbv.ShapeBank, name: str) -> nbv.Planner:
     """A planner with the shapes of a bank, without the object of this name."""
-    others = [row for row, known in enumerate(bank.names) if known != name]
+    others = [row for row, shape_name in enumerate(bank.names) if shape_name != name]
     sampler = planner.sampler.with_bank(bank.select(others), nbv.surfaces.Upright(by_axis=True))
     return dataclasses.replace(planner, sampler=sampler)
 
@@ -112,8 +112,8 @@ def random_views(scene: nbv.scanning.Surface, key: jax.Array) -> list[tuple[nbv.
         direction_key, noise_key = jax.random.split(jax.random.fold_in(key, index))
         direction = jax.random.normal(direction_key, (3,))
         pose = nbv.look_at(2.5 * direction / jnp.linalg.norm(direction))
-        seen = observe_scene(scene, nbv.Camera(), pose, nbv.SensorNoise(), noise_key)
-        views += [(pose, seen)] if int(seen.count) >= LEAST_HITS else []
+        cloud = observe_scene(scene, nbv.Camera(), pose, nbv.SensorNoise(), noise_key)
+        views += [(pose, cloud)] if int(cloud.count) >= LEAST_HITS else []
         if len(views) == VIEWS:
             return views
     raise SystemExit(f"the object shows from fewer than {VIEWS} of 100 random directions: give a larger one")
@@ -208,7 +208,7 @@ def main() -> None:
         parser.error(f"--better {compared[1]} is none of the models that are compared: {', '.join(names)}")
     planners = {name: planner_of(variants[name]) for name in names}
     candidates = sphere_candidates(arguments.candidates, 2.5)
-    held = json.loads(arguments.out.read_text()) if arguments.out.exists() else {}
+    stored = json.loads(arguments.out.read_text()) if arguments.out.exists() else {}
     rows, warm = {}, set[str]()
     objects = objects_of(arguments)
     with tqdm(total=len(objects) * len(arguments.seeds) * len(names), unit="run") as bar:
@@ -218,19 +218,21 @@ def main() -> None:
                 base, views = jax.random.fold_in(jax.random.key(seed), zlib.crc32(name.encode())), None
                 for model, plain in planners.items():
                     planner = with_bank(plain, bank, name) if bank is not None and model == "known" else plain
-                    asked = describe([scene, planner, arguments.candidates, RAYS, VOLUME, LEAST_HITS])
+                    settings = describe([scene, planner, arguments.candidates, RAYS, VOLUME, LEAST_HITS])
                     label = f"{name}, seed {seed}, {model}"
                     bar.set_description(label)
-                    made_of = hashlib.sha256(json.dumps(asked).encode()).hexdigest()
-                    if held.get(label, {}).get("made_of") != made_of:
+                    made_of = hashlib.sha256(json.dumps(settings).encode()).hexdigest()
+                    if stored.get(label, {}).get("made_of") != made_of:
                         truth = truth or Truth.of(scene, planner, candidates, VOLUME, RAYS)
                         views = views or random_views(scene, jax.random.fold_in(base, 0))
                         records = run(planner, views, truth, jax.random.fold_in(base, 1), model in warm)
                         warm.add(model)
-                        held[label] = {"made_of": made_of, "versions": versions(), "records": records}
+                        stored[label] = {"made_of": made_of, "versions": versions(), "records": records}
                         arguments.out.parent.mkdir(parents=True, exist_ok=True)
-                        write_whole(arguments.out, lambda out: out.write((json.dumps(held, indent=1) + "\n").encode()))
-                    rows[name, seed, model] = held[label]["records"]
+                        write_whole(
+                            arguments.out, lambda out: out.write((json.dumps(stored, indent=1) + "\n").encode())
+                        )
+                    rows[name, seed, model] = stored[label]["records"]
                     bar.update()
     show(rows, names)
     if arguments.reliability:
@@ -238,10 +240,10 @@ def main() -> None:
     if arguments.figure:
         name, make = next(iter(objects.items()))
         base = jax.random.fold_in(jax.random.key(arguments.seeds[0]), zlib.crc32(name.encode()))
-        shown = {model: planners[model] for model in compared}
+        by_model = {model: planners[model] for model in compared}
         scene = make()
         first = random_views(scene, jax.random.fold_in(base, 0))[0]
-        draw_samples(arguments.figure, scene, first, shown, jax.random.fold_in(base, 1))
+        draw_samples(arguments.figure, scene, first, by_model, jax.random.fold_in(base, 1))
 
 
 if __name__ == "__main__":

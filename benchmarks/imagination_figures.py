@@ -35,10 +35,10 @@ def picture(surface: nbv.scanning.Surface, eye: nbv.Pose, seen: nbv.PointCloud, 
 
 def crop(images: list[np.ndarray]) -> tuple[slice, slice]:
     """The rows and columns that any of the pictures needs, except for stray specks."""
-    shown = np.mean([image[..., 3] for image in images], axis=0)
+    opacity = np.mean([image[..., 3] for image in images], axis=0)
     spans = []
     for axis in (1, 0):
-        (used,) = np.nonzero(shown.sum(axis=axis) > 0.5)
+        (used,) = np.nonzero(opacity.sum(axis=axis) > 0.5)
         spans.append(slice(max(used[0] - 6, 0), used[-1] + 7))
     return spans[0], spans[1]
 

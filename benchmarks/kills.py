@@ -54,9 +54,9 @@ def take_session(folder: Path) -> None:
     while len(session.views) < 4:
         matrix = np.asarray(session.next().matrix if session.views else first.matrix)
         pose = nbv.Pose.from_matrix(matrix)
-        seen = nbv.scan(ball, camera, pose)
-        depth = np.asarray((seen.points - pose.position) @ pose.forward).reshape(48, 64)
-        session.add(np.where(np.asarray(seen.mask).reshape(48, 64), depth, np.inf), matrix)
+        cloud = nbv.scan(ball, camera, pose)
+        depth = np.asarray((cloud.points - pose.position) @ pose.forward).reshape(48, 64)
+        session.add(np.where(np.asarray(cloud.mask).reshape(48, 64), depth, np.inf), matrix)
     nbv.write_report(session.episode, folder / "report")
 
 
@@ -108,22 +108,22 @@ def main() -> None:
     parser.add_argument("--commands", nargs="+", choices=COMMANDS, default=list(COMMANDS))
     parser.add_argument("--out", type=Path, default=Path("runs/kills"))
     parser.add_argument("--session", type=Path, help=argparse.SUPPRESS)
-    asked = parser.parse_args()
-    if asked.session:
-        return take_session(asked.session)
-    shutil.rmtree(asked.out, ignore_errors=True)
-    (inputs := asked.out / "inputs").mkdir(parents=True)
+    options = parser.parse_args()
+    if options.session:
+        return take_session(options.session)
+    shutil.rmtree(options.out, ignore_errors=True)
+    (inputs := options.out / "inputs").mkdir(parents=True)
     trimesh.creation.box((1.0, 0.7, 0.5)).export(inputs / "box.ply")
     random, failures = np.random.default_rng(0), []
-    share = -(-asked.kills // len(asked.commands))
-    for name in asked.commands:
+    share = -(-options.kills // len(options.commands))
+    for name in options.commands:
         # The second run compiles nothing, like the runs that are killed.
-        let_through(name, asked.out / name / "first", inputs)
-        seconds = let_through(name, asked.out / name / "whole", inputs)
-        expected, killed = contents(asked.out / name / "whole"), 0
+        let_through(name, options.out / name / "first", inputs)
+        seconds = let_through(name, options.out / name / "whole", inputs)
+        expected, killed = contents(options.out / name / "whole"), 0
         with tqdm(total=share, desc=name, unit="kill") as bar:
             while killed < share:
-                shutil.rmtree(out := asked.out / name / "killed", ignore_errors=True)
+                shutil.rmtree(out := options.out / name / "killed", ignore_errors=True)
                 # Kill several times in the same folder, at one random moment of each stratum of the run's time.
                 for moment in random.permutation(min(STRATA, share - killed)):
                     processes = start(name, out, inputs)
@@ -135,7 +135,7 @@ def main() -> None:
                 bar.update(killed - bar.n)
                 let_through(name, out, inputs)
                 if contents(out) != expected:
-                    differ = [file for file, found in contents(out).items() if expected.get(file) != found]
+                    differ = [file for file, content_now in contents(out).items() if expected.get(file) != content_now]
                     failures.append(f"{name} after {killed} kills: {differ or sorted(expected)}")
         print(f"{name}: {killed} kills of {seconds:.0f} s")
     print("\n".join(failures) or "every run ended with the files of one that was left alone")

@@ -59,9 +59,9 @@ def views_of(mesh: trimesh.Trimesh, seed: int) -> list[tuple[np.ndarray, np.ndar
     for tilt, turn in zip(_TILTS, _TURNS + random.uniform(0.0, 2.0 * np.pi), strict=True):
         place = _AWAY * np.array([np.cos(tilt) * np.cos(turn), np.cos(tilt) * np.sin(turn), np.sin(tilt)])
         pose = nbv.look_at(place, (0.0, 0.0, 0.03), up=(0.0, 0.0, 1.0))
-        seen = nbv.scan(world, _CAMERA, pose)
-        depth = (np.asarray(seen.points) - np.asarray(pose.position)) @ np.asarray(pose.forward)
-        depth = np.where(seen.mask, depth + _NOISE * random.standard_normal(depth.shape), 0.0)
+        cloud = nbv.scan(world, _CAMERA, pose)
+        depth = (np.asarray(cloud.points) - np.asarray(pose.position)) @ np.asarray(pose.forward)
+        depth = np.where(cloud.mask, depth + _NOISE * random.standard_normal(depth.shape), 0.0)
         views.append((depth.reshape(_CAMERA.height, _CAMERA.width), np.asarray(pose.to_matrix(), np.float64)))
     return views
 

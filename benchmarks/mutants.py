@@ -36,16 +36,16 @@ def places(path: Path) -> dict[tuple[int, int], list[tuple[str, int]]]:
     from cosmic_ray.plugins import get_operator, operator_names
 
     code = path.read_text()
-    parsed, found = get_ast(code), {}
+    parsed, by_place = get_ast(code), {}
     for name in operator_names():
         # An operator with arguments changes nothing without them.
         if (kind := get_operator(name)).arguments():
             continue
         spots = [at for node in ast_nodes(parsed) for at, _ in kind().mutation_positions(node)]
         for occurrence, at in enumerate(spots):
-            found.setdefault(at, []).append((name, occurrence))
+            by_place.setdefault(at, []).append((name, occurrence))
     typed = [note for node in ast.walk(ast.parse(code)) if (note := annotation(node)) is not None]
-    return {at: ways for at, ways in found.items() if not any(covers(note, at) for note in typed)}
+    return {at: ways for at, ways in by_place.items() if not any(covers(note, at) for note in typed)}
 
 
 def annotation(node: ast.AST) -> ast.AST | None:
@@ -58,9 +58,9 @@ def covers(node: ast.AST, at: tuple[int, int]) -> bool:
 
 def statement(code: str, line: int) -> range:
     """Lines of the smallest statement around a line, or of its head if it contains other statements."""
-    found = [node for node in ast.walk(ast.parse(code)) if isinstance(node, ast.stmt)]
-    first = {node: min(one.lineno for one in (node, *getattr(node, "decorator_list", ()))) for node in found}
-    inner = max((node for node in found if first[node] <= line <= node.end_lineno), key=first.__getitem__)
+    statements = [node for node in ast.walk(ast.parse(code)) if isinstance(node, ast.stmt)]
+    first = {node: min(one.lineno for one in (node, *getattr(node, "decorator_list", ()))) for node in statements}
+    inner = max((node for node in statements if first[node] <= line <= node.end_lineno), key=first.__getitem__)
     body = getattr(inner, "body", None)
     return range(first[inner], max(body[0].lineno, line + 1) if body else inner.end_lineno + 1)
 
@@ -77,8 +77,8 @@ def tests_of(path: Path, code: str, line: int, by_line: dict[int, list[str]], se
     # Only the first test of a process that needs a compiled function traces it, so others may need the line too.
     of_statement, of_module = running(statement(code, line)), running(by_line)
     names = [*sorted(of_statement, key=order), *sorted(of_module - of_statement, key=order)]
-    taken = np.cumsum([seconds.get(name, 0.0) for name in names])
-    return names[: 1 + int(np.searchsorted(taken, SECONDS))]
+    total_seconds = np.cumsum([seconds.get(name, 0.0) for name in names])
+    return names[: 1 + int(np.searchsorted(total_seconds, SECONDS))]
 
 
 def outcome(path: Path, mutated: str, tests: list[str]) -> str:
@@ -106,25 +106,25 @@ def main() -> None:
     parser.add_argument("--coverage", default=".coverage")
     parser.add_argument("--durations", type=Path, required=True, help="what pytest --durations=0 printed")
     parser.add_argument("--out", type=Path, default=Path("runs/mutants.json"))
-    asked = parser.parse_args()
+    options = parser.parse_args()
     # The tests do not depend on it.
     from cosmic_ray.mutating import mutate_code
     from cosmic_ray.plugins import get_operator
     from coverage import CoverageData
 
-    measured = CoverageData(asked.coverage)
+    measured = CoverageData(options.coverage)
     measured.read()
-    told = re.findall(r"^([\d.]+)s \w+ +(tests\S.*)$", asked.durations.read_text(), re.MULTILINE)
+    durations = re.findall(r"^([\d.]+)s \w+ +(tests\S.*)$", options.durations.read_text(), re.MULTILINE)
     seconds: dict[str, float] = {}
-    for took, name in told:
+    for took, name in durations:
         seconds[name] = seconds.get(name, 0.0) + float(took)
     files = [
         file for part in PARTS for file in sorted(Path("jaxnbv").glob(f"{part}/**/*.py" if "." not in part else part))
     ]
     drawn = [(path, at, ways) for path in files for at, ways in places(path).items()]
     random = np.random.default_rng(0)
-    rows = json.loads(asked.out.read_text()) if asked.out.exists() else []
-    chosen = random.choice(len(drawn), asked.mutants, replace=False)
+    rows = json.loads(options.out.read_text()) if options.out.exists() else []
+    chosen = random.choice(len(drawn), options.mutants, replace=False)
     for number, index in enumerate(tqdm(chosen, unit="mutant")):
         path, at, ways = drawn[index]
         name, occurrence = ways[random.integers(len(ways))]
@@ -135,8 +135,8 @@ def main() -> None:
         tests = tests_of(path, code, at[0], measured.contexts_by_lineno(str(path.resolve())), seconds)
         after = mutated.splitlines()[at[0] - 1].strip()
         rows.append({"at": f"{path}:{at[0]}", "to": after, "by": name, "is": outcome(path, mutated, tests)})
-        asked.out.parent.mkdir(parents=True, exist_ok=True)
-        asked.out.write_text(json.dumps(rows, indent=1))
+        options.out.parent.mkdir(parents=True, exist_ok=True)
+        options.out.write_text(json.dumps(rows, indent=1))
     for row in rows:
         if row["is"] not in ("killed", "no end"):
             print(f"{row['is']}: {row['at']}  {row['to']}")

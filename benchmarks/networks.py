@@ -66,14 +66,14 @@ def multiply_adds(network: PointNet2Classifier) -> int:
 
 def groups(network: PointNet2Classifier, points: jax.Array) -> list[jax.Array]:
     """Sampling and grouping at all levels, without the products."""
-    found = []
+    indices = []
     for level in network.levels:
         mask = jnp.ones(len(points), dtype=bool)
         centers = points[farthest_point_indices(points, mask, level.centers)]
         rules = zip(level.radii, level.members, strict=True)
-        found += [ball_query(centers, points, mask, radius, members) for radius, members in rules]
+        indices += [ball_query(centers, points, mask, radius, members) for radius, members in rules]
         points = centers
-    return found
+    return indices
 
 
 def timings(network: PointNet2Classifier, points: jax.Array, normals: jax.Array) -> dict[str, float]:

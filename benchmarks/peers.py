@@ -93,25 +93,25 @@ def planned(trial: Trial, search: nbv.search.Search, rays: int, first: int, seed
         max_views=trial.protocol.views,
     )
     key, places = jax.random.key(seed), np.asarray(trial.poses.position, np.float64)
-    pose, taken, seconds = trial.poses[first], [first], []
+    pose, chosen, seconds = trial.poses[first], [first], []
     observations = planner.init(pose, nbv.scan(trial.mesh, camera, pose))
-    while len(taken) < trial.protocol.views:
+    while len(chosen) < trial.protocol.views:
         start = time.perf_counter()
-        pose = jax.block_until_ready(planner.propose(observations, jax.random.fold_in(key, len(taken)))).pose
+        pose = jax.block_until_ready(planner.propose(observations, jax.random.fold_in(key, len(chosen)))).pose
         seconds.append(time.perf_counter() - start)
-        taken.append(int(np.argmin(np.linalg.norm(places - np.asarray(pose.position), axis=1))))
+        chosen.append(int(np.argmin(np.linalg.norm(places - np.asarray(pose.position), axis=1))))
         observations = planner.observe(observations, pose, nbv.scan(trial.mesh, camera, pose))
-    return taken, seconds[2:]
+    return chosen, seconds[2:]
 
 
 def greedy(trial: Trial, first: int) -> list[int]:
     """The candidates that truly add most, among those that `new surface` scores."""
     among = spread(trial.poses)
-    covers, taken, known = trial.covers(among.tolist()), [first], trial.covers([first])[0]
-    while len(taken) < trial.protocol.views:
-        best = int(np.argmax(np.sum(covers & ~known, axis=1)))
-        known, taken = known | covers[best], [*taken, int(among[best])]
-    return taken
+    covers, chosen, covered = trial.covers(among.tolist()), [first], trial.covers([first])[0]
+    while len(chosen) < trial.protocol.views:
+        best = int(np.argmax(np.sum(covers & ~covered, axis=1)))
+        covered, chosen = covered | covers[best], [*chosen, int(among[best])]
+    return chosen
 
 
 def uniform(trial: Trial, first: int) -> list[int]:
@@ -138,18 +138,18 @@ def beyond_boundary(trial: Trial, first: int, seed: int, best: bool) -> list[Boo
     """Coverage of views beyond the boundary, of which there are twenty. Takes a random one, or the best by BENBV's
     score of its true scan, which weighs new coverage against overlap with the scanned surface."""
     random, look = np.random.default_rng(seed), trial.look(trial.poses[first])
-    known, normals, shown = look.covers.copy(), look.normals, [look.covers]
-    while len(shown) < trial.protocol.views:
-        targets, directions = boundary_views(trial.points[known], normals[known], int(random.integers(2**31)))
+    covered, normals, coverage = look.covers.copy(), look.normals, [look.covers]
+    while len(coverage) < trial.protocol.views:
+        targets, directions = boundary_views(trial.points[covered], normals[covered], int(random.integers(2**31)))
         if len(targets) == 0:
             break
         away = trial.protocol.distance / trial.unit * directions
         poses = [nbv.look_at(target + way, target) for target, way in zip(targets, away, strict=True)]
         looks = [trial.look(pose) for pose in (poses if best else [poses[int(random.integers(len(poses)))]])]
-        look = max(looks, key=lambda one: score(trial, one, known))
-        known, normals = known | look.covers, np.where(known[:, None], normals, look.normals)
-        shown.append(look.covers)
-    return shown
+        look = max(looks, key=lambda one: score(trial, one, covered))
+        covered, normals = covered | look.covers, np.where(covered[:, None], normals, look.normals)
+        coverage.append(look.covers)
+    return coverage
 
 
 def score(trial: Trial, look: Look, known: Bool[np.ndarray, " points"]) -> float:
@@ -170,7 +170,7 @@ def spread(poses: nbv.Pose) -> Int[np.ndarray, " some"]:
 
 def run(trial: Trial, methods: tuple[str, ...], rays: int, seed: int) -> dict:
     """Coverage of each method after each view, and the seconds of a choice for planning methods."""
-    protocol, random, found = trial.protocol, np.random.default_rng(seed), {}
+    protocol, random, results = trial.protocol, np.random.default_rng(seed), {}
     above = np.asarray(trial.poses.position)[:, 1] >= 0
     first = 0 if protocol.repeats == 1 else int(random.choice(np.nonzero(above)[0]))
     lattice = np.radians([(polar, azimuth) for polar in range(30, 180, 30) for azimuth in range(0, 360, 45)])
@@ -191,14 +191,14 @@ def run(trial: Trial, methods: tuple[str, ...], rays: int, seed: int) -> dict:
     for method in methods:
         seconds: list[float] = []
         if method in searches:
-            taken, seconds = planned(trial, searches[method], rays, first, seed)
-            shown = trial.covers(taken)
+            chosen, seconds = planned(trial, searches[method], rays, first, seed)
+            coverage = trial.covers(chosen)
         else:
-            shown = np.stack(ways[method]())
-        covered = np.mean(np.logical_or.accumulate(shown, axis=0), axis=1)
+            coverage = np.stack(ways[method]())
+        covered = np.mean(np.logical_or.accumulate(coverage, axis=0), axis=1)
         covered = np.pad(covered, (0, protocol.views - len(covered)), mode="edge")
-        found[method] = {"covered": covered.tolist(), "seconds": float(np.mean(seconds)) if seconds else None}
-    return found
+        results[method] = {"covered": covered.tolist(), "seconds": float(np.mean(seconds)) if seconds else None}
+    return results
 
 
 def table(records: dict, methods: tuple[str, ...], protocol: Protocol) -> str:
@@ -236,29 +236,31 @@ def main() -> None:
     parser.add_argument("--stride", type=int, help="rows and columns of the sensor's image for one that counts")
     parser.add_argument("--repeats", type=int, help="runs of each object; default: the protocol's")
     parser.add_argument("--out", type=Path, help="default: runs/peers-PROTOCOL[-half].json")
-    asked = parser.parse_args()
-    protocol, methods = PROTOCOLS[asked.protocol], METHODS[asked.protocol]
-    repeats = asked.repeats or protocol.repeats
-    protocol = protocol._replace(stride=asked.stride or protocol.stride)
-    out = asked.out or Path("runs") / f"peers-{asked.protocol}{'-half' if asked.half else ''}.json"
+    options = parser.parse_args()
+    protocol, methods = PROTOCOLS[options.protocol], METHODS[options.protocol]
+    repeats = options.repeats or protocol.repeats
+    protocol = protocol._replace(stride=options.stride or protocol.stride)
+    out = options.out or Path("runs") / f"peers-{options.protocol}{'-half' if options.half else ''}.json"
     out.parent.mkdir(parents=True, exist_ok=True)
-    settings = {name: getattr(asked, name) for name in ("protocol", "half", "up", "rays")} | {"stride": protocol.stride}
-    held = json.loads(out.read_text()) if out.exists() else {"settings": settings, "runs": {}}
-    if held.get("settings") != settings:
-        parser.error(f"{out} holds runs of {held.get('settings')}, asked for are {settings}: give another --out")
-    records = held["runs"]
-    for file in tqdm(asked.mesh, desc="objects"):
+    settings = {name: getattr(options, name) for name in ("protocol", "half", "up", "rays")} | {
+        "stride": protocol.stride
+    }
+    results = json.loads(out.read_text()) if out.exists() else {"settings": settings, "runs": {}}
+    if results.get("settings") != settings:
+        parser.error(f"{out} holds runs of {results.get('settings')}, asked for are {settings}: give another --out")
+    records = results["runs"]
+    for file in tqdm(options.mesh, desc="objects"):
         names = [f"{file.parent.name}/{file.stem} {repeat}" for repeat in range(repeats)]
         if all(name in records for name in names):
             continue
-        trial = Trial(file, protocol, asked.half, asked.up)
+        trial = Trial(file, protocol, options.half, options.up)
         if trial.mesh.bounding_radius * trial.unit > protocol.distance / 1.5:
             tqdm.write(f"left out {file.stem}: the cameras would stand in or beside it")
             continue
         for repeat, name in enumerate(names):
             if name not in records:
-                records[name] = run(trial, methods, asked.rays, repeat)
-                write_text(out, json.dumps(held))
+                records[name] = run(trial, methods, options.rays, repeat)
+                write_text(out, json.dumps(results))
     print(table(records, methods, protocol))
 
 

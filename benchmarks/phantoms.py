@@ -64,58 +64,58 @@ class Case:
         study, scene = self.study, self.study.scene(start)
         planner, recording = study.planner(NEW_AREA, scene), self.recording
         loop = Loop(planner, study.key(start, "episode"), camera=study.camera)
-        taken: list[int] = []
+        visited: list[int] = []
         first = recording.poses[study.first_view(scene)]
         before: tuple[float, Newness] | None = None
         for step in itertools.islice(loop.steps(study.sensor(scene), first), study.views):
-            taken.append(study.frame_of(step.view.pose))
+            visited.append(study.frame_of(step.view.pose))
             row = [np.nan] * len(COLUMNS)
-            row[-2] = float(recording.is_shown[taken].any(axis=0).mean())
+            row[-2] = float(recording.is_shown[visited].any(axis=0).mean())
             if self.area is not None:
-                row[-1] = float(self.area[taken].any(axis=0).mean())
+                row[-1] = float(self.area[visited].any(axis=0).mean())
             if before is not None:
                 row[-4:-2] = before[0], float(_new_area(step.view.scan, step.view.pose, study, before[1]))
             inputs = loop.inputs()
             newness = planner.acquisition.context(inputs)
-            if len(taken) < study.views:
+            if len(visited) < study.views:
                 before = float(loop.propose().value), newness
-            row[:-4] = self._judge(inputs, newness, taken)
+            row[:-4] = self._judge(inputs, newness, visited)
             yield row
 
-    def _judge(self, inputs: StepInputs, newness: Newness, taken: list[int]) -> list[float]:
+    def _judge(self, inputs: StepInputs, newness: Newness, visited: list[int]) -> list[float]:
         recording, camera, surfaces = self.recording, self.study.imagined_camera, inputs.surfaces
         areas, points = _expected(surfaces, newness, camera, recording.poses)
         expected = np.asarray(areas.sum(axis=-1).mean(axis=0))
-        known = recording.is_shown[taken].any(axis=0)
-        gain = (recording.is_shown & ~known).sum(axis=1)
-        left = ~np.isin(np.arange(len(gain)), taken)
+        is_covered = recording.is_shown[visited].any(axis=0)
+        gain = (recording.is_shown & ~is_covered).sum(axis=1)
+        left = ~np.isin(np.arange(len(gain)), visited)
         varies = np.ptp(expected[left]) > 0 and np.ptp(gain[left]) > 0
         rank = float(spearmanr(expected[left], gain[left])[0]) if varies else np.nan
         chosen = gain[left][expected[left].argmax()] / max(1, gain[left].max())
         weights, places = np.asarray(areas).reshape(-1), np.asarray(points).reshape(-1, 3)
         weights, places = weights[weights > 0], places[weights > 0]
         phantom = self.shown.query(places)[0] > 2.0 * self.voxel
-        kinds = self._kinds(places[phantom], taken)
+        kinds = self._kinds(places[phantom], visited)
         share = weights[phantom].sum() / max(weights.sum(), 1e-9)
         of_kind = [weights[phantom][kinds == kind].sum() / max(weights[phantom].sum(), 1e-9) for kind in range(4)]
         covered = float(seen_share(newness, surfaces, camera, recording.poses, inputs.observations.poses))
         return [rank, chosen, share, *of_kind, covered]
 
-    def _kinds(self, places: np.ndarray, taken: list[int]) -> np.ndarray:
+    def _kinds(self, places: np.ndarray, visited: list[int]) -> np.ndarray:
         study, recording = self.study, self.recording
         volume = study.sampler.carving.volume
         cut = np.asarray(volume(jnp.asarray(places))) > -self.voxel
         empty, silent = np.zeros(len(places), bool), np.zeros(len(places), bool)
         camera = study.camera
-        for index in taken:
-            pose, seen = recording.poses[index], recording.scans[index]
+        for index in visited:
+            pose, cloud = recording.poses[index], recording.scans[index]
             local = (places - np.asarray(pose.position)) @ np.asarray(pose.rotation)
             ahead = local[:, 2] > 0
             pixel = np.asarray(camera.to_pixels(jnp.asarray(local[:, :2] / np.where(ahead, local[:, 2], 1.0)[:, None])))
             column, row = np.floor(pixel).astype(int).T
             inside = ahead & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
             ray = np.where(inside, row * camera.width + column, 0)
-            sight = np.asarray(seen.sight)[ray]
+            sight = np.asarray(cloud.sight)[ray]
             returned = np.isfinite(sight)
             empty |= inside & returned & (sight > np.linalg.norm(local, axis=1) + self.voxel)
             silent |= inside & ~returned
@@ -126,16 +126,16 @@ class Case:
 def _expected(surfaces, newness: Newness, camera, poses: Pose):
     def of_sample(surface):
         def of_pose(pose):
-            seen = scan(surface, camera, pose)
-            return pixel_area(seen, camera, pose, STEEP) * newness(seen.points), seen.points
+            cloud = scan(surface, camera, pose)
+            return pixel_area(cloud, camera, pose, STEEP) * newness(cloud.points), cloud.points
 
         return jax.lax.map(of_pose, poses, batch_size=32)
 
     return jax.lax.map(of_sample, surfaces)
 
 
-def _new_area(seen: PointCloud, pose: Pose, study: RecordedStudy, newness: Newness):
-    return jnp.sum(pixel_area(seen, study.camera, pose, STEEP) * newness(seen.points))
+def _new_area(cloud: PointCloud, pose: Pose, study: RecordedStudy, newness: Newness):
+    return jnp.sum(pixel_area(cloud, study.camera, pose, STEEP) * newness(cloud.points))
 
 
 def measured(case: Case, starts: int) -> np.ndarray:

@@ -64,8 +64,8 @@ def of_mesh(file: Path, folder: Path, above: bool) -> Recorded:
     # The table's noise stays below the box.
     room = np.array([[-0.03, -0.03, 0.02 if above else -0.03], [0.03, 0.03, 0.03]])
     box = tuple((corners + _SIDE * room).reshape(-1).tolist())
-    known = TriangleMesh(np.asarray(frame.to_world(mesh.vertices), np.float64), mesh.faces, nbv.Frame())
-    recorded = Recorded(f"{file.stem}, {'above' if above else 'around'}", folder, box, mesh=known)
+    world_mesh = TriangleMesh(np.asarray(frame.to_world(mesh.vertices), np.float64), mesh.faces, nbv.Frame())
+    recorded = Recorded(f"{file.stem}, {'above' if above else 'around'}", folder, box, mesh=world_mesh)
     if (folder / "frames.json").exists():
         return recorded
     if above:
@@ -76,8 +76,8 @@ def of_mesh(file: Path, folder: Path, above: bool) -> Recorded:
     noise = nbv.DepthNoise(_NOISE, scale=frame.scale)
     images = []
     for index, pose in enumerate(poses):
-        seen = nbv.scan(mesh, _CAMERA, pose)
-        depth = np.where(seen.mask, (seen.points - pose.position) @ pose.forward, 0.0)
+        cloud = nbv.scan(mesh, _CAMERA, pose)
+        depth = np.where(cloud.mask, (cloud.points - pose.position) @ pose.forward, 0.0)
         measured = noise.measured(depth, jax.random.key(index))
         images.append(np.asarray(measured, np.float64).reshape(_CAMERA.height, _CAMERA.width) / frame.scale)
     matrices = np.asarray(frame.to_world(poses).to_matrix(), np.float64)
@@ -144,7 +144,7 @@ def area_shown(recorded: Recorded, count: int = 20_000) -> np.ndarray:
     inside = np.all((points >= recorded.box[:3]) & (points <= recorded.box[3:]), axis=1)
     points, normals = points[inside], mesh.face_normals[faces[inside]]
     middle = np.array([320.0, 240.0])
-    shown = []
+    masks = []
     for matrix in RecordedFrames(str(recorded.folder)).matrices:
         offset = points - matrix[:3, 3]
         away = np.linalg.norm(offset, axis=1)
@@ -153,8 +153,8 @@ def area_shown(recorded: Recorded, count: int = 20_000) -> np.ndarray:
         facing = -np.sum(directions * normals, axis=1) >= math.cos(_CAMERA.max_incidence)
         hits = recorded.mesh.trace(np.broadcast_to(matrix[:3, 3], offset.shape), directions)
         met = np.linalg.norm(np.asarray(hits.points) - matrix[:3, 3], axis=1)
-        shown.append(within & facing & np.asarray(hits.mask) & (np.abs(met - away) < 2e-3 * away))
-    return np.array(shown)
+        masks.append(within & facing & np.asarray(hits.mask) & (np.abs(met - away) < 2e-3 * away))
+    return np.array(masks)
 
 
 def study_of(recorded: Recorded, views: int) -> RecordedStudy:
@@ -180,25 +180,25 @@ def main() -> None:
     parser.add_argument("--starts", type=int, default=2)
     parser.add_argument("--views", type=int, default=6)
     args = parser.parse_args()
-    seen: dict[str, list[np.ndarray]] = {method: [] for method in (NEW_AREA, "farthest", "random", ORACLE)}
+    curves: dict[str, list[np.ndarray]] = {method: [] for method in (NEW_AREA, "farthest", "random", ORACLE)}
     for file in args.mesh:
         # Each object has its own box, and so its own programs. Those of twenty exceed the limit of memory maps.
         jax.clear_caches()
         folder = args.work / f"{file.stem}-{'above' if args.above else 'around'}"
         study = study_of(of_mesh(file, folder, args.above), args.views)
-        for method, rows in seen.items():
+        for method, rows in curves.items():
             rows.append(np.mean([covered(study, method, start) for start in range(args.starts)], axis=0)[1:])
-        print(file.stem, *(f"{method} {np.round(100 * rows[-1], 1)}" for method, rows in seen.items()), flush=True)
-    own = np.array(seen[NEW_AREA])
-    for method, rows in seen.items():
+        print(file.stem, *(f"{method} {np.round(100 * rows[-1], 1)}" for method, rows in curves.items()), flush=True)
+    own = np.array(curves[NEW_AREA])
+    for method, rows in curves.items():
         print(f"{method:12}", np.round(100 * np.mean(rows, axis=0), 1))
     for method in ("farthest", "random"):
-        less = 100 * (own - np.array(seen[method]))
+        less = 100 * (own - np.array(curves[method]))
         less = np.concatenate([less, less.mean(axis=1, keepdims=True)], axis=1)
-        shown = [
+        coverage = [
             f"{mean:.1f} [{low:.1f}, {high:.1f}]" for mean, low, high in zip(less.mean(0), *interval(less), strict=True)
         ]
-        print(f"less {method:8}", "  ".join(shown))
+        print(f"less {method:8}", "  ".join(coverage))
 
 
 if __name__ == "__main__":

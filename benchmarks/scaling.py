@@ -44,9 +44,9 @@ def measured(points: int, samples: int, candidates: int, rays: int) -> dict[str,
     sensor, scene, observations = nbv.Camera(height=150, width=150), demo_object(), None
     for position in ((0.8, 0.9, 2.2), (-1.4, 0.6, -1.9)):
         pose = nbv.look_at(position)
-        seen = observe_scene(scene, sensor, pose, nbv.SensorNoise(), key)
+        cloud = observe_scene(scene, sensor, pose, nbv.SensorNoise(), key)
         observations = (
-            planner.observe(observations, pose, seen, sensor) if observations else planner.init(pose, seen, sensor)
+            planner.observe(observations, pose, cloud, sensor) if observations else planner.init(pose, cloud, sensor)
         )
     assert int(observations.cloud.count) == points
     inputs = planner.step_inputs(observations, key)
@@ -56,12 +56,12 @@ def measured(points: int, samples: int, candidates: int, rays: int) -> dict[str,
     }
 
 
-def figure(held: dict[str, dict[str, dict[str, float]]], path: Path) -> None:
+def figure(times: dict[str, dict[str, dict[str, float]]], path: Path) -> None:
     """Draw a panel for each of the four, with logarithmic axes."""
-    shown, panels = plt.subplots(1, len(ASKED), figsize=(11, 2.7), sharey=True, layout="constrained")
+    chart, panels = plt.subplots(1, len(ASKED), figsize=(11, 2.7), sharey=True, layout="constrained")
     for panel, (name, sizes) in zip(panels, ASKED.items(), strict=True):
         for stage, label in STAGES.items():
-            panel.loglog(sizes, [held[name][str(size)][stage] for size in sizes], "o-", label=label)
+            panel.loglog(sizes, [times[name][str(size)][stage] for size in sizes], "o-", label=label)
         panel.set(xlabel=name, xticks=sizes, xticklabels=[f"{size:,}" for size in sizes])
         panel.minorticks_off()
         panel.axvline(USUAL[name], color="0.8", zorder=0)
@@ -69,7 +69,7 @@ def figure(held: dict[str, dict[str, dict[str, float]]], path: Path) -> None:
     seconds = (0.02, 0.1, 0.5, 1, 2, 5, 10, 50)
     panels[0].set(ylabel="seconds", yticks=seconds, yticklabels=seconds, ylim=panels[0].get_ylim())
     panels[0].legend(frameon=False)
-    shown.savefig(path, dpi=150)
+    chart.savefig(path, dpi=150)
 
 
 def main() -> None:
@@ -78,14 +78,14 @@ def main() -> None:
     out = parser.parse_args().out
     out.parent.mkdir(parents=True, exist_ok=True)
     file = out.with_suffix(".json")
-    held = json.loads(file.read_text()) if file.exists() else {}
+    times = json.loads(file.read_text()) if file.exists() else {}
     for name, sizes in ASKED.items():
         for size in sizes:
-            if str(size) not in held.setdefault(name, {}):
-                held[name][str(size)] = measured(**USUAL | {name: size})
-                print(f"{size:,} {name}: {held[name][str(size)]}", flush=True)
-                write_text(file, json.dumps(held))
-    figure(held, out.with_suffix(".png"))
+            if str(size) not in times.setdefault(name, {}):
+                times[name][str(size)] = measured(**USUAL | {name: size})
+                print(f"{size:,} {name}: {times[name][str(size)]}", flush=True)
+                write_text(file, json.dumps(times))
+    figure(times, out.with_suffix(".png"))
 
 
 if __name__ == "__main__":

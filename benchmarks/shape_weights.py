@@ -47,7 +47,7 @@ def weights(study: ClassificationStudy, index: int) -> dict:
     planner, sensor, poses = study.planner("coverage", scene), study.sensor(scene), study.candidates.poses()
     first = study.first_view(scene)
     order = jax.random.permutation(study.key(index, "measure"), study.num_candidates).tolist()
-    observations, found = None, []
+    observations, rows = None, []
     for view, candidate in enumerate([first, *(one for one in order if one != first)][:VIEWS]):
         pose = poses[candidate]
         scan = sensor(pose, view_keys(study.key(index, "episode"), view)[2])
@@ -55,17 +55,17 @@ def weights(study: ClassificationStudy, index: int) -> dict:
         posterior = planner.sampler.posterior(observations)
         assert isinstance(posterior, KnownShapesPosterior)
         kinds = posterior.kinds()
-        found.append([kinds.get(name, 0.0) for name in (*study.objects.classes, NONE)])
-    return {"label": scene.task.label, "weights": found}
+        rows.append([kinds.get(name, 0.0) for name in (*study.objects.classes, NONE)])
+    return {"label": scene.task.label, "weights": rows}
 
 
 def show(kind: str, records: list[dict]) -> None:
     """Print a line for each number of views, and one for all."""
     labels = np.array([record["label"] for record in records])
-    held = np.array([record["weights"] for record in records])
+    weight_rows = np.array([record["weights"] for record in records])
     for view in range(VIEWS):
-        _line(f"{kind}, {view + 1} views", held[:, view], labels)
-    _line(f"{kind}, all", held.reshape(-1, held.shape[-1]), np.repeat(labels, VIEWS))
+        _line(f"{kind}, {view + 1} views", weight_rows[:, view], labels)
+    _line(f"{kind}, all", weight_rows.reshape(-1, weight_rows.shape[-1]), np.repeat(labels, VIEWS))
 
 
 def _line(name: str, held: np.ndarray, labels: np.ndarray) -> None:
@@ -83,18 +83,18 @@ def main() -> None:
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/shape_weights.json"))
     arguments = parser.parse_args()
-    held = json.loads(arguments.out.read_text()) if arguments.out.exists() else {}
+    results = json.loads(arguments.out.read_text()) if arguments.out.exists() else {}
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     for kind in arguments.kinds:
         study = study_of(kind)
         for index in tqdm(range(arguments.scenes), kind):
-            if f"{kind} {index}" not in held:
-                held[f"{kind} {index}"] = weights(study, index)
-                write_whole(arguments.out, lambda out: out.write(json.dumps(held).encode()))
+            if f"{kind} {index}" not in results:
+                results[f"{kind} {index}"] = weights(study, index)
+                write_whole(arguments.out, lambda out: out.write(json.dumps(results).encode()))
     heads = "views", "right", "likeliest", "true", "none", "error"
     print(f"{'':22}{heads[0]:>7}" + "".join(f"{head:>10}" for head in heads[1:]))
     for kind in arguments.kinds:
-        show(kind, [held[f"{kind} {index}"] for index in range(arguments.scenes)])
+        show(kind, [results[f"{kind} {index}"] for index in range(arguments.scenes)])
 
 
 if __name__ == "__main__":

@@ -30,14 +30,14 @@ def planner(max_views: int, candidates: int) -> nbv.Planner:
 
 
 def planning(steps: int) -> Iterator[None]:
-    asked, first = planner(VIEWS, 20), nbv.look_at((0.0, 0.0, 2.5))
+    small_planner, first = planner(VIEWS, 20), nbv.look_at((0.0, 0.0, 2.5))
     observations = None
     for step in range(steps):
         if step % VIEWS == 0:
-            observations = asked.init(first, nbv.scan(BALL, CAMERA, first))
-        pose = asked.propose(observations, jax.random.key(step)).pose
+            observations = small_planner.init(first, nbv.scan(BALL, CAMERA, first))
+        pose = small_planner.propose(observations, jax.random.key(step)).pose
         if step % VIEWS < VIEWS - 1:
-            observations = asked.observe(observations, pose, nbv.scan(BALL, CAMERA, pose))
+            observations = small_planner.observe(observations, pose, nbv.scan(BALL, CAMERA, pose))
         yield
 
 
@@ -46,16 +46,18 @@ def session(steps: int) -> Iterator[None]:
     matrices = np.asarray(poses.to_matrix())
     with tempfile.TemporaryDirectory() as folder:
         # A session proposes no pose twice, so it needs enough candidates.
-        asked = planner(steps, 20 + steps // 10)
-        taken = nbv.Session(CAMERA, ((-1.2,) * 3, (1.2,) * 3), asked, up="y", folder=folder, progress=False)
+        small_planner = planner(steps, 20 + steps // 10)
+        live_session = nbv.Session(
+            CAMERA, ((-1.2,) * 3, (1.2,) * 3), small_planner, up="y", folder=folder, progress=False
+        )
         for step in range(steps):
             pose = poses[step]
-            seen = nbv.scan(BALL, CAMERA, pose)
-            depth = np.asarray((seen.points - pose.position) @ pose.forward)
-            image = np.where(seen.mask, depth, np.inf).reshape(CAMERA.height, CAMERA.width)
-            taken.add(image, matrices[step])
+            cloud = nbv.scan(BALL, CAMERA, pose)
+            depth = np.asarray((cloud.points - pose.position) @ pose.forward)
+            image = np.where(cloud.mask, depth, np.inf).reshape(CAMERA.height, CAMERA.width)
+            live_session.add(image, matrices[step])
             if step % 10 == 0:
-                taken.next()
+                live_session.next()
             yield
 
 

@@ -74,7 +74,7 @@ def measured(task: str, index: int) -> dict:
     planner = planner_for(task, category)
     episode = nbv.simulate(planner, surface, first, VIEWS[task], key, progress=False)
     if task == "coverage":
-        shown, areas = truly_shown(thing.solid, planner, episode)
+        is_shown, areas = truly_shown(thing.solid, planner, episode)
     right, ends = [], {name: VIEWS[task] for name in RULES[task]}
     for count, observations in enumerate(episode.observations(), start=1):
         if task == "class":
@@ -84,13 +84,13 @@ def measured(task: str, index: int) -> dict:
             counts = planner.acquisition.answer(observations.cloud).values
             right.append(float((counts[np.asarray(thing.parts)] >= 60).all()))
         else:
-            right.append(float(areas[shown[:count].any(axis=0)].sum() / areas.sum()))
+            right.append(float(areas[is_shown[:count].any(axis=0)].sum() / areas.sum()))
         poses = tuple(view.pose for view in episode.views[:count])
         sample_key, *_ = view_keys(key, count)
         surfaces = functools.cache(functools.partial(planner.sampler.sample, observations, sample_key))
-        known = StopContext(planner, observations, poses, 0.0, sample_key, surfaces, nbv.Frame())
+        context = StopContext(planner, observations, poses, 0.0, sample_key, surfaces, nbv.Frame())
         for name, rule in RULES[task].items():
-            if ends[name] == VIEWS[task] and rule.after(known) is not None:
+            if ends[name] == VIEWS[task] and rule.after(context) is not None:
                 ends[name] = count
     return {"right": right, "ends": ends}
 
@@ -104,8 +104,8 @@ def truly_shown(solid, planner: nbv.Planner, episode: Episode) -> tuple[np.ndarr
     points = spread_points(surface, 20_000)
     poses = jax.tree.map(lambda *rows: jnp.stack(rows), *(view.pose for view in episode.views))
     views, candidates = (
-        np.asarray(is_visible(surface, planner.camera, given, points, grid.spacing))
-        for given in (poses, planner.search.poses_around())
+        np.asarray(is_visible(surface, planner.camera, view_poses, points, grid.spacing))
+        for view_poses in (poses, planner.search.poses_around())
     )
     any_shown = candidates.any(axis=0)
     return views & any_shown, np.asarray(points.areas)[any_shown]
@@ -137,15 +137,15 @@ def main() -> None:
     parser.add_argument("--task", nargs="+", choices=RULES, default=list(RULES))
     parser.add_argument("--scenes", type=int, default=24)
     parser.add_argument("--out", type=Path, default=Path("runs/stopping.json"))
-    asked = parser.parse_args()
-    asked.out.parent.mkdir(parents=True, exist_ok=True)
-    held = json.loads(asked.out.read_text()) if asked.out.exists() else {}
-    for task in asked.task:
-        records = held.setdefault(task, [])
-        for index in tqdm(range(len(records), asked.scenes), desc=task):
+    options = parser.parse_args()
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    results = json.loads(options.out.read_text()) if options.out.exists() else {}
+    for task in options.task:
+        records = results.setdefault(task, [])
+        for index in tqdm(range(len(records), options.scenes), desc=task):
             records.append(measured(task, index))
-            write_text(asked.out, json.dumps(held))
-        print(table(task, records[: asked.scenes]))
+            write_text(options.out, json.dumps(results))
+        print(table(task, records[: options.scenes]))
 
 
 if __name__ == "__main__":

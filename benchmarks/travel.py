@@ -39,17 +39,17 @@ def episode(planner: nbv.Planner, mesh: nbv.TriangleMesh, truth: np.ndarray, vie
     """Coverage and length of the path after each view."""
     direction = jax.random.normal(jax.random.fold_in(key, 99), (3,))
     pose = nbv.look_at(2.5 * direction / jnp.linalg.norm(direction))
-    observations, taken, scans, found = None, [], [], {"way": []}
+    observations, poses, scans, measures = None, [], [], {"way": []}
     for index in range(views):
         if observations is not None:
             pose = planner.propose(observations, view_keys(key, index)[0]).pose
-        seen = observe_scene(mesh, planner.camera, pose, nbv.SensorNoise(), view_keys(key, index)[2])
-        observations = planner.init(pose, seen) if observations is None else planner.observe(observations, pose, seen)
-        taken.append(pose)
-        scans.append(nbv.View(pose, seen, observations.cloud, None, planner.camera))
-        found["way"].append(total_cost(taken))
-    found["coverage"] = coverage(scans, truth)
-    return found
+        cloud = observe_scene(mesh, planner.camera, pose, nbv.SensorNoise(), view_keys(key, index)[2])
+        observations = planner.init(pose, cloud) if observations is None else planner.observe(observations, pose, cloud)
+        poses.append(pose)
+        scans.append(nbv.View(pose, cloud, observations.cloud, None, planner.camera))
+        measures["way"].append(total_cost(poses))
+    measures["coverage"] = coverage(scans, truth)
+    return measures
 
 
 def summary(records: dict, views: int) -> str:
@@ -79,23 +79,23 @@ def main() -> None:
     parser.add_argument("--mesh", nargs="+", type=Path, required=True)
     parser.add_argument("--views", type=int, default=8)
     parser.add_argument("--out", type=Path, default=Path("runs/travel.json"))
-    asked = parser.parse_args()
-    asked.out.parent.mkdir(parents=True, exist_ok=True)
-    records = json.loads(asked.out.read_text()) if asked.out.exists() else {}
-    for file in tqdm(asked.mesh, desc="meshes"):
+    options = parser.parse_args()
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    records = json.loads(options.out.read_text()) if options.out.exists() else {}
+    for file in tqdm(options.mesh, desc="meshes"):
         if file.stem in records:
             continue
         mesh = nbv.load_mesh(file)
         truth = truth_points(mesh, jax.random.key(0))
-        found = {}
+        results = {}
         for name, (search, cost) in METHODS.items():
             sampler = nbv.SurfaceSampler(grid=nbv.Grid(64), num_samples=8)
             planner = nbv.Planner(nbv.Coverage(), search, sampler=sampler, cost=cost, capacity=4096)
             key = jax.random.fold_in(jax.random.key(4), sum(map(ord, file.stem)))
-            found[name] = episode(planner, mesh, truth, asked.views, key)
-        records[file.stem] = found
-        write_text(asked.out, json.dumps(records))
-    print(summary(records, asked.views))
+            results[name] = episode(planner, mesh, truth, options.views, key)
+        records[file.stem] = results
+        write_text(options.out, json.dumps(records))
+    print(summary(records, options.views))
 
 
 if __name__ == "__main__":

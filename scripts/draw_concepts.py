@@ -126,10 +126,10 @@ def draw_utility(
     return figure
 
 
-def draw_search(found: dict[str, nbv.search.Proposal], quantities: dict[str, nbv.Quantity]) -> Figure:
+def draw_search(proposals: dict[str, nbv.search.Proposal], quantities: dict[str, nbv.Quantity]) -> Figure:
     """Draw a map of the sphere of directions for each search."""
     figure = Figure(figsize=(9.6, 2.3))
-    for index, (name, proposal) in enumerate(found.items()):
+    for index, (name, proposal) in enumerate(proposals.items()):
         axes = figure.add_axes((0.005 + 0.333 * index, 0.02, 0.323, 0.76))
         draw_acquisition(axes, proposal, quantities[name])
         axes.set_title(f"{name}: {quantities[name].name}", loc="center", fontsize=8)
@@ -192,9 +192,9 @@ def main() -> None:
         save(draw_utility(planner, observations, surfaces, proposal), folder / "concepts_utility.png")
         searches = (nbv.DiscreteSearch(), nbv.search.UncertaintyView(), nbv.FarthestView())
         planners = {type(search).__name__: dataclasses.replace(planner, search=search) for search in searches}
-        found = {name: one.choose(inputs, search_key) for name, one in planners.items()}
+        proposals = {name: one.choose(inputs, search_key) for name, one in planners.items()}
         quantities = {name: one.quantity for name, one in planners.items()}
-        save(draw_search(found, quantities), folder / "concepts_search.png")
+        save(draw_search(proposals, quantities), folder / "concepts_search.png")
         save(draw_known(), folder / "concepts_known.png")
 
 

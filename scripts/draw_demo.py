@@ -51,8 +51,8 @@ class Film:
         """Add a frame: a picture after `view` views, and the answers so far, for the rival up to view `rival`."""
         figure = Figure(figsize=SIZE)
         figure.text(0.19, 0.95, f"after view {view}: what is known", ha="center", fontsize=10)
-        known = figure.add_axes((0.0, 0.0, 0.38, 0.93))
-        draw_scene(known, self.data, view - 1, self.stills[view - 1], inset=False)
+        panel = figure.add_axes((0.0, 0.0, 0.38, 0.93))
+        draw_scene(panel, self.data, view - 1, self.stills[view - 1], inset=False)
         figure.text(0.52, 0.95, head, ha="center", fontsize=10)
         axes = figure.add_axes((0.395, 0.12, 0.25, 0.25 * SIZE[0] / SIZE[1]))
         axes.imshow(tile.picture, interpolation="bilinear")
@@ -109,10 +109,10 @@ def main() -> None:
                 for tile in looks(view.imagined, None):
                     guess = Tile(tile.name.rstrip(" 0123456789") + "?", tile.picture)
                     film.add(number - 1, guess, f"imagined from view {number}", GUESS)
-            seen = Tile("scanned", look_picture(view.look, plain=True))
-            film.add(number, seen, f"seen from view {number}", ANSWER)
+            scan_tile = Tile("scanned", look_picture(view.look, plain=True))
+            film.add(number, scan_tile, f"seen from view {number}", ANSWER)
         assert data.task.rival is not None
-        film.add(len(views), seen, f"seen from view {len(views)}", END, len(data.task.rival.charts[0].values))
+        film.add(len(views), scan_tile, f"seen from view {len(views)}", END, len(data.task.rival.charts[0].values))
     film.save(out / "demo.gif")
 
 

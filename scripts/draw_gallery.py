@@ -58,9 +58,9 @@ def episode_of(surface: Surface, views: int) -> nbv.Episode:
 
 def draw_gallery(figure: Figure, columns: int = 4) -> None:
     """Draw the posterior mean of each object after its last view."""
-    shown = objects()
-    rows = -(-len(shown) // columns)
-    for index, (name, surface) in enumerate(tqdm(shown.items(), "objects")):
+    surfaces = objects()
+    rows = -(-len(surfaces) // columns)
+    for index, (name, surface) in enumerate(tqdm(surfaces.items(), "objects")):
         episode = episode_of(surface, VIEWS)
         data = report_data(episode, progress=False, imagine=False)
         row, column = divmod(index, columns)
@@ -75,8 +75,8 @@ def draw_hero(figure: Figure) -> None:
     """Draw one step: the cloud, the samples, the values of candidates, the scan from the best, and the answer."""
     episode = demo_episode(SEED, "halving", 2)
     data: ReportData = report_data(episode, progress=False)
-    seen, proposal = data.views[1].imagined, data.views[1].proposal
-    assert seen is not None
+    sketch, proposal = data.views[1].imagined, data.views[1].proposal
+    assert sketch is not None
     heads = (
         ("a truck: what does it carry?", "pale is known, dark is guessed"),
         ("what may be there", "four guesses; blue: not seen yet"),
@@ -93,7 +93,7 @@ def draw_hero(figure: Figure) -> None:
             index = 0 if place == 0 else 1
             draw_scene(figure.add_axes((x, 0.0, w, 0.86)), data, index, painted(data, index), inset=False)
         elif place == 1:
-            for number, tile in enumerate(looks(seen, None)):
+            for number, tile in enumerate(looks(sketch, None)):
                 down, across = divmod(number, 2)
                 box = (x + (0.04 + 0.48 * across) * w, 0.43 - 0.42 * down, 0.44 * w, 0.4)
                 _tile(figure.add_axes(box), tile.picture)

@@ -34,13 +34,13 @@ CLOUDS, VIEWS, STAND_INS = 10, 5, 200
 def clouds_of(file: MeshFile, number: int, points: int) -> PointCloud:
     """Clouds of an object, each from different random views."""
     mesh = file.read()
-    made = []
+    clouds = []
     for key in jax.random.split(jax.random.fold_in(jax.random.key(0), number), CLOUDS):
         place_key, noise_key = jax.random.split(key)
         poses = random_poses(place_key, VIEWS, SENSOR_RADIUS)
-        seen = SensorNoise()(scan(mesh, Camera(), poses), noise_key)
-        made.append(farthest_point_subsample(joined_views(seen), points))
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *made)
+        cloud = SensorNoise()(scan(mesh, Camera(), poses), noise_key)
+        clouds.append(farthest_point_subsample(joined_views(cloud), points))
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *clouds)
 
 
 def told(network, objects: list[tuple[MeshFile, PointCloud]], names: tuple[str, ...]) -> dict:
@@ -76,22 +76,22 @@ def main() -> None:
     results = {"versions": versions(), "tuned_on": [f"{names[f.label]} {f.name}" for f, _ in few]}
     results["as it is"] = told(network, rest, names)
     if few:
-        made = scanned_clouds(household_scene, Split.TRAIN, range(STAND_INS), points)
+        procedural = scanned_clouds(household_scene, Split.TRAIN, range(STAND_INS), points)
         clouds = jax.tree.map(
             lambda *leaves: np.concatenate(leaves),
-            PointCloud(made.clouds.points, made.clouds.normals, made.clouds.mask),
+            PointCloud(procedural.clouds.points, procedural.clouds.normals, procedural.clouds.mask),
             *(PointCloud(of.points, of.normals, of.mask) for _, of in few),
         )
-        labels = np.concatenate([made.labels, *(np.full(CLOUDS, file.label) for file, _ in few)])
+        labels = np.concatenate([procedural.labels, *(np.full(CLOUDS, file.label) for file, _ in few)])
         tuned = train(network, clouds, labels, jax.random.key(1), arguments.steps, learning_rate=3e-4)
         results["tuned"] = told(tuned, rest, names)
     print(f"tuned on: {', '.join(results['tuned_on']) or 'none'}")
     for observations in ("as it is", "tuned"):
         if observations in results:
-            found = results[observations]
-            error = "" if found["error"] is None else f" ± {found['error']:.0%}"
-            print(f"{observations}: {found['right']:.0%}{error} right of {found['objects']} objects")
-            for name, share in found["by_object"].items():
+            scores = results[observations]
+            error = "" if scores["error"] is None else f" ± {scores['error']:.0%}"
+            print(f"{observations}: {scores['right']:.0%}{error} right of {scores['objects']} objects")
+            for name, share in scores["by_object"].items():
                 print(f"    {share:4.0%}  {name}")
     if arguments.out:
         arguments.out.write_text(json.dumps(results, indent=2))

@@ -59,13 +59,13 @@ def report(name: str, network: CompactPartSegmenter, data: LabelledClouds) -> No
     print(f"{name}: {right[mask].mean():.1%} of points right, mean confidence {confidence[mask].mean():.1%}")
     for index in np.unique(data.labels):
         rows = data.labels == index
-        shown, said, true = mask[rows], labels[rows], data.point_labels[rows]
+        is_filled, said, true = mask[rows], labels[rows], data.point_labels[rows]
         ratios = []
         for part in CATEGORIES[index].labels:
-            either = shown & ((said == part) | (true == part))
+            either = is_filled & ((said == part) | (true == part))
             if either.any():
                 ratios.append((either & (said == true)).sum() / either.sum())
-        accuracy = (said == true)[shown].mean()
+        accuracy = (said == true)[is_filled].mean()
         text = ", ".join(f"{ratio:.2f}" for ratio in ratios)
         print(f"  {CATEGORIES[index].name:12} {accuracy:6.1%} of points, intersection over union {text}")
 

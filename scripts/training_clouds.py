@@ -158,12 +158,12 @@ def _imagined(thing: Thing, key: PRNGKeyArray, planner: Planner, num_points: int
     views, poses, count, pixels = _partial_views(thing, key, MOST_VIEWS - 1, setting)
     *_, observations = planner.replay(((poses[i], views[i]) for i in range(MOST_VIEWS - 1)), setting.camera)
     surfaces = planner.sampler.sample(observations, sample_key)
-    seen = limit_capacity(joined_views(views), num_points)
+    cloud = limit_capacity(joined_views(views), num_points)
 
     def of_sample(surface_and_key):
         surface, pose_key = surface_and_key
         scans = scan(surface, setting.camera, random_poses(pose_key, _POSES, setting.radius))
-        return jax.lax.map(lambda one: farthest_point_subsample(concatenate(seen, one), num_points), scans)
+        return jax.lax.map(lambda one: farthest_point_subsample(concatenate(cloud, one), num_points), scans)
 
     keys = jax.random.split(pose_key, planner.sampler.num_samples)
     clouds = jax.lax.map(of_sample, (surfaces, keys))
