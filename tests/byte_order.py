@@ -71,10 +71,10 @@ TAKES_VALUES = {
 def different(function, array, kind):
     """Largest difference of the results, or the error that is raised instead."""
     try:
-        expected, given = (np.asarray(function(numbers), float) for numbers in (array, array.astype(kind)))
+        expected, result = (np.asarray(function(numbers), float) for numbers in (array, array.astype(kind)))
     except Exception as error:
         return f"{type(error).__name__}: {str(error)[:150]}"
-    apart = np.abs(expected - given).max()
+    apart = np.abs(expected - result).max()
     return None if apart < 1e-5 and (expected.ndim == 0 or np.ptp(expected) > 0) else f"{apart} apart"
 
 

@@ -103,14 +103,14 @@ def random_numbers_of_its_own(request):
 @pytest.fixture
 def compilations():
     """Names of JAX's compilation events in order, including those of eager operations."""
-    seen = []
+    events = []
 
     def listen(event, duration, **_):
         if event == "/jax/core/compile/backend_compile_duration":
-            seen.append(event)
+            events.append(event)
 
     jax.monitoring.register_event_duration_secs_listener(listen)
-    yield seen
+    yield events
     jax.monitoring.unregister_event_duration_listener(listen)
 
 

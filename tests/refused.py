@@ -511,7 +511,7 @@ def problem(action, *words):
 def main() -> None:
     warnings.simplefilter("ignore")
     problems = {name: problem(*case) for name, case in REFUSED.items()}
-    print("\n".join(f"{name}: {found}" for name, found in problems.items() if found))
+    print("\n".join(f"{name}: {message}" for name, message in problems.items() if message))
     sys.exit(any(problems.values()))
 
 

@@ -32,9 +32,9 @@ def shot(matrix, unit=1000.0):
     """A depth image in whole millimetres, zero without a hit. A pixel in a corner flickers, so that images of a round
     object from different sides differ."""
     pose = Pose.from_matrix(matrix)
-    seen = scan(WORLD, CAMERA, pose)
-    depth = (np.asarray(seen.points, np.float64) - np.asarray(pose.position)) @ np.asarray(pose.forward, np.float64)
-    image = np.where(seen.mask, unit * depth, 0.0).reshape(48, 64)
+    cloud = scan(WORLD, CAMERA, pose)
+    depth = (np.asarray(cloud.points, np.float64) - np.asarray(pose.position)) @ np.asarray(pose.forward, np.float64)
+    image = np.where(cloud.mask, unit * depth, 0.0).reshape(48, 64)
     image[0, 0] = unit * 0.001 * (1 + int(1e4 * np.abs(matrix).sum()) % 97)
     return np.round(image).astype(np.uint16) if unit > 1 else image
 
@@ -45,6 +45,6 @@ def planner_of(search=DiscreteSearch(), num_samples=3, capacity=400):  # noqa: B
 
 
 def session_of(folder=None, **changes):
-    told = {"obstacles": Obstacles(), "poses": POSES, "folder": folder}
-    settings = {"camera": CAMERA, "box": BOX, "up": "z", **told, **changes}
+    defaults = {"obstacles": Obstacles(), "poses": POSES, "folder": folder}
+    settings = {"camera": CAMERA, "box": BOX, "up": "z", **defaults, **changes}
     return Session(**{"planner": planner_of(), **settings})

@@ -66,10 +66,10 @@ def double_loop(surfaces, score):
 def test_an_acquisition_against_the_double_loop(surfaces, cloud):
     highest = cloud.to_numpy()[0][:, 1].max()
     values = double_loop(surfaces, lambda points, _: np.abs(points[:, 1] - highest).sum())
-    found = nbv.expected_value(Toy(), cloud, surfaces, CAMERA, POSES)
-    np.testing.assert_allclose(found, values.mean(axis=0), rtol=1e-4)
+    expectations = nbv.expected_value(Toy(), cloud, surfaces, CAMERA, POSES)
+    np.testing.assert_allclose(expectations, values.mean(axis=0), rtol=1e-4)
     assert values[:, :6].std(axis=0).min() > 0
-    assert float(found[6]) == 0
+    assert float(expectations[6]) == 0
 
 
 def test_utility_improvement_against_its_formula(surfaces, cloud):
@@ -83,12 +83,12 @@ def test_utility_improvement_against_its_formula(surfaces, cloud):
     change = double_loop(surfaces, improvement)
     assert (change < -0.5).any()
     assert (change > 0.5).any()
-    found = nbv.expected_value(nbv.ExpectedUtilityImprovement(height), cloud, surfaces, CAMERA, POSES)
-    np.testing.assert_allclose(found, np.maximum(change, 0).mean(axis=0), rtol=1e-3, atol=1e-3)
+    values = nbv.expected_value(nbv.ExpectedUtilityImprovement(height), cloud, surfaces, CAMERA, POSES)
+    np.testing.assert_allclose(values, np.maximum(change, 0).mean(axis=0), rtol=1e-3, atol=1e-3)
     # Each sample is cut at zero, not their mean.
     assert np.abs(np.maximum(change, 0).mean(axis=0) - np.maximum(change.mean(axis=0), 0)).max() > 0.1
-    assert bool((found >= 0).all())
-    assert float(found[6]) == 0
+    assert bool((values >= 0).all())
+    assert float(values[6]) == 0
 
 
 def test_the_context_is_computed_once_a_step(surfaces, cloud):
@@ -115,9 +115,9 @@ class Vector(Toy):
 
 def test_several_acquisitions_of_the_same_scans_are_each_that_of_its_own(surfaces, cloud):
     acquisitions = (Toy(), Vector(), nbv.ExpectedUtilityImprovement(height))
-    found = nbv.expected_value(nbv.AcquisitionList(acquisitions), cloud, surfaces, CAMERA, POSES)
+    values = nbv.expected_value(nbv.AcquisitionList(acquisitions), cloud, surfaces, CAMERA, POSES)
     toy, improvement = (nbv.expected_value(acquisitions[i], cloud, surfaces, CAMERA, POSES) for i in (0, 2))
-    np.testing.assert_allclose(found, jnp.stack([toy, toy, -toy, improvement], axis=1), rtol=1e-6)
+    np.testing.assert_allclose(values, jnp.stack([toy, toy, -toy, improvement], axis=1), rtol=1e-6)
     assert float(jnp.ptp(toy)) > 0 < float(jnp.ptp(improvement))
     assert nbv.AcquisitionList(acquisitions).batch_size == min(acquisition.batch_size for acquisition in acquisitions)
     with pytest.raises(nbv.InputError, match="it must be finite"):
@@ -136,7 +136,7 @@ class Highest(eqx.Module):
 @pytest.mark.parametrize("utility", [height, Highest()])
 def test_a_plain_function_is_a_utility_whose_improvement_is_sought(utility):
     plain, explicit = (
-        nbv.Planner(given, nbv.FarthestView(6)) for given in (utility, nbv.ExpectedUtilityImprovement(utility))
+        nbv.Planner(score, nbv.FarthestView(6)) for score in (utility, nbv.ExpectedUtilityImprovement(utility))
     )
     assert plain == explicit
     assert plain.acquisition.num_points is None
@@ -167,9 +167,9 @@ def value_of(acquisition, surfaces, cloud):
     """The expected value at one pose, as a function of its position and the cloud's points."""
 
     def value(x, points=cloud.points):
-        seen = nbv.PointCloud(points, cloud.normals, cloud.mask)
+        data = nbv.PointCloud(points, cloud.normals, cloud.mask)
         pose = nbv.look_at(jnp.stack([x, jnp.full_like(x, 0.4), jnp.full_like(x, 2.4)]))
-        return nbv.expected_value(acquisition, seen, surfaces, nbv.Camera(height=3, width=3), pose[None])[0]
+        return nbv.expected_value(acquisition, data, surfaces, nbv.Camera(height=3, width=3), pose[None])[0]
 
     return value
 

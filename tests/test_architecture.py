@@ -45,20 +45,20 @@ FILES = {
 def imported(path: Path, name: str) -> set[str]:
     """Modules of the package that a file names: in any import, in its stub, and in strings that are names of modules,
     as in registries and for `import_module`."""
-    found: set[str] = set()
+    imports: set[str] = set()
     stub = path.with_suffix(".pyi")
     package = name if path.name == "__init__.py" else name.rpartition(".")[0]
     for source in (path, stub) if stub.exists() else (path,):
         for node in ast.walk(ast.parse(source.read_text())):
             if isinstance(node, ast.Import):
-                found |= {alias.name for alias in node.names}
+                imports |= {alias.name for alias in node.names}
             elif isinstance(node, ast.ImportFrom):
                 base = f"{package}.{node.module or ''}".rstrip(".") if node.level else node.module or ""
-                found |= {base, *(f"{base}.{alias.name}" for alias in node.names)}
+                imports |= {base, *(f"{base}.{alias.name}" for alias in node.names)}
             elif isinstance(node, ast.Constant) and isinstance(node.value, str):
-                found.add(node.value.partition(":")[0])
+                imports.add(node.value.partition(":")[0])
     # A package that is imported together with its members counts by these.
-    modules = {module for module in found if module in FILES and module != "jaxnbv"}
+    modules = {module for module in imports if module in FILES and module != "jaxnbv"}
     return modules - {name}
 
 

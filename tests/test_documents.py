@@ -62,7 +62,7 @@ def test_messages_that_are_explained_are_given():
 
 def commands(text: str) -> list[list[str]]:
     """Commands in blocks of shell, without variables that are set before them."""
-    found = []
+    command_lines = []
     for block in re.findall(r"(?ms)^```bash\n(.*?)^```$", text):
         for line in block.replace("\\\n", " ").splitlines():
             words = shlex.split(line, comments=True)
@@ -70,9 +70,9 @@ def commands(text: str) -> list[list[str]]:
                 words.pop(0)
             while words:
                 end = words.index("&&") if "&&" in words else len(words)
-                found.append(words[:end])
+                command_lines.append(words[:end])
                 words = words[end + 1 :]
-    return found
+    return command_lines
 
 
 COMMAND = typer.main.get_command(cli.app)
@@ -83,10 +83,10 @@ def parse(arguments: list[str], whole: bool = True) -> None:
     command = COMMAND
     while arguments and arguments[0] in getattr(command, "commands", {}):
         command, arguments = command.commands[arguments[0]], arguments[1:]
-    known = getattr(command, "commands", {})
-    if known and not arguments and not whole:
+    subcommands = getattr(command, "commands", {})
+    if subcommands and not arguments and not whole:
         return
-    assert not known or arguments[0].startswith("-"), f"{arguments[0]} is none of {', '.join(known)}"
+    assert not subcommands or arguments[0].startswith("-"), f"{arguments[0]} is none of {', '.join(subcommands)}"
     try:
         command.make_context("jaxnbv", list(arguments))
     except typer.Exit:
@@ -159,12 +159,12 @@ def test_every_public_class_and_function_has_its_place_in_the_reference(package)
     public = getattr(module, "__all__", None) or [name for name in vars(module) if not name.startswith("_")]
     of = {name: getattr(module, name) for name in public}
     wanted = {name for name, thing in of.items() if inspect.isclass(thing) or inspect.isfunction(inspect.unwrap(thing))}
-    known = {*names.get(package, []), *names["jaxnbv"]}
-    assert wanted <= known
+    listed = {*names.get(package, []), *names["jaxnbv"]}
+    assert wanted <= listed
     assert len(names[package]) == len(set(names[package]))
 
 
 def test_the_example_of_style_is_the_code():
     """CONTRIBUTING.md shows the class as it is in the code."""
-    (shown,) = re.findall(r"(?ms)^```python\n(.*?)^```$", (ROOT / "CONTRIBUTING.md").read_text())
-    assert shown.strip() in (ROOT / "jaxnbv" / "tasks" / "coverage.py").read_text()
+    (example,) = re.findall(r"(?ms)^```python\n(.*?)^```$", (ROOT / "CONTRIBUTING.md").read_text())
+    assert example.strip() in (ROOT / "jaxnbv" / "tasks" / "coverage.py").read_text()

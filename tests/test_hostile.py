@@ -9,8 +9,8 @@ import pytest
 
 def run(name, *arguments):
     script = Path(__file__).with_name(name)
-    found = subprocess.run([sys.executable, script, *arguments], capture_output=True, text=True)
-    assert found.returncode == 0, found.stdout + found.stderr
+    result = subprocess.run([sys.executable, script, *arguments], capture_output=True, text=True)
+    assert result.returncode == 0, result.stdout + result.stderr
 
 
 @pytest.mark.slow

@@ -49,9 +49,9 @@ def recording(tmp_path_factory):
     for index, direction in enumerate([(1, 0.2, 0.5), (0, 1, 0.6), (-1, 0.1, 0.4), (0.3, -1, 0.7)]):
         away = 0.3 * np.asarray(direction) / np.linalg.norm(direction)
         pose = nbv.look_at(CENTRE + away, CENTRE, up=(0.0, 0.0, 1.0))
-        seen = nbv.scan(mesh, CAMERA, pose)
-        depth = (np.asarray(seen.points) - np.asarray(pose.position)) @ np.asarray(pose.forward)
-        image = np.where(seen.mask, np.round(1000 * depth), 0).astype(np.uint16).reshape(48, 64)
+        cloud = nbv.scan(mesh, CAMERA, pose)
+        depth = (np.asarray(cloud.points) - np.asarray(pose.position)) @ np.asarray(pose.forward)
+        image = np.where(cloud.mask, np.round(1000 * depth), 0).astype(np.uint16).reshape(48, 64)
         Image.fromarray(image).save(folder / f"{index}.png")
         frames.append({"depth": f"{index}.png", "pose": np.asarray(pose.to_matrix(), np.float64).tolist()})
     intrinsics = [[90.0, 0.0, 32.0], [0.0, 90.0, 24.0], [0.0, 0.0, 1.0]]
@@ -90,8 +90,8 @@ def test_objects_that_masks_show_are_named_apart(parts, recording, tmp_path, cap
     for index in (0, 2):
         pixels = np.asarray(Image.open(recording / f"{index}.png")) > 0
         Image.fromarray(255 * pixels.astype(np.uint8)).save(tmp_path / "masks" / f"{index}.it.png")
-    asked = ASKED | {"box": (*(CENTRE - 0.08), *(CENTRE + 0.08)), "masks": tmp_path / "masks"}
-    identify(recording=recording, parts=parts, parts_scale="mm", views=4, out=tmp_path, **asked)
+    options = ASKED | {"box": (*(CENTRE - 0.08), *(CENTRE + 0.08)), "masks": tmp_path / "masks"}
+    identify(recording=recording, parts=parts, parts_scale="mm", views=4, out=tmp_path, **options)
     said = capsys.readouterr().out
     assert [line.split()[:3] for line in said.splitlines() if line.startswith("frame")] == [
         ["frame", "0", "it:"],

@@ -51,12 +51,12 @@ def code_cells(notebook):
 
 def kinds(cell):
     """Kinds of outputs of a cell: text, pictures, pages."""
-    found = set()
+    outputs = set()
     for output in cell.outputs:
-        found |= (
+        outputs |= (
             {output.name} if output.output_type == "stream" else {kind for kind in output.data if kind != "text/plain"}
         )
-    return found
+    return outputs
 
 
 def wording(cell):

@@ -37,8 +37,8 @@ PROGRAMS = [page for page in PAGES if blocks(page) and page != "how_to/depth_cam
 def smaller(planner_of=nbv.Planner):
     """Replace `Planner` by one with smaller settings where computation is long. Models of a page's own stay."""
 
-    def make(*given, **named):
-        planner = planner_of(*given, **named)
+    def make(*arguments, **named):
+        planner = planner_of(*arguments, **named)
         model = planner.sampler.model
         if isinstance(model, nbv.ScreenedSPSR):
             model = dataclasses.replace(model, base=SMALL)
@@ -155,13 +155,18 @@ def test_the_script_of_the_readme_runs(tmp_path, monkeypatch):
         assert script.count(text) == 1
         script = script.replace(text, less)
     pose = nbv.look_at((0.0, 0.0, 2.5))
-    seen = nbv.scan(nbv.SDFSurface(nbv.sdf.Sphere(1.0)), nbv.Camera(height=12, width=12), pose)
-    scan = nbv.PointCloud(seen.points, seen.normals, seen.mask)
-    given = {"key": jax.random.key(2), "pose": pose, "scan": scan, "x": np.random.default_rng(0).normal(size=(5, 3))}
-    exec(compile(script, "README.md", "exec"), given)
-    assert len(given["episode"].views) == 2
-    assert given["fields"](given["x"]).shape == (16, 5)
-    assert int(given["observations"].num_views) == 2
+    cloud = nbv.scan(nbv.SDFSurface(nbv.sdf.Sphere(1.0)), nbv.Camera(height=12, width=12), pose)
+    scan = nbv.PointCloud(cloud.points, cloud.normals, cloud.mask)
+    variables = {
+        "key": jax.random.key(2),
+        "pose": pose,
+        "scan": scan,
+        "x": np.random.default_rng(0).normal(size=(5, 3)),
+    }
+    exec(compile(script, "README.md", "exec"), variables)
+    assert len(variables["episode"].views) == 2
+    assert variables["fields"](variables["x"]).shape == (16, 5)
+    assert int(variables["observations"].num_views) == 2
     assert (tmp_path / "runs" / "spot" / "cloud.ply").exists()
 
 
@@ -169,10 +174,10 @@ def test_the_script_of_the_readme_runs(tmp_path, monkeypatch):
 def test_the_block_of_episodes_runs():
     """With two of 64 scenes, and two views."""
     block = blocks("../README.md")[1].replace("64", "2").replace("views=5", "views=2")
-    given = {"nbv": nbv, "jax": jax, "planner": smaller()(nbv.NewSurface(), nbv.DiscreteSearch(12))}
-    exec(compile(block, "README.md", "exec"), given)
-    assert given["batch"].values.shape == (2, 2)
-    assert np.isfinite(given["batch"].values[:, 1]).all()
+    variables = {"nbv": nbv, "jax": jax, "planner": smaller()(nbv.NewSurface(), nbv.DiscreteSearch(12))}
+    exec(compile(block, "README.md", "exec"), variables)
+    assert variables["batch"].values.shape == (2, 2)
+    assert np.isfinite(variables["batch"].values[:, 1]).all()
 
 
 def image_of_a_ball(matrix):
@@ -210,10 +215,10 @@ def test_the_block_of_a_session_runs(tmp_path, monkeypatch):
         capacity=2048,
     )
     monkeypatch.setattr("jaxnbv.planning.session.usual_planner", lambda: planner)
-    given = {"K": INTRINSICS, **CORNERS, "places": poses, "first": poses[0], "take_image": image_of_a_ball}
+    variables = {"K": INTRINSICS, **CORNERS, "places": poses, "first": poses[0], "take_image": image_of_a_ball}
     (block,) = (block for block in blocks("how_to/depth_camera.md") if "take_image" in block)
-    exec(block, given)
-    session = given["session"]
+    exec(block, variables)
+    session = variables["session"]
     assert 2 <= len(session.views) < 10
     assert "expected to be covered" in session.done()
     assert len(reported[0].views) == len(session.views)
@@ -223,10 +228,10 @@ def test_the_block_of_a_session_runs(tmp_path, monkeypatch):
     assert points[:, 0].max() > 0.08
     # The loaded session is the same.
     (block,) = (block for block in blocks("how_to/depth_camera.md") if "Session.load" in block)
-    exec(block, given)
-    assert given["session"] is not session
-    assert len(given["session"].views) == len(session.views)
-    assert given["session"].done() == session.done()
+    exec(block, variables)
+    assert variables["session"] is not session
+    assert len(variables["session"].views) == len(session.views)
+    assert variables["session"].done() == session.done()
 
 
 @pytest.mark.slow
@@ -239,10 +244,10 @@ def test_the_block_for_a_recording_runs(tmp_path, monkeypatch):
     said = {"intrinsics": np.asarray(INTRINSICS).tolist(), "depth_scale": 0.001, "frames": frames}
     (folder / "frames.json").write_text(json.dumps(said))
     monkeypatch.chdir(tmp_path)
-    given = {"nbv": nbv, **CORNERS}
+    variables = {"nbv": nbv, **CORNERS}
     (block,) = (block for block in blocks("how_to/depth_camera.md") if "RecordedFrames" in block)
-    exec(block, given)
-    assert int(given["session"].cloud.count) > 100
+    exec(block, variables)
+    assert int(variables["session"].cloud.count) > 100
 
 
 @pytest.mark.slow
@@ -251,7 +256,7 @@ def test_the_block_for_a_depth_camera_runs(monkeypatch):
     sampler = nbv.SurfaceSampler(nbv.GeometricSPSR(0.05, 0.2, 8), grid=nbv.Grid(24), num_samples=2)
     small = nbv.Planner(nbv.NewSurface(), nbv.DiscreteSearch(12), nbv.Camera(height=12, width=12), sampler)
     monkeypatch.setattr(nbv, "Planner", lambda *_: small)
-    given = {
+    variables = {
         "nbv": nbv,
         "camera": nbv.Camera.from_intrinsics(INTRINSICS, 480, 640),
         "T": np.asarray(pose.matrix),
@@ -260,12 +265,12 @@ def test_the_block_for_a_depth_camera_runs(monkeypatch):
         "key": jax.random.key(0),
     }
     (block,) = (block for block in blocks("how_to/depth_camera.md") if "depth_mm" in block)
-    exec(block, given)
-    points = given["cloud"].to_numpy()[0]
+    exec(block, variables)
+    points = variables["cloud"].to_numpy()[0]
     assert len(points) > 100
     assert np.abs(np.linalg.norm(points - [0.0, 0.0, 0.1], axis=1) - 0.1).max() < 0.01
     # Candidates stand on a sphere of 2.5 scene units about the box, whose longest side is 2.5, and look at its centre.
-    place, forward = given["matrix"][:3, 3] - np.array([0.0, 0.0, 0.13]), given["matrix"][:3, 2]
+    place, forward = variables["matrix"][:3, 3] - np.array([0.0, 0.0, 0.13]), variables["matrix"][:3, 2]
     assert np.linalg.norm(place) == pytest.approx(0.3, abs=1e-4)
     np.testing.assert_allclose(forward, -place / np.linalg.norm(place), atol=1e-4)
 

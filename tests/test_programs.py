@@ -92,37 +92,37 @@ def test_numbers_and_structure_are_those_of_filter_jit(folder):
     expected = eqx.filter_jit(function)(ball, x, 2, label="ball")
     for _ in range(2):
         # The second one is read from disk.
-        kept, calls = counted(function)
-        result = kept(ball, x, 2, label="ball")
+        stored, calls = counted(function)
+        result = stored(ball, x, 2, label="ball")
         assert eqx.tree_equal(result, expected, typematch=True)
     assert len(calls) == 0
 
 
 def test_another_kind_of_argument_is_another_program(folder):
-    kept, calls = counted(lambda x, power: x**power)
-    kept(jnp.ones(3), 2)
+    stored, calls = counted(lambda x, power: x**power)
+    stored(jnp.ones(3), 2)
     for x, power in ((jnp.ones(4), 2), (jnp.ones(3), 3), (jnp.ones(3), 2.0), (jnp.ones(3, jnp.int32), 2), (1.0, 2)):
         before = len(calls)
-        np.testing.assert_array_equal(kept(x, power), x**power)
+        np.testing.assert_array_equal(stored(x, power), x**power)
         assert len(calls) == before + 1
-    kept(jnp.zeros(3), 2)
+    stored(jnp.zeros(3), 2)
     assert len(calls) == 6
 
 
 def test_settings_are_part_of_a_program(folder):
-    kept, _ = counted(lambda x: x + jnp.asarray(0.1))
-    assert kept(jnp.ones(2)).dtype == jnp.float32
+    stored, _ = counted(lambda x: x + jnp.asarray(0.1))
+    assert stored(jnp.ones(2)).dtype == jnp.float32
     with jax.enable_x64(True):
-        assert kept(jnp.ones(2)).dtype == jnp.float64
+        assert stored(jnp.ones(2)).dtype == jnp.float64
     with jax.debug_nans(True), pytest.raises(FloatingPointError):
         counted(jnp.log)[0](-jnp.ones(2))
 
 
 def test_code_of_others_is_not_kept(folder):
     """The user may change it, and a stored program would not follow."""
-    kept, _ = counted(lambda line, x: line(x))
-    np.testing.assert_array_equal(kept(Line(jnp.asarray(2.0)), jnp.ones(2)), [2.0, 2.0])
-    np.testing.assert_array_equal(kept(lambda x: -x, jnp.ones(2)), [-1.0, -1.0])
+    stored, _ = counted(lambda line, x: line(x))
+    np.testing.assert_array_equal(stored(Line(jnp.asarray(2.0)), jnp.ones(2)), [2.0, 2.0])
+    np.testing.assert_array_equal(stored(lambda x: -x, jnp.ones(2)), [-1.0, -1.0])
     assert list(folder.iterdir()) == []
 
 
@@ -130,16 +130,16 @@ def test_what_calls_back_is_not_kept(folder):
     def function(x):
         return jax.pure_callback(lambda y: np.asarray(y) + 1, jax.ShapeDtypeStruct((2,), jnp.float32), x)
 
-    kept, _ = counted(function)
-    np.testing.assert_array_equal(kept(jnp.ones(2)), [2.0, 2.0])
+    stored, _ = counted(function)
+    np.testing.assert_array_equal(stored(jnp.ones(2)), [2.0, 2.0])
     assert list(folder.iterdir()) == []
 
 
 def test_transformations_go_through(folder):
-    kept, _ = counted(lambda x: jnp.sum(x**2))
+    stored, _ = counted(lambda x: jnp.sum(x**2))
     x = jnp.arange(3.0)
-    np.testing.assert_array_equal(jax.grad(kept)(x), 2 * x)
-    np.testing.assert_array_equal(jax.vmap(kept)(jnp.stack([x, x])), [5.0, 5.0])
+    np.testing.assert_array_equal(jax.grad(stored)(x), 2 * x)
+    np.testing.assert_array_equal(jax.vmap(stored)(jnp.stack([x, x])), [5.0, 5.0])
     assert list(folder.iterdir()) == []
 
 
@@ -149,11 +149,11 @@ def test_a_damaged_file_is_made_again(folder):
     assert len(files) == 2
     for file in files:
         file.write_bytes(file.read_bytes()[:-3])
-    kept, calls = counted(lambda x: x + 1)
-    np.testing.assert_array_equal(kept(jnp.ones(2)), [2.0, 2.0])
+    stored, calls = counted(lambda x: x + 1)
+    np.testing.assert_array_equal(stored(jnp.ones(2)), [2.0, 2.0])
     assert len(calls) == 1
-    kept, calls = counted(lambda x: x + 1)
-    np.testing.assert_array_equal(kept(jnp.ones(2)), [2.0, 2.0])
+    stored, calls = counted(lambda x: x + 1)
+    np.testing.assert_array_equal(stored(jnp.ones(2)), [2.0, 2.0])
     assert len(calls) == 0
 
 
@@ -161,8 +161,8 @@ def test_after_an_edit_the_same_code_is_not_compiled_again(folder, monkeypatch):
     counted(lambda x: x + 1)[0](jnp.ones(2))
     monkeypatch.setattr(programs, "_source", lambda: "edited")
     monkeypatch.setattr(programs, "_without_cache", lambda lowered: pytest.fail("compiled"))
-    kept, calls = counted(lambda x: x + 1)
-    np.testing.assert_array_equal(kept(jnp.ones(2)), [2.0, 2.0])
+    stored, calls = counted(lambda x: x + 1)
+    np.testing.assert_array_equal(stored(jnp.ones(2)), [2.0, 2.0])
     assert len(calls) == 1
 
 

@@ -36,9 +36,9 @@ def test_an_object_fits_the_view(asked, ring):
     result = run_command(*FARTHEST, *asked, "--out", "mine", cwd=ring)
     assert result.returncode == 0, result.stderr
     for file in sorted((ring / "mine").glob("view_*.npz")):
-        hits, seen = border_hits(file)
+        hits, total = border_hits(file)
         assert hits == 0
-        assert seen > 100
+        assert total > 100
 
 
 def test_the_papers_close_up_is_there_when_asked(ring):

@@ -159,8 +159,8 @@ def test_a_box_that_is_given_does_not_close_the_object_at_its_faces(room):
     box = nbv.Box((-1.0, -0.5, -0.8), (1.0, 0.9, 0.7))
     rows = nbv.surfaces.OutsideBoundary(box, 200, room=room).rows(nbv.Observations.start(SCANS[0]))
     np.testing.assert_allclose(box(rows.points), room, atol=1e-4)
-    given = preset(volume=box).model.values[0], nbv.SurfaceSampler().within(box).model.values[0]
-    assert all(one.room == 0.2 and one.volume == box for one in given)
+    pair = preset(volume=box).model.values[0], nbv.SurfaceSampler().within(box).model.values[0]
+    assert all(one.room == 0.2 and one.volume == box for one in pair)
     assert preset().model.values[0].room == 0.0
 
 
@@ -206,8 +206,8 @@ def test_another_box_takes_the_place_of_the_default_one_alone():
     values = (back[0], after.model.values[1], back[1])
     model = dataclasses.replace(after.model, values=values)
     assert eqx.tree_equal(dataclasses.replace(after, model=model, carving=before.carving), before)
-    kept = nbv.SurfaceSampler(carving=nbv.Carving(own)).within(box)
-    assert kept.carving.volume == own
+    sampler = nbv.SurfaceSampler(carving=nbv.Carving(own)).within(box)
+    assert sampler.carving.volume == own
     assert eqx.tree_equal(preset("screened", 1.25).within(box), preset("screened", 1.25))
     assert eqx.tree_equal(preset("screened").within(box).carving, nbv.Carving(box))
 
@@ -231,9 +231,9 @@ def test_observations_of_another_grid_are_refused(made_by):
 
 
 def test_where_nothing_is_carved_observations_of_any_grid_will_do():
-    known = balls(None).adapt(seen(balls()))
-    assert known.empty_nodes is None
-    np.testing.assert_array_equal(known.cloud.points, seen(balls()).cloud.points)
+    adapted = balls(None).adapt(seen(balls()))
+    assert adapted.empty_nodes is None
+    np.testing.assert_array_equal(adapted.cloud.points, seen(balls()).cloud.points)
 
 
 @pytest.mark.parametrize("carving", [None, nbv.Carving()])

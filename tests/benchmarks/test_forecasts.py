@@ -135,13 +135,13 @@ def test_balls_of_other_sizes_are_scored_as_by_hand(planner, truth):
 
 def test_only_unseen_nodes_are_judged_and_hits_in_seen_space_counted(planner, truth):
     # Right of x = 0.25 everything was seen to be empty. Nothing is judged there, and one of the three rays ends there.
-    seen = NOTHING.copy()
-    seen[15:] = True
-    record = judge(planner, _state(planner), _balls(0.5, 0.5), truth, seen)
+    is_empty = NOTHING.copy()
+    is_empty[15:] = True
+    record = judge(planner, _state(planner), _balls(0.5, 0.5), truth, is_empty)
     assert record.in_empty == pytest.approx(1 / 3)
     assert sum(record.reliability.nodes) == (21 - 8) * 21 * 21
     with pytest.raises(nbv.InputError, match="make both with the planner's grid"):
-        judge(planner, _state(planner), _balls(0.5, 0.5), truth, seen[1:, 1:, 1:])
+        judge(planner, _state(planner), _balls(0.5, 0.5), truth, is_empty[1:, 1:, 1:])
 
 
 def test_a_surface_that_encloses_nothing_has_no_brier_score(planner, truth):

@@ -32,10 +32,10 @@ def test_the_boundary_of_a_disc_is_its_rim():
     points, radius = disc(1500)
     normals = np.tile([0.0, 0.0, 1.0], (1500, 1))
     apart, near = cKDTree(points).query(points, k=30)
-    found = is_boundary(points, normals, apart[:, 1:], near[:, 1:])
+    on_boundary = is_boundary(points, normals, apart[:, 1:], near[:, 1:])
     # Points are 0.05 apart.
-    assert np.all(radius[found] > 0.9)
-    assert np.all(found[radius > 0.999])
+    assert np.all(radius[on_boundary] > 0.9)
+    assert np.all(on_boundary[radius > 0.999])
 
 
 def test_views_of_a_boundary_look_at_it_from_above_and_from_both_sides():
@@ -60,8 +60,8 @@ def test_a_closed_surface_has_no_boundary():
 def test_one_point_a_voxel_is_the_mean():
     points = np.array([[0.1, 0.1, 0.1], [0.3, 0.1, 0.1], [1.2, 0.0, 0.0]])
     normals = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    kept, mean = one_a_voxel(points, normals, 1.0)
-    np.testing.assert_allclose(kept, [[0.2, 0.1, 0.1], [1.2, 0.0, 0.0]])
+    rows, mean = one_a_voxel(points, normals, 1.0)
+    np.testing.assert_allclose(rows, [[0.2, 0.1, 0.1], [1.2, 0.0, 0.0]])
     np.testing.assert_allclose(mean, [[math.sqrt(0.5), math.sqrt(0.5), 0.0], [0.0, 0.0, 1.0]])
 
 

@@ -36,12 +36,12 @@ def camera_and_matrix(given):
 def test_rays_go_through_the_pixels_of_the_intrinsic_matrix(values):
     camera, matrix = camera_and_matrix(values)
     directions = np.asarray(camera.pixel_directions(), np.float64)
-    seen = directions @ matrix.T
+    pixels = directions @ matrix.T
     column, row = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    np.testing.assert_allclose(seen[:, 0], column.ravel(), atol=1e-3)
-    np.testing.assert_allclose(seen[:, 1], row.ravel(), atol=1e-3)
+    np.testing.assert_allclose(pixels[:, 0], column.ravel(), atol=1e-3)
+    np.testing.assert_allclose(pixels[:, 1], row.ravel(), atol=1e-3)
     np.testing.assert_allclose(camera.intrinsics, matrix, rtol=1e-6, atol=1e-5)
-    np.testing.assert_allclose(camera.to_pixels(directions[:, :2]), seen[:, :2] + 0.5, atol=2e-3)
+    np.testing.assert_allclose(camera.to_pixels(directions[:, :2]), pixels[:, :2] + 0.5, atol=2e-3)
 
 
 @settings(max_examples=50, deadline=None)
@@ -97,9 +97,9 @@ def test_the_rays_of_a_window_are_those_of_the_whole_image(left, top):
     matrix, whole = FULL - np.array([[0.0, 0.0, left], [0.0, 0.0, top], [0.0, 0.0, 0.0]]), np.array(FULL)
     camera = nbv.Camera.from_intrinsics(matrix, 120, 160)
     directions = np.asarray(camera.pixel_directions(), np.float64).reshape(120, 160, 3)
-    seen = directions @ whole.T
-    np.testing.assert_allclose(seen[0, 0, :2], [left, top], atol=1e-3)
-    np.testing.assert_allclose(seen[-1, -1, :2], [left + 159, top + 119], atol=1e-3)
+    pixels = directions @ whole.T
+    np.testing.assert_allclose(pixels[0, 0, :2], [left, top], atol=1e-3)
+    np.testing.assert_allclose(pixels[-1, -1, :2], [left + 159, top + 119], atol=1e-3)
 
 
 @pytest.mark.parametrize("binning", [2, 3, 4])
@@ -142,12 +142,12 @@ def test_distortion_is_undone_once_an_image(lens):
     without a return keep none."""
     matrix = np.array([[250.0, 0.0, 160.5], [0.0, 252.0, 118.0], [0.0, 0.0, 1.0]])
     v, u = np.mgrid[:240, :320].astype(float)
-    seen = (u - 160.5) / 250.0, (v - 118.0) / 252.0
-    x, y = np.array(seen)
+    bent = (u - 160.5) / 250.0, (v - 118.0) / 252.0
+    x, y = np.array(bent)
     for _ in range(100):
         now = through_lens(x, y, *lens)
-        x, y = x + seen[0] - now[0], y + seen[1] - now[1]
-    np.testing.assert_allclose(through_lens(x, y, *lens), seen, atol=1e-9)
+        x, y = x + bent[0] - now[0], y + bent[1] - now[1]
+    np.testing.assert_allclose(through_lens(x, y, *lens), bent, atol=1e-9)
     center, radius = np.array([0.05, -0.02, 0.55]), 0.15
     rays = np.stack([x, y, np.ones_like(x)], axis=-1)
     a, b, c = (rays**2).sum(axis=-1), rays @ center, center @ center - radius**2
@@ -188,28 +188,28 @@ def test_a_scan_tells_what_lies_in_range_and_is_not_aslant():
     cosine = -np.sum(np.asarray(every.normals) * np.asarray(rays), axis=1)
     hit = np.asarray(every.mask)
     limited = nbv.Camera(math.radians(50.0), 40, 40, nearest=2.1, farthest=3.0, max_incidence=math.radians(60.0))
-    found = nbv.scan(surface, limited, pose)
+    scanned = nbv.scan(surface, limited, pose)
     expected = hit & (depth >= 2.1) & (depth <= 3.0) & (cosine >= 0.5)
     for share in (expected, hit & (depth < 2.1), hit & (depth > 3.0), hit & (depth < 3.0) & (cosine < 0.5)):
         assert 10 < share.sum() < 1500
-    np.testing.assert_array_equal(found.mask, expected)
-    np.testing.assert_array_equal(found.missed, ~hit | (hit & (depth > 3.0)))
-    np.testing.assert_array_equal(np.asarray(found.points)[expected], np.asarray(every.points)[expected])
-    assert not np.asarray(found.points)[~expected].any()
+    np.testing.assert_array_equal(scanned.mask, expected)
+    np.testing.assert_array_equal(scanned.missed, ~hit | (hit & (depth > 3.0)))
+    np.testing.assert_array_equal(np.asarray(scanned.points)[expected], np.asarray(every.points)[expected])
+    assert not np.asarray(scanned.points)[~expected].any()
 
 
 def test_what_a_limited_sensor_missed_is_empty_as_far_as_it_reaches():
     grid, pose, see = nbv.Grid(24), nbv.look_at((0.0, 0.0, 2.5)), eqx.filter_jit(nbv.Carving.empty_nodes)
     nothing = nbv.SDFSurface(Sphere(0.01).translate([0.0, 1.4, 0.0]))
-    seen = {
+    masks = {
         farthest: np.asarray(see(nbv.Carving(), grid, pose, nbv.scan(nothing, camera, pose), camera))
         for farthest, camera in ((far, nbv.Camera(0.9, 48, 48, farthest=far)) for far in (2.5, None))
     }
     deep = 2.5 - grid.axis
-    assert seen[None].any(axis=(0, 1))[deep > 3.0].any()
-    assert not seen[2.5].any(axis=(0, 1))[deep > 2.5 - grid.spacing].any()
-    near = seen[2.5].any(axis=(0, 1))[deep < 2.5 - 2 * grid.spacing]
-    np.testing.assert_array_equal(near, seen[None].any(axis=(0, 1))[deep < 2.5 - 2 * grid.spacing])
+    assert masks[None].any(axis=(0, 1))[deep > 3.0].any()
+    assert not masks[2.5].any(axis=(0, 1))[deep > 2.5 - grid.spacing].any()
+    near = masks[2.5].any(axis=(0, 1))[deep < 2.5 - 2 * grid.spacing]
+    np.testing.assert_array_equal(near, masks[None].any(axis=(0, 1))[deep < 2.5 - 2 * grid.spacing])
 
 
 rotations = st.tuples(st.integers(0, 2**32 - 1), st.lists(st.floats(-3, 3, width=32), min_size=3, max_size=3))

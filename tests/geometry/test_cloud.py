@@ -179,16 +179,16 @@ def test_farthest_points_against_the_greedy_definition(points, mask, count):
 def test_limit_capacity_keeps_all_points_that_fit(capacity):
     mask = np.isin(np.arange(20), [2, 3, 11, 19])
     cloud = tagged(np.random.default_rng(1).normal(size=(20, 3)), mask)
-    kept = limit_capacity(cloud, capacity)
-    np.testing.assert_array_equal(kept.mask, np.arange(capacity) < 4)
-    np.testing.assert_array_equal(kept.normals[:4, 0], [2, 3, 11, 19])
-    np.testing.assert_array_equal(kept.points[:4], cloud.points[mask])
-    assert not np.asarray(kept.points)[4:].any()
+    thinned = limit_capacity(cloud, capacity)
+    np.testing.assert_array_equal(thinned.mask, np.arange(capacity) < 4)
+    np.testing.assert_array_equal(thinned.normals[:4, 0], [2, 3, 11, 19])
+    np.testing.assert_array_equal(thinned.points[:4], cloud.points[mask])
+    assert not np.asarray(thinned.points)[4:].any()
 
 
 def test_limit_capacity_thins_by_farthest_points_what_does_not_fit():
     rng = np.random.default_rng(2)
     points, mask = rng.integers(-5, 5, size=(30, 3)), rng.random(30) < 0.7
-    kept = limit_capacity(tagged(points, mask), 9)
-    np.testing.assert_array_equal(kept.normals[:, 0], greedy(points, mask, 9))
-    assert bool(kept.mask.all())
+    thinned = limit_capacity(tagged(points, mask), 9)
+    np.testing.assert_array_equal(thinned.normals[:, 0], greedy(points, mask, 9))
+    assert bool(thinned.mask.all())

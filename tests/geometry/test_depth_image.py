@@ -23,9 +23,9 @@ BOX = nbv.Box((-0.15, -0.15, 0.002), (0.15, 0.15, 0.25))
 
 def depth_of(*solids, camera=CAMERA, pose=POSE):
     """Depth along the camera's axis. Infinite where nothing is hit."""
-    seen = nbv.scan(nbv.SDFSurface(functools.reduce(operator.or_, solids)), camera, pose)
-    depth = (np.asarray(seen.points, np.float64) - np.asarray(pose.position)) @ np.asarray(pose.forward, np.float64)
-    return np.where(seen.mask, depth, np.inf).reshape(camera.height, camera.width)
+    cloud = nbv.scan(nbv.SDFSurface(functools.reduce(operator.or_, solids)), camera, pose)
+    depth = (np.asarray(cloud.points, np.float64) - np.asarray(pose.position)) @ np.asarray(pose.forward, np.float64)
+    return np.where(cloud.mask, depth, np.inf).reshape(camera.height, camera.width)
 
 
 def test_millimetres_of_a_sensor_give_the_points_in_metres():
@@ -48,8 +48,8 @@ def test_a_strided_image_has_rows_of_the_whole(stride):
     cloud, whole = (nbv.PointCloud.from_depth(depth_of(BALL, TABLE), CAMERA, POSE, stride=n) for n in (stride, 1))
     assert cloud.capacity == strided.num_rays
     for name in ("points", "normals", "mask", "missed"):
-        kept = np.asarray(getattr(whole, name)).reshape(CAMERA.height, CAMERA.width, -1)[rows, rows]
-        np.testing.assert_allclose(getattr(cloud, name), kept.reshape(getattr(cloud, name).shape), atol=1e-6)
+        rows_of_whole = np.asarray(getattr(whole, name)).reshape(CAMERA.height, CAMERA.width, -1)[rows, rows]
+        np.testing.assert_allclose(getattr(cloud, name), rows_of_whole.reshape(getattr(cloud, name).shape), atol=1e-6)
     points = np.asarray(cloud.points, np.float64) - np.asarray(POSE.position)
     along = points / np.linalg.norm(points, axis=1, keepdims=True) @ np.asarray(POSE.rotation, np.float64)
     rays = np.asarray(strided.pixel_directions(), np.float64)
@@ -99,9 +99,9 @@ def image_with(mark, background, dtype, camera=CAMERA):
     depths."""
     depth = depth_of(BALL, camera=camera)
     ball = np.isfinite(depth)
-    shown = np.where(ball, 1000.0 * depth, background)
-    shown[:, : camera.width // 2][ball[:, : camera.width // 2]] = mark
-    return np.round(shown).astype(dtype) / (1.0 if dtype == np.uint16 else 1000.0), ball
+    image = np.where(ball, 1000.0 * depth, background)
+    image[:, : camera.width // 2][ball[:, : camera.width // 2]] = mark
+    return np.round(image).astype(dtype) / (1.0 if dtype == np.uint16 else 1000.0), ball
 
 
 WALL = 2500.0 + 5.0 * np.random.default_rng(0).normal(size=(48, 64))

@@ -42,9 +42,9 @@ def test_what_a_sensor_sees_in_the_world_is_what_it_sees_in_the_scene(up):
     pose = nbv.look_at((50.0, 90.0, 190.0), (48.0, -18.0, 31.0), up=(0.1, 0.9, 0.3))
     box = nbv.Box((0.0, -60.0, -20.0), (75.0, 30.0, 80.0))
     ball = nbv.SDFSurface(Sphere(45.0).translate([50.0, -20.0, 30.0]), bounding_radius=400.0)
-    seen = nbv.scan(ball, camera, pose)
+    cloud = nbv.scan(ball, camera, pose)
     depth = np.where(
-        seen.mask, (np.asarray(seen.points) - np.asarray(pose.position)) @ np.asarray(pose.forward), np.inf
+        cloud.mask, (np.asarray(cloud.points) - np.asarray(pose.position)) @ np.asarray(pose.forward), np.inf
     )
     depth = depth.reshape(12, 14)
     world = frame.to_scene(nbv.PointCloud.from_depth(depth, camera, pose, box=box))

@@ -30,20 +30,20 @@ def test_against_kdtree_with_masked_rows_anywhere(count, share):
     mask[rng.integers(count)] = True
     points = np.where(mask[:, None] | (rng.random(count) < 0.5)[:, None], points, 0.0)
     distance, _ = cKDTree(points[mask]).query(x)
-    found = nearest_squared_distance(jnp.asarray(x, jnp.float32), cloud_of(points.astype(np.float32), mask))
-    np.testing.assert_allclose(found, distance**2, atol=3e-6)
+    distances = nearest_squared_distance(jnp.asarray(x, jnp.float32), cloud_of(points.astype(np.float32), mask))
+    np.testing.assert_allclose(distances, distance**2, atol=3e-6)
 
 
 def test_points_of_the_cloud_are_at_distance_zero_and_never_below():
     points = np.random.default_rng(2).uniform(-1.5, 1.5, (64, 3)).astype(np.float32)
-    found = np.asarray(nearest_squared_distance(jnp.asarray(points), cloud_of(points)))
-    assert (found >= 0).all()
-    np.testing.assert_allclose(found, 0.0, atol=3e-6)
+    distances = np.asarray(nearest_squared_distance(jnp.asarray(points), cloud_of(points)))
+    assert (distances >= 0).all()
+    np.testing.assert_allclose(distances, 0.0, atol=3e-6)
 
 
 def test_an_empty_cloud_is_infinitely_far():
-    found = nearest_squared_distance(jnp.ones((4, 3)), cloud_of(np.zeros((20, 3), np.float32), np.zeros(20, bool)))
-    assert np.isposinf(found).all()
+    distances = nearest_squared_distance(jnp.ones((4, 3)), cloud_of(np.zeros((20, 3), np.float32), np.zeros(20, bool)))
+    assert np.isposinf(distances).all()
 
 
 def problem():
@@ -89,9 +89,9 @@ def test_the_spacing_is_the_median_distance_between_neighbours(count):
     """For many points the median of some is within a tenth."""
     points = np.random.default_rng(3).normal(size=(count, 3))
     rows = np.random.default_rng(4).permutation(1000)[:count]
-    held, mask = np.zeros((1000, 3), np.float32), np.zeros(1000, bool)
-    held[rows], mask[rows] = points, True
-    cloud = nbv.PointCloud(jnp.asarray(held), jnp.asarray(held), jnp.asarray(mask))
+    padded, mask = np.zeros((1000, 3), np.float32), np.zeros(1000, bool)
+    padded[rows], mask[rows] = points, True
+    cloud = nbv.PointCloud(jnp.asarray(padded), jnp.asarray(padded), jnp.asarray(mask))
     expected = np.median(cKDTree(points).query(points, k=2)[0][:, 1])
     assert float(spacing(cloud)) == pytest.approx(expected, rel=0.1)
 

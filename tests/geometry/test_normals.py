@@ -11,17 +11,17 @@ from jaxnbv.geometry.depth_noise import depth_noise
 CENTRES = np.asarray(nbv.geometry.fibonacci_sphere(3000), np.float64)
 
 
-def angles(found, expected):
-    return np.degrees(np.arccos(np.clip(np.sum(found * expected, axis=1), -1.0, 1.0)))
+def angles(vectors, expected):
+    return np.degrees(np.arccos(np.clip(np.sum(vectors * expected, axis=1), -1.0, 1.0)))
 
 
 def test_normals_of_a_ball_are_its_radii_and_face_each_points_own_sensor():
     """Within a patch of 16 of 3,000 points (radius 0.073) the normal of a ball turns by four degrees."""
-    found = nbv.geometry.estimate_normals(0.7 * CENTRES, 3.0 * CENTRES)
-    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1.0, atol=1e-9)
-    assert np.percentile(angles(found, CENTRES), 99) < 2.0
+    normals = nbv.geometry.estimate_normals(0.7 * CENTRES, 3.0 * CENTRES)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-9)
+    assert np.percentile(angles(normals, CENTRES), 99) < 2.0
     inward = nbv.geometry.estimate_normals(0.7 * CENTRES, (0.0, 0.0, 0.0))
-    np.testing.assert_allclose(inward, -found, atol=1e-9)
+    np.testing.assert_allclose(inward, -normals, atol=1e-9)
 
 
 def test_more_neighbours_smooth_noise():
@@ -65,9 +65,9 @@ def image(noise, seed=0):
 def test_the_noise_of_an_image_is_found(noise):
     """The tolerance is that of the median of some hundred differences near a pixel, and of the surface's curvature."""
     depth = jnp.asarray(1e-3 * image(noise))
-    found = np.asarray(depth_noise(depth, depth > 0, 0.0)) / np.hypot(noise, 1e-3 / np.sqrt(12))
-    assert np.median(found) == pytest.approx(1.0, rel=0.1)
-    assert np.quantile(np.abs(found - 1.0), 0.9) < 0.25
+    ratio = np.asarray(depth_noise(depth, depth > 0, 0.0)) / np.hypot(noise, 1e-3 / np.sqrt(12))
+    assert np.median(ratio) == pytest.approx(1.0, rel=0.1)
+    assert np.quantile(np.abs(ratio - 1.0), 0.9) < 0.25
 
 
 def test_noise_is_that_of_a_pixels_own_place_and_depth():
@@ -81,9 +81,9 @@ def test_noise_is_that_of_a_pixels_own_place_and_depth():
     wall = np.where(near[:, None], 0.5, 2.0) * np.ones((240, 320))
     truth = np.where(near[:, None], 1e-3, 8e-3) * np.where(np.arange(320) < 160, 1.0, 4.0)
     depth = jnp.asarray(wall + truth * rng.normal(size=wall.shape))
-    found = np.asarray(depth_noise(depth, depth > 0, 0.0)) / truth
+    ratio = np.asarray(depth_noise(depth, depth > 0, 0.0)) / truth
     away = np.abs(np.arange(320) - 160) > 16
-    assert np.quantile(np.abs(np.log(found[:, away])), 0.95) < 0.3
+    assert np.quantile(np.abs(np.log(ratio[:, away])), 0.95) < 0.3
 
 
 def test_neighbours_that_err_alike_hide_no_noise():
@@ -99,8 +99,8 @@ def test_neighbours_that_err_alike_hide_no_noise():
 def test_steps_of_depth_are_noise():
     """The depth of a slope changes in steps of 1 cm, each over a dozen pixels, so most differences are zero."""
     slope = 2.0 + 0.01 * np.floor(np.arange(320) / 12.0) * np.ones((240, 1))
-    found = depth_noise(jnp.asarray(slope), jnp.ones(slope.shape, bool), 0.0)
-    assert np.median(found) == pytest.approx(0.01 / np.sqrt(12), rel=0.5)
+    noise = depth_noise(jnp.asarray(slope), jnp.ones(slope.shape, bool), 0.0)
+    assert np.median(noise) == pytest.approx(0.01 / np.sqrt(12), rel=0.5)
 
 
 @pytest.mark.parametrize("shape", [(5, 3), (6, 6), (240, 320)])
@@ -118,18 +118,18 @@ def test_a_noisy_background_does_not_blur_what_is_before_it(wall):
     camera = nbv.Camera.from_intrinsics([[570.0, 0.0, 319.5], [0.0, 570.0, 239.5], [0.0, 0.0, 1.0]], 480, 640)
     pose = nbv.look_at((0.03, 0.0, 0.57))
     ball = nbv.scan(nbv.SDFSurface(nbv.scanning.sdf.Sphere(RADIUS)), camera, pose)
-    seen = np.asarray(ball.mask).reshape(480, 640)
+    on_ball = np.asarray(ball.mask).reshape(480, 640)
     along = (np.asarray(ball.points) - np.asarray(pose.position)) @ np.asarray(pose.forward)
-    truth = np.where(seen, along.reshape(480, 640), wall)
+    truth = np.where(on_ball, along.reshape(480, 640), wall)
     noisy = truth + 2.5e-3 * truth**2 * np.random.default_rng(0).normal(size=truth.shape)
     clouds = {}
-    for name, depth in (("alone", np.where(seen, noisy, 0.0)), ("before", noisy)):
+    for name, depth in (("alone", np.where(on_ball, noisy, 0.0)), ("before", noisy)):
         cloud = nbv.PointCloud.from_depth(np.round(1e3 * depth).astype(np.uint16), camera, pose, 1e-3, stride=4)
-        mask = np.asarray(cloud.mask) & seen[2::4, 2::4].reshape(-1)
+        mask = np.asarray(cloud.mask) & on_ball[2::4, 2::4].reshape(-1)
         points, normals = np.asarray(cloud.points)[mask], np.asarray(cloud.normals)[mask]
         away = np.linalg.norm(points, axis=1)
         clouds[name] = np.median(np.abs(away - RADIUS)), np.quantile(angles(normals, points / away[:, None]), 0.9)
-        assert mask.sum() > 0.99 * seen[2::4, 2::4].sum()
+        assert mask.sum() > 0.99 * on_ball[2::4, 2::4].sum()
     np.testing.assert_allclose(clouds["before"], clouds["alone"], rtol=0.1)
     assert clouds["before"][0] < 2.3e-4
     assert clouds["before"][1] < 4.0

@@ -58,16 +58,16 @@ def test_boundary_points_lie_on_the_boundary_all_around(name):
     np.testing.assert_allclose(zero_on_boundary(points), 0.0, atol=2e-6)
     # Every direction has a point nearby: each of 300 cells of the sphere has a radius of about 0.12.
     directions = points / np.linalg.norm(points, axis=1, keepdims=True)
-    asked = RNG.normal(size=(500, 3))
-    cosines = (asked / np.linalg.norm(asked, axis=1, keepdims=True)) @ directions.T
+    probes = RNG.normal(size=(500, 3))
+    cosines = (probes / np.linalg.norm(probes, axis=1, keepdims=True)) @ directions.T
     assert np.arccos(cosines.max(axis=1)).max() < 0.3
 
 
 def test_the_share_of_points_beyond_each_face():
     box = nbv.Box((0.0, 0.0, 0.0), (1.0, 2.0, 3.0))
     points = np.array([[1.2, 1.0, 1.0], [1.05, 1.0, 3.3], [0.5, -0.2, 1.0], [0.5, 1.0, 1.0]])
-    found = box.shares_beyond(points, 0.1)
-    assert found == {"-x": 0.0, "+x": 0.25, "-y": 0.25, "+y": 0.0, "-z": 0.0, "+z": 0.25}
+    shares = box.shares_beyond(points, 0.1)
+    assert shares == {"-x": 0.0, "+x": 0.25, "-y": 0.25, "+y": 0.0, "-z": 0.0, "+z": 0.25}
     assert box.shares_beyond(points[:0], 0.1) == {}
 
 

@@ -84,7 +84,7 @@ def encode(state, kind, sampling, points, features):
         while len(chosen) < count:
             distance = np.minimum(distance, ((points - points[chosen[-1]]) ** 2).sum(axis=1))
             chosen.append(int(np.argmax(distance)))
-        found = []
+        levels = []
         for i in chosen:
             squared = ((points - points[i]) ** 2).sum(axis=1)
             row = []
@@ -93,8 +93,8 @@ def encode(state, kind, sampling, points, features):
                 parts = [points[group] - points[i], features[group]]
                 x = np.concatenate(parts if kind == "ssg" else parts[::-1], axis=1)
                 row.append(perceptron(state, x, *_names(kind, level, branch)).max(axis=0))
-            found.append(np.concatenate(row))
-        points, features = points[chosen], np.array(found)
+            levels.append(np.concatenate(row))
+        points, features = points[chosen], np.array(levels)
         stages.append((points, features))
     whole = perceptron(state, np.concatenate([points, features], axis=1), "sa3.mlp_convs", "sa3.mlp_bns")
     return stages, whole.max(axis=0)

@@ -22,9 +22,9 @@ def state():
     return classifier_state(RNG, "ssg", 6)
 
 
-def assert_same(found, expected, rtol=1e-6):
-    assert jax.tree.structure(found) == jax.tree.structure(expected)
-    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+def assert_same(network, expected, rtol=1e-6):
+    assert jax.tree.structure(network) == jax.tree.structure(expected)
+    for a, b in zip(jax.tree.leaves(network), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(a, b, rtol=rtol, atol=rtol)
 
 
@@ -87,10 +87,10 @@ def own(request):
 
 def test_networks_of_our_own_come_back(own, tmp_path):
     save_checkpoint(own, tmp_path / "net.safetensors")
-    found = load_checkpoint(tmp_path / "net.safetensors")
-    assert_same(found, own, rtol=0)
+    loaded = load_checkpoint(tmp_path / "net.safetensors")
+    assert_same(loaded, own, rtol=0)
     if isinstance(own, InvariantClassifier):
-        assert CloudClassifier(found).classes == own.classes
+        assert CloudClassifier(loaded).classes == own.classes
 
 
 def test_files_that_hold_no_whole_network_of_our_own_are_refused(own, tmp_path):

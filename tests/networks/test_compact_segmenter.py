@@ -43,15 +43,15 @@ def test_it_gives_log_probabilities_and_is_small(network):
 def test_masked_rows_do_not_matter_whatever_they_hold_and_wherever_they_stand(network):
     points, normals = cloud()
     mask = np.arange(COUNT) < 220
-    found = segment(network, points, normals, CHAIR, mask)
+    log_p = segment(network, points, normals, CHAIR, mask)
     worse = points.copy(), normals.copy()
     for rows in worse:
         rows[~mask] = np.nan
-    np.testing.assert_array_equal(segment(network, *worse, CHAIR, mask)[mask], found[mask])
+    np.testing.assert_array_equal(segment(network, *worse, CHAIR, mask)[mask], log_p[mask])
     # The first row stays, since farthest point sampling starts there. The others change places with the padding.
     order = np.concatenate([[0], 1 + RNG.permutation(COUNT - 1)])
     moved = segment(network, points[order], normals[order], CHAIR, mask[order])
-    np.testing.assert_allclose(moved[mask[order]], found[order][mask[order]], atol=2e-4)
+    np.testing.assert_allclose(moved[mask[order]], log_p[order][mask[order]], atol=2e-4)
 
 
 def test_the_category_matters_and_may_be_an_array(network):
@@ -106,12 +106,12 @@ def predicted(segmenter, found):
 @pytest.mark.slow
 def test_the_shipped_weights_know_the_parts_of_objects_that_they_were_not_trained_on(computes):
     """Two test objects of each procedural category. Training uses none of them."""
-    found = scanned_clouds(part_scene, Split.TEST, range(5000, 5026), setting=PART_SETTING)
-    fed, said = jax.tree.map(np.asarray, predicted(part_segmenter("chair", num_points=1024), found))
+    batch = scanned_clouds(part_scene, Split.TEST, range(5000, 5026), setting=PART_SETTING)
+    fed, said = jax.tree.map(np.asarray, predicted(part_segmenter("chair", num_points=1024), batch))
     # Farthest point sampling of its own result returns it in the same order.
-    np.testing.assert_array_equal(fed.points, found.clouds.points)
-    mask, labels = np.asarray(found.clouds.mask), np.asarray(found.point_labels)
-    for category, rows, there in zip(np.asarray(found.labels), said, mask, strict=True):
+    np.testing.assert_array_equal(fed.points, batch.clouds.points)
+    mask, labels = np.asarray(batch.clouds.mask), np.asarray(batch.point_labels)
+    for category, rows, there in zip(np.asarray(batch.labels), said, mask, strict=True):
         assert set(rows[there].tolist()) <= set(CATEGORIES[category].labels)
         assert (rows[~there] == -1).all()
     assert np.mean(said[mask] == labels[mask]) >= 0.85

@@ -36,16 +36,16 @@ def test_balls_against_a_loop(x64, n, count, share):
     filled = np.where(mask[:, None], points, RNG.choice([np.nan, 0.0], size=(n, 1)))
     centers = np.concatenate([points[mask][:30], RNG.uniform(-1, 1, (10, 3))])
     for radius in (0.05, 0.5, 1.2, 9.0):
-        found = ball_query(jnp.asarray(centers), jnp.asarray(filled), jnp.asarray(mask), radius, count)
-        np.testing.assert_array_equal(found, ball_by_loop(centers, points, mask, radius, count))
+        indices = ball_query(jnp.asarray(centers), jnp.asarray(filled), jnp.asarray(mask), radius, count)
+        np.testing.assert_array_equal(indices, ball_by_loop(centers, points, mask, radius, count))
 
 
 def test_a_point_on_the_sphere_is_within():
     points = lattice(5)
     mask = np.ones(len(points), bool)
     for radius in (1.0, 2.0, 3.0):
-        found = ball_query(jnp.asarray(points), jnp.asarray(points), jnp.asarray(mask), radius, 90)
-        np.testing.assert_array_equal(found, ball_by_loop(points, points, mask, radius, 90))
+        indices = ball_query(jnp.asarray(points), jnp.asarray(points), jnp.asarray(mask), radius, 90)
+        np.testing.assert_array_equal(indices, ball_by_loop(points, points, mask, radius, 90))
 
 
 def interpolated_by_loop(points, coarse, features):

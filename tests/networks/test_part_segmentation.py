@@ -94,8 +94,8 @@ def test_log_probabilities_are_those_of_the_reference(shared):
     assert network.num_categories == 16
     assert np.ptp(expected) > 1
     for cloud, category, log_p in zip(jnp.asarray(points), categories, expected, strict=True):
-        found = segment(network, cloud[:, :3], cloud[:, 3:], jnp.asarray(category))
-        np.testing.assert_allclose(found, log_p, atol=3e-5)
+        result = segment(network, cloud[:, :3], cloud[:, 3:], jnp.asarray(category))
+        np.testing.assert_allclose(result, log_p, atol=3e-5)
 
 
 @pytest.mark.parametrize(("kind", "inputs", "n"), [("ssg", 6, 60), ("msg", 9, 560)])
@@ -111,8 +111,8 @@ def test_against_a_plain_network(x64, tmp_path, kind, inputs, n):
     for category in (4, 15):
         plain = [np.asarray(a) for a in (points, normals)]
         answers.append(plain_network(state, kind, plain[0], plain[1] if inputs == 9 else None, category))
-        found = segment(network, points, normals, jnp.asarray(category))
-        np.testing.assert_allclose(found, answers[-1], atol=1e-10)
+        log_p = segment(network, points, normals, jnp.asarray(category))
+        np.testing.assert_allclose(log_p, answers[-1], atol=1e-10)
     assert np.abs(answers[0] - answers[1]).max() > 0.01
 
 
@@ -127,8 +127,8 @@ def test_masked_rows_and_capacity_do_not_matter():
     for filling in (0.3, np.nan):
         wide = [np.full((40, 3), filling, np.float32) for _ in range(2)]
         wide[0][place], wide[1][place] = points, normals
-        found = segment(network, *map(jnp.asarray, wide), jnp.asarray(3), jnp.asarray(mask))
-        np.testing.assert_allclose(found[place], expected, atol=1e-5)
+        log_p = segment(network, *map(jnp.asarray, wide), jnp.asarray(3), jnp.asarray(mask))
+        np.testing.assert_allclose(log_p[place], expected, atol=1e-5)
 
 
 def test_calls_that_cannot_be_answered_are_refused():
@@ -192,8 +192,8 @@ def test_a_cloud_segmenter_gives_probabilities_of_the_categorys_parts():
     np.testing.assert_allclose(p[:30].sum(axis=1), 1.0, atol=1e-6)
     # The network's own answer for the points in the order that it gets, at its scale, given the category.
     log_p = segment(network, 0.5 * fed.points, fed.normals, jnp.asarray(15), fed.mask)
-    given = np.exp(np.asarray(log_p, np.float64))[:30, 47:]
-    np.testing.assert_allclose(p[:30, 47:], given / given.sum(axis=1, keepdims=True), atol=1e-5)
+    expected = np.exp(np.asarray(log_p, np.float64))[:30, 47:]
+    np.testing.assert_allclose(p[:30, 47:], expected / expected.sum(axis=1, keepdims=True), atol=1e-5)
     np.testing.assert_array_equal(labels, np.where(np.arange(40) < 30, p.argmax(axis=1), -1))
     assert set(np.asarray(labels[:30]).tolist()) <= {47, 48, 49}
     p, _, labels = answers_of(segmenter, nbv.PointCloud(cloud.points, cloud.normals, jnp.zeros(50, bool)))

@@ -56,8 +56,8 @@ def test_log_probabilities_are_those_of_the_reference(shared, kind):
         points, expected = jnp.asarray(saved["points"]), saved["log_probs"]
     assert network.uses_normals
     assert np.ptp(expected) > 1
-    found = eqx.filter_jit(lambda net, x: jax.lax.map(lambda row: net(row[:, :3], row[:, 3:]), x))(network, points)
-    np.testing.assert_allclose(found, expected, atol=3e-5)
+    log_p = eqx.filter_jit(lambda net, x: jax.lax.map(lambda row: net(row[:, :3], row[:, 3:]), x))(network, points)
+    np.testing.assert_allclose(log_p, expected, atol=3e-5)
 
 
 @pytest.mark.parametrize(
@@ -139,8 +139,8 @@ def test_gradients_against_central_differences(x64):
 def test_a_cloud_with_no_filled_row_gives_finite_numbers(x64):
     points, normals = cloud(20)
     network = eqx.filter_jit(small_network())
-    found = network(points, normals, jnp.zeros(20, bool))
-    np.testing.assert_allclose(found, network(jnp.zeros((1, 3)), jnp.zeros((1, 3))), atol=1e-13)
+    log_p = network(points, normals, jnp.zeros(20, bool))
+    np.testing.assert_allclose(log_p, network(jnp.zeros((1, 3)), jnp.zeros((1, 3))), atol=1e-13)
 
 
 def test_shapes_that_are_not_one_cloud_are_refused():

@@ -37,10 +37,10 @@ def test_right_where_the_pattern_is_seen_and_undecided_where_it_is_not(framing):
     classifier = pretrained_classifier("pyramid", framing.longest_side)
     right, undecided, first = [], [], 0
     while len(right) < 50:
-        found = scanned_clouds(partial(pyramid_scene, framing=framing), Split.TEST, range(first, first + _CHUNK))
-        log_p = answers(classifier, found.clouds)
-        pixels = np.asarray(found.cue_pixels)
-        right += (np.argmax(log_p, axis=1) == np.asarray(found.labels))[pixels >= enough].tolist()
+        batch = scanned_clouds(partial(pyramid_scene, framing=framing), Split.TEST, range(first, first + _CHUNK))
+        log_p = answers(classifier, batch.clouds)
+        pixels = np.asarray(batch.cue_pixels)
+        right += (np.argmax(log_p, axis=1) == np.asarray(batch.labels))[pixels >= enough].tolist()
         undecided += np.asarray(entropy(log_p))[pixels == 0].tolist()
         first += _CHUNK
     # The accuracy of fifty clouds has a standard error of 2.4 points at 97 %, and of 4.2 at 90 %.
@@ -56,10 +56,10 @@ def test_the_class_of_a_cargo_by_what_is_seen_of_it():
     assert classifier.classes == HOUSEHOLD
     right, undecided, first = [], [], 0
     while len(right) < 30:
-        found = scanned_clouds(truck_scene, Split.TEST, range(first, first + _CHUNK), 2048)
-        log_p = answers(classifier, found.clouds)
-        telling = np.asarray(found.point_labels).sum(axis=1)
-        right += (np.argmax(log_p, axis=1) == np.asarray(found.labels))[telling >= 150].tolist()
+        batch = scanned_clouds(truck_scene, Split.TEST, range(first, first + _CHUNK), 2048)
+        log_p = answers(classifier, batch.clouds)
+        telling = np.asarray(batch.point_labels).sum(axis=1)
+        right += (np.argmax(log_p, axis=1) == np.asarray(batch.labels))[telling >= 150].tolist()
         undecided += np.asarray(entropy(log_p))[telling == 0].tolist()
         first += _CHUNK
     # Guessing is right for a tenth. 541 such clouds are right in 92 %. The standard error of 30 clouds is 5 points.
@@ -73,9 +73,9 @@ def test_the_class_of_objects_seen_from_several_sides():
     """Test objects that were not trained on, from three views or more."""
     classifier = pretrained_classifier("household")
     assert classifier.classes == HOUSEHOLD
-    found = scanned_clouds(household_scene, Split.TEST, range(60))
-    rows = np.asarray(found.views) >= 3
-    right = np.argmax(answers(classifier, found.clouds), axis=1) == np.asarray(found.labels)
+    batch = scanned_clouds(household_scene, Split.TEST, range(60))
+    rows = np.asarray(batch.views) >= 3
+    right = np.argmax(answers(classifier, batch.clouds), axis=1) == np.asarray(batch.labels)
     assert rows.sum() >= 25
     # The standard error of these clouds is 2.8 points at 98 %.
     assert np.mean(right[rows]) >= 0.85

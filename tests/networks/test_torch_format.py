@@ -39,10 +39,10 @@ def test_tensors_of_every_type(tmp_path):
     arrays = {kind: RNG.uniform(0, 9, (2, 3, 4)).astype(kind) for kind in STORAGES}
     arrays["scalar"] = np.array(5, np.int64)
     content, data = tensors_and_bytes(arrays)
-    found = read_torch_tensors(write_archive(tmp_path / "net.pth", content, data))
+    tensors = read_torch_tensors(write_archive(tmp_path / "net.pth", content, data))
     for name, array in arrays.items():
-        np.testing.assert_array_equal(found[name], array)
-        assert found[name].dtype == array.dtype
+        np.testing.assert_array_equal(tensors[name], array)
+        assert tensors[name].dtype == array.dtype
 
 
 def test_bfloat16(tmp_path):
@@ -63,11 +63,11 @@ def test_views_of_one_storage(tmp_path):
         "parameter": call(parameter, view(shared, 23, (1,), (1,)), True, {}),
         "none": view(shared, 0, (0, 3), (3, 1)),
     }
-    found = read_torch_tensors(write_archive(tmp_path / "net.pth", content, {"0": numbers.tobytes()}))
-    np.testing.assert_array_equal(found["transposed"], numbers.reshape(4, 6).T)
-    np.testing.assert_array_equal(found["part"], 5 + np.array([[0, 2, 4], [8, 10, 12]]))
-    np.testing.assert_array_equal(found["parameter"], [23])
-    assert found["none"].shape == (0, 3)
+    tensors = read_torch_tensors(write_archive(tmp_path / "net.pth", content, {"0": numbers.tobytes()}))
+    np.testing.assert_array_equal(tensors["transposed"], numbers.reshape(4, 6).T)
+    np.testing.assert_array_equal(tensors["part"], 5 + np.array([[0, 2, 4], [8, 10, 12]]))
+    np.testing.assert_array_equal(tensors["parameter"], [23])
+    assert tensors["none"].shape == (0, 3)
 
 
 def test_the_older_layout(tmp_path, state):
@@ -118,8 +118,8 @@ def test_what_a_training_run_left_beside_its_model_is_passed_over(tmp_path, stat
         "args": Op(b"b", Op(b"\x81", named("argparse", "Namespace"), ()), {"batch_size": 24}),
         "model": named("models.pointnet2_cls_ssg", "get_model"),
     }
-    found = read_torch_tensors(checkpoint(tmp_path / "net.pth", state, **others))
-    assert set(found) == set(state)
+    tensors = read_torch_tensors(checkpoint(tmp_path / "net.pth", state, **others))
+    assert set(tensors) == set(state)
 
 
 def test_damaged_archives_are_refused(tmp_path, state):
@@ -265,5 +265,5 @@ def test_long_lists_and_deep_settings_are_read(tmp_path, state):
     for _ in range(300):
         deep = (deep,)
     items = Op(b"".join(b"K\x01a" for _ in range(3000)), [])
-    found = read_torch_tensors(checkpoint(tmp_path / "net.pth", state, losses=items, settings=deep))
-    assert set(found) == set(state)
+    tensors = read_torch_tensors(checkpoint(tmp_path / "net.pth", state, losses=items, settings=deep))
+    assert set(tensors) == set(state)

@@ -40,8 +40,11 @@ def views_of_a_box(errors, noise=0.0, eyes=EYES, roll=True):
         points = random.uniform(-1.0, 1.0, (4000, 3))
         points[np.arange(4000), face % 3] = np.where(face < 3, 1.0, -1.0)
         points, normals = SIDES * points, AXES[face]
-        seen = np.sum(normals * (np.array(eye) - points), axis=1) > 0
-        points, normals = points[seen] + noise * random.normal(size=(seen.sum(), 1)) * normals[seen], normals[seen]
+        is_visible = np.sum(normals * (np.array(eye) - points), axis=1) > 0
+        points, normals = (
+            points[is_visible] + noise * random.normal(size=(is_visible.sum(), 1)) * normals[is_visible],
+            normals[is_visible],
+        )
         up = Rotation.from_rotvec([0.0, 0.0, number * roll]).apply([1.0, 0.0, 0.2])
         true = np.asarray(look_at(eye, up=up).to_matrix(), np.float64)
         said = true @ np.linalg.inv(error)

@@ -73,9 +73,9 @@ def test_neither_the_object_nor_a_table_nor_the_robot_is_clutter():
 
 def shot_of(world, matrix):
     pose = Pose.from_matrix(matrix)
-    seen = scan(SDFSurface(world), CAMERA, pose)
-    depth = (np.asarray(seen.points, np.float64) - np.asarray(pose.position)) @ np.asarray(pose.forward, np.float64)
-    return np.where(seen.mask, depth, 0.0).reshape(48, 64)
+    cloud = scan(SDFSurface(world), CAMERA, pose)
+    depth = (np.asarray(cloud.points, np.float64) - np.asarray(pose.position)) @ np.asarray(pose.forward, np.float64)
+    return np.where(cloud.mask, depth, 0.0).reshape(48, 64)
 
 
 WORLD = Sphere(0.1).translate([0.3, 0.2, 0.101]) | Cuboid([1.0, 1.0, 0.02]).translate([0.3, 0.2, -0.021]) | POST

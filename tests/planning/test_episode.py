@@ -38,10 +38,10 @@ def test_simulate_is_the_loop_of_ask_and_tell(episode):
         if observations is not None:
             proposal = PLANNER.propose(observations, choose_key)
             pose = proposal.pose
-        seen = observe_scene(SCENE, PLANNER.camera, pose, SensorNoise(), noise_key)
-        observations = PLANNER.init(pose, seen) if observations is None else PLANNER.observe(observations, pose, seen)
+        cloud = observe_scene(SCENE, PLANNER.camera, pose, SensorNoise(), noise_key)
+        observations = PLANNER.init(pose, cloud) if observations is None else PLANNER.observe(observations, pose, cloud)
         view = episode.views[index]
-        assert_same_bits((view.pose, view.scan, view.cloud), (pose, seen, observations.cloud))
+        assert_same_bits((view.pose, view.scan, view.cloud), (pose, cloud, observations.cloud))
         assert_same_bits(view.proposal, proposal)
         assert_same_bits(episode.observations_after(index + 1), observations)
     assert_same_bits(episode.cloud, observations.cloud)
@@ -92,14 +92,14 @@ def test_a_whole_episode_as_one_jitted_function(episode):
         def keys(index):
             return jax.random.split(jax.random.fold_in(key, index))
 
-        seen = noise(scan(SCENE, PLANNER.camera, first), keys(0)[1])
-        observations = PLANNER.init(first, seen)
+        cloud = noise(scan(SCENE, PLANNER.camera, first), keys(0)[1])
+        observations = PLANNER.init(first, cloud)
 
         def step(observations, index):
             choose_key, noise_key = keys(index)
             proposal = PLANNER.propose(observations, choose_key)
-            seen = noise(scan(SCENE, PLANNER.camera, proposal.pose), noise_key)
-            return PLANNER.observe(observations, proposal.pose, seen), (proposal.pose, proposal.values)
+            cloud = noise(scan(SCENE, PLANNER.camera, proposal.pose), noise_key)
+            return PLANNER.observe(observations, proposal.pose, cloud), (proposal.pose, proposal.values)
 
         return jax.lax.scan(step, observations, jnp.arange(1, 4))
 
@@ -137,7 +137,7 @@ def test_what_views_found_of_a_ball():
     sampler = nbv.SurfaceSampler(nbv.GeometricSPSR(0.2, truncation=6), nbv.Grid(40), num_samples=2)
     planner = nbv.Planner(nbv.NewSurface(), nbv.DiscreteSearch(poses), camera, sampler, capacity=400, max_views=4)
     scans = [scan(SDFSurface(Sphere(radius)), camera, pose) for pose in poses]
-    views = tuple(nbv.View(pose, seen, seen, None, camera) for pose, seen in zip(poses, scans, strict=True))
+    views = tuple(nbv.View(pose, cloud, cloud, None, camera) for pose, cloud in zip(poses, scans, strict=True))
     first, other_side, again = Episode(planner, None, None, poses[0], KEY, views).actual_scores()
     cap = 2.0 * np.pi * radius**2 * (1.0 - radius / away)
     assert first is None

@@ -48,9 +48,9 @@ def test_a_mount_that_is_off_moves_the_camera_and_not_what_the_robot_says():
     error = mujoco_arm.hand_eye_error(2.0, 10.0)
     exact, off = arm_simulator.Arm(MUG), arm_simulator.Arm(MUG, error)
     np.testing.assert_array_equal(exact.matrix(), off.matrix())
-    depth, told = off.depth(), off.matrix()
-    assert np.median(away_from_scene(points_of(depth, told)[::7])) > 3e-3
-    assert np.median(away_from_scene(points_of(depth, told @ error)[::7])) < 5e-4
+    depth, reported = off.depth(), off.matrix()
+    assert np.median(away_from_scene(points_of(depth, reported)[::7])) > 3e-3
+    assert np.median(away_from_scene(points_of(depth, reported @ error)[::7])) < 5e-4
 
 
 def test_the_arm_holds_the_camera_where_it_is_sent_within_its_joints_limits():

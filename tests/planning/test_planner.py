@@ -42,8 +42,8 @@ def test_nothing_recompiles_after_the_second_view(name, compilations):
     for view in range(5):
         if observations is not None:
             pose = planner.propose(observations, jax.random.fold_in(key, view)).pose
-        seen = observe_scene(pose, jax.random.fold_in(key, view))
-        observations = planner.init(pose, seen) if observations is None else planner.observe(observations, pose, seen)
+        cloud = observe_scene(pose, jax.random.fold_in(key, view))
+        observations = planner.init(pose, cloud) if observations is None else planner.observe(observations, pose, cloud)
         after.append(len(compilations))
     assert after[0] > 0, "the counter counts nothing"
     assert after[1:] == [after[1]] * 4, f"compilations after each view: {after}"
@@ -63,13 +63,13 @@ def test_simulated_episodes_do_not_recompile_either(planner, compilations):
 def test_asking_and_telling_leave_the_observations_as_they_were(planner, observations):
     before = jax.tree.map(np.array, observations)
     proposal = planner.propose(observations, jax.random.key(1))
-    seen = scan(SCENE, planner.camera, proposal.pose)
-    after = planner.observe(observations, proposal.pose, seen)
+    cloud = scan(SCENE, planner.camera, proposal.pose)
+    after = planner.observe(observations, proposal.pose, cloud)
     jax.tree.map(np.testing.assert_array_equal, before, jax.tree.map(np.array, observations))
     assert int(observations.num_views) == 1
     assert int(after.num_views) == 2
     np.testing.assert_array_equal(after.poses.rows.position[:2], jnp.stack([FIRST.position, proposal.pose.position]))
-    assert int(after.cloud.count) == int(observations.cloud.count + seen.count) <= 128
+    assert int(after.cloud.count) == int(observations.cloud.count + cloud.count) <= 128
     with pytest.raises(AttributeError):
         observations.num_views = 3
     again = planner.propose(observations, jax.random.key(1))
@@ -87,22 +87,22 @@ def test_a_cloud_alone_makes_observations(planner):
     cloud, key = scan(SCENE, planner.camera, FIRST), jax.random.key(4)
     sample_key, search_key = jax.random.split(key)
     observations = planner.init(None, cloud)
-    known = planner.propose(observations, key)
+    proposal = planner.propose(observations, key)
     alone = planner.choose(planner.sampler.step_inputs(observations.cloud, sample_key), search_key)
-    jax.tree.map(np.testing.assert_array_equal, jax.tree.map(np.array, known), jax.tree.map(np.array, alone))
+    jax.tree.map(np.testing.assert_array_equal, jax.tree.map(np.array, proposal), jax.tree.map(np.array, alone))
 
 
 def test_beyond_its_capacity_the_cloud_is_thinned_by_farthest_points(planner, observations):
     proposal_pose = look_at((-0.8, 0.9, 2.2))
-    seen = scan(SCENE, planner.camera, proposal_pose)
+    cloud = scan(SCENE, planner.camera, proposal_pose)
     small = planner_of(SEARCHES["DiscreteSearch"], capacity=40)
     first = scan(SCENE, small.camera, FIRST)
     assert int(first.count) > 40
     start = small.init(FIRST, first)
     expected = farthest_point_subsample(first, 40)
     np.testing.assert_array_equal(start.cloud.points, expected.points)
-    after = small.observe(start, proposal_pose, seen)
-    expected = farthest_point_subsample(concatenate(expected, seen), 40)
+    after = small.observe(start, proposal_pose, cloud)
+    expected = farthest_point_subsample(concatenate(expected, cloud), 40)
     np.testing.assert_array_equal(after.cloud.points, expected.points)
     np.testing.assert_array_equal(after.cloud.normals, expected.normals)
     assert bool(after.cloud.mask.all())
@@ -137,9 +137,9 @@ def test_a_point_that_lies_alone_where_another_view_looked_through_goes(partners
 
 def test_a_scan_that_saw_nothing_only_records_its_pose(planner, observations):
     away = Pose(np.eye(3, dtype=np.float32), np.array([0.0, 0.0, 2.5], np.float32))
-    seen = scan(SCENE, planner.camera, away)
-    assert int(seen.count) == 0
-    after = planner.observe(observations, away, seen)
+    cloud = scan(SCENE, planner.camera, away)
+    assert int(cloud.count) == 0
+    after = planner.observe(observations, away, cloud)
     np.testing.assert_array_equal(after.cloud.points, observations.cloud.points)
     assert int(after.num_views) == 2
 
@@ -226,10 +226,10 @@ def test_parts_thinner_than_a_cell_are_told_of_with_the_remedy():
 
 
 def test_what_is_constant_under_jit_is_checked_too(planner, observations):
-    seen = scan(SCENE, planner.camera, FIRST)
-    begun = jax.jit(lambda: planner.init(FIRST, seen))()
+    cloud = scan(SCENE, planner.camera, FIRST)
+    begun = jax.jit(lambda: planner.init(FIRST, cloud))()
     np.testing.assert_array_equal(begun.cloud.points, observations.cloud.points)
-    assert int(jax.jit(lambda observations: planner.observe(observations, FIRST, seen).num_views)(observations)) == 2
-    long = eqx.tree_at(lambda c: c.normals, seen, 2 * seen.normals)
+    assert int(jax.jit(lambda observations: planner.observe(observations, FIRST, cloud).num_views)(observations)) == 2
+    long = eqx.tree_at(lambda c: c.normals, cloud, 2 * cloud.normals)
     with pytest.raises(ValueError, match="not of unit length"):
         jax.jit(lambda: planner.init(FIRST, long))()

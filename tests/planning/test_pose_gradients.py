@@ -140,7 +140,7 @@ class Events(NamedTuple):
 
 def events(surfaces, pairs, step):
     ends = [scan_samples(surfaces, CAMERA, pairs.moved(sign * step)) for sign in (1, -1)]
-    masks, points = zip(*[(np.asarray(seen.mask), np.asarray(seen.points)) for seen in ends], strict=True)
+    masks, points = zip(*[(np.asarray(end.mask), np.asarray(end.points)) for end in ends], strict=True)
     both = masks[0] & masks[1]
     # A hit that does not jump moves by at most 34 times as much as its ray, which moves by three times the step.
     jumps = (masks[0] != masks[1]) | (both & (np.linalg.norm(points[0] - points[1], axis=-1) > 200 * step))
@@ -174,11 +174,11 @@ def compare(score, surfaces, pairs, step=STEP):
     cloud = random_cloud()
     slope = np.asarray(slopes_at(score, cloud, surfaces, pairs.starts, jnp.asarray(pairs.parameters)))
     assert np.isfinite(slope).all()
-    found = np.einsum("pdk,pk->pd", pairs.directions, slope).ravel()
+    derivatives = np.einsum("pdk,pk->pd", pairs.directions, slope).ravel()
     ahead, behind = (values_at(score, cloud, surfaces, pairs.moved(sign * step)) for sign in (1, -1))
     # The gradient in the parameters that the directions change.
     length = np.linalg.norm(np.where((pairs.directions != 0).any(axis=1), slope, 0.0), axis=-1)
-    return found, np.asarray(ahead - behind) / (2 * step), np.repeat(length, pairs.directions.shape[1])
+    return derivatives, np.asarray(ahead - behind) / (2 * step), np.repeat(length, pairs.directions.shape[1])
 
 
 @pytest.mark.parametrize(
@@ -190,35 +190,35 @@ def compare(score, surfaces, pairs, step=STEP):
 )
 def test_derivatives_are_those_of_central_differences(kind, space, x64):
     surfaces, pairs = surfaces_of(kind), pairs_of(space)
-    seen = events(surfaces, pairs, STEP)
+    event = events(surfaces, pairs, STEP)
     counts = np.asarray(scan_samples(surfaces, CAMERA, pairs.moved(0.0)).count)
     if kind == "filling" and space == "sphere":
         assert (counts == CAMERA.num_rays).all()
-        assert not seen.grazes.any()
+        assert not event.grazes.any()
     if kind != "filling":
         assert (counts < CAMERA.num_rays).all()
-    assert seen.jumps.mean() < 0.03
-    assert seen.crosses.mean() < 0.03
-    assert seen.grazes.mean() < 0.3
+    assert event.jumps.mean() < 0.03
+    assert event.crosses.mean() < 0.03
+    assert event.grazes.mean() < 0.3
     weights = jnp.eye(len(ACQUISITIONS))
     for name, weight in zip(ACQUISITIONS, weights, strict=True):
-        found, expected, length = compare(OneOf(list(ACQUISITIONS.values()), weight), surfaces, pairs)
-        error = np.abs(found - expected)
-        worst = np.max((error / (1e-6 * length + 1e-7))[seen.none])
+        derivatives, expected, length = compare(OneOf(list(ACQUISITIONS.values()), weight), surfaces, pairs)
+        error = np.abs(derivatives - expected)
+        worst = np.max((error / (1e-6 * length + 1e-7))[event.none])
         assert worst < 1, f"{name}: {worst:.3g} times the tolerance"
-        assert (length[seen.none] > 1e-3).mean() > 0.5, f"{name} has no slope"
+        assert (length[event.none] > 1e-3).mean() > 0.5, f"{name} has no slope"
 
 
 def test_a_jump_is_not_in_the_derivative(x64):
     """With a step of a thousandth, silhouettes pass over some pixels. Differences there are much larger than
     elsewhere."""
     surfaces, pairs, step = surfaces_of("blob"), pairs_of("free"), 1e-3
-    seen = events(surfaces, pairs, step)
+    event = events(surfaces, pairs, step)
     weight = jnp.eye(len(ACQUISITIONS))[0]
-    found, expected, length = compare(OneOf(list(ACQUISITIONS.values()), weight), surfaces, pairs, step)
-    error = np.abs(found - expected) / length
-    assert 0.0 < seen.jumps.mean() < 0.2
-    assert np.median(error[seen.jumps]) > 30 * np.median(error[~seen.jumps & ~seen.grazes])
+    derivatives, expected, length = compare(OneOf(list(ACQUISITIONS.values()), weight), surfaces, pairs, step)
+    error = np.abs(derivatives - expected) / length
+    assert 0.0 < event.jumps.mean() < 0.2
+    assert np.median(error[event.jumps]) > 30 * np.median(error[~event.jumps & ~event.grazes])
 
 
 @pytest.mark.slow
@@ -226,9 +226,9 @@ def test_derivatives_through_a_network(x64):
     """A network has kinks where a unit switches and where it picks other points. Almost everywhere the two agree."""
     network = CloudClassifier(InvariantClassifier(3, jax.random.key(0)), 96)
     surfaces, pairs = surfaces_of("blob"), pairs_of("free", 6)
-    seen = events(surfaces, pairs, STEP)
-    found, expected, length = compare(CrossEntropy(network), surfaces, pairs)
-    error = (np.abs(found - expected) / length)[seen.none]
-    assert seen.none.mean() > 0.5
+    event = events(surfaces, pairs, STEP)
+    derivatives, expected, length = compare(CrossEntropy(network), surfaces, pairs)
+    error = (np.abs(derivatives - expected) / length)[event.none]
+    assert event.none.mean() > 0.5
     assert np.median(error) < 1e-5
     assert error.max() < 1e-2

@@ -30,8 +30,8 @@ def chain(x, y, z):
 
 @pytest.mark.parametrize("compiled", [jax.jit, lambda f: lambda *a: jax.jit(jax.vmap(f))(*(x[None] for x in a))[0]])
 def test_a_program_has_the_bits_of_its_parts(compiled):
-    found = compiled(lambda *given: in_parts(chain, *given))(X, Y, Z)
-    np.testing.assert_array_equal(found, chain(X, Y, Z))
+    result = compiled(lambda *arrays: in_parts(chain, *arrays))(X, Y, Z)
+    np.testing.assert_array_equal(result, chain(X, Y, Z))
 
 
 def test_what_does_not_change_in_a_loop_keeps_its_bits():
@@ -41,15 +41,15 @@ def test_what_does_not_change_in_a_loop_keeps_its_bits():
     def add(index, total):
         return in_parts(step, total, X, Y)
 
-    found = jax.jit(lambda: jax.lax.fori_loop(0, 4, add, Z))()
+    result = jax.jit(lambda: jax.lax.fori_loop(0, 4, add, Z))()
     expected = Z
     for _ in range(4):
         expected = step(expected, X, Y)
-    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(result, expected)
 
 
 def test_what_is_no_array_passes():
     part = eqx.filter_jit(lambda pair: in_parts(lambda p: (p[0] + 1, p[1], None), pair))
-    found = part((X, "name"))
-    assert found[1:] == ("name", None)
-    np.testing.assert_array_equal(found[0], X + 1)
+    result = part((X, "name"))
+    assert result[1:] == ("name", None)
+    np.testing.assert_array_equal(result[0], X + 1)

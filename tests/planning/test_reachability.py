@@ -36,10 +36,10 @@ def number_of(matrix):
 def test_the_best_pose_that_can_be_reached_is_proposed_in_the_world(free):
     """Matrices in metres. All poses but the third best are too far from the arm's shoulder."""
     third = POSES[free[2], :3, 3]
-    asked = []
+    calls = []
 
     def reachable(matrices):
-        asked.append(matrices)
+        calls.append(matrices)
         return [None if np.linalg.norm(place - third) < 1e-4 else "joint limit" for place in matrices[:, :3, 3]]
 
     session = begun(reachable=reachable)
@@ -48,7 +48,7 @@ def test_the_best_pose_that_can_be_reached_is_proposed_in_the_world(free):
     assert view.refusals == {"joint limit": 2}
     assert view.value == pytest.approx(float(session.frame.length_to_world(view.proposal.values[free[2]], 2)), rel=1e-5)
     # Calls are batches. Other rolls are tried only for the two refused poses.
-    assert [len(matrices) for matrices in asked] == [8, 7, 7]
+    assert [len(matrices) for matrices in calls] == [8, 7, 7]
     assert session.next() is view
 
 
@@ -125,10 +125,10 @@ def test_a_score_is_multiplied_by_the_value(free):
     order = np.argsort(-free_values(), kind="stable")
     scores = np.random.default_rng(0).uniform(0.3, 1.0, len(POSES))
     scores[order[3]] = 0.0
-    asked = []
+    calls = []
 
     def reachable(matrices):
-        asked.extend(number_of(matrix) for matrix in matrices)
+        calls.extend(number_of(matrix) for matrix in matrices)
         return [scores[number_of(matrix)] for matrix in matrices]
 
     view = begun(reachable=reachable).next()
@@ -139,7 +139,7 @@ def test_a_score_is_multiplied_by_the_value(free):
     assert float(view.proposal.value) == pytest.approx(values[best], rel=1e-6)
     # At most one batch more than needed, and seven rolls of the pose with score zero.
     can_win = int((values > scores[best] * values[best]).sum())
-    assert len(set(asked)) <= 8 * (can_win // 8 + 1)
+    assert len(set(calls)) <= 8 * (can_win // 8 + 1)
 
 
 def free_values():

@@ -55,8 +55,8 @@ def test_it_asks_and_tells_as_a_planner_in_the_scene_does(finished):
     for index in range(3):
         pose = Pose.from_matrix(matrix)
         cloud = PointCloud.from_depth(shot(matrix), CAMERA, pose, depth_scale=1e-3, box=box)
-        told = (frame.to_scene(pose), frame.to_scene(cloud), frame.to_scene(CAMERA))
-        observations = planner.init(*told) if observations is None else planner.observe(observations, *told)
+        in_scene = (frame.to_scene(pose), frame.to_scene(cloud), frame.to_scene(CAMERA))
+        observations = planner.init(*in_scene) if observations is None else planner.observe(observations, *in_scene)
         sample_key, search_key, _ = view_keys(jax.random.key(0), index + 1)
         surfaces = planner.sampler.sample(observations, sample_key)
         proposal = planner.choose(StepInputs(observations, None, surfaces), search_key)
@@ -94,10 +94,10 @@ def test_the_expected_depth_is_near_what_is_then_seen(finished):
     proposed, expected = finished.next(), finished.expected_depth()
     assert expected.shape == (12, 16)
     camera = CAMERA.resized(12, 16)
-    seen = scan(WORLD, camera, Pose.from_matrix(proposed.matrix))
-    inside = np.asarray(Box(*BOX)(seen.points)) < 0
-    depth = (np.asarray(seen.points) - proposed.matrix[:3, 3]) @ proposed.matrix[:3, 2]
-    both = (np.asarray(seen.mask) & inside).reshape(12, 16) & np.isfinite(expected)
+    cloud = scan(WORLD, camera, Pose.from_matrix(proposed.matrix))
+    inside = np.asarray(Box(*BOX)(cloud.points)) < 0
+    depth = (np.asarray(cloud.points) - proposed.matrix[:3, 3]) @ proposed.matrix[:3, 2]
+    both = (np.asarray(cloud.mask) & inside).reshape(12, 16) & np.isfinite(expected)
     assert both.sum() > 15
     assert np.median(np.abs(expected - depth.reshape(12, 16))[both]) < 0.02
 
@@ -275,9 +275,11 @@ def test_a_rim_about_the_box_is_modelled_and_not_given(finished):
 def test_a_box_that_cuts_the_object_is_told_once_a_face():
     """Two centimetres of the ball are beyond the box at +x, and nothing at the other faces."""
     session = session_of(box=(BOX[0], (0.38, 0.32, 0.24)))
-    with pytest.warns(UserWarning, match=r"go on beyond the box at \+x: \d+ % of the points .* larger box") as told:
+    with pytest.warns(
+        UserWarning, match=r"go on beyond the box at \+x: \d+ % of the points .* larger box"
+    ) as warning_list:
         session.add(shot(FIRST), FIRST, depth_scale=1e-3)
-    assert len(told) == 1
+    assert len(warning_list) == 1
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         session.add(shot(POSES[0]), POSES[0], depth_scale=1e-3)
@@ -286,13 +288,13 @@ def test_a_box_that_cuts_the_object_is_told_once_a_face():
 def test_travel_counts_from_where_the_camera_was(finished):
     """Not from the proposed pose. In metres about the middle of the box."""
     plain, priced = session_of(), session_of(planner=dataclasses.replace(planner_of(), cost=ValuePerCost(fixed=0.5)))
-    taken = around(3.0, 0.7)
+    actual = around(3.0, 0.7)
     for session in (plain, priced):
         session.add(shot(FIRST), FIRST, depth_scale=1e-3)
         proposed = session.next().matrix
-        assert np.abs(proposed - taken).max() > 0.1
-        session.add(shot(taken), taken, depth_scale=1e-3)
-    start, end = taken[:3, 3] - CENTER_OF_BOX, POSES[:, :3, 3] - CENTER_OF_BOX
+        assert np.abs(proposed - actual).max() > 0.1
+        session.add(shot(actual), actual, depth_scale=1e-3)
+    start, end = actual[:3, 3] - CENTER_OF_BOX, POSES[:, :3, 3] - CENTER_OF_BOX
     radii = np.linalg.norm(start), np.linalg.norm(end, axis=1)
     angle = np.arccos(end @ start / radii[0] / radii[1])
     cost = np.hypot(0.5 * (radii[0] + radii[1]) * angle, radii[1] - radii[0])
@@ -306,9 +308,9 @@ def test_distances_are_metres_to_cameras_that_were_there():
     """A proposal that was not followed is not proposed again, but no camera stood there."""
     session = session_of(planner=planner_of(FarthestView()))
     session.add(shot(FIRST), FIRST, depth_scale=1e-3)
-    refused, taken = session.next().matrix, around(3.3, 0.4)
-    session.add(shot(taken), taken, depth_scale=1e-3)
-    places = np.array([FIRST[:3, 3], taken[:3, 3]])
+    refused, actual = session.next().matrix, around(3.3, 0.4)
+    session.add(shot(actual), actual, depth_scale=1e-3)
+    places = np.array([FIRST[:3, 3], actual[:3, 3]])
     distance = np.linalg.norm(POSES[:, None, :3, 3] - places, axis=-1).min(axis=1)
     is_refused = np.abs(POSES - refused).max(axis=(1, 2)) < 1e-5
     assert is_refused.sum() == 1
@@ -342,8 +344,8 @@ def test_what_a_rule_looked_at_was_not_proposed(tmp_path):
     session = session_of(tmp_path, until=ValueBelow(0.0))
     session.add(shot(FIRST), FIRST, depth_scale=1e-3)
     assert session.done() is None
-    taken = around(3.0, 0.7)
-    session.add(shot(taken), taken, depth_scale=1e-3)
+    actual = around(3.0, 0.7)
+    session.add(shot(actual), actual, depth_scale=1e-3)
     again = Session.load(tmp_path, progress=False)
     assert session.views[1].proposal is again.views[1].proposal is None
     np.testing.assert_array_equal(session.next().proposal.values, again.next().proposal.values)
@@ -463,10 +465,10 @@ def test_a_room_scanned_from_inside_needs_poses_inside():
 def test_a_wrong_up_is_told_by_the_table(up):
     """The warning comes once, with the right axis."""
     session = session_of(box=((0.18, 0.08, -0.02), BOX[1]), obstacles=None, up=up)
-    with pytest.warns(UserWarning, match="no table is found") as told:
+    with pytest.warns(UserWarning, match="no table is found") as warning_list:
         session.add(shot(FIRST), FIRST, depth_scale=1e-3)
     message = f'no table is found with up="{up}", but a plane would be one with up="z": give that'
-    assert [message in str(one.message) for one in told].count(True) == 1
+    assert [message in str(one.message) for one in warning_list].count(True) == 1
 
 
 def test_no_table_is_told_and_obstacles_say_that_there_is_none():
@@ -486,9 +488,9 @@ def test_no_table_is_told_and_obstacles_say_that_there_is_none():
 
 def test_a_table_is_kept_where_that_is_asked_for():
     session = session_of(box=((0.18, 0.08, -0.02), BOX[1]), poses=BELOW, obstacles=Obstacles())
-    with pytest.warns(UserWarning, match="go on beyond the box") as told:
+    with pytest.warns(UserWarning, match="go on beyond the box") as warning_list:
         session.add(shot(FIRST), FIRST, depth_scale=1e-3)
-    assert not any("stands on a plane" in str(one.message) for one in told)
+    assert not any("stands on a plane" in str(one.message) for one in warning_list)
     points, _ = session.cloud.to_numpy()
     assert (points[:, 2] < 0.001).mean() > 0.1
     assert np.isfinite(np.asarray(session.next().proposal.values)).all()

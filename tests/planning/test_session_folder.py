@@ -53,10 +53,10 @@ def test_a_folder_of_another_session_is_refused(tmp_path):
 def test_two_sessions_in_one_folder_do_not_overwrite_each_other(tmp_path):
     first, second = session_of(tmp_path), session_of(tmp_path)
     first.add(shot(FIRST), FIRST, depth_scale=1e-3)
-    held = (tmp_path / "image_00.npz").read_bytes()
+    content = (tmp_path / "image_00.npz").read_bytes()
     with pytest.raises(InputError, match=r"holds 1 images, but this session knows 0"):
         second.add(shot(POSES[0]), POSES[0], depth_scale=1e-3)
-    assert (tmp_path / "image_00.npz").read_bytes() == held
+    assert (tmp_path / "image_00.npz").read_bytes() == content
     assert len(second.views) == 0
 
 

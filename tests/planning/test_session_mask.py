@@ -27,11 +27,11 @@ def test_points_are_those_of_the_mask(tmp_path):
     column = camera.to_pixels(
         (points @ pose[:3, :3].T + pose[:3, 3])[:, :2] / (points @ pose[:3, :3].T + pose[:3, 3])[:, 2:]
     )[:, 0]
-    kept = np.asarray(masked.cloud.to_numpy()[0], np.float64)
+    masked_points = np.asarray(masked.cloud.to_numpy()[0], np.float64)
     # Points come from fitted planes, and may cross the middle by less than a pixel.
     expected = int(np.sum(np.asarray(column) < 34.0))
-    assert len(kept) == pytest.approx(expected, abs=4)
-    assert 0 < len(kept) < len(points)
+    assert len(masked_points) == pytest.approx(expected, abs=4)
+    assert 0 < len(masked_points) < len(points)
     # Rays to other things end all the same.
     assert np.array_equal(np.asarray(masked.observations.looks.sight), np.asarray(whole.observations.looks.sight))
     again = nbv.Session.load(tmp_path, progress=False)
@@ -47,11 +47,11 @@ def test_what_is_to_be_ignored_is_no_part_of_the_object():
     plain, session, image = session_of(), session_of(ignore=is_robot), shot(FIRST)
     plain.add(image, FIRST, 1e-3)
     session.add(image, FIRST, 1e-3)
-    points, kept = plain.cloud.to_numpy()[0], session.cloud.to_numpy()[0]
+    points, rest = plain.cloud.to_numpy()[0], session.cloud.to_numpy()[0]
     # A pixel is 7 mm there, and points come from fitted planes.
-    assert kept[:, 0].max() < 0.307
+    assert rest[:, 0].max() < 0.307
     inside = points[points[:, 0] < 0.293]
-    assert np.abs(inside[:, None] - kept[None]).max(axis=-1).min(axis=1).max() < 1e-6
+    assert np.abs(inside[:, None] - rest[None]).max(axis=-1).min(axis=1).max() < 1e-6
     # Rays to the robot end all the same.
     assert np.array_equal(np.asarray(session.observations.looks.sight), np.asarray(plain.observations.looks.sight))
     with pytest.raises(nbv.InputError, match=r"ignore returned .* points: return a bool for each"):

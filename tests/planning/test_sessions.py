@@ -177,10 +177,10 @@ def test_without_a_table_it_says_so():
     pose = nbv.Pose.from_matrix(at(FRONT))
     scan = nbv.scan(WORLD, CAMERA, pose)
     above = np.asarray(scan.points)[:, 2].reshape(96, 128) > 0.003
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as warning_list:
         warnings.simplefilter("always")
         sessions_of().add(np.where(above, image(FRONT), 0.0), at(FRONT))
-    assert sum("no table under the objects" in str(warning.message) for warning in told) == 1
+    assert sum("no table under the objects" in str(warning.message) for warning in warning_list) == 1
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 5))
@@ -194,8 +194,8 @@ def test_clusters_against_single_linkage(seed, count):
     ]
     owner = np.repeat(np.arange(count), sizes)
     order = draw.permutation(len(owner))
-    found = clusters(np.concatenate(lines)[order], 1.0)
+    labels = clusters(np.concatenate(lines)[order], 1.0)
     # One number for each line, and no number twice.
-    pairs = {(int(a), int(b)) for a, b in zip(owner[order], found, strict=True)}
+    pairs = {(int(a), int(b)) for a, b in zip(owner[order], labels, strict=True)}
     assert len(pairs) == count == len({b for _, b in pairs})
     assert clusters(np.zeros((0, 3)), 1.0).shape == (0,)

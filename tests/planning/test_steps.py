@@ -71,17 +71,17 @@ def test_it_ends_where_the_planner_has_no_room_and_fails_where_no_candidate_is_l
 
 
 def test_views_that_are_known_are_told_and_not_asked_for():
-    own, asked = planner(RandomView(CANDIDATES)), []
+    own, requests = planner(RandomView(CANDIDATES)), []
     whole = list(views_of(own))
 
     def sensor(pose, key):
-        asked.append(pose)
+        requests.append(pose)
         return sensor_of()(pose, key)
 
     done = [(view.pose, view.scan, view.proposal) for view in whole[:2]]
     for step, expected in zip(Loop(own, KEY).steps(sensor, FIRST, done), whole, strict=True):
         assert_same(step.view, expected)
-    assert len(asked) == 2
+    assert len(requests) == 2
 
 
 def test_a_step_holds_the_samples_and_the_observations_that_the_next_view_is_chosen_from():
@@ -96,18 +96,18 @@ def test_a_step_holds_the_samples_and_the_observations_that_the_next_view_is_cho
 
 def test_an_episode_lets_a_posterior_go_before_it_makes_the_next(monkeypatch):
     """Each posterior holds hundreds of megabytes at thousands of points."""
-    made, posterior = [], SurfaceSampler.posterior
+    references, posterior = [], SurfaceSampler.posterior
 
     def told(sampler, observations):
         gc.collect()
-        assert all(earlier() is None for earlier in made)
-        found = posterior(sampler, observations)
-        made.append(weakref.ref(found))
-        return found
+        assert all(earlier() is None for earlier in references)
+        result = posterior(sampler, observations)
+        references.append(weakref.ref(result))
+        return result
 
     monkeypatch.setattr(SurfaceSampler, "posterior", told)
     simulate(planner(DiscreteSearch(CANDIDATES), 4), SCENE, FIRST, 4, KEY, progress=False)
-    assert len(made) == 3
+    assert len(references) == 3
 
 
 def test_another_acquisition_or_search_does_not_compile_the_sampler_again(compilations):

@@ -117,25 +117,25 @@ def test_expected_coverage_is_the_share_of_the_area_that_poses_show(points, size
     apart = max(size, np.median(np.sort(apart, axis=1)[:, 1]))
     surface = np.random.default_rng(0).normal(size=(20_000, 3))
     surface *= 0.8 / np.linalg.norm(surface, axis=1, keepdims=True)
-    shown = np.zeros(len(surface), bool)
+    is_visible = np.zeros(len(surface), bool)
     for pose in DiscreteSearch(10).candidates.poses():
         origin, rotation = np.asarray(pose.position, np.float64), np.asarray(pose.rotation, np.float64)
         offset = surface - origin
         cosine = -np.sum(offset * surface, axis=1) / np.linalg.norm(offset, axis=1) / 0.8
         local = offset @ rotation
         column, row = CAMERA.to_pixels(local[:, :2] / local[:, 2:]).T
-        shown |= (cosine >= 0.2) & (np.minimum(row, column) >= 0) & (row < CAMERA.height) & (column < CAMERA.width)
-    seen = cKDTree(cloud.to_numpy()[0]).query(surface)[0] <= apart
-    share = float(np.mean(seen[shown]))
+        is_visible |= (cosine >= 0.2) & (np.minimum(row, column) >= 0) & (row < CAMERA.height) & (column < CAMERA.width)
+    is_near = cKDTree(cloud.to_numpy()[0]).query(surface)[0] <= apart
+    share = float(np.mean(is_near[is_visible]))
     assert 0.05 < share < 0.97
-    known = dataclasses.replace(after(planner, cloud, surfaces=ball), observations=Observations.start(cloud, 4))
+    context = dataclasses.replace(after(planner, cloud, surfaces=ball), observations=Observations.start(cloud, 4))
     # From 1,024 points, some of which coincide.
-    assert expected_coverage(known, NewSurface(size)) == pytest.approx(share, abs=0.03)
-    assert Covered(share - 0.04, size).after(known) is not None
-    assert Covered(min(share + 0.04, 1.0), size).after(known) is None
+    assert expected_coverage(context, NewSurface(size)) == pytest.approx(share, abs=0.03)
+    assert Covered(share - 0.04, size).after(context) is not None
+    assert Covered(min(share + 0.04, 1.0), size).after(context) is None
     # The size is a length in the world.
-    small = dataclasses.replace(known, frame=Frame(10.0))
-    assert Covered(share - 0.04, 0.1 * size).after(small) == Covered(share - 0.04, size).after(known)
+    small = dataclasses.replace(context, frame=Frame(10.0))
+    assert Covered(share - 0.04, 0.1 * size).after(small) == Covered(share - 0.04, size).after(context)
 
 
 @pytest.mark.parametrize("count", [1, 2])
@@ -146,15 +146,15 @@ def test_what_is_near_to_measured_surface_but_faces_no_view_is_unseen(count):
     planner, fine = planner_of(NewSurface(), DiscreteSearch(40)), Grid(64)
     planner = dataclasses.replace(planner, camera=camera, sampler=dataclasses.replace(planner.sampler, grid=fine))
     *_, observations = planner.replay((pose, scan(SCENE, camera, pose)) for pose in poses[:count])
-    known = dataclasses.replace(
+    context = dataclasses.replace(
         after(planner, observations.cloud, surfaces=balls(fine, [0.8])), observations=observations
     )
     # A ring remains that the views see at a cosine below 0.2, where cos = (5 n_z - 0.8) / |5 - 0.8 n|.
     heights = np.linspace(-1.0, 1.0, 20_001)
-    shown = (5.0 * heights - 0.8) / np.sqrt(25.0 - 8.0 * heights + 0.64) >= 0.2
-    share = count * shown.mean()
+    is_visible = (5.0 * heights - 0.8) / np.sqrt(25.0 - 8.0 * heights + 0.64) >= 0.2
+    share = count * is_visible.mean()
     assert 0.3 < share / count < 0.4
-    assert expected_coverage(known, planner.acquisition) == pytest.approx(share, abs=0.02)
+    assert expected_coverage(context, planner.acquisition) == pytest.approx(share, abs=0.02)
 
 
 def test_what_no_sensor_can_measure_need_not_be_covered():
@@ -164,10 +164,10 @@ def test_what_no_sensor_can_measure_need_not_be_covered():
     planner = dataclasses.replace(planner, camera=camera, sampler=dataclasses.replace(planner.sampler, grid=fine))
     *_, observations = planner.replay((pose, scan(SCENE, camera, pose)) for pose in poses)
     surfaces = balls(fine, [0.8, 1.1])
-    known = dataclasses.replace(after(planner, observations.cloud, surfaces=surfaces), observations=observations)
-    assert expected_coverage(known, NewSurface()) < 0.45
+    context = dataclasses.replace(after(planner, observations.cloud, surfaces=surfaces), observations=observations)
+    assert expected_coverage(context, NewSurface()) < 0.45
     measurable = observations.looks.without_unmeasured(surfaces, observations.poses)
-    covered = expected_coverage(dataclasses.replace(known, surfaces=lambda: measurable), NewSurface())
+    covered = expected_coverage(dataclasses.replace(context, surfaces=lambda: measurable), NewSurface())
     # Surface of the larger ball that is steep to both views may exist, except for points within a cell of excluded
     # ones.
     drawn = np.random.default_rng(2).normal(size=(50_000, 3))
@@ -180,14 +180,14 @@ def test_what_no_sensor_can_measure_need_not_be_covered():
     assert small / (small + large) - 0.01 < covered < small / (small + large) + 0.08
     # The rule leaves out such surface for any acquisition of the planner.
     other = dataclasses.replace(planner, acquisition=Coverage())
-    assert expected_coverage(dataclasses.replace(known, planner=other), NewSurface()) == pytest.approx(covered)
+    assert expected_coverage(dataclasses.replace(context, planner=other), NewSurface()) == pytest.approx(covered)
 
 
 def test_value_below_and_budgets_on_scripted_proposals():
     planner = planner_of(Coverage())
-    asked = after(planner, cloud_of(50))
-    assert "a value of 0.3 scene units², less than 0.5" in ValueBelow(0.5).before(asked, FIRST, 0.3)
-    assert ValueBelow(0.5).before(asked, FIRST, 0.5) is None
+    context = after(planner, cloud_of(50))
+    assert "a value of 0.3 scene units², less than 0.5" in ValueBelow(0.5).before(context, FIRST, 0.3)
+    assert ValueBelow(0.5).before(context, FIRST, 0.5) is None
     east, top, west = (look_at(place) for place in ((2.5, 0.0, 0.0), (0.0, 2.5, 0.0), (-2.5, 0.0, 0.0)))
     quarter = 2.5 * np.pi / 2.0
     way = after(planner, cloud_of(50), (east, top), seconds=30.0)
@@ -216,11 +216,11 @@ def test_lengths_are_those_of_the_world():
 
 def test_the_first_rule_that_holds_ends_it():
     planner = planner_of(Coverage())
-    asked = after(planner, cloud_of(50), seconds=10.0)
+    context = after(planner, cloud_of(50), seconds=10.0)
     rule = ValueBelow(0.5) | Budget(seconds=20.0) | Budget(seconds=5.0)
-    assert rule.after(asked) == "10 of 5 seconds are spent"
-    assert "less than 0.5" in rule.before(asked, FIRST, 0.1)
-    assert rule.before(asked, FIRST, 0.6) is None
+    assert rule.after(context) == "10 of 5 seconds are spent"
+    assert "less than 0.5" in rule.before(context, FIRST, 0.1)
+    assert rule.before(context, FIRST, 0.6) is None
 
 
 def test_an_episode_ends_by_its_rule_and_goes_on_by_another(tmp_path):

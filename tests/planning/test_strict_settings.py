@@ -59,8 +59,8 @@ def test_a_step_of_each_task_is_the_same(name):
     key = jax.random.key(0)
     plain = step(PLANNERS[name](), key)
     with strict():
-        found = step(PLANNERS[name](), key)
-    for one, other in zip(found, plain, strict=True):
+        result = step(PLANNERS[name](), key)
+    for one, other in zip(result, plain, strict=True):
         np.testing.assert_array_equal(one, other)
 
 
@@ -74,8 +74,8 @@ def test_so_is_a_session_from_its_first_image_to_its_points():
 
     plain = matrix_and_points()
     with strict():
-        found = matrix_and_points()
-    for one, other in zip(found, plain, strict=True):
+        result = matrix_and_points()
+    for one, other in zip(result, plain, strict=True):
         np.testing.assert_array_equal(one, other)
 
 
@@ -96,6 +96,6 @@ def test_surfaces_and_what_is_known_of_them():
         return posterior.mean(points), posterior.variance(points), posterior.sample(key, 2)(points)
 
     with strict():
-        found = values()
-    for one, other in zip(found, values(), strict=True):
+        result = values()
+    for one, other in zip(result, values(), strict=True):
         np.testing.assert_array_equal(one, other)

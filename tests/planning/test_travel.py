@@ -62,13 +62,13 @@ def test_the_derivative_of_the_way_is_that_of_its_differences():
     def way(position):
         return arc_length(start, Pose(jnp.eye(3), position))
 
-    found = np.asarray(jax.grad(way)(jnp.asarray(end, jnp.float32)))
+    gradient = np.asarray(jax.grad(way)(jnp.asarray(end, jnp.float32)))
     step = 1e-2
     differences = [
         float(way(jnp.asarray(end + d, jnp.float32)) - way(jnp.asarray(end - d, jnp.float32))) / (2.0 * step)
         for d in step * np.eye(3)
     ]
-    np.testing.assert_allclose(found, differences, atol=2e-3)
+    np.testing.assert_allclose(gradient, differences, atol=2e-3)
 
 
 def test_a_cost_that_breaks_its_contract_makes_a_value_of_nothing():
@@ -76,11 +76,11 @@ def test_a_cost_that_breaks_its_contract_makes_a_value_of_nothing():
     costs = jnp.array([-1.0, 0.0, jnp.inf, jnp.nan, 2.0])
     poses = Pose(jnp.broadcast_to(jnp.eye(3), (5, 3, 3)), jnp.zeros((5, 3)).at[:, 1].set(jnp.arange(5.0)))
     cloud = PointCloud.from_arrays(np.eye(3), np.eye(3))
-    seen = Observations.start(cloud, 1, None)
+    observations = Observations.start(cloud, 1, None)
     weighed = ValuePerCost(lambda start, end: costs[end.position[1].astype(int)], fixed=0.5)
-    np.testing.assert_array_equal(weighed(jnp.ones(5), seen, poses), 2.0)
-    seen = dataclasses.replace(seen, poses=seen.poses.append(poses[0]))
-    np.testing.assert_allclose(weighed(jnp.ones(5), seen, poses), [np.nan, 2.0, np.nan, np.nan, 0.4])
+    np.testing.assert_array_equal(weighed(jnp.ones(5), observations, poses), 2.0)
+    observations = dataclasses.replace(observations, poses=observations.poses.append(poses[0]))
+    np.testing.assert_allclose(weighed(jnp.ones(5), observations, poses), [np.nan, 2.0, np.nan, np.nan, 0.4])
 
 
 PER_COST = ValuePerCost(arc_length, fixed=0.5), lambda value, cost: value / (0.5 + cost)
@@ -104,14 +104,14 @@ def test_values_are_weighed_against_the_way_from_the_last_view(cost, worth, sear
     observations = observations_of(plain)
     second = plain.propose(observations, KEY).pose
     observations = plain.observe(observations, second, scan(SCENE, plain.camera, second))
-    values, found = (np.asarray(planner.propose(observations, KEY).values) for planner in (plain, weighed))
+    values, per_cost = (np.asarray(planner.propose(observations, KEY).values) for planner in (plain, weighed))
     places = np.asarray(plain.search.candidates.poses().position, np.float64)
     here = np.asarray(second.position, np.float64)
     angle = np.arccos(np.clip(places @ here / np.linalg.norm(places, axis=1) / np.linalg.norm(here), -1.0, 1.0))
     expected = worth(values, 2.5 * angle)
     # The other candidates dropped out in the first rounds of halving, which have fewer samples.
     open_ = np.isfinite(values)
-    np.testing.assert_allclose(found[open_], expected[open_], rtol=2e-3, atol=5e-3)
+    np.testing.assert_allclose(per_cost[open_], expected[open_], rtol=2e-3, atol=5e-3)
 
 
 def test_standard_errors_are_of_what_is_weighed():

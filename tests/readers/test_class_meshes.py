@@ -31,8 +31,8 @@ def test_meshes_of_classes_take_turns_and_other_folders_are_passed_over(tmp_path
     )
     box_files(tmp_path, "chair/deep/er/c.stl")
     (tmp_path / "chair" / "readme.txt").write_text("no mesh")
-    found = class_meshes(tmp_path, HOUSEHOLD)
-    assert [(HOUSEHOLD[mesh.label], Path(mesh.path).name) for mesh in found] == [
+    files = class_meshes(tmp_path, HOUSEHOLD)
+    assert [(HOUSEHOLD[mesh.label], Path(mesh.path).name) for mesh in files] == [
         ("chair", "a.ply"),
         ("night stand", "c.off"),
         ("chair", "b.obj"),
@@ -60,8 +60,8 @@ def test_copies_of_omniobject3d_name_objects_by_their_folder(tmp_path):
     box_files(tmp_path / "raw_scans", *(f"{name}/Scan/Scan.obj" for name in names))
     (tmp_path / "point_clouds").mkdir()
     for folder in (tmp_path, tmp_path / "raw_scans"):
-        found = found_in(folder, ["apple", "lemon", "orange"])[1]
-        assert found == [("apple", "apple_001"), ("orange", "orange_010"), ("apple", "apple_003")]
+        files = found_in(folder, ["apple", "lemon", "orange"])[1]
+        assert files == [("apple", "apple_001"), ("orange", "orange_010"), ("apple", "apple_003")]
 
 
 @pytest.mark.parametrize("form", ["model.obj", "models/model_normalized.obj"], ids=["v1", "v2"])

@@ -38,14 +38,14 @@ def seen(matrix):
 
 def images(matrices, with_gripper):
     """Images in units, with errors of 0.3 % and a fifth of the pixels lost."""
-    rng, found = np.random.default_rng(0), []
+    rng, depths = np.random.default_rng(0), []
     for matrix in matrices:
         depth = seen(matrix)
         if with_gripper:
             depth[GRIPPER] = NEAR
         depth = depth * (1.0 + 0.003 * rng.standard_normal(depth.shape)) * (rng.random(depth.shape) > 0.2)
-        found.append(np.round(depth / SCALE).astype(np.uint16))
-    return found
+        depths.append(np.round(depth / SCALE).astype(np.uint16))
+    return depths
 
 
 @pytest.mark.parametrize("with_gripper", [True, False])

@@ -67,9 +67,9 @@ def test_no_sample_is_inside_what_was_seen_empty_nor_outside_the_volume():
     assert raw_observations.empty_nodes is None
     expected = np.zeros((30,) * 3, bool)
     for pose in POSES:
-        seen = SEE(CARVING, SMALL_GRID, pose, nbv.scan(SOLIDS["ball"], planner.camera, pose), planner.camera)
-        assert seen.sum() > 200
-        expected |= np.asarray(seen)
+        empty = SEE(CARVING, SMALL_GRID, pose, nbv.scan(SOLIDS["ball"], planner.camera, pose), planner.camera)
+        assert empty.sum() > 200
+        expected |= np.asarray(empty)
     np.testing.assert_array_equal(observations.empty_nodes, expected)
 
     carved = np.asarray(planner.sampler.sample(observations, jax.random.key(1)).values)
@@ -96,8 +96,8 @@ class Told(WavesModel):
 
 
 def test_the_model_is_told_of_what_was_seen_empty_within_the_volume():
-    told, waves = planner_of(model=Told()), planner_of(carving=None)
-    observations = after_both_sides(told, SOLIDS["ball"])
+    planner, waves = planner_of(model=Told()), planner_of(carving=None)
+    observations = after_both_sides(planner, SOLIDS["ball"])
     within = observations.empty_nodes & CARVING.inside(SMALL_GRID)
     empty = dataclasses.replace(observations, empty_nodes=within).empty_points
     points = np.asarray(empty.points)[np.asarray(empty.mask)]
@@ -108,7 +108,7 @@ def test_the_model_is_told_of_what_was_seen_empty_within_the_volume():
     key = jax.random.key(0)
     raw = waves.sampler.model.condition(observations.cloud).sample(key, 3).on_grid(SMALL_GRID.axis)
     untouched = ~np.asarray(observations.empty_nodes | CARVING.outside(SMALL_GRID))
-    level = float((np.asarray(raw) - np.asarray(told.sampler.sample(observations, key).values))[:, untouched].mean())
+    level = float((np.asarray(raw) - np.asarray(planner.sampler.sample(observations, key).values))[:, untouched].mean())
     np.testing.assert_allclose(level, 1000.0 * len(points) + np.abs(points).max(), rtol=1e-4)
 
 
@@ -137,17 +137,17 @@ def test_carved_samples_keep_a_thin_sheet_that_was_seen_from_both_sides():
 
 def test_a_scan_of_another_camera_needs_that_camera():
     planner, other, pose = planner_of(), nbv.Camera(height=20, width=36, fov=0.6), POSES[1]
-    seen = nbv.scan(SOLIDS["ball"], other, pose)
-    expected = np.asarray(SEE(CARVING, SMALL_GRID, pose, seen, other))
+    cloud = nbv.scan(SOLIDS["ball"], other, pose)
+    expected = np.asarray(SEE(CARVING, SMALL_GRID, pose, cloud, other))
     column, row, _ = image(nodes_of(SMALL_GRID)[expected], other, pose)
     # The image is wider than the planner's.
     assert np.ptp(column) > 25
     assert np.ptp(row) > 10
-    np.testing.assert_array_equal(planner.init(pose, seen, camera=other).empty_nodes, expected)
+    np.testing.assert_array_equal(planner.init(pose, cloud, camera=other).empty_nodes, expected)
     observations = planner.init(POSES[0], nbv.scan(SOLIDS["ball"], planner.camera, POSES[0]))
-    after = planner.observe(observations, pose, seen, camera=other)
+    after = planner.observe(observations, pose, cloud, camera=other)
     np.testing.assert_array_equal(after.empty_nodes, expected | np.asarray(observations.empty_nodes))
-    for tell in (lambda: planner.init(pose, seen), lambda: planner.observe(observations, pose, seen)):
+    for tell in (lambda: planner.init(pose, cloud), lambda: planner.observe(observations, pose, cloud)):
         with pytest.raises(ValueError, match=r"scan has 720 rays but the camera 40 x 40: give the camera that took it"):
             tell()
 

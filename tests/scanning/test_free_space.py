@@ -36,9 +36,9 @@ def wholly_free(name, node, radius, camera, pose, in_image=True):
     shell = np.asarray(nbv.geometry.fibonacci_sphere(80), np.float64)
     ball = node[:, None] + radius[:, None, None] * np.concatenate([np.zeros((1, 3)), shell])
     column, row, ahead = image(ball, camera, pose)
-    seen = (ahead > 0) & (column > 0) & (column < camera.width) & (row > 0) & (row < camera.height)
+    in_view = (ahead > 0) & (column > 0) & (column < camera.width) & (row > 0) & (row < camera.height)
     free = ~segment_meets(name, ball, pose)
-    return ((seen & free) if in_image else (~seen | free)).all(axis=1)
+    return ((in_view & free) if in_image else (~in_view | free)).all(axis=1)
 
 
 def pixel(node, camera, pose):
@@ -92,11 +92,11 @@ def test_a_node_is_marked_only_if_all_rays_near_it_and_their_neighbours_went_on_
     near = np.linalg.norm(np.cross(local[:, None], unit), axis=-1).reshape(-1, *shape) <= margin
     padded = np.pad(near, ((0, 0), (1, 1), (1, 1)))
     near = np.any([padded[:, i : i + shape[0], j : j + shape[1]] for i in range(3) for j in range(3)], axis=0)
-    seen = near.any(axis=(1, 2))
+    has_ray = near.any(axis=(1, 2))
     stopped = depth < local[:, 2, None, None] + margin - 1e-5
-    allowed = seen & ~(near & stopped).any(axis=(1, 2))
+    allowed = has_ray & ~(near & stopped).any(axis=(1, 2))
     assert marked.sum() > 50
-    assert (seen & ~allowed).sum() > 200
+    assert (has_ray & ~allowed).sum() > 200
     assert not (marked & ~allowed).any()
 
 
@@ -109,8 +109,8 @@ def marked_and_inside(centre, radius, half, axis, angle, start, end, direction, 
     """Numbers of nodes that are marked, inside the solid, and both."""
     solid = Cuboid(half).rotate(axis, angle).translate(centre) | Capsule(start, end, radius)
     pose = nbv.look_at(target + distance * direction, target)
-    seen = nbv.SensorNoise()(nbv.scan(nbv.SDFSurface(solid), PLAIN, pose), key)
-    empty, inside = nbv.Carving().empty_nodes(FINE, pose, seen, PLAIN), solid(FINE_NODES) < 0
+    cloud = nbv.SensorNoise()(nbv.scan(nbv.SDFSurface(solid), PLAIN, pose), key)
+    empty, inside = nbv.Carving().empty_nodes(FINE, pose, cloud, PLAIN), solid(FINE_NODES) < 0
     return jnp.sum(empty), jnp.sum(inside), jnp.sum(empty & inside)
 
 

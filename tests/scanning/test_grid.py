@@ -219,11 +219,11 @@ def test_roots_of_cubics():
         roots = np.roots(np.trim_zeros(c[::-1, i], "f"))
         real = roots.real[(np.abs(roots.imag) < 1e-12) & (roots.real >= 0) & (roots.real <= 1)]
         expected[i] = real.min(initial=np.inf)
-    _, found = cubic.first_bracket([jnp.asarray(row, jnp.float32) for row in c])
+    _, has_root = cubic.first_bracket([jnp.asarray(row, jnp.float32) for row in c])
     root = cubic.first_root([jnp.asarray(row, jnp.float32) for row in c])
     # Double roots, and roots at an end of the interval, may be missed or not in float32.
-    assert (np.asarray(found) == np.isfinite(expected)).mean() > 0.999
-    hit = np.isfinite(expected) & np.asarray(found)
+    assert (np.asarray(has_root) == np.isfinite(expected)).mean() > 0.999
+    hit = np.isfinite(expected) & np.asarray(has_root)
     error = np.abs(np.asarray(root) - expected)[hit]
     value = np.abs(np.polynomial.polynomial.polyval(np.asarray(root, np.float64), c, tensor=False))[hit]
     assert value.max() < 1e-4

@@ -71,8 +71,8 @@ def test_gradients_of_depths_equal_those_of_optimistix(name, x64):
 
     def ours(along):
         if name == "waves":
-            held = jnp.full(len(near), 0.01)
-            return weights @ implicit_depth(along, jax.lax.stop_gradient(depth), held > 0, held)
+            tangents = jnp.full(len(near), 0.01)
+            return weights @ implicit_depth(along, jax.lax.stop_gradient(depth), tangents > 0, tangents)
         if name == "solid":
             traced = nbv.SDFSurface(along.function)
         else:

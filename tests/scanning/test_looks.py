@@ -34,11 +34,11 @@ def test_distances_are_those_to_all_hits_within_reach():
     """Distances at nodes, for hits of any scan, also for hits outside the grid."""
     points = RNG.uniform(-1.25, 1.25, (60, 3))
     looks = nothing().with_points(cloud_of(points[:40], 50)).with_points(cloud_of(points[40:], 20))
-    found, expected = np.asarray(looks.distance, np.float64), distances(points)
+    distance, expected = np.asarray(looks.distance, np.float64), distances(points)
     near = expected < 2.0 * GRID.spacing
-    np.testing.assert_allclose(found[near], expected[near], atol=1e-5)
-    assert (found[~near] >= expected[~near].clip(max=2.0 * GRID.spacing) - 1e-5).all()
-    assert found.max() == pytest.approx(looks.reach)
+    np.testing.assert_allclose(distance[near], expected[near], atol=1e-5)
+    assert (distance[~near] >= expected[~near].clip(max=2.0 * GRID.spacing) - 1e-5).all()
+    assert distance.max() == pytest.approx(looks.reach)
 
 
 def test_between_nodes_distances_are_linear():
@@ -55,9 +55,9 @@ def sampled(*radii):
     return nbv.scanning.GridSurface.from_values(values.astype(np.float32), 0.0, GRID)
 
 
-def after(pose, seen, camera=CAMERA, barrier=None):
+def after(pose, cloud, camera=CAMERA, barrier=None):
     """The looks and the poses after one view."""
-    looks = nothing().with_view(jnp.asarray(0), pose, seen, camera, barrier)
+    looks = nothing().with_view(jnp.asarray(0), pose, cloud, camera, barrier)
     return looks, PoseList.empty(3).append(pose)
 
 
@@ -74,13 +74,13 @@ def test_what_a_view_measured_stays_and_what_it_looked_at_in_vain_goes():
     other side, which was not seen, it is still visible."""
     surfaces = sampled(0.6, 0.8)
     looks, poses = after(POSE, scan(nbv.SDFSurface(BALL), CAMERA, POSE))
-    found = looks.without_unmeasured(surfaces, poses)
+    remaining = looks.without_unmeasured(surfaces, poses)
     behind = nbv.look_at(-POSE.position)
-    assert shown(found, POSE) == shown(surfaces, POSE)
-    assert shown(found, behind) == shown(surfaces, behind)
+    assert shown(remaining, POSE) == shown(surfaces, POSE)
+    assert shown(remaining, behind) == shown(surfaces, behind)
     # At the limb a look is too steep to count.
-    assert shown(found, POSE, 1) < 0.5 * shown(surfaces, POSE, 1)
-    assert shown(found, behind, 1) > 0.9 * shown(surfaces, behind, 1)
+    assert shown(remaining, POSE, 1) < 0.5 * shown(surfaces, POSE, 1)
+    assert shown(remaining, behind, 1) > 0.9 * shown(surfaces, behind, 1)
 
 
 @pytest.mark.parametrize(("sight", "share"), [(np.inf, 0.5), (1.0, 1.0), (0.0, 1.0)])
@@ -148,7 +148,7 @@ def test_a_simulated_scan_says_how_far_it_saw():
     """It saw up to its hits. A surface that is too oblique returns nothing."""
     camera = nbv.Camera(fov=0.6, height=40, width=40, max_incidence=0.8)
     pose = nbv.look_at((0.0, 0.0, 2.5))
-    seen = scan(nbv.SDFSurface(BALL), camera, pose)
-    away = np.linalg.norm(np.asarray(seen.points) - np.asarray(pose.position), axis=1)
-    np.testing.assert_allclose(seen.sight, np.where(seen.mask, away, np.inf), rtol=1e-6)
-    assert int((~seen.mask & ~seen.missed).sum()) > 0
+    cloud = scan(nbv.SDFSurface(BALL), camera, pose)
+    away = np.linalg.norm(np.asarray(cloud.points) - np.asarray(pose.position), axis=1)
+    np.testing.assert_allclose(cloud.sight, np.where(cloud.mask, away, np.inf), rtol=1e-6)
+    assert int((~cloud.mask & ~cloud.missed).sum()) > 0

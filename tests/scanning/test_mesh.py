@@ -257,15 +257,15 @@ def box_distance(x, center, extents):
 
 
 def test_parts_are_the_nodes_where_the_whole_has_them(tmp_path):
-    found = load_parts(saved(tmp_path / "table.glb"))
+    parts = load_parts(saved(tmp_path / "table.glb"))
     whole = nbv.load_mesh(tmp_path / "table.glb")
-    assert found.names == ("post", "slab")
-    joined = np.concatenate([part.vertices for part in found.parts])
-    np.testing.assert_allclose(np.sort(joined, axis=0), np.sort(found.mesh.vertices, axis=0), atol=1e-6)
-    np.testing.assert_array_equal(found.mesh.vertices, whole.vertices)
+    assert parts.names == ("post", "slab")
+    joined = np.concatenate([part.vertices for part in parts.parts])
+    np.testing.assert_allclose(np.sort(joined, axis=0), np.sort(parts.mesh.vertices, axis=0), atol=1e-6)
+    np.testing.assert_array_equal(parts.mesh.vertices, whole.vertices)
     # The longest side is 4, and now 2.5. The box around both is centred at (0.5, 1.5, 0).
     expected = (np.array([0.0, 1.0, 0.0]) - [0.5, 1.5, 0.0]) * 2.5 / 4
-    np.testing.assert_allclose(found.parts[0].vertices.mean(axis=0), expected, atol=1e-6)
+    np.testing.assert_allclose(parts.parts[0].vertices.mean(axis=0), expected, atol=1e-6)
 
 
 def test_distances_are_those_from_each_box(tmp_path):

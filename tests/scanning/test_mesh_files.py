@@ -55,8 +55,8 @@ PLACES, ROWS = BOX.vertices.astype("<f4"), BOX.faces.astype("<u2").ravel()
 
 def world(mesh):
     """The area, and the lowest and highest corner in the file's coordinates."""
-    found = mesh.frame.to_world(mesh.vertices)
-    return trimesh.Trimesh(found, mesh.faces, process=False).area, found.min(axis=0), found.max(axis=0)
+    vertices = mesh.frame.to_world(mesh.vertices)
+    return trimesh.Trimesh(vertices, mesh.faces, process=False).area, vertices.min(axis=0), vertices.max(axis=0)
 
 
 def check_boxes(mesh, count=2):

@@ -24,8 +24,8 @@ SIDES = nbv.look_at(AWAY * jnp.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [1.0, 0
 
 def views_of(camera, poses=SIDES, deviation=0.0):
     noise = nbv.SensorNoise(deviation, deviation)
-    seen = [noise(nbv.scan(BALL, camera, pose), jax.random.key(i)) for i, pose in enumerate(poses)]
-    return [nbv.View(pose, scan, scan, None, camera) for scan, pose in zip(seen, poses, strict=True)]
+    clouds = [noise(nbv.scan(BALL, camera, pose), jax.random.key(i)) for i, pose in enumerate(poses)]
+    return [nbv.View(pose, scan, scan, None, camera) for scan, pose in zip(clouds, poses, strict=True)]
 
 
 @pytest.mark.parametrize("pixels", [40, 200])
@@ -90,36 +90,36 @@ def points_of(mesh, seed, count=SURFACE_POINTS):
 def test_distances_are_those_found_by_brute_force(seed, n, m):
     rng = np.random.default_rng(seed)
     first, second = rng.normal(size=(n, 3)), rng.normal(size=(m, 3))
-    found, between = surface_distance(first, second), cdist(first, second)
-    assert found.accuracy == pytest.approx(between.min(axis=1).mean())
-    assert found.completeness == pytest.approx(between.min(axis=0).mean())
-    assert found.chamfer == pytest.approx(found.accuracy + found.completeness)
+    distance, between = surface_distance(first, second), cdist(first, second)
+    assert distance.accuracy == pytest.approx(between.min(axis=1).mean())
+    assert distance.completeness == pytest.approx(between.min(axis=0).mean())
+    assert distance.chamfer == pytest.approx(distance.accuracy + distance.completeness)
     both = directed_hausdorff(first, second)[0], directed_hausdorff(second, first)[0]
-    assert found.hausdorff == pytest.approx(max(both))
+    assert distance.hausdorff == pytest.approx(max(both))
 
 
 def test_concentric_spheres_are_their_radii_apart():
     inner, outer = (trimesh.creation.icosphere(5, radius) for radius in (0.6, 0.9))
-    found = surface_distance(points_of(inner, 0), points_of(outer, 1))
-    for value in (found.accuracy, found.completeness):
+    distance = surface_distance(points_of(inner, 0), points_of(outer, 1))
+    for value in (distance.accuracy, distance.completeness):
         # The nearest samples lie beside the foot of the perpendicular, a little farther away.
         assert 0.299 < value < 0.302
-    assert 0.3 < found.hausdorff < 0.32
+    assert 0.3 < distance.hausdorff < 0.32
 
 
 def test_a_square_shifted_in_its_plane_lacks_a_strip():
     """A strip of width s of the unit square sticks out on one side, with a mean distance of s / 2."""
     square = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]], process=False)
     shifted = square.copy().apply_translation([0.4, 0.0, 0.0])
-    found = surface_distance(points_of(square, 0), points_of(shifted, 1))
+    distance = surface_distance(points_of(square, 0), points_of(shifted, 1))
     floor = 0.5 / np.sqrt(SURFACE_POINTS)
-    assert found.accuracy == pytest.approx(0.4 * 0.2 + 0.6 * floor, abs=0.004)
-    assert found.completeness == pytest.approx(found.accuracy, abs=0.004)
-    assert found.hausdorff == pytest.approx(0.4, abs=0.01)
+    assert distance.accuracy == pytest.approx(0.4 * 0.2 + 0.6 * floor, abs=0.004)
+    assert distance.completeness == pytest.approx(distance.accuracy, abs=0.004)
+    assert distance.hausdorff == pytest.approx(0.4, abs=0.01)
 
 
 def test_two_samples_of_one_surface_are_as_far_apart_as_documented():
     sphere = trimesh.creation.icosphere(4, 0.8)
-    found = surface_distance(points_of(sphere, 0), points_of(sphere, 1))
-    assert found.chamfer == pytest.approx(np.sqrt(sphere.area / SURFACE_POINTS), rel=0.03)
-    assert found.hausdorff < 0.06
+    distance = surface_distance(points_of(sphere, 0), points_of(sphere, 1))
+    assert distance.chamfer == pytest.approx(np.sqrt(sphere.area / SURFACE_POINTS), rel=0.03)
+    assert distance.hausdorff < 0.06

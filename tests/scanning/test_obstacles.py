@@ -43,16 +43,16 @@ def first_hits(vertices, faces, pose):
 
 @pytest.mark.parametrize("index", range(3))
 def test_a_table_is_met_where_its_plane_is(index):
-    found = np.asarray(nbv.Obstacles((TABLE,)).barrier(CAMERA, POSES[index]), np.float64)
+    ranges = np.asarray(nbv.Obstacles((TABLE,)).barrier(CAMERA, POSES[index]), np.float64)
     origin, directions = rays_of(POSES[index])
     if origin[1] < -0.5:
         # The pose is within the obstacle, and the hit is the exit.
-        assert np.isfinite(found).mean() > 0.3
+        assert np.isfinite(ranges).mean() > 0.3
     else:
         along = (-0.5 - origin[1]) / directions[:, 1]
         near = (along > 0) & (np.linalg.norm(origin + along[:, None] * directions, axis=1) < 7.5)
-        np.testing.assert_allclose(found[near], along[near], rtol=2e-3)
-        assert np.isinf(found[along < 0]).all()
+        np.testing.assert_allclose(ranges[near], along[near], rtol=2e-3)
+        assert np.isinf(ranges[along < 0]).all()
 
 
 @pytest.mark.parametrize("as_mesh", [False, True])
@@ -65,18 +65,18 @@ def test_what_a_wall_hides_is_what_embree_says(as_mesh, index):
     pose = POSES[index]
     barrier = nbv.Obstacles((wall,)).barrier(CAMERA, pose)
     expected = first_hits(*mesh, pose)
-    found = np.asarray(barrier)
+    ranges = np.asarray(barrier)
     # Rays beside the edges may differ, since distances of meshes are sampled on cells.
-    same = np.isfinite(found) == np.isfinite(expected)
+    same = np.isfinite(ranges) == np.isfinite(expected)
     assert same.mean() > (0.95 if as_mesh else 0.99)
-    both = np.isfinite(found) & np.isfinite(expected)
-    assert np.abs(found[both] - expected[both]).max(initial=0.0) < (0.15 if as_mesh else 2e-3)
-    seen, alone = nbv.scan(BALL, CAMERA, pose, barrier), nbv.scan(BALL, CAMERA, pose)
+    both = np.isfinite(ranges) & np.isfinite(expected)
+    assert np.abs(ranges[both] - expected[both]).max(initial=0.0) < (0.15 if as_mesh else 2e-3)
+    hidden, alone = nbv.scan(BALL, CAMERA, pose, barrier), nbv.scan(BALL, CAMERA, pose)
     away = np.linalg.norm(np.asarray(alone.points, np.float64) - np.asarray(pose.position), axis=1)
     visible = np.asarray(alone.mask) & (away < expected)
-    assert (np.asarray(seen.mask) == visible).mean() > (0.95 if as_mesh else 0.99)
-    np.testing.assert_array_equal(seen.missed, ~np.asarray(seen.mask))
-    np.testing.assert_array_equal(seen.points[~np.asarray(seen.mask)], 0.0)
+    assert (np.asarray(hidden.mask) == visible).mean() > (0.95 if as_mesh else 0.99)
+    np.testing.assert_array_equal(hidden.missed, ~np.asarray(hidden.mask))
+    np.testing.assert_array_equal(hidden.points[~np.asarray(hidden.mask)], 0.0)
 
 
 def test_solids_of_meshes_have_the_distances_of_their_formulas():
@@ -84,11 +84,11 @@ def test_solids_of_meshes_have_the_distances_of_their_formulas():
     solid = solid_of_mesh(ball.vertices, ball.faces, resolution=50)
     x = np.random.default_rng(0).uniform(-2.0, 2.0, (400, 3))
     exact = np.linalg.norm(x, axis=1) - 0.7
-    found = np.asarray(solid(jnp.asarray(x, jnp.float32)))
+    distances = np.asarray(solid(jnp.asarray(x, jnp.float32)))
     within = np.abs(x).max(axis=1) < 0.8
-    np.testing.assert_allclose(found[within], exact[within], atol=0.03)
-    assert np.all(found[~within] <= exact[~within] + 0.03)
-    assert np.all(found[~within] > 0)
+    np.testing.assert_allclose(distances[within], exact[within], atol=0.03)
+    assert np.all(distances[~within] <= exact[~within] + 0.03)
+    assert np.all(distances[~within] > 0)
 
 
 def test_points_of_obstacles_are_not_the_objects():
@@ -96,10 +96,10 @@ def test_points_of_obstacles_are_not_the_objects():
     normals = np.tile([0.0, 1.0, 0.0], (3, 1))
     cloud = nbv.PointCloud.from_arrays(points, normals, 4)
     scanned = nbv.PointCloud(cloud.points, cloud.normals, cloud.mask, jnp.array([False, False, False, True]))
-    kept = nbv.Obstacles((TABLE,), margin=0.05).remove_points(scanned)
-    np.testing.assert_array_equal(kept.mask, [False, True, True, False])
-    np.testing.assert_array_equal(kept.missed, [True, False, False, True])
-    np.testing.assert_array_equal(kept.points[0], 0.0)
+    rest = nbv.Obstacles((TABLE,), margin=0.05).remove_points(scanned)
+    np.testing.assert_array_equal(rest.mask, [False, True, True, False])
+    np.testing.assert_array_equal(rest.missed, [True, False, False, True])
+    np.testing.assert_array_equal(rest.points[0], 0.0)
 
 
 def test_space_is_seen_empty_up_to_an_obstacle():
@@ -108,12 +108,12 @@ def test_space_is_seen_empty_up_to_an_obstacle():
     nothing = nbv.scan(nbv.SDFSurface(Sphere(0.01).translate([0.0, 5.0, 0.0])), CAMERA, pose)
     wall = nbv.Obstacles((Cuboid([0.1, 2.0, 2.0]).translate([0.5, 0.0, 0.0]),))
     barrier = wall.barrier(CAMERA, pose)
-    free, known = (np.asarray(SEE(nbv.Carving(), grid, pose, nothing, CAMERA, b)) for b in (None, barrier))
+    free, limited = (np.asarray(SEE(nbv.Carving(), grid, pose, nothing, CAMERA, b)) for b in (None, barrier))
     x = np.asarray(grid.axis)
     middle = 20
     assert free[(x > 0.6) & (x < 1.2), middle, middle].all()
-    assert not known[x > 0.4].any()
-    np.testing.assert_array_equal(known[x < 0.4 - 2.5 * grid.spacing], free[x < 0.4 - 2.5 * grid.spacing])
+    assert not limited[x > 0.4].any()
+    np.testing.assert_array_equal(limited[x < 0.4 - 2.5 * grid.spacing], free[x < 0.4 - 2.5 * grid.spacing])
 
 
 def planner_of(search, obstacles=None, capacity=256):
@@ -296,8 +296,8 @@ def test_no_proposal_is_inside_or_under_what_is_known():
         point, normal = rng.uniform(-0.6, 0.2, 3) * [0, 1, 0], rng.normal([0.0, 1.0, 0.0], [0.2, 0.0, 0.2])
         half, block = rng.uniform(0.1, 0.5, 3), rng.uniform(-1.5, 1.5, 3)
         start, end = rng.uniform(-2.0, 2.0, (2, 3))
-        seen = rng.uniform(-1.0, 1.0, (20, 3))
-        cloud = nbv.PointCloud.from_arrays(seen, np.tile([0.0, 1.0, 0.0], (20, 1)))
+        points = rng.uniform(-1.0, 1.0, (20, 3))
+        cloud = nbv.PointCloud.from_arrays(points, np.tile([0.0, 1.0, 0.0], (20, 1)))
         solids = jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), ((point, normal), (half, block), (start, end)))
         place, value = (np.asarray(a, np.float64) for a in chosen(solids, cloud, jax.random.key(rng.integers(1 << 30))))
         assert np.isfinite(value)
@@ -306,7 +306,7 @@ def test_no_proposal_is_inside_or_under_what_is_known():
         to_block = np.linalg.norm(np.maximum(outside, 0.0)) + min(outside.max(), 0.0)
         share = np.clip((place - start) @ (end - start) / ((end - start) @ (end - start)), 0.0, 1.0)
         to_arm = np.linalg.norm(place - start - share * (end - start)) - 0.1
-        to_seen = np.linalg.norm(seen - place, axis=1).min()
+        to_seen = np.linalg.norm(points - place, axis=1).min()
         assert min(table, to_block, to_arm, to_seen) >= clearance - 1e-4
         looked += ((x - point) @ normal < 0).mean()
     assert 200 < looked < 800

@@ -53,8 +53,8 @@ def test_vertices_lie_where_the_posterior_mean_equals_its_level():
     assert inside < 0
     assert np.abs(mean).max() < 0.03 * abs(inside)
     # The scanned half is right, and the mesh continues where nothing was scanned.
-    seen = mesh.vertices[mesh.vertices[:, 1] > 0.1]
-    assert np.abs(np.linalg.norm(seen - [0.2, 0.0, 0.0], axis=1) - RADIUS).mean() < 0.03
+    scanned_half = mesh.vertices[mesh.vertices[:, 1] > 0.1]
+    assert np.abs(np.linalg.norm(scanned_half - [0.2, 0.0, 0.0], axis=1) - RADIUS).mean() < 0.03
     assert (mesh.vertices[:, 1] < -0.1).any()
 
 
@@ -93,22 +93,22 @@ def test_a_piece_stays_with_four_points_on_it(points, kept):
     left = 0.5 * CENTRES + [-0.6, 0.0, 0.0]
     right = 0.3 * CENTRES[:: len(CENTRES) // points][:points] + [0.6, 0.3, 0.0]
     cloud = nbv.PointCloud.from_arrays(np.concatenate([left, right]), np.ones((len(left) + points, 3)) / np.sqrt(3))
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as warning_list:
         warnings.simplefilter("always")
         mesh = mean_mesh(Balls(), cloud, nbv.Grid(30))
     assert len(mesh.to_trimesh().split()) == kept
-    assert len(told) == 2 - kept
+    assert len(warning_list) == 2 - kept
 
 
 def test_what_was_seen_empty_is_not_meshed():
     """One of the model's two balls is real. The camera sees past it through the other."""
-    seen = nbv.SDFSurface(Sphere(0.5).translate((-0.6, 0.0, 0.0)))
+    surface = nbv.SDFSurface(Sphere(0.5).translate((-0.6, 0.0, 0.0)))
     camera, pose = nbv.Camera(fov=1.3, height=60, width=60), nbv.look_at((0.0, 0.0, 2.5))
 
     def mesh(carving):
         sampler = nbv.SurfaceSampler(Balls(), nbv.Grid(30), num_samples=1, carving=carving)
         planner = nbv.Planner(nbv.Coverage(), nbv.FarthestView(8), camera, sampler, capacity=4000)
-        return sampler.mean_mesh(planner.init(pose, nbv.scan(seen, camera, pose)))
+        return sampler.mean_mesh(planner.init(pose, nbv.scan(surface, camera, pose)))
 
     with pytest.warns(UserWarning, match="1 piece"):
         whole, plain = mesh(None), mean_mesh(Balls(), sphere_cloud(), nbv.Grid(30))

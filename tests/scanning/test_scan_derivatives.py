@@ -75,17 +75,17 @@ def test_scans_as_functions_of_a_pose_against_central_differences(name, x64):
     masks, hit = np.asarray(masks), np.asarray(masks[0])
     grazing = hit & is_grazing(surface, points[0], normals[0], np.asarray(rays[0]))
     # An edge changes a normal at once. Curvature changes it by at most some hundred times the step.
-    kept = (masks == hit).all(axis=0) & (np.abs(normals - normals[0]).max(axis=(0, -1)) < 1e-3)
+    is_smooth = (masks == hit).all(axis=0) & (np.abs(normals - normals[0]).max(axis=(0, -1)) < 1e-3)
     if name != "solid":
         cells = np.floor((points + GRID.half_extent) / GRID.spacing)
-        kept &= (cells == cells[0]).all(axis=(0, -1))
+        is_smooth &= (cells == cells[0]).all(axis=(0, -1))
     assert 0.6 < hit.mean() < 1
-    assert (~kept).sum() < 0.005 * hit.sum()
+    assert (~is_smooth).sum() < 0.005 * hit.sum()
     assert grazing.sum() < 0.02 * hit.sum()
-    kept &= hit & ~grazing
+    is_smooth &= hit & ~grazing
     for value, slope in ((points, slopes[0][0]), (normals, slopes[1][0])):
         central = (value[1] - value[2]) / (2 * h)
-        error = np.abs(slope - central)[kept] / (1 + np.abs(central[kept]).max(axis=-1, keepdims=True))
+        error = np.abs(slope - central)[is_smooth] / (1 + np.abs(central[is_smooth]).max(axis=-1, keepdims=True))
         assert error.max() < 1e-5
         assert np.isfinite(slope).all()
         assert not np.asarray(slope)[~hit].any()
@@ -141,15 +141,15 @@ def test_every_way_to_batch_fields_and_rays_equals_a_loop(axes, x64):
     )
     weights = jnp.asarray(RNG.normal(size=(2, 30, 3)))
     # Arguments without a batch axis are the first of the batch.
-    given = [
+    arguments = [
         batch if axis == 0 else jax.tree.map(lambda leaf: leaf[0], batch)
         for batch, axis in zip((small_surfaces(RNG, 4), origins, directions), axes, strict=True)
     ]
-    together = jax.jit(jax.vmap(traced, (None, *axes)))(weights, *given)
+    together = jax.jit(jax.vmap(traced, (None, *axes)))(weights, *arguments)
     for i in range(4):
         turn = [
             jax.tree.map(lambda leaf, i=i: leaf[i], each) if axis == 0 else each
-            for each, axis in zip(given, axes, strict=True)
+            for each, axis in zip(arguments, axes, strict=True)
         ]
         alone = traced(weights, *turn)
         assert bool(alone[0][1].any())

@@ -128,17 +128,17 @@ def seen_share(setting, reach):
 
 @pytest.mark.parametrize("setting", [USUAL_SETTING, PART_SETTING, HEAT_SETTING])
 def test_all_of_an_object_is_seen_from_everywhere_and_hardly_more(setting):
-    found = fit_distance(setting, 1.7)
-    assert seen_share(found, 1.7) == 1.0
-    assert seen_share(found, 1.7 * 1.06) < 1.0
-    assert found._replace(radius=setting.radius) == setting
+    distance = fit_distance(setting, 1.7)
+    assert seen_share(distance, 1.7) == 1.0
+    assert seen_share(distance, 1.7 * 1.06) < 1.0
+    assert distance._replace(radius=setting.radius) == setting
 
 
 def test_from_further_away_the_same_ball_stands_under_the_angle_of_the_sine():
     """A ray along the silhouette touches the ball at the angle arcsin(reach / radius) to the axis."""
-    found = fit_distance(USUAL_SETTING, 1.0)
-    edge = nbv.look_at((0.0, 0.0, found.radius))
-    a = 0.5 * found.camera.fov
+    distance = fit_distance(USUAL_SETTING, 1.0)
+    edge = nbv.look_at((0.0, 0.0, distance.radius))
+    a = 0.5 * distance.camera.fov
     direction = np.asarray(edge.rotation) @ [math.sin(a), 0.0, math.cos(a)]
     away = np.linalg.norm(np.cross(direction, np.asarray(edge.position)))
     assert away == pytest.approx(1.05, rel=1e-5)
@@ -158,13 +158,13 @@ COUNT = 20_000
 )
 def test_noise_and_steps_grow_with_the_square_of_the_depth(noise, at_a_metre, step):
     for depth in (0.7, 2.0, 4.0):
-        found = np.asarray(noise.apply(jnp.full(COUNT, depth), KEY), np.float64)
+        depths = np.asarray(noise.apply(jnp.full(COUNT, depth), KEY), np.float64)
         # Rounding adds a twelfth of its square. The deviation has a standard error of 0.5 %, and its mean one of 0.7 %
         # of the deviation. 1/z is not linear, which adds (deviation / z)^2 z to the mean.
         spread = depth**2 * np.hypot(at_a_metre, step / np.sqrt(12.0))
-        assert found.std() == pytest.approx(spread, rel=0.06)
-        assert found.mean() == pytest.approx(depth, abs=0.05 * spread + 2.0 * spread**2 / depth)
-        steps = 1.0 / found / step
+        assert depths.std() == pytest.approx(spread, rel=0.06)
+        assert depths.mean() == pytest.approx(depth, abs=0.05 * spread + 2.0 * spread**2 / depth)
+        steps = 1.0 / depths / step
         assert np.abs(steps - np.round(steps)).max() < 1e-2
 
 
@@ -178,16 +178,16 @@ def test_scene_units_scale_it_and_nothing_stays_nothing():
 
 def test_a_noisy_scan_is_an_image_of_the_same_rays():
     ball, pose, camera = nbv.SDFSurface(nbv.sdf.Sphere(0.8)), nbv.look_at((0.0, 0.0, 2.5)), nbv.Camera()
-    seen = nbv.scan(ball, camera, pose)
-    noisy = nbv.DepthNoise.kinect_v1(scale=2.5)(seen, KEY, camera, pose)
-    np.testing.assert_array_equal(noisy.missed, seen.missed)
+    cloud = nbv.scan(ball, camera, pose)
+    noisy = nbv.DepthNoise.kinect_v1(scale=2.5)(cloud, KEY, camera, pose)
+    np.testing.assert_array_equal(noisy.missed, cloud.missed)
     both = np.asarray(noisy.mask)
-    assert not np.any(both & ~np.asarray(seen.mask))
+    assert not np.any(both & ~np.asarray(cloud.mask))
     # All except the limb, where a pixel has no plane.
-    assert both.sum() > 0.8 * int(seen.count)
+    assert both.sum() > 0.8 * int(cloud.count)
     outward = np.asarray(noisy.points)[both] / np.linalg.norm(np.asarray(noisy.points)[both], axis=1, keepdims=True)
     angle = np.degrees(np.arccos(np.clip(np.sum(outward * np.asarray(noisy.normals)[both], axis=1), -1.0, 1.0)))
     assert np.median(angle) < 10.0
-    exact = nbv.DepthNoise(0.0)(seen, KEY, camera, pose)
+    exact = nbv.DepthNoise(0.0)(cloud, KEY, camera, pose)
     off = np.linalg.norm(np.asarray(exact.points)[np.asarray(exact.mask)], axis=1) - 0.8
     assert np.median(np.abs(off)) < 2e-3

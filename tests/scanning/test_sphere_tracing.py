@@ -92,9 +92,9 @@ def test_vmapped_scenes_equal_single_scenes():
 def test_normals_on_flat_faces_survive_compilation():
     """On a face the slopes of a box come from one of two cases. Rounding must lose neither both nor the unit length."""
     surface = nbv.SDFSurface(Sphere(0.7) | Cuboid([0.4, 0.3, 0.8]).translate([0.3, 0.2, 0.0]))
-    seen = jax.jit(lambda pose: nbv.scan(surface, nbv.Camera(height=16, width=16), pose))(
+    cloud = jax.jit(lambda pose: nbv.scan(surface, nbv.Camera(height=16, width=16), pose))(
         nbv.look_at(nbv.geometry.fibonacci_sphere(12, 2.5))
     )
-    assert int(seen.count.sum()) > 2000
-    lengths = np.linalg.norm(np.asarray(seen.normals)[np.asarray(seen.mask)], axis=1)
+    assert int(cloud.count.sum()) > 2000
+    lengths = np.linalg.norm(np.asarray(cloud.normals)[np.asarray(cloud.mask)], axis=1)
     np.testing.assert_allclose(lengths, 1.0, atol=1e-5)

@@ -65,9 +65,9 @@ def test_a_pose_sees_what_faces_it_and_nothing_hides():
     poses = look_at([(0.0, 0.0, 4.0), (4.0, 0.0, 0.0), (0.0, -2.0, 3.0)])
     points = spread_points(both, 1500)
     x, normals = np.asarray(points.points, np.float64), np.asarray(points.normals, np.float64)
-    found = seen_of(both, poses, points)
+    masks = seen_of(both, poses, points)
     own = np.argmin([np.abs(ball(m, r)(x)) for m, r in zip(middles, radii, strict=True)], axis=0)
-    for seen, origin in zip(found, np.asarray(poses.position, np.float64), strict=True):
+    for mask, origin in zip(masks, np.asarray(poses.position, np.float64), strict=True):
         offset = x - origin
         away = np.linalg.norm(offset, axis=1)
         direction = offset / away[:, None]
@@ -80,8 +80,8 @@ def test_a_pose_sees_what_faces_it_and_nothing_hides():
         clear = (np.abs(past - reach) > GRID.spacing) & (np.abs(cosine - 0.2) > 0.05)
         expected = (cosine >= 0.2) & ~hidden
         assert 0.1 < expected.mean() < 0.6
-        np.testing.assert_array_equal(seen[clear], expected[clear])
-    assert np.mean(np.any(found, axis=0)) > np.mean(found, axis=1).max() + 0.1
+        np.testing.assert_array_equal(mask[clear], expected[clear])
+    assert np.mean(np.any(masks, axis=0)) > np.mean(masks, axis=1).max() + 0.1
 
 
 @pytest.mark.parametrize(

@@ -55,11 +55,11 @@ def test_one_step_is_adamw_on_the_mean_loss_of_the_drawn_batch():
     sign."""
     clouds, labels = toy_clouds(1)
     before, key = Toy(), jax.random.key(0)
-    found = train(before, clouds, labels, key, 1, batch_size=4, learning_rate=0.01, weight_decay=0.1)
+    after = train(before, clouds, labels, key, 1, batch_size=4, learning_rate=0.01, weight_decay=0.1)
     p = np.exp(np.asarray(log_probabilities(before, clouds))[0])
     slope = np.outer(p - np.eye(3)[labels[0]], np.asarray(clouds.points[0]).mean(axis=0))
     expected = np.asarray(before.linear.weight) * (1 - 0.01 * 0.1) - 0.01 * np.sign(slope)
-    np.testing.assert_allclose(found.linear.weight, expected, atol=1e-5)
+    np.testing.assert_allclose(after.linear.weight, expected, atol=1e-5)
 
 
 @pytest.mark.parametrize(("factor", "start"), [(2.5, 1.0), (0.6, 1.0), (2.5, 0.5)])

@@ -70,11 +70,11 @@ def test_points_that_tell_the_class_lie_in_the_pattern_where_a_view_shows_it(sca
         inner = mask[row] & (own[:, 2] > 0.5 * float(pyramid.solid.depth)) & (side < -0.12)
         if pixels == 0 or pixels > 500:
             shares[bool(pixels)].append((inner.sum() / mask[row].sum(), tells[row].sum()))
-    unseen, seen = (np.array(shares[key]) for key in (False, True))
+    unseen, visible = (np.array(shares[key]) for key in (False, True))
     assert len(unseen) >= 2
-    assert len(seen) >= 5
+    assert len(visible) >= 5
     assert unseen.max(axis=0)[0] < 0.01
-    assert (seen.min(axis=0) > (0.02, 10)).all()
+    assert (visible.min(axis=0) > (0.02, 10)).all()
     assert np.asarray(scanned.cue_pixels).max() <= 2500
 
 
@@ -110,12 +110,12 @@ def test_imagined_clouds_begin_with_what_was_truly_seen(imagined):
 def test_clouds_are_kept_in_the_units_of_the_network(tmp_path, monkeypatch):
     monkeypatch.setattr("training_clouds._AT_ONCE", 3)
     source = Source(tmp_path, pyramid_scene, PLANNER, POINTS, scale=2.0)
-    made = source.scanned(Split.TEST, 6)
+    batch = source.scanned(Split.TEST, 6)
     again = scanned_clouds(pyramid_scene, Split.TEST, range(6), POINTS)
-    np.testing.assert_allclose(made.clouds.points, 2.0 * again.clouds.points, atol=2e-5)
-    np.testing.assert_array_equal(made.labels, again.labels)
+    np.testing.assert_allclose(batch.clouds.points, 2.0 * again.clouds.points, atol=2e-5)
+    np.testing.assert_array_equal(batch.labels, again.labels)
     monkeypatch.setattr("training_clouds.scanned_clouds", None)
-    for one, other in zip(jax.tree.leaves(source.scanned(Split.TEST, 6)), jax.tree.leaves(made), strict=True):
+    for one, other in zip(jax.tree.leaves(source.scanned(Split.TEST, 6)), jax.tree.leaves(batch), strict=True):
         np.testing.assert_array_equal(one, other)
 
 
@@ -131,14 +131,14 @@ def surface_points(solid):
 
 @pytest.mark.slow
 def test_points_of_parts_have_the_label_of_the_surface_nearby():
-    found = scanned_clouds(part_scene, Split.TRAIN, PARTS, POINTS, SETTING)
+    batch = scanned_clouds(part_scene, Split.TRAIN, PARTS, POINTS, SETTING)
     for row, index in enumerate(PARTS):
         scene = part_scene(Split.TRAIN, index)
-        assert int(found.labels[row]) == int(scene.category)
+        assert int(batch.labels[row]) == int(scene.category)
         points, labels, mask = (np.asarray(one) for one in surface_points(scene.solid))
         points, labels = points[mask], labels[mask]
-        there = np.asarray(found.clouds.mask[row])
-        noisy, own = np.asarray(found.clouds.points[row])[there], np.asarray(found.point_labels[row])[there]
+        there = np.asarray(batch.clouds.mask[row])
+        noisy, own = np.asarray(batch.clouds.points[row])[there], np.asarray(batch.point_labels[row])[there]
         assert np.asarray(scene.parts)[own].all()
         # Six deviations of the noise.
         near = cKDTree(points).query_ball_point(noisy, 0.06)

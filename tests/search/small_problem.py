@@ -33,10 +33,10 @@ def visit(problem, *poses):
     """The problem after views from exactly these poses."""
     if not poses:
         return problem
-    taken = PoseList.empty(6)
+    pose_list = PoseList.empty(6)
     for pose in poses:
-        taken = taken.append(pose)
-    return eqx.tree_at(lambda p: p.inputs.observations.poses, problem, taken)
+        pose_list = pose_list.append(pose)
+    return eqx.tree_at(lambda p: p.inputs.observations.poses, problem, pose_list)
 
 
 @eqx.filter_jit

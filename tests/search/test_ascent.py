@@ -38,17 +38,17 @@ SOLVERS = {"Adam": None, "BFGS": optx.BFGS(rtol=1e-4, atol=1e-4), "NonlinearCG":
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_a_pose_in_space_is_found(solver):
     steps = {"num_starts": 2, "iterations": 80, "learning_rate": 0.05, "solver": SOLVERS[solver]}
-    found = propose(nbv.GradientSearch(dof=6, num_candidates=12, **steps), known(), jax.random.key(1))
-    assert float(found.value) == pytest.approx(5.0, abs=1e-3)
-    assert float(found.values.max()) < 4.9
-    np.testing.assert_allclose(found.pose.position, [0.9, -1.1, 1.4], atol=0.03)
-    np.testing.assert_allclose(found.pose.forward, [-0.6, 0.0, -0.8], atol=0.03)
+    proposal = propose(nbv.GradientSearch(dof=6, num_candidates=12, **steps), known(), jax.random.key(1))
+    assert float(proposal.value) == pytest.approx(5.0, abs=1e-3)
+    assert float(proposal.values.max()) < 4.9
+    np.testing.assert_allclose(proposal.pose.position, [0.9, -1.1, 1.4], atol=0.03)
+    np.testing.assert_allclose(proposal.pose.forward, [-0.6, 0.0, -0.8], atol=0.03)
 
 
 def test_it_starts_from_the_poses_it_is_given():
-    given = nbv.look_at(nbv.geometry.fibonacci_sphere(3, 2.2))
-    found = propose(nbv.GradientSearch(num_starts=1, iterations=1, candidates=given), known(), jax.random.key(0))
-    np.testing.assert_array_equal(found.candidates.position, given.position)
+    starts = nbv.look_at(nbv.geometry.fibonacci_sphere(3, 2.2))
+    proposal = propose(nbv.GradientSearch(num_starts=1, iterations=1, candidates=starts), known(), jax.random.key(0))
+    np.testing.assert_array_equal(proposal.candidates.position, starts.position)
 
 
 class Constant(Known):
@@ -60,11 +60,11 @@ class Constant(Known):
 
 def test_where_values_tie_the_first_candidate_wins():
     search, key = nbv.GradientSearch(num_starts=2, iterations=4, num_candidates=9), jax.random.key(0)
-    found = propose(search, known(Constant), key)
-    jax.tree.map(np.testing.assert_array_equal, found.pose, found.candidates[0])
-    np.testing.assert_array_equal(found.values, 7.0)
-    again = propose(search, known(Constant, found.pose), key)
-    jax.tree.map(np.testing.assert_array_equal, again.pose, found.candidates[1])
+    proposal = propose(search, known(Constant), key)
+    jax.tree.map(np.testing.assert_array_equal, proposal.pose, proposal.candidates[0])
+    np.testing.assert_array_equal(proposal.values, 7.0)
+    again = propose(search, known(Constant, proposal.pose), key)
+    jax.tree.map(np.testing.assert_array_equal, again.pose, proposal.candidates[1])
 
 
 @pytest.mark.parametrize("space", [nbv.search.SpherePoses(), nbv.search.FreePoses(), nbv.search.ConstrainedPoses()])

@@ -45,8 +45,8 @@ def test_farthest_view_against_its_definition():
 
 def test_random_view_is_uniform_over_what_is_unvisited():
     """2,000 draws over ten candidates. The chi-square test has size 1e-4."""
-    search, asked = nbv.RandomView(12), problem(CANDIDATES[[3, 8]])
-    draw = eqx.filter_jit(jax.vmap(lambda key: search.propose(asked, key).pose.position))
+    search, question = nbv.RandomView(12), problem(CANDIDATES[[3, 8]])
+    draw = eqx.filter_jit(jax.vmap(lambda key: search.propose(question, key).pose.position))
     chosen = np.asarray(draw(jax.random.split(jax.random.key(0), 2000)))
     index = np.linalg.norm(CANDIDATES - chosen[:, None], axis=-1).argmin(axis=1)
     counts = np.bincount(index, minlength=12)
@@ -85,11 +85,11 @@ def test_uncertainty_against_its_definition():
     rng = np.random.default_rng(0)
     surfaces = balls(GRID, [0.9, 0.6, 0.7, 0.3], rng.uniform(-0.5, 0.5, (4, 3)))
     search, values = nbv.search.UncertaintyView(12), np.asarray(surfaces.values, dtype=np.float64)
-    asked = problem(CANDIDATES[:1], surfaces)
+    question = problem(CANDIDATES[:1], surfaces)
     step = 0.5 * GRID.spacing
     expected = np.array([slow_uncertain_length(values, c, step / 8) for c in CANDIDATES])
-    proposal = search.propose(asked, jax.random.key(0))
-    short = expected - np.asarray(uncertain_length(asked, proposal.candidates))
+    proposal = search.propose(question, jax.random.key(0))
+    short = expected - np.asarray(uncertain_length(question, proposal.candidates))
     assert short.min() > -step / 4
     assert short.max() < 2 * step
     assert expected.std() > 3 * step

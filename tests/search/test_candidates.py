@@ -87,12 +87,12 @@ def test_an_arm_s_places_are_even_in_its_volume():
 
 
 def test_a_predicate_keeps_what_it_allows():
-    kept = nbv.SphereCandidates(40).where(lambda pose: pose.position[0] > 1.0)
+    subset = nbv.SphereCandidates(40).where(lambda pose: pose.position[0] > 1.0)
     every = positions(nbv.SphereCandidates(40))
-    np.testing.assert_array_equal(positions(kept), every[every[:, 0] > 1.0])
-    assert kept.count == (every[:, 0] > 1.0).sum() > 3
-    again = kept.where(lambda pose: pose.position[1] > 0)
-    assert 0 < again.count < kept.count
+    np.testing.assert_array_equal(positions(subset), every[every[:, 0] > 1.0])
+    assert subset.count == (every[:, 0] > 1.0).sum() > 3
+    again = subset.where(lambda pose: pose.position[1] > 0)
+    assert 0 < again.count < subset.count
 
 
 def test_numbers_and_poses_stand_for_candidates():
@@ -106,8 +106,8 @@ def test_numbers_and_poses_stand_for_candidates():
 def test_every_search_chooses_among_the_poses_it_is_given(kind):
     given = DOME.where(lambda pose: pose.position[2] < 0)
     search = kind(given)
-    found = propose(search, visit(three_balls(), given.poses()[0]))
-    np.testing.assert_array_equal(found.candidates.position, positions(given).astype(np.float32))
-    assert found.values[0] == -jnp.inf
-    chosen = int(np.argmax(found.values))
-    np.testing.assert_array_equal(found.pose.position, found.candidates.position[chosen])
+    proposal = propose(search, visit(three_balls(), given.poses()[0]))
+    np.testing.assert_array_equal(proposal.candidates.position, positions(given).astype(np.float32))
+    assert proposal.values[0] == -jnp.inf
+    chosen = int(np.argmax(proposal.values))
+    np.testing.assert_array_equal(proposal.pose.position, proposal.candidates.position[chosen])

@@ -37,12 +37,12 @@ def test_the_argmax_of_values_recomputed_one_by_one():
 
 def test_visited_views_are_excluded_one_after_the_other():
     values = np.asarray(propose(SEARCH, PROBLEM).values)
-    order, taken = np.argsort(-values), []
+    order, visited = np.argsort(-values), []
     for rank in range(4):
-        proposal = propose(SEARCH, visit(PROBLEM, *taken))
+        proposal = propose(SEARCH, visit(PROBLEM, *visited))
         np.testing.assert_array_equal(proposal.pose.position, proposal.candidates.position[order[rank]])
         np.testing.assert_array_equal(np.isneginf(proposal.values), np.isin(np.arange(12), order[:rank]))
-        taken.append(proposal.pose)
+        visited.append(proposal.pose)
 
 
 def test_only_the_same_place_and_direction_counts_as_visited():
@@ -70,9 +70,9 @@ def test_only_the_same_place_and_direction_counts_as_visited():
     ],
 )
 def test_values_that_rounding_may_turn_round_tie_and_the_first_is_taken(values, expected):
-    found = best_unvisited(PROBLEM, POSES[:4], jnp.asarray(values))
-    np.testing.assert_array_equal(found.pose.position, POSES.position[expected])
-    assert float(found.value) == np.float32(values[expected])
+    best = best_unvisited(PROBLEM, POSES[:4], jnp.asarray(values))
+    np.testing.assert_array_equal(best.pose.position, POSES.position[expected])
+    assert float(best.value) == np.float32(values[expected])
 
 
 def test_standard_errors_are_those_of_the_scores_sample_by_sample():
@@ -105,20 +105,20 @@ def test_of_what_is_gained_once_the_farthest_of_those_that_are_level(taken):
     away = np.linalg.norm(places[:, None] - places[list(taken)], axis=-1).min(axis=1, initial=np.inf)
     expected = np.argmax(np.where(level & is_open, away, -np.inf)) if taken else values.argmax()
     assert (level & is_open).sum() > 1
-    found = propose(SEARCH, problem)
-    assert float(found.value_at_visited) == pytest.approx(in_vain, rel=1e-4)
-    np.testing.assert_array_equal(found.tied_with_best()[is_open], level[is_open])
-    np.testing.assert_array_equal(found.pose.position, found.candidates.position[expected])
-    assert float(found.value) == pytest.approx(values[expected], rel=1e-5)
-    assert float(found.standard_error) == pytest.approx(float(found.standard_errors[expected]))
+    proposal = propose(SEARCH, problem)
+    assert float(proposal.value_at_visited) == pytest.approx(in_vain, rel=1e-4)
+    np.testing.assert_array_equal(proposal.tied_with_best()[is_open], level[is_open])
+    np.testing.assert_array_equal(proposal.pose.position, proposal.candidates.position[expected])
+    assert float(proposal.value) == pytest.approx(values[expected], rel=1e-5)
+    assert float(proposal.standard_error) == pytest.approx(float(proposal.standard_errors[expected]))
 
 
 def test_of_what_is_gained_once_the_way_there_counts_for_more():
     here, cost = nbv.look_at(jnp.array([0.0, 0.0, 2.5])), nbv.ValuePerCost(nbv.arc_length, fixed=1e-3)
     problem = dataclasses.replace(visit(PROBLEM.with_acquisition(Once()), here), cost=cost)
-    found = propose(SEARCH, problem)
-    assert float(found.value) == float(found.values.max())
-    assert found.value_at_visited is None
+    proposal = propose(SEARCH, problem)
+    assert float(proposal.value) == float(proposal.values.max())
+    assert proposal.value_at_visited is None
 
 
 def test_what_is_gained_once_and_is_no_number_is_told_of():
@@ -181,10 +181,10 @@ def asked(request):
     return visit(PROBLEM, *[POSES[index] for index in request.param])
 
 
-def assert_same(found, expected):
-    assert jax.tree.structure(found) == jax.tree.structure(expected)
-    jax.tree.map(np.testing.assert_array_equal, found.pose, expected.pose)
-    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+def assert_same(proposal, expected):
+    assert jax.tree.structure(proposal) == jax.tree.structure(expected)
+    jax.tree.map(np.testing.assert_array_equal, proposal.pose, expected.pose)
+    for one, other in zip(jax.tree.leaves(proposal), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-5)
 
 
@@ -196,10 +196,10 @@ def test_what_is_picked_by_the_scores_is_what_is_proposed(name, asked):
 
 @pytest.mark.parametrize("name", SEARCHES)
 def test_scores_are_those_of_each_sample_by_each_acquisition_that_is_asked(name):
-    found, acquisitions = score(SEARCHES[name], PROBLEM), ASKED.get(name, ())
+    result, acquisitions = score(SEARCHES[name], PROBLEM), ASKED.get(name, ())
     assert SEARCHES[name].acquisitions(nbv.Coverage()) == acquisitions
-    assert found.shape == ((len(acquisitions), 3, 12) if acquisitions else (0, 0, 12))
-    for scores, acquisition in zip(found, acquisitions, strict=True):
+    assert result.shape == ((len(acquisitions), 3, 12) if acquisitions else (0, 0, 12))
+    for scores, acquisition in zip(result, acquisitions, strict=True):
         np.testing.assert_allclose(scores, sample_by_sample(PROBLEM, acquisition), rtol=1e-5, atol=1e-6)
 
 
@@ -233,30 +233,30 @@ def test_the_best_by_the_second_score_of_those_that_are_tied_by_the_first(factor
 
 
 def test_where_the_first_tells_nothing_the_second_decides_and_where_it_tells_all_the_first_does():
-    told = tie_break(PROBLEM.with_acquisition(Constant(1.0)), nbv.Coverage())
-    np.testing.assert_array_equal(told.pose.position, propose(nbv.DiscreteSearch(12), PROBLEM).pose.position)
+    proposal = tie_break(PROBLEM.with_acquisition(Constant(1.0)), nbv.Coverage())
+    np.testing.assert_array_equal(proposal.pose.position, propose(nbv.DiscreteSearch(12), PROBLEM).pose.position)
     # Equal samples determine the first score exactly, and so does a single sample.
     for rows in (jnp.zeros(3, int), slice(0, 1)):
-        found = tie_break(with_samples(PROBLEM, rows), Height())
-        assert float(found.value) == float(found.values.max())
+        other = tie_break(with_samples(PROBLEM, rows), Height())
+        assert float(other.value) == float(other.values.max())
 
 
 def test_a_tie_break_does_not_choose_visited_views():
-    told, taken = PROBLEM.with_acquisition(Constant(0.0)), []
+    problem, visited = PROBLEM.with_acquisition(Constant(0.0)), []
     for _ in range(3):
-        taken.append(tie_break(visit(told, *taken), Height()).pose)
+        visited.append(tie_break(visit(problem, *visited), Height()).pose)
     heights = np.sort(sample_by_sample(PROBLEM, Height()).mean(axis=0))[::-1]
-    of = [sample_by_sample(PROBLEM, Height(), pose[None]).mean() for pose in taken]
+    of = [sample_by_sample(PROBLEM, Height(), pose[None]).mean() for pose in visited]
     np.testing.assert_allclose(of, heights[:3], rtol=1e-5)
 
 
 def test_the_way_there_counts_among_ties():
     """Among candidates that tie except for travel the nearest one wins, whatever the second score."""
     here, cost = nbv.look_at(jnp.array([0.0, 0.0, 2.5])), nbv.ValuePerCost(nbv.arc_length, fixed=1e-3)
-    told = dataclasses.replace(visit(PROBLEM.with_acquisition(Constant(1.0)), here), cost=cost)
-    found = tie_break(told, Height())
-    distances = np.linalg.norm(np.asarray(found.candidates.position - here.position), axis=1)
-    np.testing.assert_array_equal(found.pose.position, found.candidates.position[distances.argmin()])
+    problem = dataclasses.replace(visit(PROBLEM.with_acquisition(Constant(1.0)), here), cost=cost)
+    proposal = tie_break(problem, Height())
+    distances = np.linalg.norm(np.asarray(proposal.candidates.position - here.position), axis=1)
+    np.testing.assert_array_equal(proposal.pose.position, proposal.candidates.position[distances.argmin()])
 
 
 def test_a_second_score_that_is_no_number_is_told_of():

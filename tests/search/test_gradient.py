@@ -120,14 +120,14 @@ def test_the_known_maximum_is_found(name, direction):
         ways = [mean_hit(1.0, d, gaze) for d in np.linspace(2.0, 3.0, 5) for gaze in np.radians([0.0, 3.0, 6.0, 10.0])]
         assert np.argmax(ways) == 0
     direction = np.asarray(direction) / np.linalg.norm(direction)
-    known = 4.0 - np.mean([(mean_hit(r, distance) - length) ** 2 for r in radii])
+    maximum = 4.0 - np.mean([(mean_hit(r, distance) - length) ** 2 for r in radii])
 
     problem = problem_of(balls(GRID, radii), Nearness(jnp.asarray(length * direction, jnp.float32)))
-    found = run(name, problem, 3)
+    proposal = run(name, problem, 3)
     # The trilinear ball is flatter than the true one, by 7e-4 in these values.
-    assert float(found.value) == pytest.approx(known, abs=2e-3)
-    assert float(found.value) > float(found.values[: SEARCHES[name].num_starts].max()) + 0.01
-    position = np.asarray(found.pose.position, np.float64)
+    assert float(proposal.value) == pytest.approx(maximum, abs=2e-3)
+    assert float(proposal.value) > float(proposal.values[: SEARCHES[name].num_starts].max()) + 0.01
+    position = np.asarray(proposal.pose.position, np.float64)
     if name != "6-DOF":
         # With constraints the gaze can compensate for a small error of the position.
         angle = {"constrained": 10.0}.get(name, 4.0)
@@ -141,25 +141,25 @@ def test_trajectories_hold_every_look_and_the_best_of_all_is_returned(name):
     downhill = 0
     for seed in range(3):
         problem = uneven(seed)
-        found = run(name, problem, seed)
-        ways = found.trajectories
+        proposal = run(name, problem, seed)
+        ways = proposal.trajectories
         assert ways.values.shape == (2, 41)
-        assert len(found.values) == SEARCHES[name].num_candidates
-        assert_close(ways.poses[:, 0], found.candidates[jnp.argsort(found.values, descending=True)[:2]])
+        assert len(proposal.values) == SEARCHES[name].num_candidates
+        assert_close(ways.poses[:, 0], proposal.candidates[jnp.argsort(proposal.values, descending=True)[:2]])
         poses, values = ways.flat
         np.testing.assert_allclose(values_at(problem, poses), values, rtol=1e-4)
         # All starts take each step together.
         assert_equal(poses[2 * 17 + 1], ways.poses[1, 17])
-        looks = [(found.candidates, found.values), (poses, values)]
+        looks = [(proposal.candidates, proposal.values), (poses, values)]
         poses, values = jax.tree.map(lambda *rows: jnp.concatenate(rows), *looks)
-        assert float(found.value) == float(values.max())
-        assert_equal(found.pose, poses[int(jnp.argmax(values))])
+        assert float(proposal.value) == float(values.max())
+        assert_equal(proposal.pose, poses[int(jnp.argmax(values))])
         downhill += int((ways.values[:, -1] < ways.values.max(axis=1)).sum())
         if name == "hybrid":
             discrete = propose(nbv.DiscreteSearch(20), problem, jax.random.key(0))
-            assert_close(found.candidates, discrete.candidates)
-            np.testing.assert_allclose(found.values, discrete.values, rtol=1e-4)
-            assert float(found.value) >= float(discrete.value) - 1e-4
+            assert_close(proposal.candidates, discrete.candidates)
+            np.testing.assert_allclose(proposal.values, discrete.values, rtol=1e-4)
+            assert float(proposal.value) >= float(discrete.value) - 1e-4
     assert downhill > 0 or name == "BFGS"
 
 
@@ -167,16 +167,16 @@ def test_visited_poses_are_neither_started_from_nor_answered():
     problem = uneven(1)
     first = run("2-DOF", problem)
     order = jnp.argsort(first.values, descending=True)
-    taken = [first.pose, first.candidates[order[0]], first.candidates[order[2]]]
-    again = run("2-DOF", visit(problem, *taken))
+    visited = [first.pose, first.candidates[order[0]], first.candidates[order[2]]]
+    again = run("2-DOF", visit(problem, *visited))
     assert_close(again.trajectories.poses[:, 0], first.candidates[order[jnp.array([1, 3])]])
     assert bool(jnp.isneginf(again.values[order[jnp.array([0, 2])]]).all())
     # The second start moves as before. Only the visited pose is excluded from it.
     third = run("2-DOF", visit(problem, again.pose))
-    for pose, proposal in [(pose, again) for pose in taken] + [(again.pose, third)]:
+    for pose, proposal in [(pose, again) for pose in visited] + [(again.pose, third)]:
         assert float(jnp.linalg.norm(pose.position - proposal.pose.position)) > 1e-3
-    kept = run("2-DOF", visit(problem, first.pose))
-    assert float(kept.value) < float(first.value)
+    rerun = run("2-DOF", visit(problem, first.pose))
+    assert float(rerun.value) < float(first.value)
 
 
 def test_the_key_alone_decides():
@@ -193,26 +193,26 @@ def test_a_view_of_nothing_is_worth_nothing_and_not_chosen():
     towards = nbv.look_at(jnp.asarray([[1.5, -2.0, 0.3]]))
     candidates = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), away, towards)
     steps = {"num_starts": 3, "iterations": 12, "learning_rate": 0.3}
-    found = propose(nbv.GradientSearch(dof=6, candidates=candidates, **steps), problem, jax.random.key(0))
+    proposal = propose(nbv.GradientSearch(dof=6, candidates=candidates, **steps), problem, jax.random.key(0))
     surface = jax.tree.map(lambda leaf: leaf[0], problem.surfaces)
 
     @jax.jit
     def slopes(pose):
         def scores(parameters):
-            seen = scan(surface, CAMERA, nbv.search.FreePoses().retract(pose, parameters))
+            cloud = scan(surface, CAMERA, nbv.search.FreePoses().retract(pose, parameters))
             each = jnp.stack(
-                [score_of(one, context_of(one, problem.observations), seen) for one in ACQUISITIONS.values()]
+                [score_of(one, context_of(one, problem.observations), cloud) for one in ACQUISITIONS.values()]
             )
-            return each, (each, seen.count)
+            return each, (each, cloud.count)
 
         return jax.jacrev(scores, has_aux=True)(jnp.zeros(9))
 
-    slope, (each, count) = jax.lax.map(slopes, found.trajectories.flat[0])
-    assert bool(jnp.isfinite(slope).all() & jnp.isfinite(found.values).all())
+    slope, (each, count) = jax.lax.map(slopes, proposal.trajectories.flat[0])
+    assert bool(jnp.isfinite(slope).all() & jnp.isfinite(proposal.values).all())
     empty = np.asarray(count == 0)
     assert 24 < empty.sum() < empty.size, "some walks see the object, and some nothing"
     assert bool((each[empty] == 0).all() & (slope[empty] == 0).all() & (each >= 0).all())
     assert bool((jnp.abs(slope[~empty]).max(axis=(0, 2)) > 0).all())
-    assert int(scan(surface, CAMERA, found.pose).count) > 0
-    assert_equal(found.values[:2], jnp.zeros(2))
-    assert float(found.value) >= float(found.values[2]) > 0
+    assert int(scan(surface, CAMERA, proposal.pose).count) > 0
+    assert_equal(proposal.values[:2], jnp.zeros(2))
+    assert float(proposal.value) >= float(proposal.values[2]) > 0

@@ -170,14 +170,14 @@ def test_a_record_without_views_binds_nobody(tmp_path, finished):
 
 def test_every_view_is_told_when_it_is_done(tmp_path):
     """The view's file exists then, and the next one's does not. Views from the folder are passed too."""
-    told = []
+    calls = []
 
     def each(step):
-        told.append((step.view, len([*tmp_path.glob("view_*.npz")])))
+        calls.append((step.view, len([*tmp_path.glob("view_*.npz")])))
 
     run(tmp_path, views=2, each=each)
-    assert [files for _, files in told] == [1, 2]
-    told.clear()
+    assert [files for _, files in calls] == [1, 2]
+    calls.clear()
     episode = run(tmp_path, views=3, each=each)
-    assert [files for _, files in told] == [2, 2, 3]
-    assert all(view is own for (view, _), own in zip(told, episode.views, strict=True))
+    assert [files for _, files in calls] == [2, 2, 3]
+    assert all(view is own for (view, _), own in zip(calls, episode.views, strict=True))

@@ -81,13 +81,13 @@ def test_estimates_are_those_of_the_clouds(record):
     assert coldest_point(truth.mesh, heat).temperature == low
     run = record["methods"]["heat"]
     for view, (_, observations) in enumerate(replay(study, scene, run)):
-        for name, found in run["estimates"].items():
+        for name, estimate in run["estimates"].items():
             expected = coldest_point(observations.cloud, heat, reached_only=name == "reached")
-            assert found["points"][view] == expected.point.tolist()
-            assert found["temperatures"][view] == expected.temperature
+            assert estimate["points"][view] == expected.point.tolist()
+            assert estimate["temperatures"][view] == expected.temperature
             distance = np.linalg.norm(near - expected.point, axis=1).min()
-            assert found["distances"][view] == pytest.approx(distance)
-            assert found["distances"][view] <= np.linalg.norm(truth.coldest - expected.point)
+            assert estimate["distances"][view] == pytest.approx(distance)
+            assert estimate["distances"][view] <= np.linalg.norm(truth.coldest - expected.point)
 
 
 def test_the_coldest_points_are_those_within_a_hundredth_of_the_range():

@@ -121,13 +121,13 @@ def test_a_scan_has_noisy_ranges_and_nothing_of_the_table(folder):
     study = small_study(folder, Setup.TABLE)
     scene = study.scene(0)
     pose = study.candidates.poses()[0]
-    seen = study.sensor(scene)(pose, jax.random.key(0))
-    points, _ = seen.to_numpy()
+    cloud = study.sensor(scene)(pose, jax.random.key(0))
+    points, _ = cloud.to_numpy()
     assert len(points) > 50
     assert np.asarray(scene.task.obstacles.distance(points)).min() >= scene.task.obstacles.margin
-    mask = np.asarray(seen.mask)
-    away = np.linalg.norm(np.asarray(seen.points) - np.asarray(pose.position), axis=1)
-    np.testing.assert_allclose(np.asarray(seen.sight)[mask], away[mask], rtol=1e-6)
+    mask = np.asarray(cloud.mask)
+    away = np.linalg.norm(np.asarray(cloud.points) - np.asarray(pose.position), axis=1)
+    np.testing.assert_allclose(np.asarray(cloud.sight)[mask], away[mask], rtol=1e-6)
 
 
 def test_methods_hold_the_same_bank_and_differ_in_their_views(folder):
@@ -158,22 +158,22 @@ def test_what_is_measured_is_right_for_the_truth_and_its_symmetries_alone(folder
     assert truth[2] == pytest.approx(task.scale * np.linalg.norm([0.10, 0.06, 0.04]), rel=1e-4)
     half_turn, quarter_turn = np.diag([-1.0, -1.0, 1.0]), np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0, 0, 1.0]])
     for turn in (None, half_turn):
-        told = study._view_record(truth, hypotheses_of(task, task.part, turn))
-        assert told["named"] == "block"
-        assert told["right"] == told["placed"] == 1
-        assert told["p_true"] == 1.0
-        assert told["fit"] < 0.005
-        assert told["add_s"] < 0.01
-    told = study._view_record(truth, hypotheses_of(task, task.part, quarter_turn))
-    assert (told["right"], told["placed"]) == (1, 0)
-    assert told["fit"] > 0.03
-    assert told["add_s"] > 0.03
+        measures = study._view_record(truth, hypotheses_of(task, task.part, turn))
+        assert measures["named"] == "block"
+        assert measures["right"] == measures["placed"] == 1
+        assert measures["p_true"] == 1.0
+        assert measures["fit"] < 0.005
+        assert measures["add_s"] < 0.01
+    measures = study._view_record(truth, hypotheses_of(task, task.part, quarter_turn))
+    assert (measures["right"], measures["placed"]) == (1, 0)
+    assert measures["fit"] > 0.03
+    assert measures["add_s"] > 0.03
     other = next(part for part, name in enumerate(task.bank.names) if name == "cross")
-    told = study._view_record(truth, hypotheses_of(task, other))
-    assert (told["named"], told["right"], told["placed"], told["p_true"]) == ("cross", 0, 0, 0)
-    told = study._view_record(truth, hypotheses_of(task, task.part, none=0.6))
-    assert (told["named"], told["right"]) == (NONE, 0)
-    assert told["p_true"] == pytest.approx(0.4)
+    measures = study._view_record(truth, hypotheses_of(task, other))
+    assert (measures["named"], measures["right"], measures["placed"], measures["p_true"]) == ("cross", 0, 0, 0)
+    measures = study._view_record(truth, hypotheses_of(task, task.part, none=0.6))
+    assert (measures["named"], measures["right"]) == (NONE, 0)
+    assert measures["p_true"] == pytest.approx(0.4)
 
 
 def test_names_that_are_level_share_what_is_right(folder):
@@ -185,8 +185,8 @@ def test_names_that_are_level_share_what_is_right(folder):
     both = dataclasses.replace(both, shape=jnp.asarray([(task.part + 1) % 3, task.part]))
     for weights, right in (([0.45, 0.45], 0.5), ([0.4, 0.5], 1.0), ([0.5, 0.4], 0.0)):
         hypotheses = PartHypotheses(task.bank, both, jnp.asarray([*weights, 0.1]), jnp.asarray(0.03))
-        told = study._view_record(truth, hypotheses)
-        assert told["right"] == right
+        measures = study._view_record(truth, hypotheses)
+        assert measures["right"] == right
 
 
 def test_a_record_is_json_and_holds_what_is_measured(record):

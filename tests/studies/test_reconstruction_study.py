@@ -66,12 +66,12 @@ def test_a_record_is_json_and_holds_every_method(record):
         assert len({tuple(view["position"]) for view in method["views"]}) == 3
         assert 0 < method["coverage"][0] < method["coverage"][-1] <= 1
         assert 0 < method["points"] <= 250
-        for name, found in method["reconstructions"].items():
+        for name, distance in method["reconstructions"].items():
             if name == POISSON and not HAS_POISSON:
-                assert found is None
+                assert distance is None
                 continue
-            assert found["chamfer"] == found["accuracy"] + found["completeness"]
-            assert 0 < found["chamfer"] < 2 * found["hausdorff"]
+            assert distance["chamfer"] == distance["accuracy"] + distance["completeness"]
+            assert 0 < distance["chamfer"] < 2 * distance["hausdorff"]
 
 
 def test_planners_differ_in_what_they_seek_and_their_search_alone():
@@ -97,8 +97,8 @@ def test_views_are_those_of_an_episode_from_the_shared_first_view(record, meshes
             study.planner(name, scene), scene.surface, poses[record["first"]], 3, key, progress=False
         )
         assert method["coverage"] == coverage(episode.views, truth)
-        for view, taken in zip(episode.views, method["views"], strict=True):
-            np.testing.assert_array_equal(view.pose.position, np.float32(taken["position"]))
+        for view, recorded in zip(episode.views, method["views"], strict=True):
+            np.testing.assert_array_equal(view.pose.position, np.float32(recorded["position"]))
         cloud = replay(study, scene, method)[-1][1].cloud
         np.testing.assert_array_equal(cloud.points, episode.cloud.points)
 
@@ -109,19 +109,19 @@ def test_distances_are_those_of_the_reconstruction_from_the_last_cloud(record, m
     truth = scene.surface.sample_points(jax.random.key(5), 20_000)
     sampler, method = study.mesher(scene).sampler, record["methods"]["farthest"]
     observations = replay(study, scene, method)[-1][1]
-    for name, found in method["reconstructions"].items():
-        if found is not None:
+    for name, distances in method["reconstructions"].items():
+        if distances is not None:
             points = reconstruct(sampler, observations, name).sample_points(jax.random.key(6), 20_000)
             expected = surface_distance(points, truth)
-            assert found["chamfer"] == pytest.approx(expected.chamfer, rel=0.05)
-            assert found["hausdorff"] == pytest.approx(expected.hausdorff, rel=0.1)
+            assert distances["chamfer"] == pytest.approx(expected.chamfer, rel=0.05)
+            assert distances["hausdorff"] == pytest.approx(expected.hausdorff, rel=0.1)
 
 
 def test_without_pymeshlab_the_mean_alone_is_measured(monkeypatch, meshes):
     monkeypatch.setattr(reconstruction, "has_poisson", lambda: False)
-    found = run_scene(small_study(meshes), 1, ("farthest",))["methods"]["farthest"]["reconstructions"]
-    assert found[POISSON] is None
-    assert found[MEAN]["chamfer"] > 0
+    distances = run_scene(small_study(meshes), 1, ("farthest",))["methods"]["farthest"]["reconstructions"]
+    assert distances[POISSON] is None
+    assert distances[MEAN]["chamfer"] > 0
 
 
 def test_procedural_scenes_differ_and_are_named():
@@ -161,16 +161,16 @@ def test_the_pictures_show_something(record, meshes, tmp_path, monkeypatch):
 
 
 def test_a_reconstruction_that_no_scene_has_is_left_out():
-    held = {"chamfer": 0.3, "accuracy": 0.1, "completeness": 0.2, "hausdorff": 0.4}
+    distances = {"chamfer": 0.3, "accuracy": 0.1, "completeness": 0.2, "hausdorff": 0.4}
 
     def record(scene, poisson):
-        run = {"coverage": [0.25, 0.5 + 0.1 * scene], "reconstructions": {POISSON: poisson, MEAN: held}}
+        run = {"coverage": [0.25, 0.5 + 0.1 * scene], "reconstructions": {POISSON: poisson, MEAN: distances}}
         return {"scene": scene, "methods": {"coverage": run, "farthest": run}}
 
-    records = [record(0, None), record(1, held)]
+    records = [record(0, None), record(1, distances)]
     table = results(records, ReconstructionStudy).set_index(["at", "quantity", "method"]).sort_index()
-    found = [table.loc[way, "chamfer", "farthest"] for way in (MEAN, POISSON)]
-    assert [(row["mean"], row["scenes"]) for row in found] == [(pytest.approx(0.3), 2), (pytest.approx(0.3), 1)]
+    means = [table.loc[way, "chamfer", "farthest"] for way in (MEAN, POISSON)]
+    assert [(row["mean"], row["scenes"]) for row in means] == [(pytest.approx(0.3), 2), (pytest.approx(0.3), 1)]
     assert table.loc[(2, "covered", "farthest"), "mean"] == pytest.approx(0.55)
     assert POISSON in summary(results(records, ReconstructionStudy), ReconstructionStudy)
     assert POISSON not in summary(results(records[:1], ReconstructionStudy), ReconstructionStudy)

@@ -195,9 +195,9 @@ def test_a_frame_whose_pose_was_lost_is_left_out(layout, name, sequence, tmp_pat
     with pytest.warns(UserWarning, match=r"1 of the 9 poses .*3.*left out") as warned:
         frames = nbv.readers.RecordedFrames(tmp_path)
     assert len(warned) == 1
-    kept = np.arange(COUNT) != 3
-    np.testing.assert_allclose(frames.matrices, matrices[kept], atol=1e-6)
-    check_points(frames, (depths[kept], None))
+    has_pose = np.arange(COUNT) != 3
+    np.testing.assert_allclose(frames.matrices, matrices[has_pose], atol=1e-6)
+    check_points(frames, (depths[has_pose], None))
 
 
 @pytest.mark.parametrize(
@@ -345,35 +345,35 @@ def voxels_of(study, depth, matrix):
 
 def test_its_voxels_are_those_that_three_frames_have_seen(study, sequence):
     """From all pixels. By rounding, a few are in the next voxel."""
-    seen = [voxels_of(study, *frame) for frame in zip(*sequence, strict=True)]
-    often = {place for place in set().union(*seen) if sum(place in one for one in seen) >= 3}
-    shown = study.recording.is_shown
-    assert shown.shape[1] == pytest.approx(len(often), rel=0.01)
-    expected = [len(one & often) / len(often) for one in seen]
-    np.testing.assert_allclose(shown.mean(axis=1), expected, atol=0.01)
-    assert (shown.sum(axis=0) >= 3).all()
+    voxels = [voxels_of(study, *frame) for frame in zip(*sequence, strict=True)]
+    often = {place for place in set().union(*voxels) if sum(place in one for one in voxels) >= 3}
+    is_shown = study.recording.is_shown
+    assert is_shown.shape[1] == pytest.approx(len(often), rel=0.01)
+    expected = [len(one & often) / len(often) for one in voxels]
+    np.testing.assert_allclose(is_shown.mean(axis=1), expected, atol=0.01)
+    assert (is_shown.sum(axis=0) >= 3).all()
 
 
 def test_a_study_takes_intrinsics_and_unit(study, sequence, tmp_path):
     folder = tmp_path / "sequence"
     folder.mkdir()
     tum(folder, *sequence)
-    given = {"folder": folder, "box": (*LOW, *HIGH), "intrinsics": (40.0, 40.0, 23.5, 17.5), "depth_scale": 1 / 5000}
-    told = RecordedStudy.configured("screened", VIEWS, quick=True, **given)[""]
-    np.testing.assert_array_equal(told.recording.is_shown, study.recording.is_shown)
+    options = {"folder": folder, "box": (*LOW, *HIGH), "intrinsics": (40.0, 40.0, 23.5, 17.5), "depth_scale": 1 / 5000}
+    configured = RecordedStudy.configured("screened", VIEWS, quick=True, **options)[""]
+    np.testing.assert_array_equal(configured.recording.is_shown, study.recording.is_shown)
 
 
 def test_every_method_is_measured_by_what_its_frames_show(study):
     record = run_scene(study, 1)
-    first, shown = record["first"], study.recording.is_shown
+    first, is_shown = record["first"], study.recording.is_shown
     for name, method in record["methods"].items():
         frames = method["frames"]
         assert frames[0] == first, name
         assert len(set(frames)) == VIEWS
-        expected = [shown[frames[: count + 1]].any(axis=0).mean() for count in range(VIEWS)]
+        expected = [is_shown[frames[: count + 1]].any(axis=0).mean() for count in range(VIEWS)]
         assert method["covered"] == pytest.approx(expected)
     assert record["methods"][EVEN]["frames"] == [(first + 3 * part) % COUNT for part in range(VIEWS)]
-    gain = [shown[[first, other]].any(axis=0).sum() for other in range(COUNT)]
+    gain = [is_shown[[first, other]].any(axis=0).sum() for other in range(COUNT)]
     best = record["methods"][ORACLE]
     assert gain[best["frames"][1]] == max(gain)
     assert all(method["covered"][1] <= best["covered"][1] for method in record["methods"].values())
@@ -411,9 +411,9 @@ def test_a_frame_that_looks_away_shows_nothing(sequence, tmp_path):
     looks = np.concatenate([depths, depths[:1]]), np.concatenate([matrices, matrices[:1] @ back])
     known_sensor(plain, tmp_path, looks)
     study = RecordedStudy.configured("screened", VIEWS, quick=True, folder=tmp_path, box=(*LOW, *HIGH))[""]
-    shown = study.recording.is_shown.sum(axis=1)
-    assert shown[-1] == 0
-    assert (shown[:-1] > 0).all()
+    counts = study.recording.is_shown.sum(axis=1)
+    assert counts[-1] == 0
+    assert (counts[:-1] > 0).all()
 
 
 def test_a_box_with_room_is_found_about_what_was_seen(sequence, tmp_path):

@@ -68,8 +68,8 @@ def test_float32_is_exact_to_a_ten_thousandth(monkeypatch):
     with jax.enable_x64(True):
         expected = model.condition(nbv.PointCloud.from_arrays(0.5 * points, points)).mean(queries)
     monkeypatch.setattr(solver, "MOST_FACTORISED", 499)
-    found = model.condition(nbv.PointCloud.from_arrays(0.5 * points, points)).mean(queries)
-    np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
+    mean = model.condition(nbv.PointCloud.from_arrays(0.5 * points, points)).mean(queries)
+    np.testing.assert_allclose(mean, expected, atol=1e-4 * np.abs(expected).max())
 
 
 def test_what_does_not_converge_is_refused(few, monkeypatch):

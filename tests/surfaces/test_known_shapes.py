@@ -83,56 +83,56 @@ AROUND = ((0.5, 1.0, 3.2), (2.8, 1.2, -1.2), (-2.5, -1.5, -1.5))
 @pytest.fixture(scope="module")
 def planted():
     """Eight poses of one shape of the bank, seen from three sides, and the registered shapes."""
-    found = []
+    fits = []
     for seed in range(8):
         rotation, index = Rotation.random(random_state=seed), seed % len(ARMS)
         surface, _, shift = filling(ARMS[index], rotation)
-        seen = FitTargets.of(observations_of(surface, AROUND))
-        found.append(
-            (index, rotation, shift, register(BANK, Prior(nbv.surfaces.FreeRotation(), nbv.Box()), seen, 2048))
+        targets = FitTargets.of(observations_of(surface, AROUND))
+        fits.append(
+            (index, rotation, shift, register(BANK, Prior(nbv.surfaces.FreeRotation(), nbv.Box()), targets, 2048))
         )
-    return found
+    return fits
 
 
 def test_planted_poses_are_recovered(planted):
     turned, moved = [], []
-    for _, rotation, shift, found in planted:
-        off = Rotation.from_matrix(np.asarray(found.placement.rotation[0])) * rotation.inv()
+    for _, rotation, shift, fits in planted:
+        off = Rotation.from_matrix(np.asarray(fits.placement.rotation[0])) * rotation.inv()
         turned.append(np.degrees(off.magnitude()))
-        moved.append(np.linalg.norm(np.asarray(found.placement.shift[0]) - shift))
+        moved.append(np.linalg.norm(np.asarray(fits.placement.shift[0]) - shift))
     assert np.median(turned) < 3.0
     assert np.median(moved) < 0.02
     # The true shape fits best.
-    assert sum(int(found.shape[0]) == index for index, *_, found in planted) >= 7
+    assert sum(int(fits.shape[0]) == index for index, *_, fits in planted) >= 7
 
 
 def test_modes_of_one_shape_are_far_apart(planted):
-    for *_, found in planted:
-        kept = np.asarray(found.is_mode)
-        rotation, shape = np.asarray(found.placement.rotation)[kept], np.asarray(found.shape)[kept]
+    for *_, fits in planted:
+        is_mode = np.asarray(fits.is_mode)
+        rotation, shape = np.asarray(fits.placement.rotation)[is_mode], np.asarray(fits.shape)[is_mode]
         trace = np.einsum("aij,bij->ab", rotation, rotation)
         near = (trace > 1.0 + 2.0 * np.cos(np.radians(15.0))) & (shape[:, None] == shape)
         np.testing.assert_array_equal(near, np.eye(len(shape), dtype=bool))
-        assert np.all(np.diff(np.asarray(found.misfit)) >= 0)
+        assert np.all(np.diff(np.asarray(fits.misfit)) >= 0)
 
 
 def test_a_symmetric_shape_stands_in_all_the_ways_that_look_alike():
     """A bar seen from above may be rotated by half a turn."""
     bank = nbv.ShapeBank.of([Cuboid([1.2, 0.3, 0.4])])
-    seen = FitTargets.of(observations_of(nbv.SDFSurface(Cuboid([1.25, 0.31, 0.42])), ((0.5, 3.0, 1.5),)))
-    found = register(bank, Prior(nbv.surfaces.Upright(), nbv.Box()), seen, 512)
+    targets = FitTargets.of(observations_of(nbv.SDFSurface(Cuboid([1.25, 0.31, 0.42])), ((0.5, 3.0, 1.5),)))
+    fits = register(bank, Prior(nbv.surfaces.Upright(), nbv.Box()), targets, 512)
     angles = np.degrees(
-        np.arctan2(np.asarray(found.placement.rotation)[:, 0, 2], np.asarray(found.placement.rotation)[:, 0, 0])
+        np.arctan2(np.asarray(fits.placement.rotation)[:, 0, 2], np.asarray(fits.placement.rotation)[:, 0, 0])
     )
-    good = np.asarray(found.is_mode) & (np.asarray(found.misfit) < 0.2)
+    good = np.asarray(fits.is_mode) & (np.asarray(fits.misfit) < 0.2)
     assert sorted(np.round(np.abs(angles[good])).astype(int).tolist()) == pytest.approx([0, 180], abs=3)
 
 
 def test_what_was_seen_empty_is_among_what_shapes_are_fitted_to():
     observations = observations_of(nbv.SDFSurface(Cuboid([0.5, 0.3, 0.4])), AROUND)
-    seen = FitTargets.of(observations)
-    assert bool(seen.is_empty.all())
-    node = (np.asarray(seen.empty, np.float64) + GRID.half_extent) / GRID.spacing
+    targets = FitTargets.of(observations)
+    assert bool(targets.is_empty.all())
+    node = (np.asarray(targets.empty, np.float64) + GRID.half_extent) / GRID.spacing
     np.testing.assert_allclose(node, np.rint(node), atol=1e-4)
     assert np.asarray(observations.empty_nodes)[tuple(np.rint(node).astype(int).T)].all()
     nothing = dataclasses.replace(observations, empty_nodes=None, grid=None)
@@ -187,8 +187,8 @@ def test_of_one_exact_shape_samples_are_that_shape_to_the_noise():
 def test_weights_are_tempered_fits():
     observations = observations_of(filling(0.5, UPRIGHT)[0], AROUND[:1])
     posterior = model(inverse_temperature=7.0, misfit_of_none=0.4).condition(observations)
-    found = posterior.fits
-    energy = np.append(np.where(found.is_mode, np.exp(-7.0 * np.asarray(found.misfit, np.float64)), 0.0), np.exp(-2.8))
+    fits = posterior.fits
+    energy = np.append(np.where(fits.is_mode, np.exp(-7.0 * np.asarray(fits.misfit, np.float64)), 0.0), np.exp(-2.8))
     np.testing.assert_allclose(posterior.weights, energy / energy.sum(), rtol=1e-4, atol=1e-7)
     listed = posterior.hypotheses
     assert sum(one.weight for one in listed) == pytest.approx(1.0, abs=1e-4)

@@ -95,10 +95,10 @@ BOTH = pytest.mark.parametrize("kind", ["geometric", "screened"])
 @pytest.mark.parametrize("scales", SCALES)
 def test_mean_about_functions_equals_regression_of_the_data_less_them(x64, kind, scales):
     posterior = make(kind, scales).condition(cloud())
-    found = np.asarray(mean_about(posterior, bumps())(QUERIES) - posterior.level)
+    sample_mean = np.asarray(mean_about(posterior, bumps())(QUERIES) - posterior.level)
     for s in range(3):
         mean, _ = regression(posterior, scales, s, QUERIES)
-        np.testing.assert_allclose(found[s], mean, atol=1e-9 * np.abs(mean).max())
+        np.testing.assert_allclose(sample_mean[s], mean, atol=1e-9 * np.abs(mean).max())
 
 
 @pytest.mark.parametrize("kind", [pytest.param("geometric", marks=pytest.mark.slow), "screened"])
@@ -209,9 +209,9 @@ class OneValue(nbv.surfaces.Fields):
 @BOTH
 def test_what_cannot_be_sampled_about_is_refused(kind, change, message):
     posterior = make(kind, "one scale").condition(cloud(dtype=jnp.float32))
-    given = {"means": bumps(jnp.float32), "key": jax.random.key(0), "noise_scale": 1.0} | change
+    arguments = {"means": bumps(jnp.float32), "key": jax.random.key(0), "noise_scale": 1.0} | change
     with pytest.raises(nbv.InputError, match=message):
-        posterior.sample_about(**given)
+        posterior.sample_about(**arguments)
 
 
 @BOTH

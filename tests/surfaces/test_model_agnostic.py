@@ -52,7 +52,7 @@ def test_proposed_view_is_the_best_by_chamfer_distance_to_exact_scans_of_the_sam
     proposal = plan.propose(observations, key)
     sample_key, _ = jax.random.split(key)
     fields = RandomSpheres().condition(observations).sample(sample_key, 3)
-    known, _ = cloud.to_numpy()
+    points, _ = cloud.to_numpy()
     values = np.zeros(12)
     for i, pose in enumerate(nbv.look_at(nbv.geometry.fibonacci_sphere(12, 2.5))[j] for j in range(12)):
         origins, directions = (np.asarray(a, np.float64) for a in CAMERA.rays(pose))
@@ -61,7 +61,7 @@ def test_proposed_view_is_the_best_by_chamfer_distance_to_exact_scans_of_the_sam
             inside = along**2 - np.sum((centre - origins) ** 2, axis=1) + radius**2
             t = along - np.sqrt(np.maximum(inside, 0))
             hits = (origins + t[:, None] * directions)[inside > 0]
-            values[i] += np.min(np.sum((hits[:, None] - known) ** 2, axis=-1), axis=1).sum() / 3
+            values[i] += np.min(np.sum((hits[:, None] - points) ** 2, axis=-1), axis=1).sum() / 3
     np.testing.assert_allclose(proposal.values, values, rtol=0.03, atol=0.03 * values.max())
     assert int(np.argmax(proposal.values)) == int(np.argmax(values))
     np.testing.assert_allclose(

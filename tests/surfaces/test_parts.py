@@ -105,9 +105,9 @@ def test_parts_that_are_the_same_are_told():
     mirrored.apply_transform(np.diag([1.0, -1.0, 1.0, 1.0]))
     parts = [own, turned, bracket(30.0, (5.0, 5.0, 5.0)), bracket(45.0), own.copy().apply_scale(0.96), mirrored]
     names = ["own", "turned", "moved", "deeper", "smaller", "mirrored"]
-    with pytest.warns(UserWarning, match="the same up to") as told:
+    with pytest.warns(UserWarning, match="the same up to") as warning_list:
         nbv.ShapeBank.from_meshes(parts, names=names, resolution=48, progress=False, scale="mm")
-    pairs = {tuple(str(warning.message).split(" are the same")[0].split(" and ")) for warning in told}
+    pairs = {tuple(str(warning.message).split(" are the same")[0].split(" and ")) for warning in warning_list}
     assert pairs == {("own", "turned"), ("own", "moved"), ("turned", "moved")}
 
 
@@ -241,14 +241,14 @@ def test_where_one_part_lies_all_that_look_alike_may():
     surface = nbv.SDFSurface(nbv.sdf.Rotated(housing(*pins[3]), turn))
     observations = observations_of(surface, [TURN.apply([0.4, -4.0, 0.9])], sampler)
     true = Placement(jnp.asarray(turn), jnp.zeros(3), jnp.ones(3))
-    known = Hypotheses(jnp.asarray(0), true, jnp.asarray(0.0), jnp.asarray(True))
-    before = jax.tree.map(lambda rows, row: rows.at[0].set(row), placeholder_hypotheses(jnp.float32), known)
+    carried_over = Hypotheses(jnp.asarray(0), true, jnp.asarray(0.0), jnp.asarray(True))
+    before = jax.tree.map(lambda rows, row: rows.at[0].set(row), placeholder_hypotheses(jnp.float32), carried_over)
     seen, rays = FitTargets.of(observations), Rays.of(observations, box)
     for carried, all_parts in ((before, set(range(5))), (placeholder_hypotheses(jnp.float32), set())):
-        found = search_parts(bank, FreeRotation(), box, seen, rays, carried, 4)
-        off = (TURN.inv() * Rotation.from_matrix(found.placement.rotation)).magnitude()
-        there = np.asarray(found.is_mode) & (off < np.radians(3.0))
-        assert set(np.asarray(found.shape)[there]) == all_parts
+        placements = search_parts(bank, FreeRotation(), box, seen, rays, carried, 4)
+        off = (TURN.inv() * Rotation.from_matrix(placements.placement.rotation)).magnitude()
+        there = np.asarray(placements.is_mode) & (off < np.radians(3.0))
+        assert set(np.asarray(placements.shape)[there]) == all_parts
 
 
 def test_none_of_these():

@@ -59,8 +59,8 @@ def test_free_rotations_leave_no_gap():
         rotations @ np.swapaxes(rotations, 1, 2), np.broadcast_to(np.eye(3), (4096, 3, 3)), atol=1e-12
     )
     np.testing.assert_allclose(np.linalg.det(rotations), 1.0, atol=1e-12)
-    asked = Rotation.random(200, random_state=0).as_matrix()
-    trace = np.einsum("aij,bij->ab", asked, rotations)
+    targets = Rotation.random(200, random_state=0).as_matrix()
+    trace = np.einsum("aij,bij->ab", targets, rotations)
     nearest = np.degrees(np.arccos(np.clip(0.5 * (trace.max(axis=1) - 1.0), -1, 1)))
     assert nearest.max() < 15.0
 

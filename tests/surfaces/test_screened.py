@@ -112,8 +112,8 @@ def test_what_was_seen_empty_is_likelier_to_be_outside_and_so_is_what_is_near():
         (nbv.surfaces.OutsideBoundary(num_points=60), nbv.surfaces.EmptySpace(30)),
     )
     nothing = nbv.Observations.start(data, 1, grid)
-    seen = eqx.tree_at(lambda e: e.empty_nodes, nothing, jnp.asarray(is_beside | beyond))
-    without, with_bank = (model.condition(observations) for observations in (nothing, seen))
+    with_empty = eqx.tree_at(lambda e: e.empty_nodes, nothing, jnp.asarray(is_beside | beyond))
+    without, with_bank = (model.condition(observations) for observations in (nothing, with_empty))
     beside = nodes[is_beside]
     near, far = beside + np.array([0.0, 0.0, 0.1]), beside * np.array([1.0, -1.0, 1.0])
 
@@ -123,7 +123,7 @@ def test_what_was_seen_empty_is_likelier_to_be_outside_and_so_is_what_is_near():
     assert inside(with_bank, beside) < 0.3 * inside(without, beside)
     assert inside(with_bank, near) < 0.5 * inside(without, near)
     assert abs(inside(with_bank, far) - inside(without, far)) < 0.1
-    rows = nbv.surfaces.EmptySpace(30).rows(seen)
+    rows = nbv.surfaces.EmptySpace(30).rows(with_empty)
     assert np.asarray(rows.mask).all()
     assert len(np.unique(np.asarray(rows.points), axis=0)) == 30
     assert {tuple(p) for p in np.asarray(rows.points)} <= {tuple(p) for p in np.float32(beside)}

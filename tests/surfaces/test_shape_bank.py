@@ -48,8 +48,8 @@ def test_a_closed_mesh_has_the_distances_of_its_solid(tmp_path, inverted):
     """A ball of radius 1.25 in scene units. A mesh with inverted winding is the same solid."""
     bank = bank_of(ball(tmp_path / "ball.ply", inverted))
     x = nodes()
-    found = bank.shape(jnp.asarray(0)).solid(x)
-    np.testing.assert_allclose(found, np.linalg.norm(x, axis=1) - 1.25, atol=0.02)
+    distance = bank.shape(jnp.asarray(0)).solid(x)
+    np.testing.assert_allclose(distance, np.linalg.norm(x, axis=1) - 1.25, atol=0.02)
     assert bank.names == ("ball",)
     np.testing.assert_allclose(np.linalg.norm(bank.extremes[0], axis=1), 1.25, atol=0.01)
 
@@ -101,8 +101,8 @@ def test_what_was_made_is_kept_and_what_changed_is_made_anew(tmp_path, cache, mo
 def test_what_is_kept_damaged_is_made_anew(tmp_path, cache):
     file = ball(tmp_path / "ball.ply")
     first = bank_of(file, resolution=16)
-    (kept,) = cache.iterdir()
-    kept.write_bytes(kept.read_bytes()[:100])
+    (cached,) = cache.iterdir()
+    cached.write_bytes(cached.read_bytes()[:100])
     np.testing.assert_array_equal(bank_of(file, resolution=16).shapes.solid.values, first.shapes.solid.values)
 
 

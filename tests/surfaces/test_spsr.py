@@ -143,9 +143,9 @@ def test_a_truncation_that_keeps_little_variance_is_reported():
 
 @pytest.mark.parametrize("nu", [0.5, 1.5, 2.5])
 def test_kept_variance_is_the_prior_variance_of_weight_space(nu):
-    kept = nbv.GeometricSPSR(lengthscale=0.1, variance=0.8, truncation=4, nu=nu).kept_variance
+    variance = nbv.GeometricSPSR(lengthscale=0.1, variance=0.8, truncation=4, nu=nu).kept_variance
     oracle = WeightSpace(lengthscale=0.1, variance=0.8, truncation=4, nu=nu)
-    np.testing.assert_allclose(kept, (oracle.amplitude**2).sum() / 0.8**3 + oracle.constant**2 / 0.8**3, rtol=1e-5)
+    np.testing.assert_allclose(variance, (oracle.amplitude**2).sum() / 0.8**3 + oracle.constant**2 / 0.8**3, rtol=1e-5)
 
 
 def test_bad_clouds_are_refused():
@@ -166,8 +166,8 @@ def test_points_where_functions_only_repeat_are_refused():
     posterior = nbv.GeometricSPSR(**SETTINGS).condition(cloud(POINTS, NORMALS, dtype=jnp.float32))
     fields, far = posterior.sample(jax.random.key(0), 2), np.array([[0.0, 0.0, -3.2]], np.float32)
     near = np.array([[0.0, 0.0, np.pi]], np.float32)
-    asked = (posterior.mean, posterior.variance, fields, lambda x: posterior.covariance(x, QUERIES))
-    for ask in asked:
+    functions = (posterior.mean, posterior.variance, fields, lambda x: posterior.covariance(x, QUERIES))
+    for ask in functions:
         with pytest.raises(ValueError, match=r"coordinate of 3\.2, outside \[-pi, pi\]\^3.*Frame\.to_scene"):
             ask(far)
         assert np.isfinite(ask(near)).all()

@@ -71,7 +71,7 @@ def test_probability_zero_adds_nothing_where_expected_and_a_finite_price_where_n
 def test_scores_of_chosen_probabilities(x64, p, q):
     before, after = entropy_in_numpy(p), entropy_in_numpy(q)
     reduction, crossed = max(0.0, before - after), entropy_in_numpy(p, q)
-    seen, scanned = one_point(p), one_point(q)
+    cloud, scanned = one_point(p), one_point(q)
     scores = {
         nbv.CrossEntropy(first_point): crossed,
         nbv.tasks.MixedEntropy(first_point): crossed if before > 0.75 else reduction,
@@ -80,7 +80,9 @@ def test_scores_of_chosen_probabilities(x64, p, q):
         nbv.tasks.EntropyReduction(first_point): reduction,
     }
     for score, expected in scores.items():
-        assert float(score_of(score, context_of(score, seen), scanned)) == pytest.approx(expected, rel=1e-12, abs=1e-15)
+        assert float(score_of(score, context_of(score, cloud), scanned)) == pytest.approx(
+            expected, rel=1e-12, abs=1e-15
+        )
 
 
 def test_the_switch_is_at_the_threshold_and_not_above_it(x64):
@@ -129,8 +131,8 @@ def test_thinning_is_that_by_hand_and_happens_once_before_scans_are_added(x64):
     }
     for score, expected in scores.items():
         context = context_of(score, data)
-        for found, wanted in zip(jax.tree.leaves(context[0]), jax.tree.leaves(by_hand), strict=True):
-            np.testing.assert_array_equal(found, wanted)
+        for leaf, wanted in zip(jax.tree.leaves(context[0]), jax.tree.leaves(by_hand), strict=True):
+            np.testing.assert_array_equal(leaf, wanted)
         assert float(score_of(score, context, scanned)) == pytest.approx(expected, rel=1e-10, abs=1e-14)
     assert not np.allclose(p, linear_in_numpy(*data.to_numpy()), atol=1e-3)
 

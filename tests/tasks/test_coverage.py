@@ -41,9 +41,9 @@ def ball_area(sharpest: float) -> float:
 
 @pytest.mark.parametrize(("height", "width"), [(240, 240), (120, 240)])
 def test_the_area_of_a_ball_is_its_integral(height, width):
-    seen, camera = looked_at(height, width)
+    cloud, camera = looked_at(height, width)
     for steepest in (0.2, 0.5):
-        area = float(jnp.sum(pixel_area(seen, camera, POSE, steepest)))
+        area = float(jnp.sum(pixel_area(cloud, camera, POSE, steepest)))
         # A pixel at the limb is a hit or a miss, which is about one in a hundred of the area.
         assert area == pytest.approx(ball_area(steepest), rel=0.02)
 
@@ -63,31 +63,31 @@ def cloud_of(points, capacity=None):
 
 
 def test_the_score_is_the_area_weighed_by_how_far_it_is_to_d():
-    seen, camera = looked_at()
+    ball, camera = looked_at()
     rng = np.random.default_rng(0)
     data = rng.normal(size=(40, 3)) + np.array([0.0, 4.0, 0.0])
     data *= RADIUS / np.linalg.norm(data, axis=1, keepdims=True)
     acquisition, cloud = nbv.NewSurface(0.15), cloud_of(data, 64)
     context = context_of(acquisition, cloud)
-    found = float(acquisition.score(context, ImaginedView(seen, camera, POSE)))
+    score = float(acquisition.score(context, ImaginedView(ball, camera, POSE)))
 
-    points, mask = np.asarray(seen.points, np.float64), np.asarray(seen.mask)
+    points, mask = np.asarray(ball.points, np.float64), np.asarray(ball.mask)
     distance = np.linalg.norm(points[:, None] - data[None], axis=-1).min(axis=1)
     # A pixel steeper than 60 degrees counts less.
-    area = np.asarray(pixel_area(seen, camera, POSE, 0.5), np.float64)
+    area = np.asarray(pixel_area(ball, camera, POSE, 0.5), np.float64)
     expected = float(np.sum(area[mask] * np.clip(distance[mask] / 0.15 - 1.0, 0.0, 1.0)))
     assert 0.1 * area.sum() < expected < 0.9 * area.sum()
     # Between nodes a distance has a small error relative to their spacing, here 0.026, of either sign.
-    assert found == pytest.approx(expected, rel=0.03)
+    assert score == pytest.approx(expected, rel=0.03)
 
 
 def test_between_the_points_of_a_sparse_cloud_nothing_is_new():
     """Points 0.1 apart all over the visible ball. By the size alone half of the ball would be new."""
-    seen, camera = looked_at()
+    ball, camera = looked_at()
     cloud = cloud_of(RADIUS * np.asarray(nbv.geometry.fibonacci_sphere(300)))
     acquisition = nbv.NewSurface(0.02)
-    score = float(acquisition.score(context_of(acquisition, cloud), ImaginedView(seen, camera, POSE)))
-    assert score < 0.02 * float(jnp.sum(pixel_area(seen, camera, POSE, 0.2)))
+    score = float(acquisition.score(context_of(acquisition, cloud), ImaginedView(ball, camera, POSE)))
+    assert score < 0.02 * float(jnp.sum(pixel_area(ball, camera, POSE, 0.2)))
 
 
 def score_new(observations, view):
@@ -107,8 +107,8 @@ def observed(points, capacity):
 def test_what_is_new_does_not_depend_on_the_points_that_are_kept():
     """Hits all over the visible ball except for a hole. The area of the hole is new, although D is too sparse to
     tell."""
-    seen, camera = looked_at(120, 120)
-    view = ImaginedView(seen, camera, POSE)
+    cloud, camera = looked_at(120, 120)
+    view = ImaginedView(cloud, camera, POSE)
     everywhere = np.asarray(nbv.geometry.fibonacci_sphere(6000), np.float64)
     toward = np.asarray(POSE.position, np.float64) / AWAY
     radius = 0.4
@@ -124,12 +124,12 @@ def test_what_is_new_does_not_depend_on_the_points_that_are_kept():
 def test_between_the_rays_of_a_coarse_sensor_nothing_is_new():
     """A ball seen by 14 x 14 pixels, and again from there by six times as many on a side. Hits alone are almost two
     spacings of the grid apart, which would leave a twelfth of the area new."""
-    seen, camera = looked_at(14, 14)
-    start = nbv.Observations.start(limit_capacity(seen, 60), 2, nbv.Grid(40, 1.2))
-    observations = start.add_view(POSE, seen, camera, nbv.Carving(), None)
+    cloud, camera = looked_at(14, 14)
+    start = nbv.Observations.start(limit_capacity(cloud, 60), 2, nbv.Grid(40, 1.2))
+    observations = start.add_view(POSE, cloud, camera, nbv.Carving(), None)
     fine, sharp = looked_at(80, 80)
     new = float(score_new(observations, ImaginedView(fine, sharp, POSE)))
-    points = dataclasses.replace(start, looks=start.looks.with_points(seen))
+    points = dataclasses.replace(start, looks=start.looks.with_points(cloud))
     by_points = float(score_new(points, ImaginedView(fine, sharp, POSE)))
     assert new < 0.03 * ball_area(0.5)
     assert by_points > 0.08 * ball_area(0.5)
@@ -145,11 +145,11 @@ def test_it_can_be_climbed(x64):
         pose = nbv.look_at(jnp.array([x, 0.4, 2.4]))
         return nbv.expected_value(nbv.NewSurface(0.3), cloud, surfaces, camera, pose[None])[0]
 
-    found = float(jax.grad(value)(0.5))
+    slope = float(jax.grad(value)(0.5))
     step = 1e-6
     differences = (value(0.5 + step) - value(0.5 - step)) / (2 * step)
-    assert abs(found) > 1e-3
-    assert found == pytest.approx(float(differences), rel=1e-3)
+    assert abs(slope) > 1e-3
+    assert slope == pytest.approx(float(differences), rel=1e-3)
 
 
 def test_searches_of_both_kinds_take_it():
@@ -165,11 +165,11 @@ def chamfer(points, data):
 
 @pytest.mark.parametrize("score", [nbv.Coverage(), nbv.NewSurface()])
 def test_a_scan_that_sees_nothing_or_nothing_new_is_worth_nothing(score):
-    seen, camera = looked_at()
-    known, far = (context_of(score, cloud) for cloud in (seen, cloud_of([[1.0, 1.0, 1.0]])))
-    assert float(score.score(known, ImaginedView(seen, camera, POSE))) == pytest.approx(0.0, abs=1e-5)
-    assert float(score.score(far, ImaginedView(nothing(seen.capacity), camera, POSE))) == 0.0
-    assert float(score.score(far, ImaginedView(seen, camera, POSE))) > 0.1
+    ball, camera = looked_at()
+    contexts, far = (context_of(score, cloud) for cloud in (ball, cloud_of([[1.0, 1.0, 1.0]])))
+    assert float(score.score(contexts, ImaginedView(ball, camera, POSE))) == pytest.approx(0.0, abs=1e-5)
+    assert float(score.score(far, ImaginedView(nothing(ball.capacity), camera, POSE))) == 0.0
+    assert float(score.score(far, ImaginedView(ball, camera, POSE))) > 0.1
 
 
 def test_the_acquisition_against_brute_force_over_all_scans():
@@ -181,19 +181,19 @@ def test_the_acquisition_against_brute_force_over_all_scans():
         surface = jax.tree.map(lambda leaf, s=s: leaf[s], surfaces)
         expected[s, p] = chamfer(nbv.scan(surface, SMALL, poses[p]).to_numpy()[0], data.to_numpy()[0])
     assert expected.min() > 0
-    found = nbv.expected_value(nbv.Coverage(), data, surfaces, SMALL, poses)
-    np.testing.assert_allclose(found, expected.mean(axis=0), rtol=1e-4)
+    values = nbv.expected_value(nbv.Coverage(), data, surfaces, SMALL, poses)
+    np.testing.assert_allclose(values, expected.mean(axis=0), rtol=1e-4)
 
 
 def test_gradient_in_the_scan(x64):
     """d/dx min_y |x - y|^2 = 2 (x - y*). Masked rows and normals have zero derivatives."""
     rng = np.random.default_rng(3)
-    data, seen = drawn_cloud(rng, 15, 20), drawn_cloud(rng, 6, 9)
+    data, scan = drawn_cloud(rng, 15, 20), drawn_cloud(rng, 6, 9)
     score = nbv.Coverage()
-    gradient = jax.grad(lambda points: score_of(score, data, nbv.PointCloud(points, seen.normals, seen.mask)))(
-        seen.points
+    gradient = jax.grad(lambda points: score_of(score, data, nbv.PointCloud(points, scan.normals, scan.mask)))(
+        scan.points
     )
-    points, known = np.asarray(seen.points)[:6], np.asarray(data.points)[:15]
-    nearest = known[((points[:, None] - known[None]) ** 2).sum(-1).argmin(axis=1)]
+    points, cloud_points = np.asarray(scan.points)[:6], np.asarray(data.points)[:15]
+    nearest = cloud_points[((points[:, None] - cloud_points[None]) ** 2).sum(-1).argmin(axis=1)]
     np.testing.assert_allclose(gradient[:6], 2 * (points - nearest), atol=1e-12)
     assert not np.asarray(gradient)[6:].any()

@@ -43,9 +43,9 @@ def test_zonal_harmonics_on_the_sphere_decay_as_they_should():
         assert laplacian.mass.sum() == pytest.approx(4 * np.pi * radius**2, rel=0.01)
         for degree in (1, 2, 4):
             mode = eval_legendre(degree, points[:, 2] / radius)
-            found = diffuse(laplacian, mode, np.zeros(len(points)), duration, steps)
+            result = diffuse(laplacian, mode, np.zeros(len(points)), duration, steps)
             decay = (1 + duration / steps * degree * (degree + 1) / radius**2) ** -steps
-            np.testing.assert_allclose(found, decay * mode, atol=0.02 * decay)
+            np.testing.assert_allclose(result, decay * mode, atol=0.02 * decay)
 
 
 def test_a_heated_sphere_against_its_series():
@@ -74,9 +74,9 @@ def test_cosine_modes_of_an_insulated_plate_decay_as_they_should():
         for i, j in ((1, 0), (0, 1), (2, 1)):
             mode = np.cos(np.pi * i * vertices[:, 0]) * np.cos(np.pi * j * vertices[:, 1] / 0.5)
             rate = np.pi**2 * (i**2 + (j / 0.5) ** 2)
-            found = diffuse(laplacian, mode, np.zeros(len(mode)), duration, steps)
+            result = diffuse(laplacian, mode, np.zeros(len(mode)), duration, steps)
             decay = (1 + duration / steps * rate) ** -steps
-            np.testing.assert_allclose(found, decay * mode, atol=tolerance)
+            np.testing.assert_allclose(result, decay * mode, atol=tolerance)
 
 
 def test_heat_is_conserved_and_grows_by_what_the_source_gives():
@@ -84,12 +84,12 @@ def test_heat_is_conserved_and_grows_by_what_the_source_gives():
     laplacian = cloud_laplacian(points)
     start, heating = RNG.uniform(size=400), np.where(points[:, 0] > 0.9, 10.0, 0.0)
     for steps in (1, 7):
-        kept = diffuse(laplacian, start, 0.0 * heating, 3.0, steps)
+        without_source = diffuse(laplacian, start, 0.0 * heating, 3.0, steps)
         fed = diffuse(laplacian, start, heating, 3.0, steps)
         before = laplacian.mass @ start
-        assert laplacian.mass @ kept == pytest.approx(before, rel=1e-12)
+        assert laplacian.mass @ without_source == pytest.approx(before, rel=1e-12)
         assert laplacian.mass @ fed == pytest.approx(before + 3.0 * laplacian.mass @ heating, rel=1e-12)
-        assert start.min() < kept.min() < kept.max() < start.max()
+        assert start.min() < without_source.min() < without_source.max() < start.max()
 
 
 def test_halving_the_time_step_halves_the_error():
@@ -236,14 +236,14 @@ def test_bad_input_is_told():
 def test_three_points_are_a_triangle():
     """By the cotangent formula. A line of three points conducts nothing."""
     points = np.array([[0.0, 0.0, 0.3], [2.0, 0.0, 0.3], [0.5, 1.0, 0.3]])
-    found = cloud_laplacian(points)
+    laplacian = cloud_laplacian(points)
     a, b, c = points
     expected = np.zeros((3, 3))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         u, v = points[i] - points[k], points[j] - points[k]
         expected[i, j] = expected[j, i] = 0.5 * (u @ v) / np.linalg.norm(np.cross(u, v))
     expected -= np.diag(expected.sum(axis=1))
-    np.testing.assert_allclose(found.weak.toarray(), -expected, atol=1e-9)
-    np.testing.assert_allclose(found.mass, np.linalg.norm(np.cross(b - a, c - a)) / 6.0)
+    np.testing.assert_allclose(laplacian.weak.toarray(), -expected, atol=1e-9)
+    np.testing.assert_allclose(laplacian.mass, np.linalg.norm(np.cross(b - a, c - a)) / 6.0)
     line = cloud_laplacian(np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0], [2.0, 4.0, 6.0]]))
     assert line.weak.nnz == 0

@@ -51,14 +51,14 @@ def least_in_numpy(points, heat):
 def test_the_utility_against_a_dense_solve(x64):
     points = sphere(150)
     utility = utility_of(HEAT, workers=1)
-    found = utility(cloud_of(points, 170))
-    assert float(found) == pytest.approx(-least_in_numpy(points, HEAT), rel=1e-9)
-    assert float(found) < -0.55
+    least = utility(cloud_of(points, 170))
+    assert float(least) == pytest.approx(-least_in_numpy(points, HEAT), rel=1e-9)
+    assert float(least) < -0.55
     for change in ({"power": 4.0}, {"duration": 2.0}, {"steps": 2}, {"initial": -1.0}, {"radius": 0.8}):
         other = dataclasses.replace(HEAT, **change)
         value = float(utility_of(other, workers=1)(cloud_of(points)))
         assert value == pytest.approx(-least_in_numpy(points, other), rel=1e-9)
-        assert abs(value - float(found)) > 1e-3
+        assert abs(value - float(least)) > 1e-3
 
 
 def test_a_source_alone_is_heated_as_by_the_authors():

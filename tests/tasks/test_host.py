@@ -43,9 +43,9 @@ def test_a_host_classifier_equals_the_one_in_jax_in_one_call_a_batch():
     }
     for name, (call, shapes, wanted) in calls.items():
         host = Host()
-        found = np.asarray(call(nbv.HostClassifier(host, 4)))
+        values = np.asarray(call(nbv.HostClassifier(host, 4)))
         assert host.shapes == shapes, name
-        np.testing.assert_allclose(found, wanted, atol=2e-5, err_msg=name)
+        np.testing.assert_allclose(values, wanted, atol=2e-5, err_msg=name)
 
 
 def test_a_host_classifier_of_a_large_batch_comes_back():
@@ -95,9 +95,7 @@ def test_a_segmenter_on_the_host_is_one_in_jax():
     scans = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[random_cloud(4, 6) for _ in range(5)])
     contexts = [context_of(score, cloud) for score in scores]
     del calls[:]
-    values = [
-        jax.vmap(lambda seen, s=s, c=c: score_of(s, c, seen))(scans) for s, c in zip(scores, contexts, strict=True)
-    ]
+    values = [jax.vmap(lambda one, s=s, c=c: score_of(s, c, one))(scans) for s, c in zip(scores, contexts, strict=True)]
     np.testing.assert_allclose(values[1], values[0], atol=1e-5)
     assert calls == [5], "all candidates in one call"
     assert scores[1].batch_size == 128

@@ -68,11 +68,11 @@ def certain(part):
 
 
 def test_it_saturates_for_a_part_that_is_found():
-    def gain(seen):
+    def gain(count):
         score = nbv.ExpectedUtilityImprovement(nbv.SoftPartCount(certain(2), 60.0))
-        return float(score_of(score, context_of(score, make_cloud(seen, 1000)), make_cloud(30, 30)))
+        return float(score_of(score, context_of(score, make_cloud(count, 1000)), make_cloud(30, 30)))
 
-    gains = [gain(seen) for seen in (1, 60, 200, 600)]
+    gains = [gain(count) for count in (1, 60, 200, 600)]
     assert gains[0] > gains[1] > gains[2] > gains[3]
     # tanh(31 / 60) - tanh(1 / 60), and less than a millionth away from 1 - 1.
     assert gains[0] == pytest.approx(np.tanh(31 / 60) - np.tanh(1 / 60), rel=1e-5)

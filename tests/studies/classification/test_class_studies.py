@@ -50,17 +50,17 @@ def test_first_views_of_trucks_are_random_and_told_apart_by_what_they_show():
 @pytest.mark.parametrize("kind", [HouseholdStudy, pytest.param(TruckStudy, marks=pytest.mark.slow)])
 def test_records_tables_charts_and_pictures(kind, tmp_path):
     """If the whole object tells its class, no pixels are counted."""
-    found = json.loads(json.dumps(run_scene(small_study(kind=kind), SCENE), allow_nan=False))
-    assert list(found["methods"]) == list(kind.methods)
-    assert found["label"] == SCENE % len(kind.objects.classes)
-    for held in found["methods"].values():
-        assert np.shape(held["log_p"])[1:] == (3, 10)
-        assert bool(held["pixels"]) == bool(kind.cue)
-    table = results([found], kind)
+    record = json.loads(json.dumps(run_scene(small_study(kind=kind), SCENE), allow_nan=False))
+    assert list(record["methods"]) == list(kind.methods)
+    assert record["label"] == SCENE % len(kind.objects.classes)
+    for method in record["methods"].values():
+        assert np.shape(method["log_p"])[1:] == (3, 10)
+        assert bool(method["pixels"]) == bool(kind.cue)
+    table = results([record], kind)
     assert ("seen" in {*table["quantity"]}) == bool(kind.cue)
     assert kind.title in summary(table, kind)
     assert chart(table, kind)[:4] == b"\x89PNG"
-    (picture,) = write_pictures([found], small_study(kind=kind), tmp_path, pixels=24)
+    (picture,) = write_pictures([record], small_study(kind=kind), tmp_path, pixels=24)
     with Image.open(picture) as image:
         assert np.asarray(image.convert("L")).std() > 5
 
@@ -76,14 +76,14 @@ def test_meshes_in_place_of_procedural_objects(tmp_path):
     box_files(tmp_path, "chair/a.off", "desk/b.obj")
     study = small_study(kind=HouseholdStudy, meshes=class_meshes(tmp_path, HOUSEHOLD))
     assert study.num_scenes == 2
-    found = run_scene(study, 1, ("farthest", "coverage"))
-    assert (found["label"], found["name"]) == (HOUSEHOLD.index("desk"), "desk b")
-    assert len({tuple(view["position"]) for view in found["methods"]["coverage"]["views"]}) == 3
-    seen = study.scene(1).task.scans[found["first"]].to_numpy()[0]
+    record = run_scene(study, 1, ("farthest", "coverage"))
+    assert (record["label"], record["name"]) == (HOUSEHOLD.index("desk"), "desk b")
+    assert len({tuple(view["position"]) for view in record["methods"]["coverage"]["views"]}) == 3
+    points = study.scene(1).task.scans[record["first"]].to_numpy()[0]
     # A box of sides 2.5, 1.25 and 0.625, with noise of 0.01.
-    away = np.abs(np.abs(seen) - [1.25, 0.625, 0.3125]).min(axis=1)
+    away = np.abs(np.abs(points) - [1.25, 0.625, 0.3125]).min(axis=1)
     assert away.max() < 0.06
-    (picture,) = write_pictures([found], study, tmp_path, pixels=24)
+    (picture,) = write_pictures([record], study, tmp_path, pixels=24)
     assert picture.exists()
     with pytest.raises(InputError, match="no scene 2: the study has 2 meshes"):
         run_scene(study, 2)
@@ -95,8 +95,8 @@ def test_a_network_of_ones_own_takes_the_place_of_the_shipped_one(tmp_path):
     network = InvariantClassifier(5, jax.random.key(0), groups=(20, 8))
     save_checkpoint(network, tmp_path / "mine.safetensors")
     box_files(tmp_path, "mango/mango_001/Scan/Scan.obj")
-    given = {"meshes": tmp_path, "classifier": tmp_path / "mine.safetensors"}
-    (study,) = OmniObject3DStudy.configured("screened", 2, True, **given).values()
+    settings = {"meshes": tmp_path, "classifier": tmp_path / "mine.safetensors"}
+    (study,) = OmniObject3DStudy.configured("screened", 2, True, **settings).values()
     assert study.scene(0).name == "mango mango_001"
     assert (study.classifier.num_points, study.imagined_classifier.num_points) == OmniObject3DStudy.network_points
     np.testing.assert_array_equal(study.classifier.network.head[1].bias, network.head[1].bias)
@@ -104,4 +104,4 @@ def test_a_network_of_ones_own_takes_the_place_of_the_shipped_one(tmp_path):
         HouseholdStudy.configured("screened", 2, True, classifier=tmp_path / "mine.safetensors")
     for name, word in (("meshes", "--classifier FILE"), ("classifier", "--meshes FOLDER.* lemon, mango")):
         with pytest.raises(InputError, match=f"nothing ships for the study omniobject3d: give {word}"):
-            OmniObject3DStudy.configured("screened", 2, True, **{name: given[name]})
+            OmniObject3DStudy.configured("screened", 2, True, **{name: settings[name]})

@@ -83,9 +83,9 @@ def test_a_record_is_json_and_holds_every_method():
     assert record["label"] == int(pyramid.label)
     places = [tuple(place) for place in np.asarray(SphereCandidates(CANDIDATES).poses().position).tolist()]
     for name, method in record["methods"].items():
-        taken = [tuple(view["position"]) for view in method["views"]]
-        assert len({*taken}) == 3
-        assert {*taken} <= {*places}
+        positions = [tuple(view["position"]) for view in method["views"]]
+        assert len({*positions}) == 3
+        assert {*positions} <= {*places}
         assert np.shape(method["log_p"]) == (8 if name == "random" else 1, 3, 5)
         assert np.shape(method["pixels"]) == np.shape(method["log_p"])[:2]
         np.testing.assert_allclose(np.exp(method["log_p"]).sum(axis=-1), 1.0, atol=1e-5)
@@ -102,9 +102,9 @@ def test_the_first_view_is_that_of_all_methods_and_shows_no_pattern_but_somethin
     record = whole_record()
     assert {chosen(small_study(), method)[0] for method in record["methods"].values()} == {record["first"]}
     pyramid, poses = pyramid_scene(Split.TEST, SCENE), SphereCandidates(CANDIDATES).poses()
-    _, seen = scan_cue(pyramid, CAMERA, poses)
-    pixels = np.asarray(jnp.sum(pyramid.on_cue(seen.points) & seen.mask, axis=-1))
-    assert pixels[record["first"]] == 0 < int(seen.count[record["first"]])
+    _, num_pixels = scan_cue(pyramid, CAMERA, poses)
+    pixels = np.asarray(jnp.sum(pyramid.on_cue(num_pixels.points) & num_pixels.mask, axis=-1))
+    assert pixels[record["first"]] == 0 < int(num_pixels.count[record["first"]])
     for method in record["methods"].values():
         np.testing.assert_allclose(method["pixels"][0], pixels[chosen(small_study(), method)], atol=1)
     outward = -np.asarray(pyramid.solid.rotation)[:, 2]
@@ -126,14 +126,14 @@ def test_every_choice_is_the_one_that_the_planner_proposes_with_the_same_key():
     """Each method's planner by `propose` alone, at each view of its run. For random search, the first run."""
     study, record = small_study(), whole_record()
     scene, places = study.scene(SCENE), np.asarray(study.candidates.poses().position)
-    for method, held in record["methods"].items():
-        planner, taken = study.planner(method, scene), chosen(study, held)
+    for method, run in record["methods"].items():
+        planner, indices = study.planner(method, scene), chosen(study, run)
         for view in (1, 2):
-            observations = observations_of(study, planner, scene, taken[:view])
+            observations = observations_of(study, planner, scene, indices[:view])
             proposed = planner.propose(
                 observations, step_key(study, view, 0 if method == "random" else None)
             ).pose.position
-            np.testing.assert_allclose(places[taken[view]], proposed, atol=1e-6, err_msg=method)
+            np.testing.assert_allclose(places[indices[view]], proposed, atol=1e-6, err_msg=method)
 
 
 def test_the_oracle_values_true_scans():
@@ -151,10 +151,10 @@ def test_the_oracle_values_true_scans():
 
 def test_answers_are_the_classifiers_of_all_that_was_seen():
     study, method = small_study(), whole_record()["methods"]["coverage"]
-    scene, taken = study.scene(SCENE), chosen(small_study(), whole_record()["methods"]["coverage"])
+    scene, indices = study.scene(SCENE), chosen(small_study(), whole_record()["methods"]["coverage"])
     planner = study.planner("coverage", scene)
     for count in (1, 2, 3):
-        observations = observations_of(study, planner, scene, taken[:count])
+        observations = observations_of(study, planner, scene, indices[:count])
         np.testing.assert_allclose(method["log_p"][0][count - 1], study.classifier(observations.cloud), atol=1e-5)
 
 
@@ -168,8 +168,8 @@ def test_a_method_of_ones_own_sees_what_others_see_from_a_candidate(tmp_path):
     ours, farthest = record["methods"]["mine:own"], whole_record()["methods"]["farthest"]
     np.testing.assert_allclose(ours["log_p"], farthest["log_p"], atol=1e-5)
     assert ours["pixels"] == farthest["pixels"]
-    for shown in (record, whole_record()):
-        (path,) = write_pictures([shown], study, tmp_path, pixels=24)
+    for one in (record, whole_record()):
+        (path,) = write_pictures([one], study, tmp_path, pixels=24)
         assert path == tmp_path / f"scene_{SCENE:04d}.png"
         with Image.open(path) as image:
             assert np.asarray(image.convert("L")).std() > 5

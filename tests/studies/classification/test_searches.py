@@ -32,14 +32,14 @@ def record():
 
 def test_a_search_that_climbs_from_the_candidates_finds_no_less_and_one_with_fewer_samples_no_more():
     """At the second view all have the same samples."""
-    value = {method: held["steps"][0]["value"] for method, held in record()["methods"].items()}
+    value = {method: run["steps"][0]["value"] for method, run in record()["methods"].items()}
     assert {*value} == {*SEARCHES}
     assert value["halving"] <= value["cross-entropy"] + 1e-5
     assert value["hybrid"] >= value["cross-entropy"] - 1e-5
 
 
 def test_each_search_keeps_to_its_poses():
-    poses = {method: poses_of(held)[1:] for method, held in record()["methods"].items()}
+    poses = {method: poses_of(run)[1:] for method, run in record()["methods"].items()}
     assert all(len(views) == VIEWS - 1 for views in poses.values())
     candidates = np.asarray(study().candidates.poses().position)
     for method in ("cross-entropy", "halving"):
@@ -58,6 +58,6 @@ def test_each_search_keeps_to_its_poses():
 
 
 def test_what_is_recorded_is_what_the_classifier_says_of_the_views():
-    scene, held = study().scene(SCENE), record()["methods"]["gradient-2dof"]
-    clouds = [observations.cloud for _, observations in replay(study(), scene, held)]
-    np.testing.assert_allclose(held["log_p"][0], [Linear()(cloud) for cloud in clouds], atol=1e-4)
+    scene, run = study().scene(SCENE), record()["methods"]["gradient-2dof"]
+    clouds = [observations.cloud for _, observations in replay(study(), scene, run)]
+    np.testing.assert_allclose(run["log_p"][0], [Linear()(cloud) for cloud in clouds], atol=1e-4)

@@ -18,8 +18,10 @@ POINTS, MANY, ODD = ToyStudy.measures
 
 
 def record(scene, **methods):
-    held = {name: made if isinstance(made, dict) else {"points": made} for name, made in methods.items()}
-    return {"scene": scene, "methods": held}
+    runs = {
+        name: measures if isinstance(measures, dict) else {"points": measures} for name, measures in methods.items()
+    }
+    return {"scene": scene, "methods": runs}
 
 
 RECORDS = [
@@ -32,16 +34,16 @@ def measuring(*measures, claims=()):
     return type("Measuring", (ToyStudy,), {"measures": measures, "claims": claims})
 
 
-def row_of(found, quantity, at, method, group="all"):
-    same = (found["group"] == group) & (found["quantity"] == quantity)
-    (row,) = found[same & (found["at"] == at) & (found["method"] == method)].to_dict("records")
+def row_of(table, quantity, at, method, group="all"):
+    same = (table["group"] == group) & (table["quantity"] == quantity)
+    (row,) = table[same & (table["at"] == at) & (table["method"] == method)].to_dict("records")
     return row
 
 
 def test_rows_are_means_with_errors_intervals_and_leads():
-    found = results(RECORDS, ToyStudy)
-    assert {*found["group"]} == {"all", "even", "odd"}
-    ours, theirs = (row_of(found, "points", 2, method) for method in ("farthest", "random"))
+    table = results(RECORDS, ToyStudy)
+    assert {*table["group"]} == {"all", "even", "odd"}
+    ours, theirs = (row_of(table, "points", 2, method) for method in ("farthest", "random"))
     # Points of 3,500 and 3,100: a standard deviation of 400 / sqrt(2), divided by sqrt(2).
     assert (ours["mean"], ours["standard_error"], ours["scenes"], ours["by"]) == (
         3300.0,
@@ -52,8 +54,8 @@ def test_rows_are_means_with_errors_intervals_and_leads():
     # Two scenes have four resamples, each of one scene twice in a quarter of them.
     assert (ours["low"], ours["high"]) == (3100.0, 3500.0)
     assert (theirs["lead"], theirs["lead_low"], theirs["lead_high"]) == (1000.0, 500.0, 1500.0)
-    assert row_of(found, "many", 3, "random")["mean"] == 0.5
-    alone = row_of(found, "points", 2, "random", "odd")
+    assert row_of(table, "many", 3, "random")["mean"] == 0.5
+    alone = row_of(table, "points", 2, "random", "odd")
     assert (alone["mean"], alone["scenes"], pd.isna(alone["standard_error"])) == (2600.0, 1, True)
     with pytest.raises(InputError, match="no records"):
         results([], ToyStudy)
@@ -63,21 +65,21 @@ def test_scenes_without_a_value_are_left_out_of_a_number():
     def gaps(record, method):
         return [1.0, None if record["scene"] == 0 and method == "random" else 2.0 + record["scene"]]
 
-    found = results(
+    table = results(
         RECORDS, measuring(Measure("gaps", "Gaps", gaps), Measure("none", "None", lambda r, m: [None]), ODD)
     )
-    assert {row_of(found, "gaps", 1, method)["scenes"] for method in ("farthest", "random")} == {2}
+    assert {row_of(table, "gaps", 1, method)["scenes"] for method in ("farthest", "random")} == {2}
     # The comparison uses the one scene that both have.
-    two = [row_of(found, "gaps", 2, method) for method in ("farthest", "random")]
+    two = [row_of(table, "gaps", 2, method) for method in ("farthest", "random")]
     assert [(row["scenes"], row["mean"]) for row in two] == [(1, 3.0)] * 2
     # A method without values has no row.
-    assert [*found[(found["quantity"] == "odd") & (found["group"] == "all")]["method"]] == ["random"]
-    assert "none" not in {*found["quantity"]}
+    assert [*table[(table["quantity"] == "odd") & (table["group"] == "all")]["method"]] == ["random"]
+    assert "none" not in {*table["quantity"]}
 
 
 def test_tables_show_shares_errors_and_leads():
-    found = results(RECORDS, ToyStudy)
-    lines = [" ".join(line.split()) for line in summary(found, ToyStudy).splitlines()]
+    table = results(RECORDS, ToyStudy)
+    lines = [" ".join(line.split()) for line in summary(table, ToyStudy).splitlines()]
     assert "Points of a ball: 2 scenes" in lines
     assert "farthest 900.0 +- 100.0* 3300.0 +- 200.0* 4500.0 +- 500.0*" in lines
     assert "random 900.0 +- 100.0* 2300.0 +- 300.0 2800.0 +- 300.0" in lines

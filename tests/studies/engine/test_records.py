@@ -10,25 +10,25 @@ from jaxnbv.studies.engine.records import RecordFolder
 
 
 def test_records_are_kept_and_the_missing_ones_made(tmp_path):
-    asked = []
+    calls = []
 
     def run(index):
-        asked.append(index)
-        if index == 2 and len(asked) == 3:
+        calls.append(index)
+        if index == 2 and len(calls) == 3:
             raise KeyboardInterrupt
         return {"scene": index, "value": 0.1 * index}
 
     config = {"views": 3, "radii": (1, 2)}
     with pytest.raises(KeyboardInterrupt):
         RecordFolder(tmp_path / "a" / "b", config).collect(range(4), run, progress=False)
-    found = RecordFolder(tmp_path / "a" / "b", config).collect(range(4), run, progress=False)
-    assert asked == [0, 1, 2, 2, 3]
-    assert found == [{"scene": index, "value": 0.1 * index} for index in range(4)]
-    assert RecordFolder(tmp_path / "a" / "b", config).collect(range(2), run, progress=False) == found[:2]
-    assert len(asked) == 5
+    records = RecordFolder(tmp_path / "a" / "b", config).collect(range(4), run, progress=False)
+    assert calls == [0, 1, 2, 2, 3]
+    assert records == [{"scene": index, "value": 0.1 * index} for index in range(4)]
+    assert RecordFolder(tmp_path / "a" / "b", config).collect(range(2), run, progress=False) == records[:2]
+    assert len(calls) == 5
     (tmp_path / "a" / "b" / "scene_0001.json").unlink()
-    assert RecordFolder(tmp_path / "a" / "b", config).collect(range(4), run, progress=False) == found
-    assert asked[5:] == [1]
+    assert RecordFolder(tmp_path / "a" / "b", config).collect(range(4), run, progress=False) == records
+    assert calls[5:] == [1]
 
 
 def test_folders_of_another_study_are_refused(tmp_path):
@@ -94,14 +94,14 @@ def test_records_of_several_folders_are_joined(tmp_path):
     with pytest.warns(UserWarning, match="cores: 77 there"):
         joined.join([tmp_path / "a", tmp_path / "b"])
     assert json.loads((tmp_path / "joined" / "study.json").read_text())["versions"]["cores"] == 77
-    asked = []
+    calls = []
     with pytest.warns(UserWarning, match="cores: 77 there"):
-        records = joined.collect(range(5), lambda index: asked.append(index) or record(index), progress=False)
+        records = joined.collect(range(5), lambda index: calls.append(index) or record(index), progress=False)
     assert records == [record(0), record(1), record(2), record(3, 2.0), record(4)]
-    assert asked == [4]
+    assert calls == [4]
     # Joining a folder again changes nothing.
     joined.join([tmp_path / "a"])
-    assert joined.collect(range(5), asked.append, progress=False) == records
+    assert joined.collect(range(5), calls.append, progress=False) == records
 
 
 def test_folders_that_do_not_belong_together_are_not_joined(tmp_path):
@@ -125,8 +125,8 @@ def test_folders_that_do_not_belong_together_are_not_joined(tmp_path):
 
 
 def test_keys_that_are_numbers_are_read_as_text(tmp_path):
-    found = RecordFolder(tmp_path, {}).collect(range(1), lambda index: {"by view": {10: 1.5, 9: 0.5}}, progress=False)
-    assert found == [{"by view": {"10": 1.5, "9": 0.5}}]
+    records = RecordFolder(tmp_path, {}).collect(range(1), lambda index: {"by view": {10: 1.5, 9: 0.5}}, progress=False)
+    assert records == [{"by view": {"10": 1.5, "9": 0.5}}]
 
 
 def test_a_study_that_fails_at_once_does_not_bind_its_folder(tmp_path):

@@ -59,9 +59,9 @@ def test_a_record_is_json_and_methods_share_the_first_view():
 def test_the_same_views_are_scanned_again_from_a_record():
     study = small()
     scene, run = study.scene(0), run_scene(study, 0)["methods"]["farthest"]
-    seen = replay(study, scene, run)
-    assert [int(observations.cloud.count) for _, observations in seen] == run["points"]
-    scans = [scan for scan, _ in seen]
+    steps = replay(study, scene, run)
+    assert [int(observations.cloud.count) for _, observations in steps] == run["points"]
+    scans = [scan for scan, _ in steps]
     assert int(scans[0].count) + int(scans[1].count) == run["points"][1]
     # The scans have noise.
     distance = np.abs(np.linalg.norm(scans[0].to_numpy()[0], axis=1) - 1.0)
@@ -86,15 +86,15 @@ def test_a_study_takes_the_views_of_a_simulation():
 
 
 def test_a_method_of_ones_own_stands_in_the_same_record():
-    study, asked = small(), []
+    study, calls = small(), []
 
     def above(study, scene) -> Planner:
-        asked.append(scene.index)
+        calls.append(scene.index)
         poses = look_at(jnp.array([[0.0, 2.5, 0.1], [0.0, -2.5, 0.1], [0.1, 2.5, 0.0]]))
         return study.planner_of(Coverage(), RandomView(GivenPoses(poses)), scene)
 
     record = run_scene(study, 2, ["random"], {"mine:above": above})
-    assert asked == [2]
+    assert calls == [2]
     assert list(record["methods"]) == ["random", "mine:above"]
     own = record["methods"]["mine:above"]
     assert own["views"][0] == record["methods"]["random"]["views"][0]

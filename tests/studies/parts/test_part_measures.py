@@ -37,14 +37,14 @@ def test_the_share_by_view_is_of_the_middle_target():
 
 @given(st.lists(st.lists(st.integers(0, 130), min_size=3, max_size=3), min_size=1, max_size=6), st.integers(1, 120))
 def test_discovery_is_the_first_view_with_enough_of_every_part(counts, target):
-    found = discovery_time(np.array(counts), target)
+    time = discovery_time(np.array(counts), target)
     enough = [min(row) >= target for row in counts]
-    if found is None:
+    if time is None:
         assert not any(enough)
     else:
-        assert enough[found - 1]
-        assert not any(enough[: found - 1])
+        assert enough[time - 1]
+        assert not any(enough[: time - 1])
         # A higher target is not reached sooner, and later views do not matter.
         later = discovery_time(np.array(counts), target + 10)
-        assert later is None or later >= found
-        assert discovery_time(np.array(counts[:found]), target) == found
+        assert later is None or later >= time
+        assert discovery_time(np.array(counts[:time]), target) == time

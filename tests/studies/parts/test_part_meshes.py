@@ -57,8 +57,8 @@ def small_study(folder, **settings):
 
 
 def test_files_of_one_node_are_passed_over(folder):
-    found = MeshPartStudy.files_in(folder)
-    assert [(file.name, file.path) for file in found] == [
+    files = MeshPartStudy.files_in(folder)
+    assert [(file.name, file.path) for file in files] == [
         ("table a", str(folder / "table/a.glb")),
         ("table b", str(folder / "table/b.glb")),
     ]

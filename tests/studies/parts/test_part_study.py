@@ -81,8 +81,8 @@ def scans(record, method):
 
 def clouds(record, method, capacity=600):
     cloud = None
-    for seen in scans(record, method):
-        cloud = limit_capacity(seen if cloud is None else concatenate(cloud, seen), capacity)
+    for one in scans(record, method):
+        cloud = limit_capacity(one if cloud is None else concatenate(cloud, one), capacity)
         yield cloud
 
 
@@ -108,12 +108,12 @@ def test_every_choice_is_the_one_that_the_planner_proposes_with_the_same_key(met
     planner = study.planner(method, study.scene(SCENE))
     views = [pose_of(view) for view in record["methods"][method]["views"]]
     observations = None
-    for index, (pose, seen) in enumerate(zip(views, scans(record, method), strict=True)):
+    for index, (pose, cloud) in enumerate(zip(views, scans(record, method), strict=True)):
         if observations is not None:
             key = jax.random.split(jax.random.fold_in(study.key(SCENE, "episode"), index))[0]
             np.testing.assert_allclose(planner.propose(observations, key).pose.position, pose.position, atol=1e-6)
-        told = pose, seen, study.camera
-        observations = planner.init(*told) if observations is None else planner.observe(observations, *told)
+        inputs = pose, cloud, study.camera
+        observations = planner.init(*inputs) if observations is None else planner.observe(observations, *inputs)
 
 
 def test_each_method_has_its_search_and_score():

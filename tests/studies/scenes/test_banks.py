@@ -70,9 +70,11 @@ def test_meshes_are_stored_to_their_quantum(tmp_path):
     solid = sdf.solid_of_mesh(mesh.vertices, mesh.faces, 24, cubic=True)
     bank = nbv.ShapeBank.of([solid, solid], ["a", "b"])
     write_bank(tmp_path / "bank.npz", bank)
-    found = read_bank(tmp_path / "bank.npz", solid)
-    assert found.names == ("a", "b")
-    np.testing.assert_allclose(found.shapes.solid.values, np.clip(bank.shapes.solid.values, -1.016, 1.016), atol=0.0041)
+    stored = read_bank(tmp_path / "bank.npz", solid)
+    assert stored.names == ("a", "b")
+    np.testing.assert_allclose(
+        stored.shapes.solid.values, np.clip(bank.shapes.solid.values, -1.016, 1.016), atol=0.0041
+    )
 
 
 def test_another_name_is_refused():

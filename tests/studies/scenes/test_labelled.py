@@ -59,7 +59,7 @@ def oracle(solid, x):
     centre, rotation, half, rounding, radius, slant, revolved, labels = (
         np.asarray(getattr(solid, name), np.float64) for name in FIELDS
     )
-    found = np.full((len(x), CAPACITY), np.inf)
+    distances = np.full((len(x), CAPACITY), np.inf)
     for k in np.flatnonzero(labels >= 0):
         own, core, stretch = (x - centre[k]) @ rotation[k], half[k] - rounding[k], 1.0
         if revolved[k]:
@@ -68,8 +68,8 @@ def oracle(solid, x):
             stretch = np.linalg.norm([[1.0, -slant[k]], [0.0, 1.0]], ord=2)
         outside = np.linalg.norm(own - np.clip(own, -core, core), axis=1)
         within = np.min(core - np.abs(own), axis=1)
-        found[:, k] = (np.where(outside > 0, outside, -within) - rounding[k]) / stretch
-    return found
+        distances[:, k] = (np.where(outside > 0, outside, -within) - rounding[k]) / stretch
+    return distances
 
 
 def test_distances_are_those_of_the_formulas(x64):
@@ -109,8 +109,8 @@ def test_special_cases_have_closed_forms(name, x64):
     primitives, expected, longest = CLOSED[name]
     scale = 2.5 / longest
     x = points()
-    _, found, label = evaluate(assemble(primitives), x)
-    np.testing.assert_allclose(found, scale * expected(x / scale), atol=1e-6)
+    _, distance, label = evaluate(assemble(primitives), x)
+    np.testing.assert_allclose(distance, scale * expected(x / scale), atol=1e-6)
     np.testing.assert_array_equal(label, 3)
 
 
@@ -146,11 +146,11 @@ def test_one_program_scans_any_solid(compilations):
         return hits, solid.part_labels(hits.points)
 
     solids = [random_solid(count, 0.6) for count in (3, 11, CAPACITY)]
-    seen = [look(solids[0])]
+    clouds = [look(solids[0])]
     compilations.clear()
-    seen += [look(solid) for solid in solids[1:]]
+    clouds += [look(solid) for solid in solids[1:]]
     assert not compilations
-    for solid, (hits, label) in zip(solids, seen, strict=True):
+    for solid, (hits, label) in zip(solids, clouds, strict=True):
         mask = np.asarray(hits.mask)
         distances = np.abs(oracle(solid, np.asarray(hits.points, np.float64)[mask]))
         assert mask.sum() > 20

@@ -43,10 +43,10 @@ def surface_labels(solid, mesh):
 def test_every_part_shows_and_no_other(category):
     parts = CATEGORIES[category_index(category)].labels
     for solid, mesh in objects(category):
-        shown, share = np.unique(surface_labels(solid, mesh)[1], return_counts=True)
-        assert set(shown.tolist()) == present(solid) <= set(parts)
+        labels, share = np.unique(surface_labels(solid, mesh)[1], return_counts=True)
+        assert set(labels.tolist()) == present(solid) <= set(parts)
         assert share.min() >= 0.015 * 6000
-        assert len(shown) >= 2
+        assert len(labels) >= 2
 
 
 @pytest.mark.parametrize("category", PART_CATEGORIES)
@@ -69,12 +69,12 @@ def parameters(solid):
 
 
 def test_categories_take_turns_and_no_two_scenes_are_the_same_in_any_split():
-    count, seen = 2 * len(PART_CATEGORIES), []
+    count, scenes = 2 * len(PART_CATEGORIES), []
     for split in Split:
         for index in range(count):
             scene = part_scene(split, index)
             assert CATEGORIES[int(scene.category)].name == PART_CATEGORIES[index % len(PART_CATEGORIES)]
             assert set(np.flatnonzero(scene.parts).tolist()) == present(scene.solid)
-            seen.append(parameters(scene.solid))
-    assert len(np.unique(np.stack(seen).round(4), axis=0)) == 3 * count
-    np.testing.assert_array_equal(parameters(part_scene(Split.TEST, count - 1).solid), seen[-1])
+            scenes.append(parameters(scene.solid))
+    assert len(np.unique(np.stack(scenes).round(4), axis=0)) == 3 * count
+    np.testing.assert_array_equal(parameters(part_scene(Split.TEST, count - 1).solid), scenes[-1])

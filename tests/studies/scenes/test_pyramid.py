@@ -239,11 +239,11 @@ def test_a_hidden_view_does_not_show_the_pattern():
         assert np.min(away, axis=1).max() < 1e-6
         assert len({*np.argmin(away, axis=1)}) > 2
         for pose in drawn:
-            seen = scan(SDFSurface(pyramid), CAMERA, pose).to_numpy()[0]
+            points = scan(SDFSurface(pyramid), CAMERA, pose).to_numpy()[0]
             offset, rotation, scale = map(
                 np.asarray, (pyramid.solid.offset, pyramid.solid.rotation, pyramid.solid.scale)
             )
-            own = (seen - offset) @ rotation / scale
+            own = (points - offset) @ rotation / scale
             assert len(own) > 100
             # Only base or sides are visible: all hits above the base lie on a slanted plane.
             above = own[own[:, 2] > 5e-3]

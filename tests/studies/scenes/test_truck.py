@@ -15,8 +15,8 @@ CAMERA = nbv.Camera(height=40, width=40)
 
 @eqx.filter_jit
 def cargo_pixels(scene, poses):
-    seen = nbv.scan(nbv.SDFSurface(scene), CAMERA, poses)
-    return jnp.sum(scene.on_cue(seen.points) & seen.mask, axis=-1), jnp.sum(seen.mask, axis=-1)
+    clouds = nbv.scan(nbv.SDFSurface(scene), CAMERA, poses)
+    return jnp.sum(scene.on_cue(clouds.points) & clouds.mask, axis=-1), jnp.sum(clouds.mask, axis=-1)
 
 
 @eqx.filter_jit
@@ -56,11 +56,11 @@ def test_the_cargo_shows_from_above_alone():
         up = up_of(scene)
         side = np.asarray(scene.solid.rotation[0][:, 2])
         poses = nbv.look_at(2.5 * np.stack([up, -up, 0.95 * side - 0.3 * up]), up=side + 0.3 * up)
-        pixels, seen = cargo_pixels(scene, poses)
+        pixels, clouds = cargo_pixels(scene, poses)
         assert pixels[0] >= 40
         assert pixels[1] == 0
-        assert pixels[2] < 0.1 * seen[2]
-        assert pixels[0] < 0.5 * seen[0]
+        assert pixels[2] < 0.1 * clouds[2]
+        assert pixels[0] < 0.5 * clouds[0]
 
 
 def test_scenes_take_turns_are_the_same_each_time_and_differ_between_splits():

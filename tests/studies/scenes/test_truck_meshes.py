@@ -25,11 +25,11 @@ CARGO = {"foot": ((0.0, 0.2, 0.0), (0.3, 0.4, 0.3)), "top": ((0.0, 0.5, 0.0), (0
 
 
 def boxes(parts):
-    made = [
+    meshes = [
         trimesh.creation.box(extents, trimesh.transformations.translation_matrix(center))
         for center, extents in parts.values()
     ]
-    return trimesh.util.concatenate(made)
+    return trimesh.util.concatenate(meshes)
 
 
 def mesh(parts):
