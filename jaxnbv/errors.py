@@ -33,7 +33,7 @@ class InputError(ValueError):
 
 
 def suggestion(name: str, names: Iterable[str]) -> str:
-    """The question whether the nearest of some names was meant, with a space before it; "" if none is near."""
+    """A question that suggests the nearest of some names, after a space. "" if none is near."""
     by_lower = {one.lower(): one for one in names}
     near = difflib.get_close_matches(name.lower(), by_lower, n=1)
     return f" Did you mean {by_lower[near[0]]!r}?" if near else ""

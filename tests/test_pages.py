@@ -122,7 +122,7 @@ def as_before():
 @pytest.mark.usefixtures("as_before")
 @pytest.mark.parametrize("page", PROGRAMS)
 def test_the_program_of_a_page_runs(page, tmp_path, monkeypatch):
-    """As written, except for sizes. Reports have their own tests."""
+    """The program is as written, except for sizes. Reports have their own tests."""
     monkeypatch.chdir(tmp_path)
     BEFORE.get(page, lambda _: None)(monkeypatch)
     reported = []
@@ -147,7 +147,7 @@ LESS = {
 
 
 def test_the_script_of_the_readme_runs(tmp_path, monkeypatch):
-    """As written, except for sizes, with a scan that has only points."""
+    """The script is as written, except for sizes, with a scan that has only points."""
     monkeypatch.chdir(tmp_path)
     trimesh.creation.icosphere().export("spot.obj")
     script = blocks("../README.md")[0]
@@ -172,7 +172,7 @@ def test_the_script_of_the_readme_runs(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_the_block_of_episodes_runs():
-    """With two of 64 scenes, and two views."""
+    """Two of 64 scenes, and two views."""
     block = blocks("../README.md")[1].replace("64", "2").replace("views=5", "views=2")
     variables = {"nbv": nbv, "jax": jax, "planner": smaller()(nbv.NewSurface(), nbv.DiscreteSearch(12))}
     exec(compile(block, "README.md", "exec"), variables)

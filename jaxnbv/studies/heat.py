@@ -174,6 +174,10 @@ class HeatStudy(Study):
         return bool((np.linalg.norm(points - np.asarray(scene.task), axis=1) <= HeatProblem.radius).any())
 
     def truth(self, scene: Scene) -> Truth:
+        """Temperatures on the true surface.
+
+        **Raises:** `ValueError` unless the surface is a mesh or a signed distance.
+        """
         surface = scene.surface
         mesh = mesh_from_sdf(surface.sdf, self.true_grid) if isinstance(surface, SDFSurface) else surface
         if not isinstance(mesh, TriangleMesh):

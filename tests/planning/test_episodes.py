@@ -67,7 +67,7 @@ def assert_equal(together, alone, acquisition):
 
 
 def test_episodes_are_those_of_simulate(compilations):
-    """With a first pose for each episode or one for all. One program runs any number of views."""
+    """The first pose is for each episode, or one for all. One program runs any number of views."""
     together = nbv.episodes(COVERAGE, BALLS, POSES, 3, KEYS)
     assert_equal(together, one_by_one(COVERAGE, BALLS, POSES, 3, KEYS), COVERAGE.acquisition)
     assert len(np.unique(np.asarray(together.poses.position).reshape(-1, 3), axis=0)) > 5

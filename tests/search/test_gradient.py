@@ -129,7 +129,7 @@ def test_the_known_maximum_is_found(name, direction):
     assert float(proposal.value) > float(proposal.values[: SEARCHES[name].num_starts].max()) + 0.01
     position = np.asarray(proposal.pose.position, np.float64)
     if name != "6-DOF":
-        # With constraints the gaze can compensate for a small error of the position.
+        # The gaze of constrained poses can compensate for a small error of the position.
         angle = {"constrained": 10.0}.get(name, 4.0)
         assert position @ direction / np.linalg.norm(position) > np.cos(np.radians(angle))
         assert np.linalg.norm(position) == pytest.approx(distance, abs=0.15)

@@ -160,7 +160,7 @@ def test_a_first_view_that_fails_does_not_bind_its_folder(tmp_path, finished):
 
 
 def test_a_record_without_views_binds_nobody(tmp_path, finished):
-    """As after a run that was killed between the two files."""
+    """A run that was killed between the two files leaves such a folder."""
     run(tmp_path, views=1, key=jax.random.key(9))
     for name in ("view_00.npz", "end_00.npz", "cloud.ply"):
         (tmp_path / name).unlink()

@@ -53,7 +53,7 @@ def test_a_step_has_derivatives_where_nothing_is_turned():
 
 
 def test_free_rotations_leave_no_gap():
-    """As many random rotations would leave gaps. The spiral has a rotation within 15 degrees of any other."""
+    """The spiral has a rotation within 15 degrees of any other. The same number of random ones would leave gaps."""
     rotations = nbv.surfaces.FreeRotation().rotations(4096)
     np.testing.assert_allclose(
         rotations @ np.swapaxes(rotations, 1, 2), np.broadcast_to(np.eye(3), (4096, 3, 3)), atol=1e-12

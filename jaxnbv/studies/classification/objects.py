@@ -68,7 +68,10 @@ class PyramidStudy(ClassificationStudy):
         return super().scene_record(scene, truth, first) | {"angle": float(np.degrees(np.arccos(cosine)))}
 
     def first_view(self, scene: Scene) -> int:
-        """Index of a random candidate that hides the pattern but shows enough, see `shows_enough`."""
+        """Index of a random candidate that hides the pattern but shows enough, see `shows_enough`.
+
+        **Raises:** `ValueError` if no candidate shows enough.
+        """
         scans = scene.task.scans
         enough = [self.shows_enough(scene, scans[index]) for index in range(self.num_candidates)]
         require(any(enough), f"none of {self.num_candidates} candidates shows enough of {scene.name}: ask for more")

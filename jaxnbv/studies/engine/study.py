@@ -242,7 +242,7 @@ class Study(eqx.Module):
         return jax.random.fold_in(scene_key, _PURPOSES.index(purpose))
 
     def episode_keys(self, method: str, scene: Scene) -> list[PRNGKeyArray]:
-        """The keys of a method's episodes: one, which all methods share, or several to be merged by `merge_runs`."""
+        """Keys of a method's episodes: one that all methods share, or several for `merge_runs`."""
         return [self.key(scene.index, "episode")]
 
     def merge_runs(self, runs: Sequence[Record]) -> Record:

@@ -147,7 +147,7 @@ def test_counts_are_those_of_the_segmenter_on_all_that_was_seen():
 
 
 def test_a_run_stops_once_every_part_has_the_largest_target():
-    """With a segmenter that gives the parts equal shares once there are more points than in the first view."""
+    """The segmenter gives the parts equal shares once there are more points than in the first view."""
     first = int(next(scans(whole_record(), "farthest")).count)
     study = small_study(first + 1, capacity=4096)
     study = eqx.tree_at(lambda s: s.segmenter, study, CloudSegmenter(study.segmenter.network, 0, 2048, scale=0.8))

@@ -79,7 +79,7 @@ def test_the_study_counts_the_rays_that_hit_the_cargo(tmp_path):
     scene = study.scene(0)
     assert scene.name == "table one"
     assert scene.task.label == study.objects.classes.index("table")
-    # With the truck alone: hits in front of it, or beside it, are on the cargo.
+    # Hits in front of the truck alone, or beside it, are on the cargo.
     faces = scene.surface.faces[: len(boxes(TRUCK).faces)]
     alone = TriangleMesh(scene.surface.vertices, faces, scene.surface.frame)
     poses = study.candidates.poses()
