@@ -171,7 +171,7 @@ class RecordedStudy(Study):
         """
         require(
             "num_candidates" not in options,
-            f"--candidates {options.get('num_candidates')}: the candidates are the frames of the recording: leave it out",
+            f"--candidates {options.get('num_candidates')}: candidates are the frames of the recording: leave it out",
         )
         require(model in MODELS, f"a recording has no known shapes: give one of the models {', '.join(MODELS)}")
         folder = str(Path(options["folder"]).resolve())
