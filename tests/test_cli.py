@@ -1,4 +1,4 @@
-"""The command line: one call of each kind as a user makes it, in a process of its own, the others in this process."""
+"""The command line as a user calls it: one call of each kind in its own process, and the others in this process."""
 
 import gc
 import json
@@ -29,7 +29,7 @@ from jaxnbv.viz import Sketches
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    """A folder in which `jaxnbv demo --quick` has run, and what it printed."""
+    """A folder in which `jaxnbv demo --quick` has run, and its output."""
     folder = tmp_path_factory.mktemp("demo")
     result = run_process("demo", "--quick", "--known", "none", "--views", "2", cwd=folder)
     assert result.returncode == 0, result.stderr
@@ -42,7 +42,7 @@ def test_demo_leaves_an_episode_and_a_report(finished):
     names = {path.name for path in out.iterdir()}
     assert {"episode.json", "view_00.npz", "view_01.npz", "cloud.ply", "report.html"} <= names
     assert "view 2" in result.stdout
-    # Probabilities before and after: the likeliest three in a line after each view.
+    # Probabilities before and after: the likeliest three on a line after each view.
     lines = [line for line in result.stdout.splitlines() if line.count(" %") >= 3]
     assert [line.count("(was ") for line in lines] == [0, 3]
     assert max(map(len, result.stdout.splitlines())) <= 100
@@ -75,7 +75,7 @@ def test_equal_warnings_are_printed_once_with_their_number(tmp_path, monkeypatch
     def play(*arguments, **settings):
         for place in ("here", "there", "here", "here"):
             warnings.warn(f"the mesh is {place}", stacklevel=2)
-            # What libraries do, after which Python's own filter prints all again.
+            # Libraries do this, and then Python's own filter prints every warning again.
             with warnings.catch_warnings():
                 warnings.simplefilter("always")
 
@@ -96,15 +96,15 @@ def test_the_same_command_continues_with_more_views(finished):
     folder, _ = finished
     out = folder / "runs" / "truck-cross-entropy-halving-seed2"
     before = {path.name: path.read_bytes() for path in out.glob("view_*.npz")}
-    asked = ("--quick", "--known", "none", "--views", "3", "--until", "never", "--no-report")
-    result = run_command("demo", *asked, cwd=folder)
+    options = ("--quick", "--known", "none", "--views", "3", "--until", "never", "--no-report")
+    result = run_command("demo", *options, cwd=folder)
     assert result.returncode == 0, result.stderr
     assert (out / "view_02.npz").exists()
     assert all((out / name).read_bytes() == content for name, content in before.items())
 
 
 def test_a_rule_ends_it_and_says_what_is_saved(tmp_path):
-    """A way of a tenth leads to no other candidate."""
+    """No other candidate is within a travel of 0.1."""
     arguments = ("demo", "--task", "coverage", "--quick", "--views", "3", "--search", "farthest", "--no-report")
     rules = ("--until", "travel=0.1", "--until", "seconds=1e6")
     result = run_command(*arguments, *rules, "--out", "mine", cwd=tmp_path)
@@ -216,7 +216,7 @@ def test_a_device_that_is_not_there_is_named(tmp_path, monkeypatch):
 
 
 def test_a_command_of_another_package_stands_beside_ours(tmp_path, monkeypatch):
-    """One that cannot be imported, or has a name of ours, takes nothing from the others."""
+    """A command that cannot be imported, or has the name of ours, does not affect the others."""
     (tmp_path / "toy.py").write_text(
         'def greet(who: str = "you") -> None:\n    """Greets."""\n    print("hello", who)\n'
     )
@@ -227,11 +227,11 @@ def test_a_command_of_another_package_stands_beside_ours(tmp_path, monkeypatch):
     points = "greet = toy:greet\nview = toy:greet\nbreak = toy_broken:it\n"
     (folder / "entry_points.txt").write_text(f"[jaxnbv.commands]\n{points}")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
-    shown = run_process("--help", cwd=tmp_path)
-    assert shown.returncode == 0, shown.stderr
-    assert "Greets." in shown.stdout
-    assert "Look at a run or a session in the browser" in shown.stdout
-    (line,) = shown.stderr.splitlines()
+    result = run_process("--help", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert "Greets." in result.stdout
+    assert "Look at a run or a session in the browser" in result.stdout
+    (line,) = result.stderr.splitlines()
     assert line.startswith("warning: toy has no command break (ZeroDivisionError")
     assert run_process("greet", "--who", "me", cwd=tmp_path).stdout == "hello me\n"
 
@@ -267,7 +267,7 @@ def test_an_interrupt_ends_the_process_while_a_rival_still_runs(tmp_path):
 
 
 class Drawings(Sketches):
-    """The last one waits."""
+    """Sketches that block at the last view."""
 
     may_end = threading.Event()
 
@@ -276,7 +276,7 @@ class Drawings(Sketches):
 
 
 def test_no_posterior_waits_for_a_rival_or_for_an_earlier_drawing(tmp_path, monkeypatch):
-    held = []
+    references = []
 
     def simulate(*arguments, each=None, **settings):
         episode = types.SimpleNamespace(stop_reason=None, views=())
@@ -285,15 +285,15 @@ def test_no_posterior_waits_for_a_rival_or_for_an_earlier_drawing(tmp_path, monk
             return episode
         for view in (1, 2, 3):
             step = mock.Mock(spec=Step, view=view, posterior={1, 2, 3})
-            held.append(weakref.ref(step.posterior))
+            references.append(weakref.ref(step.posterior))
             each(step)
             del step
-        # The thread of a drawing ends after its result is there.
+        # The thread of a drawing ends after its result is available.
         until = time.monotonic() + 60
-        while any(one() for one in held[:2]) and time.monotonic() < until:
+        while any(one() for one in references[:2]) and time.monotonic() < until:
             gc.collect()
             time.sleep(0.01)
-        held[:] = [one() is not None for one in held]
+        references[:] = [one() is not None for one in references]
         Drawings.may_end.set()
         return episode
 
@@ -305,7 +305,7 @@ def test_no_posterior_waits_for_a_rival_or_for_an_earlier_drawing(tmp_path, monk
         result = run_command("demo", "--task", "coverage", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert "a race" in result.stdout
-    assert held == [False, False, True]
+    assert references == [False, False, True]
 
 
 @pytest.mark.slow

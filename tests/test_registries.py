@@ -1,5 +1,5 @@
-"""The registries of the command line: everything that they name is there, and is what it is taken for; a study of a
-user's own package is found too."""
+"""Registries of the command line: everything that they name exists and has the right kind. A study in a user's package
+is found too."""
 
 import inspect
 import os
@@ -51,9 +51,9 @@ def test_a_study_is_declared_in_full(name):
     assert study.reference in study.methods
     names = [measure.name for measure in study.measures]
     assert len({*names}) == len(names)
-    # Settings, or what else it is configured by.
-    taken = {*inspect.signature(study).parameters, *inspect.signature(study.configured).parameters}
-    assert {*entry.options} <= taken - {"model", "views", "quick", "options"}
+    # Settings, and further options of `configured`.
+    options = {*inspect.signature(study).parameters, *inspect.signature(study.configured).parameters}
+    assert {*entry.options} <= options - {"model", "views", "quick", "options"}
     assert {*study.quick, *study.paper} <= {*inspect.signature(study).parameters}
     seeds = [other.load().seed for other in studies().values()]
     assert len({*seeds}) == len(seeds)
@@ -106,7 +106,7 @@ class DentStudy(Study):
 
 @pytest.fixture
 def own_package(tmp_path, monkeypatch):
-    """The folder of an installed package of a user's, which processes find."""
+    """The folder of a user's installed package, which processes find too."""
     for name, text in OWN_PACKAGE.items():
         file = tmp_path / "installed" / name
         file.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""What starting costs: `jaxnbv` answers what it can without JAX, whose import takes seconds, and has all its names."""
+"""The start: `jaxnbv` answers without JAX where it can, because importing JAX takes seconds, and has all its names."""
 
 import ast
 import importlib.metadata
@@ -27,7 +27,7 @@ def run_fresh(*arguments: str) -> subprocess.CompletedProcess:
 
 
 def test_help_and_typos_are_answered_without_jax():
-    """One after the other in one process, whose modules are looked at after each."""
+    """One after the other in one process, with a check of its modules after each."""
     script = """
 import sys
 from jaxnbv.cli import main
@@ -58,8 +58,8 @@ def test_a_misspelt_name_suggests_the_nearest():
 
 
 def test_a_session_at_a_robot_loads_no_pictures_studies_or_networks():
-    """Nor does an episode, until it is drawn; what needs an extra that is not installed says how it is. JAX is loaded
-    when a name is used."""
+    """An episode does not load them either, until it is drawn. Names that need a missing extra say how to install it.
+    JAX is loaded at the first use of a name."""
     script = f"""
 import sys
 for extra in {[*EXTRAS]}:
@@ -98,7 +98,7 @@ def test_every_public_name_resolves(package):
 
 @LAZY
 def test_type_checkers_see_every_public_name(package):
-    """In a stub `import x` is private; it is public as `import x as x`, which the lazy package does not ask for."""
+    """In a stub `import x` is private, and `import x as x` is public. The lazy package does not need that form."""
     imports = public_imports(package)
     assert all(isinstance(statement, ast.ImportFrom) for statement in imports)
     aliases = [alias for statement in imports for alias in statement.names]
@@ -109,7 +109,7 @@ def test_type_checkers_see_every_public_name(package):
 
 @pytest.mark.slow
 def test_every_public_module_can_be_the_first_that_is_used():
-    """Modules that import each other in a circle would work after some first names, not after others."""
+    """Modules that import each other in a cycle would work only after some first names."""
     imports = public_imports(jaxnbv)
     named = [(statement.module, statement.names[0].name) for statement in imports]
     first_names = {name if inspect.ismodule(getattr(jaxnbv, name)) else module: name for module, name in named}

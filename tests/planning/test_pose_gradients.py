@@ -210,8 +210,7 @@ def test_derivatives_are_those_of_central_differences(kind, space, x64):
 
 
 def test_a_jump_is_not_in_the_derivative(x64):
-    """With a step of a thousandth, silhouettes pass over some pixels. Differences there are much larger than
-    elsewhere."""
+    """Silhouettes pass over some pixels within a step of a thousandth, and differences are much larger there."""
     surfaces, pairs, step = surfaces_of("blob"), pairs_of("free"), 1e-3
     event = events(surfaces, pairs, step)
     weight = jnp.eye(len(ACQUISITIONS))[0]

@@ -1,4 +1,4 @@
-"""A small planner and a small scene, which the tests of pictures share: what is compiled for one serves all."""
+"""A small planner and a small scene for the tests of pictures, which share compiled programs."""
 
 import base64
 import gzip
@@ -31,7 +31,7 @@ def small_run(search, views=3, scene=SCENE, acquisition=None, noise=None, first=
 
 
 def scene_in_space(page: str) -> dict:
-    """What a report holds packed, for a reader who turns the object."""
+    """Unpack the data that a report stores for its view in space."""
     packed = re.search('id="inspace">([^<]*)<', page)
     return json.loads(gzip.decompress(base64.b64decode(packed[1])))
 
@@ -52,19 +52,19 @@ class Page(HTMLParser):
             self.elements[-1][2] += text
 
     def of(self, *tags):
-        """The attributes of the elements of some kinds."""
+        """Attributes of all elements with these tags."""
         return [attributes for tag, attributes, _ in self.elements if tag in tags]
 
     @property
     def tables(self):
-        """By their captions, a row's cells by its name."""
-        found = {}
+        """Tables by caption, with the cells of each row by the row's name."""
+        tables = {}
         for tag, _, raw in self.elements:
             text = raw.strip()
             if tag == "caption":
-                rows = found[text] = []
+                rows = tables[text] = []
             elif tag == "tr":
                 rows.append([])
             elif tag == "th" or (tag == "td" and text.strip()):
                 rows[-1].append(text)
-        return found
+        return tables

@@ -1,4 +1,4 @@
-"""What is sought and what is known, for acquisitions and utilities of one's own as for those that ship."""
+"""Words for goals and answers, for a user's own acquisitions and utilities and for shipped ones."""
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ def greatest_height(cloud):
 
 
 class Metres(nbv.Utility):
-    """A utility that says more of itself."""
+    """A utility with its own words."""
 
     improvement = nbv.Quantity("expected growth", "metres", "how much higher.")
 
@@ -52,7 +52,7 @@ def _first():
 def test_a_utility_says_what_it_likes():
     acquisition = nbv.ExpectedUtilityImprovement(Metres(), num_points=1)
     assert label_of(acquisition.quantity) == "expected growth (metres)"
-    # Of all of D, however few points the acquisition looks at.
+    # The answer uses all of D, however few points the acquisition uses.
     assert words_of(acquisition.answer(CLOUD)).said() == "height 1.6, points 3.0"
     assert nbv.DiscreteSearch().quantity(acquisition) == acquisition.quantity
 

@@ -1,4 +1,4 @@
-"""Scans compared with CAD: boxes with dents and bumps of known shape, spheres, sheets; millimetres."""
+"""Comparison of scans with CAD: boxes with dents and bumps of known shape, spheres and sheets, in millimetres."""
 
 import numpy as np
 import pytest
@@ -13,12 +13,12 @@ from jaxnbv.checks import InputError
 RNG = np.random.default_rng(0)
 SIDES = np.array([100.0, 60.0, 40.0])
 BOX = trimesh.creation.box(SIDES)
-# Where the flaw lies on the top of the box, its radius there, and its height.
+# Place of the flaw on the top of the box, its radius there, and its height.
 PLACE, RADIUS, HEIGHT = np.array([20.0, -8.0]), 9.0, 2.0
 
 
 def flaw(places, height):
-    """Height of a spherical cap over the top of the box, and its slope."""
+    """Height and slope of a spherical cap on the top of the box."""
     across = places - PLACE
     radius = (RADIUS**2 + HEIGHT**2) / (2.0 * HEIGHT)
     squared = np.minimum(np.sum(across**2, axis=1), RADIUS**2)
@@ -30,7 +30,7 @@ def flaw(places, height):
 
 
 def scanned_box(height, noise=0.0, count=6000):
-    """Points and normals of the three sides of the box that one corner shows, and the distances from the box."""
+    """Points and normals of the three sides of the box that meet at a corner, and their distances from the box."""
     points, normals, distances = [], [], []
     for axis in range(3):
         places = (RNG.random((count // 3, 3)) - 0.5) * SIDES
@@ -68,7 +68,7 @@ def test_a_dent_and_a_bump_are_found_on_a_partial_noisy_scan_from_anywhere(heigh
     matrix = motion(4)
     points, normals, distances = scanned_box(height, noise=0.05)
     result = nbv.deviation(cloud(points, normals, matrix), BOX)
-    # A box looks the same in four poses; wherever it lies, its surface is that of the box that was scanned.
+    # A box looks the same in four poses. In all of them its surface is that of the scanned box.
     turns = np.abs((np.linalg.inv(matrix) @ result.pose)[:3, :3])
     np.testing.assert_allclose(turns, np.eye(3), atol=2e-3)
     np.testing.assert_allclose((np.linalg.inv(matrix) @ result.pose)[:3, 3], 0.0, atol=0.05)
@@ -81,7 +81,7 @@ def test_a_dent_and_a_bump_are_found_on_a_partial_noisy_scan_from_anywhere(heigh
     top = np.linalg.inv(matrix) @ [*first.position, 1.0]
     np.testing.assert_allclose(top[:2], PLACE, atol=3.0)
     assert first.distance == pytest.approx(height, abs=0.15)
-    # Half of the cap's height is left at this radius.
+    # At this radius half of the cap's height is left.
     radius = (RADIUS**2 + HEIGHT**2) / (2.0 * HEIGHT)
     half = np.sqrt(radius**2 - (radius - 0.5 * HEIGHT) ** 2)
     assert first.extent == pytest.approx(2.0 * half, abs=3.0)
@@ -120,7 +120,7 @@ def test_a_rigid_motion_of_both_changes_nothing(seed):
     before = nbv.deviation(cloud(points, normals), BOX, register=False)
     scan, cad = cloud(points, normals, matrix), BOX.copy().apply_transform(matrix)
     for after in (nbv.deviation(scan, cad, register=False), nbv.deviation(scan, BOX, matrix, register=False)):
-        # Clouds are of single precision.
+        # Clouds are in single precision.
         np.testing.assert_allclose(after.distances, before.distances, atol=1e-3)
         np.testing.assert_allclose(after.feet, trimesh.transform_points(before.feet, matrix), atol=1e-3)
         assert after.missing_area == pytest.approx(before.missing_area, rel=0.01)
@@ -199,7 +199,7 @@ def test_places_stand_apart_and_flanks_are_none():
     for place, at in zip(worst, [(-30.0, 0.0), (0.0, 5.0), (32.0, -9.0)], strict=True):
         np.testing.assert_allclose(place.position[:2], at, atol=2.0)
     assert [np.sign(place.distance) for place in worst] == [1, -1, 1]
-    # Full width at half maximum of a Gaussian of standard deviation 3.
+    # Full width at half maximum of a Gaussian with standard deviation 3.
     assert worst[1].extent == pytest.approx(2.355 * 3.0, abs=2.0)
     assert [place.distance for place in result.worst(2, apart=70.0)] == pytest.approx([2.0, 0.0], abs=0.2)
 

@@ -1,4 +1,4 @@
-"""Points and surfaces as files, of a ball of 10 cm in a world of metres."""
+"""Points and surfaces as files, for a ball of 10 cm in a world in metres."""
 
 import itertools
 
@@ -40,7 +40,7 @@ def test_the_surface_is_marked_where_it_was_measured(episode):
     assert 0 < measured.sum() < len(measured)
     centers = mesh.triangles_center
     assert off(centers[measured]).max() < 1.5 * cell
-    # From both cameras the ball's far side is hidden; there nothing was measured.
+    # The far side of the ball is hidden from both cameras, and was not measured.
     eyes = np.stack([FIRST[:3, 3], POSES[2][:3, 3]]) - CENTER
     hidden = ((centers - CENTER) @ eyes.T < -0.02).all(axis=1)
     assert hidden.any()
@@ -53,20 +53,20 @@ def test_the_surface_is_marked_where_it_was_measured(episode):
 
 
 def test_what_is_missing_is_the_far_side_in_metres(episode):
-    """The part of the ball that no camera sees is one region, which looks away from both."""
+    """The part of the ball that no camera sees is one region, which faces away from both."""
     regions = missing_regions(episode, smallest=1e-3)
     eyes = np.stack([FIRST[:3, 3], POSES[2][:3, 3]])
     eyes = (eyes - CENTER) / np.linalg.norm(eyes - CENTER, axis=1, keepdims=True)
     largest = regions[0]
     assert largest.normal @ eyes.sum(axis=0) < 0
     assert np.linalg.norm(largest.normal) == pytest.approx(1.0)
-    # By points spread evenly over the ball: a camera at distance d sees those whose cosine to it is above r / d.
+    # By points spread evenly over the ball. A camera at distance d sees points whose cosine to it is above r / d.
     points = np.random.default_rng(0).normal(size=(20_000, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     distances = np.linalg.norm(np.stack([FIRST[:3, 3], POSES[2][:3, 3]]) - CENTER, axis=1)
     hidden = (points @ eyes.T < 0.1 / distances).all(axis=1)
     area = hidden.mean() * 4 * np.pi * 0.1**2
-    # A cell's width about the border is missing or not.
+    # Surface within a cell of the border may count as missing or not.
     assert sum(region.area for region in regions) == pytest.approx(area, rel=0.35)
     assert largest.center @ points[hidden].mean(axis=0) > CENTER @ points[hidden].mean(axis=0)
     assert all(a.area >= b.area > 1e-3 for a, b in itertools.pairwise([*regions, regions[-1]]))
@@ -84,8 +84,8 @@ def test_files_hold_world_units(episode, tmp_path):
         assert len(mesh.faces) > 100
         assert np.all(mesh.bounds[0] > low - 0.02)
         assert np.all(mesh.bounds[1] < high + 0.02)
-    kept = trimesh.load(tmp_path / "mesh.ply", process=False)
-    raw = kept.metadata["_ply_raw"]
+    stored = trimesh.load(tmp_path / "mesh.ply", process=False)
+    raw = stored.metadata["_ply_raw"]
     assert "deviation" in raw["vertex"]["properties"]
     assert "measured" in raw["face"]["properties"]
 

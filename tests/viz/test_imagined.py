@@ -1,4 +1,4 @@
-"""What a step imagined: the same samples as it was chosen by."""
+"""Pictures of imagined surfaces show the samples by which the view was chosen."""
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +29,7 @@ class BallPosterior(nbv.surfaces.SurfacePosterior):
 
 
 class BallModel(nbv.SurfaceModel):
-    """Imagines balls of radii that the key alone decides."""
+    """A model that samples balls with radii that depend only on the key."""
 
     def condition(self, cloud):
         return BallPosterior(jnp.asarray(0.0))
@@ -50,19 +50,19 @@ def episode():
 
 
 def rim(radius):
-    """How many of 96 x 96 pixels look at a ball about the origin, from 2.5 away."""
+    """Number of 96 x 96 pixels that see a ball about the origin from a distance of 2.5."""
     tangent = radius / np.sqrt(2.5**2 - radius**2)
     return np.pi * (48 * tangent / np.tan(CAMERA.fov / 2)) ** 2
 
 
 def test_the_samples_are_those_of_the_step(episode):
-    """Their radii are those of the key of view 2, as `simulate` derives it."""
+    """Their radii follow from the key of view 2, as `simulate` derives it."""
     key = jax.random.split(jax.random.split(jax.random.fold_in(episode.key, 1))[0])[0]
     radii = 0.8 + 0.1 * np.asarray(jax.random.uniform(key, (5,)), np.float64)
     first, second = report_data(episode, progress=False).views
     assert first.imagined is None
-    found = [np.sum(sample.mask) for sample in second.imagined.samples]
-    np.testing.assert_allclose(found, rim(radii[:4]), rtol=0.02)
+    num_pixels = [np.sum(sample.mask) for sample in second.imagined.samples]
+    np.testing.assert_allclose(num_pixels, rim(radii[:4]), rtol=0.02)
     tiles = [tile.name for tile in looks(second.imagined, second.look)]
     assert tiles == [*(f"imagined {k}" for k in range(1, 5)), "then seen"]
     assert second.look.mask.shape == (32, 32)
@@ -70,7 +70,7 @@ def test_the_samples_are_those_of_the_step(episode):
 
 
 def test_what_was_seen_before_is_told_from_what_was_not(episode):
-    """Half of a ball was seen from +z: from +x its near half in z is known, the other is not."""
+    """Half of a ball was seen from +z. From +x the half towards +z is known, and the other is not."""
     cloud = 1.0 * np.asarray(nbv.geometry.fibonacci_sphere(4000), np.float64)
     pose = nbv.look_at((2.5, 0.0, 0.0))
     scan = nbv.scan(nbv.SDFSurface(Sphere(1.0)), CAMERA, pose)

@@ -1,4 +1,4 @@
-"""The live view: what is in its scene, against the observations; and one HTML file of it."""
+"""The live view: the contents of its scene against the observations, and its single HTML file."""
 
 import re
 import sys
@@ -19,7 +19,7 @@ viser = pytest.importorskip("viser", reason="viser is not installed")
 
 @pytest.fixture(scope="module")
 def watched(tmp_path_factory):
-    """A session of two images and the next question, and the page that shows it."""
+    """A session of two images and a proposal, and the page that shows it."""
     folder = tmp_path_factory.mktemp("live") / "session"
     session = session_of(folder)
     session.add(shot(FIRST), FIRST, depth_scale=1e-3)
@@ -38,13 +38,13 @@ def handles(page):
 
 def test_all_that_is_known_is_in_the_scene(watched):
     _, _, page = watched
-    shown = handles(page)
+    by_name = handles(page)
     expected = {"/points before", "/new points", "/surface of the mean", "/candidates", "/next view", "/imagined/1"}
-    assert expected <= set(shown)
-    assert {"/cameras/view 1", "/cameras/view 2"} <= set(shown)
-    assert "/cameras/view 3" not in shown
-    assert not shown["/imagined/1"].visible
-    assert shown["/surface of the mean"].visible
+    assert expected <= set(by_name)
+    assert {"/cameras/view 1", "/cameras/view 2"} <= set(by_name)
+    assert "/cameras/view 3" not in by_name
+    assert not by_name["/imagined/1"].visible
+    assert by_name["/surface of the mean"].visible
 
 
 def test_cameras_stand_and_look_as_they_do(watched):
@@ -81,10 +81,12 @@ def test_the_slider_goes_back_to_an_earlier_view(watched):
     _, session, page = watched
     first, _ = session.episode.views[0].scan.to_numpy()
     page._slider.value = 1
-    shown = handles(page)
-    np.testing.assert_allclose(shown["/new points"].points, first, atol=2e-3)
-    assert "/cameras/view 2" not in shown
-    np.testing.assert_allclose(shown["/next view"].position, session.episode.views[1].proposal.pose.position, atol=1e-5)
+    by_name = handles(page)
+    np.testing.assert_allclose(by_name["/new points"].points, first, atol=2e-3)
+    assert "/cameras/view 2" not in by_name
+    np.testing.assert_allclose(
+        by_name["/next view"].position, session.episode.views[1].proposal.pose.position, atol=1e-5
+    )
     assert re.search(r"^\*\*1 view\*\*, [\d.]+ world units² of surface seen$", page._text.content, re.MULTILINE)
     page._slider.value = 2
     assert "/cameras/view 2" in handles(page)
@@ -101,26 +103,26 @@ def test_one_file_holds_the_scene(watched, tmp_path):
 
 
 def test_the_command_shows_a_run(tmp_path, monkeypatch, capsys):
-    """The page itself is tested above; surfaces of the usual size take long."""
-    told = []
+    """The page has its own tests above. Surfaces of the usual size take long."""
+    calls = []
 
     class Page:
         def __init__(self, port):
-            told.append(port)
+            calls.append(port)
 
         def update(self, episode):
-            told.append(len(episode.views))
+            calls.append(len(episode.views))
 
         def save(self, path):
             return path
 
         def stop(self):
-            told.append("stopped")
+            calls.append("stopped")
 
     monkeypatch.setattr("jaxnbv.viz.LiveView", Page)
     small_run(nbv.RandomView(8), views=2).save(tmp_path)
     command.view(folder=tmp_path, html=tmp_path / "scene.html", port=7)
-    assert told == [7, 2, "stopped"]
+    assert calls == [7, 2, "stopped"]
     assert "scene.html" in capsys.readouterr().out
 
 

@@ -1,4 +1,4 @@
-"""The report: self-contained, complete, true to the episode; and what its pictures are made of."""
+"""The report is self-contained and complete and agrees with the episode; the data of its pictures."""
 
 import base64
 import dataclasses
@@ -34,7 +34,7 @@ def episode():
 
 @pytest.fixture(scope="module")
 def report(episode, tmp_path_factory):
-    """In a folder where a process that was killed has left a part of a page."""
+    """A report in a folder where a killed process has left a part of a page."""
     folder = tmp_path_factory.mktemp("report")
     (folder / ".0123456789abcdef.partial").write_bytes(b"half a page")
     return write_report(episode, folder, title="a <mug> & saucer", progress=False)
@@ -46,14 +46,19 @@ def data(episode):
 
 
 def poses_of(text):
-    """Those that a reader copies."""
+    """Pose matrices that a reader copies."""
     return [json.loads(html.unescape(pose)) for pose in re.findall('data-pose="([^"]*)"', text)]
 
 
 def test_the_page_loads_nothing_from_elsewhere(report):
     text = report.read_text(encoding="utf-8")
     page = Page(text)
-    loads = [made[name] for _, made, _ in page.elements for name in ("src", "href", "srcset", "action") if name in made]
+    loads = [
+        attributes[name]
+        for _, attributes, _ in page.elements
+        for name in ("src", "href", "srcset", "action")
+        if name in attributes
+    ]
     assert len(loads) > 10
     assert all(load.startswith("data:") for load in loads)
     assert len(page.of("script")) == 3
@@ -71,19 +76,21 @@ def test_the_page_holds_every_view_and_escapes_its_title(report, episode, data):
     assert not re.search(r"{{|{%", text)
     spatial = scene_in_space(text)
     assert len(spatial) == len(episode.views) == 3
-    for matrix, shown, view, told in zip(poses_of(text), spatial, episode.views, data.views, strict=True):
-        assert all(part in html.unescape(text) for part in told.told.values())
+    for matrix, figure_in_space, view, view_data in zip(
+        poses_of(text), spatial, episode.views, data.views, strict=True
+    ):
+        assert all(part in html.unescape(text) for part in view_data.told.values())
         np.testing.assert_allclose(matrix, view.pose.to_matrix(), atol=1e-5)
-        (points,) = (trace for trace in shown["data"] if trace["name"] == "new points")
+        (points,) = (trace for trace in figure_in_space["data"] if trace["name"] == "new points")
         assert points["x"]["dtype"] == "f4"
         count = len(base64.b64decode(points["x"]["bdata"])) // 4
         assert count == int(view.scan.count)
 
 
 def test_what_is_drawn_in_space_stands_where_it_is(episode, data):
-    """Plotly's z is our y; coordinates are rounded to 1 / 256."""
-    shown = figures_in_space(data)[2]
-    traces = {trace.name: trace for trace in reversed(shown.data)}
+    """Plotly's z is the scene's y. Coordinates are rounded to 1 / 256."""
+    figure = figures_in_space(data)[2]
+    traces = {trace.name: trace for trace in reversed(figure.data)}
     names = ["surface of the mean", "points before", "new points", "cameras", "new camera"]
     assert [name for name in names if name in traces] == names
     places = {name: np.stack([trace.y, trace.z, trace.x], axis=1) for name, trace in traces.items()}
@@ -93,7 +100,7 @@ def test_what_is_drawn_in_space_stands_where_it_is(episode, data):
 
 
 def test_poses_are_in_the_units_of_the_objects_file(episode, data):
-    """That of a mesh which lies elsewhere and is larger; without a file they are in scene units."""
+    """The units of the file of a mesh that is larger and elsewhere. Without a file they are scene units."""
     frame = nbv.Frame(0.5, (1.0, 2.0, 3.0), "z")
     elsewhere = dataclasses.replace(data, episode=dataclasses.replace(episode, frame=frame))
     matrix = np.array(poses_of(report_html(elsewhere, "mug"))[1])
@@ -115,7 +122,7 @@ def test_the_sentence_tells_the_numbers_of_the_step(episode, data):
 
 
 def test_of_a_scene_without_truth_the_area_that_was_seen_is_told(tmp_path, episode):
-    """Of a ball of radius 1 a first view sees the cap before its horizon, 2 pi (1 - 1 / r)."""
+    """The first view of a ball of radius 1 sees the cap before its horizon, 2 pi (1 - 1 / r)."""
     grid = nbv.Grid(24)
     distance = np.linalg.norm(np.stack(np.meshgrid(*[grid.axis] * 3, indexing="ij")), axis=0) - 1.0
     scene = nbv.scanning.GridSurface.from_values(distance, 0.0, grid)
@@ -128,7 +135,7 @@ def test_of_a_scene_without_truth_the_area_that_was_seen_is_told(tmp_path, episo
     area = report_data(lone, progress=False, imagine=False).views[0].seen.values[0]
     assert area == pytest.approx(2.0 * np.pi * (1.0 - 1.0 / 2.5), rel=0.15)
     assert f"<td>{number(area)}</td>" in page
-    # Seen again it adds nothing, from the other side as much again.
+    # The same view again adds nothing. A view from the other side adds as much again.
     behind = nbv.look_at((0.0, 0.0, -2.5))
     other = nbv.scan(nbv.SDFSurface(nbv.sdf.Sphere(1.0)), camera, behind)
     views = *lone.views, *lone.views, nbv.View(behind, other, other, None, camera)
@@ -164,7 +171,8 @@ def surface_of(sampler, observations):
 
 
 def test_any_posterior_has_a_surface_with_a_standard_deviation():
-    # f = |x| - r with r ~ N(0.9, 0.03^2): the surface is a sphere known to 0.03 all over, estimated from 64 samples.
+    # f = |x| - r with r ~ N(0.9, 0.03^2). The surface is a sphere, known to 0.03 everywhere, as estimated from 64
+    # samples.
     planner = small_planner(nbv.RandomView(), model=SphereModel(), grid=nbv.Grid(40))
     cloud = nbv.PointCloud.from_arrays([[0.9, 0.0, 0.0]], [[1.0, 0.0, 0.0]])
     surface = surface_of(planner.sampler, planner.init(None, cloud))
@@ -180,7 +188,7 @@ def test_the_surface_of_the_mean_is_carved():
     empty = jnp.broadcast_to((planner.sampler.grid.axis > 0.3)[:, None, None], observations.empty_nodes.shape)
     vertices = surface_of(planner.sampler, eqx.tree_at(lambda s: s.empty_nodes, observations, empty)).vertices
     assert vertices[:, 0].max() < 0.3 + planner.sampler.grid.spacing
-    # The other side is as it was.
+    # The other side is unchanged.
     left = vertices[vertices[:, 0] < 0.3 - planner.sampler.grid.spacing]
     np.testing.assert_allclose(np.linalg.norm(left, axis=1).max(), 0.9, atol=0.02)
 
@@ -219,10 +227,10 @@ def test_the_map_keeps_values():
     assert smooth.shape == (len(latitudes), len(longitudes))
     longitude, latitude = on_map(some).T
     there = smooth[np.abs(latitudes - latitude[:, None]).argmin(1), np.abs(longitudes - longitude[:, None]).argmin(1)]
-    known = ~np.isnan(values) & ~np.isnan(there)
-    assert known.sum() > 90
-    np.testing.assert_allclose(there[known], values[known], atol=0.1)
-    # Of candidates above the horizon alone nothing is said of what is below it.
+    has_value = ~np.isnan(values) & ~np.isnan(there)
+    assert has_value.sum() > 90
+    np.testing.assert_allclose(there[has_value], values[has_value], atol=0.1)
+    # If all candidates are above the horizon, the map has no values below it.
     upper = smooth_map(some[some[:, 1] > 0], values[some[:, 1] > 0])[2]
     assert np.isfinite(upper[latitudes > 0.2]).all()
     assert np.isnan(upper[latitudes < -0.5]).all()

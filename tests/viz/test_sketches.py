@@ -1,4 +1,4 @@
-"""What is drawn while an episode is under way is what would be drawn after it."""
+"""Sketches drawn during an episode equal those drawn after it."""
 
 import jax
 import numpy as np
@@ -22,17 +22,17 @@ def assert_equal(drawn, again):
 
 def test_steps_are_drawn_as_they_would_be_again_and_the_model_is_asked_once_more(monkeypatch):
     episode, sketches = run(3)
-    again, asked, posterior = report_data(episode, progress=False), [], nbv.SurfaceSampler.posterior
+    again, calls, posterior = report_data(episode, progress=False), [], nbv.SurfaceSampler.posterior
 
     def told(sampler, observations):
-        asked.append(observations)
+        calls.append(observations)
         return posterior(sampler, observations)
 
     monkeypatch.setattr(nbv.SurfaceSampler, "posterior", told)
     drawn = report_data(episode, progress=False, sketches=sketches)
     assert_equal(drawn, again)
     assert drawn.views[2].imagined is not None
-    assert [int(observations.num_views) for observations in asked] == [3]
+    assert [int(observations.num_views) for observations in calls] == [3]
 
 
 def test_of_views_that_a_folder_holds_there_are_none_and_the_report_makes_them(tmp_path):

@@ -1,4 +1,4 @@
-"""Gradient searches in pictures and words: trajectories beside candidates."""
+"""Gradient searches in pictures and words: trajectories next to candidates."""
 
 from typing import ClassVar
 
@@ -30,7 +30,8 @@ def joined(first, second):
 
 
 class Walks(Search):
-    """Answers as a gradient search does, but walks from each of four candidates to the far side of the first view."""
+    """A search whose proposals look like those of gradient search, with paths from four candidates to the far side of
+    the first view."""
 
     uses_samples: ClassVar[bool] = True
 
@@ -42,13 +43,13 @@ class Walks(Search):
         poses = look_at(2.5 * away / jnp.linalg.norm(away, axis=-1, keepdims=True))
         flat = jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), poses)
         ways = Trajectories(poses, problem.values(flat).reshape(4, 6))
-        found = best_unvisited(problem, *joined((candidates, values), ways.flat))
-        return nbv.search.Proposal(found.pose, found.value, candidates, found.values[:4], ways)
+        best = best_unvisited(problem, *joined((candidates, values), ways.flat))
+        return nbv.search.Proposal(best.pose, best.value, candidates, best.values[:4], ways)
 
 
 @pytest.fixture(scope="module", autouse=True)
 def coarse():
-    """Surfaces are traced at a quarter of their pixels a side, which is most of what a picture takes."""
+    """Trace surfaces at a quarter of the pixels on each side, since tracing takes most of the time of a picture."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("jaxnbv.viz.render._STILL", 160)
         yield
@@ -56,7 +57,7 @@ def coarse():
 
 @pytest.fixture(scope="module")
 def few():
-    """On the sphere, from as many candidates as starts, which are too few for a map."""
+    """An episode on the sphere with as many candidates as starts, too few for a map."""
     return small_run(Walks(), views=2)
 
 
@@ -66,7 +67,7 @@ def few_data(few):
 
 
 def trajectories(values) -> Trajectories:
-    """Ways round the equator, one start every 90 degrees."""
+    """Paths around the equator, with one start every 90 degrees."""
     values = np.asarray(values, dtype=np.float32)
     starts, steps = values.shape
     angle = np.radians(90 * np.arange(starts)[:, None] + np.arange(steps))
@@ -77,15 +78,15 @@ def trajectories(values) -> Trajectories:
 @pytest.mark.parametrize(("count", "lots", "has_map"), [(48, False, True), (11, False, False), (48, True, False)])
 def test_a_map_is_made_of_enough_candidates_and_of_no_lots(count, lots, has_map):
     candidates = sphere_candidates(count)
-    seen = nbv.search.Proposal(candidates[0], jnp.ones(()), candidates, candidates.position[:, 0])
+    proposal = nbv.search.Proposal(candidates[0], jnp.ones(()), candidates, candidates.position[:, 0])
     axes = Figure().add_axes((0, 0, 1, 1))
-    draw_acquisition(axes, seen, nbv.Quantity("", "", "", smooth=not lots))
+    draw_acquisition(axes, proposal, nbv.Quantity("", "", "", smooth=not lots))
     (globe,) = axes.child_axes
     assert any(isinstance(drawn, QuadMesh) for drawn in globe.collections) == has_map
 
 
 def said_of(value, others, starts=0, pose=None, standard_error=None, quantity=COVERAGE):
-    """What is said of a second view with such a value, beside candidates with others, and ascents from some starts."""
+    """The text for a second view with this value, next to candidates with others, and ascents from some starts."""
     pose, first = look_at((0.0, 0.0, 2.5)) if pose is None else pose, look_at((2.5, 0.0, 0.0))
     ways = trajectories(np.zeros((starts, 2))) if starts else None
     errors = None if standard_error is None else jnp.full(len(others), standard_error)
@@ -93,8 +94,8 @@ def said_of(value, others, starts=0, pose=None, standard_error=None, quantity=CO
     looked = nbv.search.Proposal(pose, jnp.asarray(value), candidates, jnp.asarray(others), ways, errors, errors)
     scan = nbv.PointCloud.from_arrays(np.eye(3), np.eye(3))
     views = [nbv.View(first, scan, scan, None, CAMERA), nbv.View(pose, scan, scan, looked, CAMERA)]
-    seen = [CoverageAnswer(("of surface seen",), np.array([area]), unit="scene units²") for area in (0.2, 0.3)]
-    return " ".join(told(quantity, views, seen, nbv.Frame()).values())
+    answers = [CoverageAnswer(("of surface seen",), np.array([area]), unit="scene units²") for area in (0.2, 0.3)]
+    return " ".join(told(quantity, views, answers, nbv.Frame()).values())
 
 
 @pytest.mark.parametrize(
@@ -128,8 +129,8 @@ def test_words_say_where_a_camera_looks_past_the_centre():
 
 def test_the_sentence_and_the_summary_tell_the_numbers_of_the_step(few, few_data, capsys):
     said = few_data.views[1].told
-    seen = few.views[1].proposal
-    best = float(np.max(seen.values))
+    proposal = few.views[1].proposal
+    best = float(np.max(proposal.values))
     assert said["What it promised"].endswith("was found by gradient ascent from 4 starts.")
     assert said["Beside the others"].startswith(f"Best candidate {number(best)}, median")
     lines = Lines(few.planner)
@@ -137,7 +138,7 @@ def test_the_sentence_and_the_summary_tell_the_numbers_of_the_step(few, few_data
         lines(one)
     first, _, second = capsys.readouterr().out.splitlines()[:3]
     assert first == "views are chosen by expected coverage gain (scene units²)"
-    assert second.endswith(f"points   {number(float(seen.value))}, by ascent from {number(best)}")
+    assert second.endswith(f"points   {number(float(proposal.value))}, by ascent from {number(best)}")
 
 
 def test_a_page_of_a_search_by_gradient(few_data):

@@ -1,4 +1,4 @@
-"""What was looked at and not measured, on a ball with a dark cap."""
+"""Surface that views looked at without measuring it, on a ball with a dark cap."""
 
 import dataclasses
 
@@ -18,9 +18,9 @@ BALL = nbv.TriangleMesh(MESH.vertices, MESH.faces, Frame())
 
 
 def observed(places, dark=DARK):
-    """What cameras at some places measured of the ball, of which no ray came back from above `dark` along z."""
+    """Observations of the ball by cameras at some places. No ray returned from above `dark` along z."""
     pole = nbv.PointCloud.from_arrays([[0.0, 0.0, -RADIUS]], [[0.0, 0.0, -1.0]], 8)
-    seen = nbv.Observations.start(pole, 4, GRID, camera=CAMERA)
+    observations = nbv.Observations.start(pole, 4, GRID, camera=CAMERA)
     for place in places:
         pose = nbv.look_at(place)
         scan = nbv.scan(BALL, CAMERA, pose)
@@ -28,12 +28,13 @@ def observed(places, dark=DARK):
         away = jnp.linalg.norm(scan.points - pose.position, axis=-1)
         sight = jnp.where(scan.mask & ~lost, away, jnp.inf)
         scan = dataclasses.replace(scan, mask=scan.mask & ~lost, sight=sight)
-        seen = seen.add_view(pose, scan, CAMERA, None, None)
-    return seen
+        observations = observations.add_view(pose, scan, CAMERA, None, None)
+    return observations
 
 
 def test_a_cap_that_two_views_did_not_measure_is_one_patch():
-    """Its area is 2 pi R h, its middle at half its height, by Archimedes. The border is off by about a cell."""
+    """Its area is 2 pi R h, and its middle is at half its height, by Archimedes. The border is accurate to about a
+    cell."""
     (patch,) = unmeasured(MESH, observed([(0.0, 0.3, 2.4), (0.3, -0.2, 2.4)]), None)
     rim = 2.0 * np.pi * np.sqrt(RADIUS**2 - DARK**2) * GRID.spacing
     assert patch.area == pytest.approx(2.0 * np.pi * RADIUS * (RADIUS - DARK), abs=rim)

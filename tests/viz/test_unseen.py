@@ -1,4 +1,4 @@
-"""What no ray has met is shown as uncertain, whatever the posterior says of it."""
+"""Surface that no ray has met is shown as uncertain, whatever the posterior's deviation."""
 
 import jax
 import numpy as np
@@ -11,29 +11,29 @@ from jaxnbv.viz.mean_surface import MeanSurface, as_shown
 
 
 def test_the_deviation_allows_for_a_quarter_of_the_distance_to_the_nearest_point():
-    """On a unit sphere of which one point was seen, and is held to be known to 0.03 all over."""
+    """A unit sphere with one measured point, whose posterior deviation is 0.03 everywhere."""
     vertices = np.asarray(nbv.geometry.fibonacci_sphere(200), np.float64)
     surface = MeanSurface(vertices, ConvexHull(vertices).simplices, vertices, np.full(200, 0.03))
-    # Rows that hold nothing lie at the origin, and are no points.
+    # Empty rows are at the origin, and must not count as points.
     cloud = nbv.PointCloud.from_arrays(vertices[:1], vertices[:1], capacity=4)
-    shown = as_shown(surface, cloud)
+    result = as_shown(surface, cloud)
     chord = 2 * np.sin(0.5 * np.arccos(np.clip(vertices @ vertices[0], -1, 1)))
-    np.testing.assert_allclose(shown.deviation, np.sqrt(0.03**2 + (chord / 4) ** 2), rtol=1e-5)
-    np.testing.assert_array_equal(shown.vertices, vertices)
+    np.testing.assert_allclose(result.deviation, np.sqrt(0.03**2 + (chord / 4) ** 2), rtol=1e-5)
+    np.testing.assert_array_equal(result.vertices, vertices)
     assert as_shown(None, cloud) is None
 
 
 def test_pieces_that_hold_no_points_are_not_shown():
-    """Of two unit spheres one point of the first was seen."""
+    """Two unit spheres, with one measured point on the first."""
     ball = np.asarray(nbv.geometry.fibonacci_sphere(200), np.float64)
     faces = ConvexHull(ball).simplices
     other = ball + np.array([3.0, 0.0, 0.0])
     both = np.concatenate([ball, other])
     surface = MeanSurface(both, np.concatenate([faces, faces + 200]), np.concatenate([ball, ball]), np.full(400, 0.03))
     cloud = nbv.PointCloud.from_arrays(ball[:1], ball[:1])
-    held = as_shown(surface, cloud)
-    np.testing.assert_array_equal(held.vertices, ball)
-    np.testing.assert_array_equal(held.faces, faces)
+    result = as_shown(surface, cloud)
+    np.testing.assert_array_equal(result.vertices, ball)
+    np.testing.assert_array_equal(result.faces, faces)
     assert as_shown(surface, nbv.PointCloud.from_arrays([[1.5, 9.0, 0.0]], [[0.0, 1.0, 0.0]])) is None
 
 

@@ -47,10 +47,10 @@ def test_no_trial_is_lost_though_some_die(tmp_path):
     assert list(records.failures(range(4))) == [3]
     assert "in __call__" in (tmp_path / "records" / "scene_0003.failed").read_text()
     # The next time only the failed ones run.
-    asked = []
+    calls = []
     again = RecordFolder(tmp_path / "records", {"views": 3})
-    assert again.collect(range(6), lambda index: asked.append(index) or {"square": index**2}) == squares(*range(6))
-    assert asked == [3, 4]
+    assert again.collect(range(6), lambda index: calls.append(index) or {"square": index**2}) == squares(*range(6))
+    assert calls == [3, 4]
     assert again.failures(range(6)) == {}
 
 
@@ -158,7 +158,7 @@ def test_a_command_writes_what_was_found_and_fails_at_the_end(tmp_path, monkeypa
     with pytest.raises(InputError, match=r"^2 of 2 scenes failed"):
         run("all", "2")
     assert not (tmp_path / "all" / "results.csv").exists()
-    monkeypatch.setattr(command, "run_scene", lambda study, index, **given: fake(study, index + 1, **given))
+    monkeypatch.setattr(command, "run_scene", lambda study, index, **settings: fake(study, index + 1, **settings))
     run("range", "7:9")
     assert sorted(file.name for file in (tmp_path / "range").glob("scene_*")) == ["scene_0007.json", "scene_0008.json"]
     for wrong in ("0", "3:3", "9:7", "-2", "all"):
@@ -166,7 +166,7 @@ def test_a_command_writes_what_was_found_and_fails_at_the_end(tmp_path, monkeypa
             run("wrong", wrong)
     with pytest.raises(InputError, match=r"belongs to another study; it differs in study\.capacity"):
         run("some", "3", capacity=77)
-    monkeypatch.setattr(command, "run_scene", lambda study, index, **given: fake(study, index + 4, **given))
+    monkeypatch.setattr(command, "run_scene", lambda study, index, **settings: fake(study, index + 4, **settings))
     run("joined", "3", join=[tmp_path / "some"])
     scenes = [json.loads((tmp_path / "joined" / f"scene_000{index}.json").read_text())["record"] for index in range(3)]
     assert [record["scene"] for record in scenes] == [0, 5, 2]
