@@ -57,7 +57,7 @@ def write_readable() -> None:
 
 @contextmanager
 def each_warning_once() -> Iterator[None]:
-    """Context manager: print each different warning once, and at the end how often it came if that was repeatedly.
+    """Context manager: print each different warning once, and at the end the counts of repeated ones.
 
     Python's own filter forgets what was printed whenever a library changes the filters.
     """

@@ -292,7 +292,10 @@ def _points(frames: RecordedFrames, index: int, stride: int) -> Float[np.ndarray
 
 
 def bounds_of(frames: RecordedFrames) -> list[float]:
-    """Two corners of a box from the 1st to the 99th percentile of all points per axis, with a margin."""
+    """Two corners of a box from the 1st to the 99th percentile of all points per axis, with a margin.
+
+    **Raises:** `ValueError` if no frame has a valid depth.
+    """
     points = np.concatenate([_points(frames, index, _COARSE) for index in range(len(frames))])
     require(len(points) > 0, f"no frame of {frames.folder} has a valid depth")
     low, high = np.percentile(points, [1, 99], axis=0)
