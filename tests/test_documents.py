@@ -51,7 +51,7 @@ def test_each_command_of_the_readme_is_one_line(name):
     assert re.search(rf"<!-- {name} command -->\n```bash\n[^\n]*\n```", text)
 
 
-def test_messages_that_are_explained_are_given():
+def test_explained_messages_exist():
     """Each message is in the code, where it may span lines."""
     code = "".join(re.sub(r'"\s*\n\s*f?"', "", path.read_text()) for path in (ROOT / "jaxnbv").rglob("*.py"))
     said = (DOCS / "how_to" / "trouble.md").read_text().partition("## It says nothing")[0]

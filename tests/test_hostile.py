@@ -18,7 +18,7 @@ def test_any_argument_works_or_is_refused_by_name():
     run("hostile.py", "25")
 
 
-def test_what_once_passed_or_failed_within_is_refused_by_name():
+def test_earlier_failures_are_refused_by_name():
     run("refused.py")
 
 

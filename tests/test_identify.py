@@ -103,7 +103,7 @@ def test_objects_that_masks_show_are_named_apart(parts, recording, tmp_path, cap
     assert (tmp_path / "it" / "report.html").exists()
 
 
-def test_a_pose_is_told_in_the_unit_of_the_world():
+def test_a_pose_is_printed_in_the_unit_of_the_world():
     """Deviations of three degrees about one axis, and of four thousandths along one."""
     deviations = np.array([0.01, np.radians(3.0), 0.0, 0.0, 0.004, 0.001])
     pose = ObjectPose("rod", np.eye(4), np.diag(deviations**2), np.eye(4)[None])
@@ -121,13 +121,13 @@ def test_a_cloud_is_no_recording(parts, tmp_path):
 
 
 @pytest.mark.parametrize("several", [False, True])
-def test_a_box_that_no_frame_shows_is_told(several, parts, recording):
+def test_a_box_that_no_frame_shows_is_refused(several, parts, recording):
     box = (*(CENTRE + 0.2), *(CENTRE + 0.3))
     with pytest.raises(InputError, match=r"none of the 4 frames of .* shows an object in the box: give --box"):
         identify(recording=recording, parts=parts, parts_scale="mm", several=several, **ASKED | {"box": box})
 
 
-def test_parts_of_another_unit_are_told(parts):
+def test_parts_of_another_unit_are_refused(parts):
     assert bank_of(parts, "mm", 0.1).names == ("block", "bracket", "rod")
     assert bank_of(parts, "0.001", 0.1).is_true_size
     with pytest.raises(InputError, match=r"are 80 to 90 long, the object about 0\.1: give the parts' unit"):

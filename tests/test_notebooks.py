@@ -67,7 +67,7 @@ def wording(cell):
 
 
 @EACH
-def test_what_is_stored_is_of_this_code(name):
+def test_stored_outputs_belong_to_this_code(name):
     """If it fails, run python scripts/run_notebooks.py NAME."""
     script, notebook = runpy.run_path(str(ROOT / "scripts" / "run_notebooks.py")), stored(name)
     assert notebook.metadata["jaxnbv"]["code"] == script["code_hash"](notebook)

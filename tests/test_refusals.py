@@ -168,7 +168,7 @@ SURFACES = [
 
 
 @pytest.mark.parametrize(("make", "message"), [*GEOMETRY, *SCANNING, *SEARCH, *SURFACES])
-def test_it_is_refused_by_name(make, message, tmp_path, monkeypatch):
+def test_impossible_input_is_refused_by_name(make, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(nbv.InputError, match=message):
         make()

@@ -52,7 +52,7 @@ def test_the_papers_close_up_is_there_when_asked(ring):
     np.testing.assert_allclose(config["first"]["position"]["values"], [0.8, 0.9, 2.2])
 
 
-def test_a_view_is_told_when_it_is_done(ring):
+def test_a_view_is_printed_when_it_is_done(ring):
     """The line is printed before the search for the next view, which fails here."""
     with mock.patch.object(Planner, "choose", side_effect=InputError("stopped here")):
         result = run_command(*FARTHEST, cwd=ring)

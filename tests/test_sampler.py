@@ -39,7 +39,7 @@ def test_lengths_are_in_proportion_to_the_object():
     assert small.base.truncation > large.base.truncation
 
 
-def test_of_a_solid_body_nothing_follows_from_what_was_seen_empty():
+def test_solid_objects_have_no_values_in_empty_space():
     kinds = [[type(one).__name__ for one in preset("screened", solid=solid).model.values] for solid in (False, True)]
     assert kinds == [["OutsideBoundary", "OnSurface", "EmptySpace"], ["OutsideBoundary", "OnSurface"]]
 
@@ -140,7 +140,7 @@ def test_nothing_is_imagined_where_the_object_cannot_be(obstacles, carving):
     np.testing.assert_allclose(values[:, ~nowhere], (AWAY - RADII[:, None, None, None])[:, ~nowhere], atol=1e-5)
 
 
-def test_what_a_volume_cuts_is_no_surface():
+def test_a_cut_by_the_volume_is_no_surface():
     """A slab cuts balls at the top. From above a ray meets the cut, which is no hit. From the side it hits the ball."""
     slab = nbv.Carving(nbv.Box((-1.25, -1.25, -1.25), (1.25, 0.1, 1.25)))
     surfaces = balls(slab).sample(SCANS[0], KEY)
@@ -155,7 +155,7 @@ def test_what_a_volume_cuts_is_no_surface():
 
 
 @pytest.mark.parametrize("room", [0.0, 0.2])
-def test_a_box_that_is_given_does_not_close_the_object_at_its_faces(room):
+def test_a_users_box_does_not_close_the_object_at_its_faces(room):
     box = nbv.Box((-1.0, -0.5, -0.8), (1.0, 0.9, 0.7))
     rows = nbv.surfaces.OutsideBoundary(box, 200, room=room).rows(nbv.Observations.start(SCANS[0]))
     np.testing.assert_allclose(box(rows.points), room, atol=1e-4)
@@ -164,7 +164,7 @@ def test_a_box_that_is_given_does_not_close_the_object_at_its_faces(room):
     assert preset().model.values[0].room == 0.0
 
 
-def test_a_posterior_at_hand_is_not_asked_for_again():
+def test_a_given_posterior_is_not_computed_again():
     sampler, observations = nbv.SurfaceSampler(nbv.GeometricSPSR(0.1, truncation=6), GRID, 3), SCANS[0]
     posterior = sampler.posterior(observations)
     np.testing.assert_array_equal(
@@ -230,7 +230,7 @@ def test_observations_of_another_grid_are_refused(made_by):
         use(fits)
 
 
-def test_where_nothing_is_carved_observations_of_any_grid_will_do():
+def test_without_carving_observations_of_any_grid_are_accepted():
     adapted = balls(None).adapt(seen(balls()))
     assert adapted.empty_nodes is None
     np.testing.assert_array_equal(adapted.cloud.points, seen(balls()).cloud.points)

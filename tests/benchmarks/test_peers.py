@@ -66,7 +66,7 @@ def test_one_point_a_voxel_is_the_mean():
 
 
 @pytest.mark.parametrize("name", PROTOCOLS)
-def test_of_a_ball_a_scan_covers_the_cap_that_the_camera_sees(ball, name):
+def test_a_scan_of_a_ball_covers_the_visible_cap(ball, name):
     protocol = PROTOCOLS[name]
     trial = Trial(ball, protocol, half=False, up="y")
     side = 2.0 * trial.mesh.bounding_radius * trial.unit

@@ -46,7 +46,7 @@ def test_rays_go_through_the_pixels_of_the_intrinsic_matrix(values):
 
 @settings(max_examples=50, deadline=None)
 @given(matrices, st.integers(1, 7))
-def test_a_strided_camera_has_the_rays_of_every_so_many_th_pixel(values, stride):
+def test_a_strided_camera_has_the_rays_of_every_nth_pixel(values, stride):
     camera, _ = camera_and_matrix(values)
     rows = slice(stride // 2, None, stride)
     every = np.asarray(camera.pixel_directions()).reshape(camera.height, camera.width, 3)[rows, rows]
@@ -198,7 +198,7 @@ def test_a_scan_tells_what_lies_in_range_and_is_not_aslant():
     assert not np.asarray(scanned.points)[~expected].any()
 
 
-def test_what_a_limited_sensor_missed_is_empty_as_far_as_it_reaches():
+def test_rays_of_a_limited_sensor_are_empty_up_to_its_range():
     grid, pose, see = nbv.Grid(24), nbv.look_at((0.0, 0.0, 2.5)), eqx.filter_jit(nbv.Carving.empty_nodes)
     nothing = nbv.SDFSurface(Sphere(0.01).translate([0.0, 1.4, 0.0]))
     masks = {

@@ -84,7 +84,7 @@ def test_a_box_keeps_the_object_and_knows_what_was_crossed():
     assert (np.abs(points[hidden & np.asarray(whole.mask)][:, 1] + 0.5) < 0.02).mean() > 0.9
 
 
-def test_beyond_its_range_a_sensor_met_nothing_and_before_it_says_nothing():
+def test_depths_beyond_the_range_are_misses_and_nearer_ones_unknown():
     limited = nbv.Camera.from_intrinsics(CAMERA.intrinsics, 48, 64, nearest=0.72, farthest=0.9)
     depth = depth_of(BALL, TABLE)
     cloud = nbv.PointCloud.from_depth(depth, limited, POSE)
@@ -112,7 +112,7 @@ WALL = 2500.0 + 5.0 * np.random.default_rng(0).normal(size=(48, 64))
 @pytest.mark.parametrize("alone", [True, False])
 @pytest.mark.parametrize("mark", [65535, 32767, 10000, 8191, 4095, 2047])
 @pytest.mark.filterwarnings("ignore:the depth image has the value")
-def test_a_mark_says_no_more_than_zero(mark, alone, dtype, farthest):
+def test_a_mark_of_missing_depth_equals_zero(mark, alone, dtype, farthest):
     """The clouds are the same row by row, and no node within the ball is known to be empty."""
     camera = nbv.Camera.from_intrinsics(CAMERA.intrinsics, 48, 64, farthest=farthest)
     scale = 1e-3 if dtype == np.uint16 else 1.0
@@ -237,7 +237,7 @@ def test_what_cannot_be_meant_is_named():
             nbv.PointCloud.from_depth(image, camera, pose, **options)
 
 
-def test_depths_beyond_the_type_say_nothing_and_only_infinity_says_nothing_is_there():
+def test_only_infinity_is_a_miss():
     camera, pose = nbv.Camera(height=4, width=4), nbv.look_at((0.0, 0.0, 2.5))
     for depth, missed in ((3.5e38, 0), (1e300, 0), (np.inf, 16)):
         cloud = nbv.PointCloud.from_depth(np.full((4, 4), depth), camera, pose)

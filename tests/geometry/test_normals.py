@@ -70,7 +70,7 @@ def test_the_noise_of_an_image_is_found(noise):
     assert np.quantile(np.abs(ratio - 1.0), 0.9) < 0.25
 
 
-def test_noise_is_that_of_a_pixels_own_place_and_depth():
+def test_noise_is_local_in_image_and_depth():
     """Two walls, both with low noise on the left and high noise on the right. Their pixels are mixed, and a third
     belong to the near wall.
 
@@ -86,7 +86,7 @@ def test_noise_is_that_of_a_pixels_own_place_and_depth():
     assert np.quantile(np.abs(np.log(ratio[:, away])), 0.95) < 0.3
 
 
-def test_neighbours_that_err_alike_hide_no_noise():
+def test_correlated_errors_do_not_hide_noise():
     """Each error is averaged with those of the next pixels, as by a sensor that smooths. The estimate is less than for
     independent errors, but more than half."""
     rng = np.random.default_rng(0)
@@ -141,7 +141,7 @@ def test_a_noisy_background_does_not_blur_what_is_before_it(wall):
     ids=["rounded", "1 mm", "2 mm"],
 )
 @pytest.mark.parametrize("stride", [1, 4])
-def test_normals_see_through_the_noise(noise, median, most, stride):
+def test_normals_are_accurate_despite_noise(noise, median, most, stride):
     """Errors in degrees at half and nine tenths of the pixels, including the edge of the ball. Fitted depths are better
     than measured ones."""
     depth, normals = ball_and_plane()

@@ -175,7 +175,7 @@ def slopes_of(net, points, normals):
     return jax.grad(lambda points: net(points, normals)[0])(points)
 
 
-def test_what_tells_the_class_does_not_depend_on_how_the_object_is_turned(x64):
+def test_points_that_tell_the_class_are_rotation_invariant(x64):
     focus = jax.tree.map(lambda leaf: leaf.astype(np.float64), focused().focus)
     points, normals = oriented(300)
     mask = jnp.arange(300) < 280

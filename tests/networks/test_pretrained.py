@@ -30,7 +30,7 @@ def test_the_weights_are_small():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("framing", Framing)
-def test_right_where_the_pattern_is_seen_and_undecided_where_it_is_not(framing):
+def test_it_is_right_with_the_pattern_in_view_and_undecided_without(framing):
     """Fifty test clouds in which a view shows the pattern well, and clouds without the pattern that occur before
     these."""
     enough = {Framing.CLOSE_UP: 500, Framing.WHOLE: 150}[framing]
@@ -50,7 +50,7 @@ def test_right_where_the_pattern_is_seen_and_undecided_where_it_is_not(framing):
 
 
 @pytest.mark.slow
-def test_the_class_of_a_cargo_by_what_is_seen_of_it():
+def test_the_class_of_a_visible_cargo():
     """Test trucks with a cargo that a view shows well. Without a point on the cargo the classifier is undecided."""
     classifier = pretrained_classifier("truck")
     assert classifier.classes == HOUSEHOLD

@@ -87,7 +87,7 @@ def test_the_older_layout(tmp_path, state):
     [("os", "system"), ("posix", "system"), ("builtins", "eval"), ("builtins", "getattr"), ("torch", "load")],
 )
 @pytest.mark.parametrize("layout", ["archive", "stream", "alone"])
-def test_whatever_else_a_file_asks_for_is_not_run(tmp_path, module, name, layout):
+def test_other_code_in_a_file_is_not_run(tmp_path, module, name, layout):
     mark = tmp_path / "mark"
     attack = {"a": call(named(module, name), f"open({str(mark)!r}, 'w')" if name == "eval" else f"touch {mark}")}
     file = tmp_path / "net.pth"
@@ -109,7 +109,7 @@ def test_the_attack_would_have_worked(tmp_path):
     assert mark.exists()
 
 
-def test_what_a_training_run_left_beside_its_model_is_passed_over(tmp_path, state):
+def test_other_data_of_a_training_run_is_ignored(tmp_path, state):
     """A NumPy number, settings of an own class, and a function, in the forms that pickles have."""
     kind = Op(b"b", call(named("numpy", "dtype"), "f8", False, True), (3, "<", None, None, None, -1, -1, 0))
     text = call(named("_codecs", "encode"), struct.pack("<d", 0.875).decode("latin1"), "latin1")

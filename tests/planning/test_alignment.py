@@ -126,7 +126,7 @@ def test_a_single_pose_is_corrected_as_small_gicp_does():
     assert np.linalg.norm(corrected - oracle, axis=1).mean() < 0.1 * moved.mean()
 
 
-def test_views_that_only_shift_do_not_tell_a_shift_of_the_mount():
+def test_views_without_rotation_do_not_determine_a_shift_of_the_mount():
     """All cameras have the same orientation, so that a shift of the mount shifts all scans alike."""
     ahead = np.asarray(look_at(EYES[0]).to_matrix(), np.float64)[:3, :3]
     (cloud, *_), _ = views_of_a_box([np.eye(4)], eyes=EYES[:1])
@@ -139,7 +139,7 @@ def test_views_that_only_shift_do_not_tell_a_shift_of_the_mount():
     assert "from another side" in alignment.motion or "turned about its optical axis" in alignment.motion
 
 
-def test_views_that_share_nothing_tell_nothing():
+def test_views_without_overlap_determine_nothing():
     clouds, poses = views_of_a_box([np.eye(4)] * 2, eyes=[(0.0, 0.0, 0.7), (0.0, 0.0, -0.7)])
     alignment = align_views(clouds, poses)
     assert np.isnan(alignment.disagreement).all()
@@ -196,7 +196,7 @@ def off_the_sphere(session):
     return np.median(np.abs(np.linalg.norm(points - np.array([0.3, 0.2, 0.101]), axis=1) - 0.1))
 
 
-def test_a_session_warns_of_its_mount_once_and_corrects_it_where_that_is_asked_for(tmp_path):
+def test_a_session_warns_of_its_mount_once_and_corrects_it_on_request(tmp_path):
     """The cameras are rolled, because a round scene determines no shift without a rotation."""
     rolls = [Rotation.from_rotvec([0.0, 0.0, 0.7 * n]).as_matrix() for n in range(4)]
     true = [place.copy() for place in PLACES]
@@ -220,7 +220,7 @@ def test_a_session_warns_of_its_mount_once_and_corrects_it_where_that_is_asked_f
     np.testing.assert_allclose(sent @ corrected.alignment.corrections[0], planned, atol=1e-5)
 
 
-def test_comparing_views_says_nothing_twice():
+def test_comparing_views_warns_once():
     """Pixels of 10 m mark missing values, which is warned of once for each image."""
     session = session_of()
     with warnings.catch_warnings(record=True) as caught:

@@ -45,7 +45,7 @@ def test_cells_of_a_wall_are_at_its_distance(wall):
     assert (np.asarray(solid(np.array([[0.0, 0.0, -1.04], [0.5, 0.3, -1.04]]))) < 0).all()
 
 
-def test_what_a_later_image_sees_through_is_free(wall):
+def test_cells_that_a_later_image_sees_through_are_free(wall):
     clutter, pose = wall
     assert (clutter.votes[12:36, 12:36, 11] == 1).all()
     behind = voted(clutter, np.full((240, 320), 3.5), pose)
@@ -115,7 +115,7 @@ def test_a_post_beside_the_box_hides_it_and_keeps_cameras_away(is_robot):
     assert values[1] < 0.7 * float(free.next().proposal.values[1])
 
 
-def test_who_says_what_stands_around_is_believed():
+def test_obstacles_of_the_user_replace_clutter():
     session = session_of(obstacles=Obstacles())
     session.add(shot_of(WORLD, BESIDE), BESIDE)
     assert session.planner.obstacles.clutter is None

@@ -44,7 +44,7 @@ def test_depth_images_show_mug_and_table_where_they_are():
     assert (points[:, 2] > 0.02).sum() > 100
 
 
-def test_a_mount_that_is_off_moves_the_camera_and_not_what_the_robot_says():
+def test_a_mount_error_moves_the_camera_and_not_the_reported_pose():
     error = mujoco_arm.hand_eye_error(2.0, 10.0)
     exact, off = arm_simulator.Arm(MUG), arm_simulator.Arm(MUG, error)
     np.testing.assert_array_equal(exact.matrix(), off.matrix())
@@ -53,7 +53,7 @@ def test_a_mount_that_is_off_moves_the_camera_and_not_what_the_robot_says():
     assert np.median(away_from_scene(points_of(depth, reported @ error)[::7])) < 5e-4
 
 
-def test_the_arm_holds_the_camera_where_it_is_sent_within_its_joints_limits():
+def test_the_arm_reaches_poses_within_its_joint_limits():
     arm = arm_simulator.Arm(MUG)
     goal = arm.matrix()
     goal[:3, 3] += [0.05, -0.03, -0.08]
@@ -68,7 +68,7 @@ def test_the_arm_holds_the_camera_where_it_is_sent_within_its_joints_limits():
     assert arm.seconds == pytest.approx(seconds)
 
 
-def test_what_an_arm_cannot_do_has_a_reason():
+def test_an_unreachable_pose_has_a_reason():
     arm = arm_simulator.Arm(MUG)
     far, in_table = arm.matrix(), arm.matrix()
     far[:3, 3] += [2.0, 0.0, 0.0]

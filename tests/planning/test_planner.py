@@ -109,7 +109,7 @@ def test_beyond_its_capacity_the_cloud_is_thinned_by_farthest_points(planner, ob
 
 
 @pytest.mark.parametrize(("partners", "kept"), [(0, 0), (1, 2)])
-def test_a_point_that_lies_alone_where_another_view_looked_through_goes(partners, kept):
+def test_a_lone_point_in_space_that_another_view_saw_empty_is_removed(partners, kept):
     """Thinning would keep such a point first. With a neighbour it stays, since it may be a thin part that the view
     missed."""
     camera, stray = Camera(fov=1.3, height=48, width=48), np.array([0.0, 1.0, -1.0])
@@ -189,7 +189,7 @@ def test_a_singular_covariance_is_named():
         planner.propose(planner.init(None, cloud), jax.random.key(0))
 
 
-def test_points_far_apart_are_told_of_with_the_remedy():
+def test_sparse_points_warn_with_the_remedy():
     """Points farther apart than 2.5 lengthscales. One long lengthscale among several is enough."""
     points = np.asarray(fibonacci_sphere(60))
     cloud = PointCloud.from_arrays(points, points)
@@ -205,7 +205,7 @@ def test_points_far_apart_are_told_of_with_the_remedy():
         init((0.025, 0.06), (0.2, 0.2))
 
 
-def test_parts_thinner_than_a_cell_are_told_of_with_the_remedy():
+def test_parts_thinner_than_a_cell_warn_with_the_remedy():
     """Both sides of a slab were scanned. One grid is too coarse for it, and one is not."""
     axis = np.linspace(-0.5, 0.5, 12)
     x, y = (side.ravel() for side in np.meshgrid(axis, axis))

@@ -48,7 +48,7 @@ def test_what_does_not_change_in_a_loop_keeps_its_bits():
     np.testing.assert_array_equal(result, expected)
 
 
-def test_what_is_no_array_passes():
+def test_other_types_than_arrays_pass():
     part = eqx.filter_jit(lambda pair: in_parts(lambda p: (p[0] + 1, p[1], None), pair))
     result = part((X, "name"))
     assert result[1:] == ("name", None)

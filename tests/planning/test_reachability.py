@@ -103,7 +103,7 @@ def test_a_gradient_search_ends_at_a_pose_that_holds():
     assert view.refusals["not reachable"] >= 1
 
 
-def test_what_cannot_be_reached_at_all_is_told():
+def test_unreachable_candidates_are_reported():
     session = begun(reachable=lambda matrices: ["collision" if x > CENTER[0] else "too far" for x in matrices[:, 0, 3]])
     with pytest.raises(InputError, match=r"none of the \d+ poses .* can be reached \(\d+ [a-z ]+, \d+ [a-z ]+\): give"):
         session.next()

@@ -43,7 +43,7 @@ def finished():
     return session
 
 
-def test_it_asks_and_tells_as_a_planner_in_the_scene_does(finished):
+def test_a_session_equals_a_planner_in_the_scene(finished):
     """Every step by hand, with the frame."""
     frame = Frame.fit(np.array(BOX), up="z")
     box = Box(*BOX)
@@ -67,7 +67,7 @@ def test_it_asks_and_tells_as_a_planner_in_the_scene_does(finished):
     np.testing.assert_allclose(finished.observations.cloud.points, observations.cloud.points, atol=1e-5)
 
 
-def test_its_matrices_are_those_that_were_given(finished):
+def test_its_matrices_are_the_users(finished):
     proposed = finished.next()
     distance = np.abs(POSES - proposed.matrix).max(axis=(1, 2))
     assert distance.min() < 1e-5
@@ -115,7 +115,7 @@ def test_metres_and_millimetres_and_both_conventions_tell_the_same(convention, u
 
 
 @pytest.mark.parametrize("elevation", [-0.5 * np.pi, -0.3, 0.5])
-def test_without_poses_it_looks_from_above_unless_told_otherwise(elevation):
+def test_default_poses_are_above_the_object(elevation):
     search = DiscreteSearch(SphereCandidates(60, min_elevation=elevation))
     session = session_of(poses=None, planner=planner_of(search))
     places = np.asarray(session.frame.to_world(session.planner.search.candidates.poses()).position)
@@ -125,7 +125,7 @@ def test_without_poses_it_looks_from_above_unless_told_otherwise(elevation):
     assert least - 1e-3 < lowest < least + 0.1
 
 
-def test_poses_that_look_away_are_worth_nothing_and_it_says_so():
+def test_poses_that_look_away_have_no_value_and_warn():
     away = POSES @ np.diag([-1.0, 1.0, -1.0, 1.0])
     session = session_of(poses=away)
     session.add(shot(FIRST), FIRST, depth_scale=1e-3)
@@ -144,7 +144,7 @@ def test_nothing_recompiles_after_the_second_image(compilations):
     assert after[2:] == [after[2]] * 3
 
 
-def test_where_the_sensor_could_not_be_held_is_not_proposed_again():
+def test_an_unreached_pose_is_not_proposed_again():
     """The user takes the image from elsewhere. Then all other poses are proposed once, and no pose is left."""
     session = session_of(planner=planner_of(FarthestView()), poses=POSES[:4])
     proposed = []
@@ -272,7 +272,7 @@ def test_a_rim_about_the_box_is_modelled_and_not_given(finished):
     assert np.asarray(box(points)).max() <= 0
 
 
-def test_a_box_that_cuts_the_object_is_told_once_a_face():
+def test_a_box_that_cuts_the_object_warns_once_for_each_face():
     """Two centimetres of the ball are beyond the box at +x, and nothing at the other faces."""
     session = session_of(box=(BOX[0], (0.38, 0.32, 0.24)))
     with pytest.warns(
@@ -339,7 +339,7 @@ def test_done_and_next_share_their_samples(monkeypatch, tmp_path):
     assert len(drawn) == 1
 
 
-def test_what_a_rule_looked_at_was_not_proposed(tmp_path):
+def test_views_that_only_a_rule_scored_are_not_proposed(tmp_path):
     """After a call of `done` alone, an image of the user's follows no proposal, live and after loading."""
     session = session_of(tmp_path, until=ValueBelow(0.0))
     session.add(shot(FIRST), FIRST, depth_scale=1e-3)
@@ -428,7 +428,7 @@ def test_a_report_stands_upright_and_needs_no_truth(finished, tmp_path):
 BELOW = np.array([[around(angle, -0.4), around(angle, 0.6)] for angle in (0.5, 2.5, 4.5)]).reshape(-1, 4, 4)
 
 
-def test_the_table_is_found_told_of_and_kept_clear_of():
+def test_the_table_is_detected_and_avoided_with_a_warning():
     """The box reaches two centimetres into the table. Half of the poses are below the table."""
     session = session_of(box=((0.18, 0.08, -0.02), BOX[1]), poses=BELOW, obstacles=None)
     with pytest.warns(UserWarning, match=r"stands on a plane through \[.*, -0\.00.*Obstacles\(\) to keep it"):
@@ -462,7 +462,7 @@ def test_a_room_scanned_from_inside_needs_poses_inside():
 
 
 @pytest.mark.parametrize("up", ["y", "-y", "x", "-x", "-z"])
-def test_a_wrong_up_is_told_by_the_table(up):
+def test_the_table_reveals_a_wrong_up(up):
     """The warning comes once, with the right axis."""
     session = session_of(box=((0.18, 0.08, -0.02), BOX[1]), obstacles=None, up=up)
     with pytest.warns(UserWarning, match="no table is found") as warning_list:
@@ -471,7 +471,7 @@ def test_a_wrong_up_is_told_by_the_table(up):
     assert [message in str(one.message) for one in warning_list].count(True) == 1
 
 
-def test_no_table_is_told_and_obstacles_say_that_there_is_none():
+def test_a_missing_table_warns_unless_obstacles_are_given():
     image = np.where(
         shot(FIRST) * 1e-3 * np.linalg.norm(CAMERA.pixel_directions(), axis=1).reshape(48, 64) < 0.6, shot(FIRST), 0
     )
@@ -486,7 +486,7 @@ def test_no_table_is_told_and_obstacles_say_that_there_is_none():
         session_of(obstacles=Obstacles()).add(image, FIRST, depth_scale=1e-3)
 
 
-def test_a_table_is_kept_where_that_is_asked_for():
+def test_a_table_is_part_of_the_object_on_request():
     session = session_of(box=((0.18, 0.08, -0.02), BOX[1]), poses=BELOW, obstacles=Obstacles())
     with pytest.warns(UserWarning, match="go on beyond the box") as warning_list:
         session.add(shot(FIRST), FIRST, depth_scale=1e-3)

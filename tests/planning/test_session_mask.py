@@ -38,7 +38,7 @@ def test_points_are_those_of_the_mask(tmp_path):
     assert np.array_equal(again.cloud.to_numpy()[0], masked.cloud.to_numpy()[0])
 
 
-def test_what_is_to_be_ignored_is_no_part_of_the_object():
+def test_ignored_points_are_no_part_of_the_object():
     """One half of the world counts as the robot."""
 
     def is_robot(points):

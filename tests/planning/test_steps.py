@@ -62,7 +62,7 @@ def test_a_finer_sensor_sees_more_from_the_same_poses():
         assert_same(view.pose, coarse.pose)
 
 
-def test_it_ends_where_the_planner_has_no_room_and_fails_where_no_candidate_is_left():
+def test_it_ends_at_full_capacity_and_fails_without_candidates():
     assert len(list(views_of(planner(FarthestView(CANDIDATES), 1)))) == 1
     few = views_of(planner(FarthestView(2), 4), first=sphere_candidates(2)[0])
     assert len(list(itertools.islice(few, 2))) == 2
@@ -70,7 +70,7 @@ def test_it_ends_where_the_planner_has_no_room_and_fails_where_no_candidate_is_l
         next(few)
 
 
-def test_views_that_are_known_are_told_and_not_asked_for():
+def test_recorded_views_are_replayed_without_proposals():
     own, requests = planner(RandomView(CANDIDATES)), []
     whole = list(views_of(own))
 
@@ -94,7 +94,7 @@ def test_a_step_holds_the_samples_and_the_observations_that_the_next_view_is_cho
     assert third.seconds > 0.0
 
 
-def test_an_episode_lets_a_posterior_go_before_it_makes_the_next(monkeypatch):
+def test_an_episode_frees_each_posterior_before_the_next(monkeypatch):
     """Each posterior holds hundreds of megabytes at thousands of points."""
     references, posterior = [], SurfaceSampler.posterior
 

@@ -63,7 +63,7 @@ def of_half(cloud):
 @pytest.mark.parametrize(
     ("enough", "resamplings", "stops"), [(1, 8, True), (200, 8, False), (200, 0, True), (201, 0, False)]
 )
-def test_sure_asks_all_of_the_cloud_and_halves_of_it(score, enough, resamplings, stops):
+def test_sure_classifies_the_cloud_and_its_halves(score, enough, resamplings, stops):
     planner = planner_of(score(functools.partial(of_count, enough=enough)))
     reason = Sure(0.95, resamplings).after(after(planner, cloud_of(200)))
     assert (reason is not None) == stops
@@ -71,13 +71,13 @@ def test_sure_asks_all_of_the_cloud_and_halves_of_it(score, enough, resamplings,
         assert reason.startswith("sure of class 0 (99 %")
 
 
-def test_sure_wants_the_same_class_of_every_half():
+def test_sure_needs_the_same_class_from_every_half():
     planner = planner_of(CrossEntropy(of_half))
     assert Sure(0.95, 0).after(after(planner, cloud_of(199))) is not None
     assert Sure(0.95, 16).after(after(planner, cloud_of(199))) is None
 
 
-def test_sure_is_asked_the_probability_that_was_given():
+def test_sure_uses_its_probability():
     planner = planner_of(CrossEntropy(functools.partial(of_count, enough=1)))
     assert Sure(0.98).after(after(planner, cloud_of(50))) is not None
     assert Sure(0.995).after(after(planner, cloud_of(50))) is None
@@ -98,7 +98,7 @@ def segmenter(counts):
         (("part 2",), 41, False),
     ],
 )
-def test_found_counts_the_points_of_the_parts_that_are_asked_for(parts, points, stops):
+def test_parts_found_counts_points_of_the_wanted_parts(parts, points, stops):
     planner = planner_of(ExpectedUtilityImprovement(segmenter((80, 80, 40))))
     reason = PartsFound(points, parts).after(after(planner, cloud_of(200, 200)))
     assert (reason is not None) == stops
@@ -139,7 +139,7 @@ def test_expected_coverage_is_the_share_of_the_area_that_poses_show(points, size
 
 
 @pytest.mark.parametrize("count", [1, 2])
-def test_what_is_near_to_measured_surface_but_faces_no_view_is_unseen(count):
+def test_surface_that_faces_no_view_is_unseen(count):
     """After one view of a ball from afar less than half of it is seen. After a second view from the other side a part
     remains."""
     camera, poses = Camera(height=60, width=60), look_at([(0.0, 0.0, 5.0), (0.0, 0.0, -5.0)])
@@ -157,7 +157,7 @@ def test_what_is_near_to_measured_surface_but_faces_no_view_is_unseen(count):
     assert expected_coverage(context, planner.acquisition) == pytest.approx(share, abs=0.02)
 
 
-def test_what_no_sensor_can_measure_need_not_be_covered():
+def test_surface_that_views_looked_through_need_not_be_covered():
     """Two samples: the ball that was measured, and a larger ball that every view looked through."""
     camera, poses = Camera(height=50, width=50), look_at([(0.0, 0.0, 5.0), (5.0, 0.0, 0.0)])
     planner, fine = planner_of(NewSurface(), DiscreteSearch(poses)), Grid(64)
@@ -242,7 +242,7 @@ def test_an_episode_ends_by_its_rule_and_goes_on_by_another(tmp_path):
         np.testing.assert_array_equal(view.scan.points, expected.scan.points)
 
 
-def test_a_view_of_too_little_value_is_not_taken():
+def test_a_view_below_the_value_is_not_taken():
     planner = planner_of(Coverage())
     episode = simulate(planner, SCENE, FIRST, 6, KEY, progress=False)
     values = [float(view.proposal.value) for view in episode.views[1:]]

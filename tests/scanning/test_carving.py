@@ -95,7 +95,7 @@ class Told(WavesModel):
         return WavesPosterior(level=1000.0 * jnp.sum(empty.mask) + outermost)
 
 
-def test_the_model_is_told_of_what_was_seen_empty_within_the_volume():
+def test_the_model_gets_the_empty_space_within_the_volume():
     planner, waves = planner_of(model=Told()), planner_of(carving=None)
     observations = after_both_sides(planner, SOLIDS["ball"])
     within = observations.empty_nodes & CARVING.inside(SMALL_GRID)

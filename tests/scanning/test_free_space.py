@@ -143,7 +143,7 @@ def with_invalid(cloud, invalid):
     return nbv.PointCloud(points, normals, cloud.mask & keep, cloud.missed & keep)
 
 
-def test_of_a_camera_among_the_nodes_those_behind_it_are_not_seen():
+def test_nodes_behind_a_camera_within_the_grid_are_not_seen():
     pose = nbv.look_at((0.1, 0.2, 0.3), (1.0, 0.4, 0.5))
     nothing = jnp.zeros((CAMERA.num_rays, 3))
     missed = jnp.ones(CAMERA.num_rays, bool)

@@ -69,7 +69,7 @@ def shown(surfaces, pose, index=0):
 EMPTY = nbv.PointCloud(jnp.zeros((600, 3)), jnp.zeros((600, 3)), jnp.zeros(600, bool), jnp.zeros(600, bool))
 
 
-def test_what_a_view_measured_stays_and_what_it_looked_at_in_vain_goes():
+def test_measured_surface_stays_and_unmeasured_surface_is_left_out():
     """A view of the ball of radius 0.6 keeps the sample of radius 0.6, and hides the one of 0.8 from there. From the
     other side, which was not seen, it is still visible."""
     surfaces = sampled(0.6, 0.8)
@@ -84,7 +84,7 @@ def test_what_a_view_measured_stays_and_what_it_looked_at_in_vain_goes():
 
 
 @pytest.mark.parametrize(("sight", "share"), [(np.inf, 0.5), (1.0, 1.0), (0.0, 1.0)])
-def test_only_as_far_as_a_view_saw_it_looked(sight, share):
+def test_a_view_looked_only_as_far_as_it_saw(sight, share):
     """Without a single return: sight to the end, up to something before the ball, or none."""
     surfaces = sampled(0.6)
     looks, poses = after(POSE, dataclasses.replace(EMPTY, sight=jnp.full(600, sight)))
@@ -92,7 +92,7 @@ def test_only_as_far_as_a_view_saw_it_looked(sight, share):
     assert count == shown(surfaces, POSE) if share == 1.0 else count < share * shown(surfaces, POSE)
 
 
-def test_a_ray_that_met_something_deeper_has_passed_however_steep_the_surface():
+def test_a_deeper_hit_passes_surface_of_any_steepness():
     """A return from a wall behind the ball removes rays up to the very limb. No return removes rays up to 60 degrees
     only."""
     surfaces, left = sampled(0.6), []
@@ -102,7 +102,7 @@ def test_a_ray_that_met_something_deeper_has_passed_however_steep_the_surface():
     assert left[1] < 0.5 * left[0]
 
 
-def test_of_a_sensor_of_many_rays_every_few_are_kept():
+def test_fine_sensors_keep_a_stride_of_rays():
     looks = Looks.empty(GRID, nbv.Camera(height=480, width=640), 2)
     assert 2_000 < looks.camera.num_rays <= 5_000
     assert looks.sight.shape == (2, looks.camera.num_rays)

@@ -119,7 +119,7 @@ UNREAD = {
 
 
 @pytest.mark.parametrize("name", UNREAD)
-def test_what_trimesh_passes_over_is_named(tmp_path, name):
+def test_data_that_trimesh_ignores_is_named(tmp_path, name):
     tree, message = UNREAD[name]
     with pytest.raises(nbv.InputError, match=message):
         nbv.load_mesh(glb(tmp_path / "boxes.glb", tree, PLACES, ROWS))
@@ -188,7 +188,7 @@ WHOLE = {
 
 
 @pytest.mark.parametrize("name", WHOLE)
-def test_whole_files_are_read_as_they_are_meant(tmp_path, name):
+def test_complete_files_are_read(tmp_path, name):
     """A box of 1 x 2 x 3. Unused places and faces with two corners are allowed."""
     content = WHOLE[name]
     (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
@@ -241,7 +241,7 @@ def test_meshes_and_scenes_of_trimesh(tmp_path):
         nbv.load_mesh(trimesh.PointCloud(CORNERS))
 
 
-def test_what_takes_a_mesh_takes_that_of_trimesh():
+def test_functions_of_meshes_take_those_of_trimesh():
     bank = nbv.ShapeBank.from_meshes([BOX, trimesh.creation.icosphere(2)], resolution=16, progress=False)
     places = np.array([[0.0, 0.0, 0.0], [0.6, 0.0, 0.0], [0.0, 0.0, 1.1]])
     solids = [jax.tree.map(lambda rows, row=row: rows[row], bank.solids) for row in range(2)]

@@ -204,7 +204,7 @@ def test_what_an_object_stands_on_is_found(seed):
     ],
     ids=["a table that is the object", "the top of a box", "things below", "a wall", "few points"],
 )
-def test_what_is_no_support_is_kept(parts):
+def test_points_of_no_support_are_kept(parts):
     assert under(*parts(np.random.default_rng(0))) is None
 
 
@@ -259,7 +259,7 @@ def test_a_table_before_a_wall_is_found_from_any_side(size, tilt):
             assert abs(float(plane(jnp.asarray(at, jnp.float32)))) / frame.scale < 0.0015
 
 
-def test_no_wall_is_a_table_and_another_axis_is_named():
+def test_a_wall_is_no_table_and_a_wrong_axis_is_named():
     """A block in the air before a wall, and a block on a table with a wrong upward axis."""
     rng = np.random.default_rng(6)
     for _ in range(3):

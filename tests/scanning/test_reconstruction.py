@@ -79,7 +79,7 @@ class BallsPosterior(nbv.surfaces.SurfacePosterior):
         return jnp.minimum(away, jnp.linalg.norm(x - jnp.array([0.6, 0.3, 0.0]), axis=-1) - 0.3) + 0.25
 
 
-def test_other_models_are_meshed_too_less_pieces_on_which_no_points_lie():
+def test_a_users_model_is_meshed_without_pieces_that_hold_no_points():
     """The cloud's sphere cuts the left ball, and passes the other one."""
     with pytest.warns(UserWarning, match="left out 1 piece of the mesh with hardly any points"):
         mesh = mean_mesh(Balls(), sphere_cloud(), nbv.Grid(30))
@@ -100,7 +100,7 @@ def test_a_piece_stays_with_four_points_on_it(points, kept):
     assert len(warning_list) == 2 - kept
 
 
-def test_what_was_seen_empty_is_not_meshed():
+def test_empty_space_is_not_meshed():
     """One of the model's two balls is real. The camera sees past it through the other."""
     surface = nbv.SDFSurface(Sphere(0.5).translate((-0.6, 0.0, 0.0)))
     camera, pose = nbv.Camera(fov=1.3, height=60, width=60), nbv.look_at((0.0, 0.0, 2.5))

@@ -35,7 +35,7 @@ def test_batched_poses_equal_single_ones(name):
         np.testing.assert_allclose(alone.normals, batch.normals[i], atol=1e-4)
 
 
-def test_a_camera_in_other_units_is_told():
+def test_a_scan_of_nothing_in_other_units_warns():
     """A scan that sees nothing warns. A large world that is visible does not."""
     camera = nbv.Camera(height=4, width=4)
     far = nbv.look_at([[0.0, 0.0, 2500.0], [0.0, 0.0, 2.5]])

@@ -69,7 +69,7 @@ def test_only_the_same_place_and_direction_counts_as_visited():
         ([-np.inf] * 4, 0),
     ],
 )
-def test_values_that_rounding_may_turn_round_tie_and_the_first_is_taken(values, expected):
+def test_values_equal_up_to_rounding_tie_and_the_first_wins(values, expected):
     best = best_unvisited(PROBLEM, POSES[:4], jnp.asarray(values))
     np.testing.assert_array_equal(best.pose.position, POSES.position[expected])
     assert float(best.value) == np.float32(values[expected])
@@ -93,7 +93,7 @@ def test_standard_errors_are_those_of_the_scores_sample_by_sample():
 
 
 @pytest.mark.parametrize("taken", [(), (3,), (3, 8), (0, 3, 8)])
-def test_of_what_is_gained_once_the_farthest_of_those_that_are_level(taken):
+def test_tied_gains_choose_the_farthest_candidate(taken):
     """A tie is within two standard errors and, from the second view on, the mean expectation at visited poses."""
     problem = visit(PROBLEM.with_acquisition(Once()), *[POSES[index] for index in taken])
     scores, is_open = sample_by_sample(PROBLEM), ~np.isin(np.arange(12), taken)
@@ -113,7 +113,7 @@ def test_of_what_is_gained_once_the_farthest_of_those_that_are_level(taken):
     assert float(proposal.standard_error) == pytest.approx(float(proposal.standard_errors[expected]))
 
 
-def test_of_what_is_gained_once_the_way_there_counts_for_more():
+def test_travel_counts_among_tied_gains():
     here, cost = nbv.look_at(jnp.array([0.0, 0.0, 2.5])), nbv.ValuePerCost(nbv.arc_length, fixed=1e-3)
     problem = dataclasses.replace(visit(PROBLEM.with_acquisition(Once()), here), cost=cost)
     proposal = propose(SEARCH, problem)
@@ -121,7 +121,7 @@ def test_of_what_is_gained_once_the_way_there_counts_for_more():
     assert proposal.value_at_visited is None
 
 
-def test_what_is_gained_once_and_is_no_number_is_told_of():
+def test_a_gain_of_nan_is_reported():
     class Broken(Once):
         def score(self, context, view):
             return jnp.nan * view.scan.points[0, 0]
@@ -129,7 +129,7 @@ def test_what_is_gained_once_and_is_no_number_is_told_of():
     assert np.isnan(float(propose(SEARCH, PROBLEM.with_acquisition(Broken())).value))
 
 
-def test_of_one_sample_no_errors_are_known():
+def test_one_sample_has_no_standard_errors():
     alone = propose(SEARCH, with_samples(PROBLEM, slice(0, 1)))
     assert alone.num_tied is None
     np.testing.assert_array_equal(np.isnan(alone.standard_errors), True)
@@ -189,13 +189,13 @@ def assert_same(proposal, expected):
 
 
 @pytest.mark.parametrize("name", SEARCHES)
-def test_what_is_picked_by_the_scores_is_what_is_proposed(name, asked):
+def test_the_proposal_is_the_pick_by_the_scores(name, asked):
     search = SEARCHES[name]
     assert_same(pick(search, asked, score(search, asked)), propose(search, asked))
 
 
 @pytest.mark.parametrize("name", SEARCHES)
-def test_scores_are_those_of_each_sample_by_each_acquisition_that_is_asked(name):
+def test_scores_are_by_sample_and_acquisition(name):
     result, acquisitions = score(SEARCHES[name], PROBLEM), ASKED.get(name, ())
     assert SEARCHES[name].acquisitions(nbv.Coverage()) == acquisitions
     assert result.shape == ((len(acquisitions), 3, 12) if acquisitions else (0, 0, 12))
@@ -218,7 +218,7 @@ def tie_break(problem, second):
 
 
 @pytest.mark.parametrize("factor", [1.0, -1.0])
-def test_the_best_by_the_second_score_of_those_that_are_tied_by_the_first(factor):
+def test_the_second_score_chooses_among_ties_of_the_first(factor):
     first, second = sample_by_sample(PROBLEM), sample_by_sample(PROBLEM, Height(factor)).mean(axis=0)
     mean = first.mean(axis=0)
     difference = first[:, [mean.argmax()]] - first
@@ -232,7 +232,7 @@ def test_the_best_by_the_second_score_of_those_that_are_tied_by_the_first(factor
     np.testing.assert_allclose(proposal.values, mean, rtol=1e-5)
 
 
-def test_where_the_first_tells_nothing_the_second_decides_and_where_it_tells_all_the_first_does():
+def test_the_second_score_decides_only_ties():
     proposal = tie_break(PROBLEM.with_acquisition(Constant(1.0)), nbv.Coverage())
     np.testing.assert_array_equal(proposal.pose.position, propose(nbv.DiscreteSearch(12), PROBLEM).pose.position)
     # Equal samples determine the first score exactly, and so does a single sample.
@@ -250,7 +250,7 @@ def test_a_tie_break_does_not_choose_visited_views():
     np.testing.assert_allclose(of, heights[:3], rtol=1e-5)
 
 
-def test_the_way_there_counts_among_ties():
+def test_travel_decides_ties_of_both_scores():
     """Among candidates that tie except for travel the nearest one wins, whatever the second score."""
     here, cost = nbv.look_at(jnp.array([0.0, 0.0, 2.5])), nbv.ValuePerCost(nbv.arc_length, fixed=1e-3)
     problem = dataclasses.replace(visit(PROBLEM.with_acquisition(Constant(1.0)), here), cost=cost)
@@ -259,5 +259,5 @@ def test_the_way_there_counts_among_ties():
     np.testing.assert_array_equal(proposal.pose.position, proposal.candidates.position[distances.argmin()])
 
 
-def test_a_second_score_that_is_no_number_is_told_of():
+def test_a_second_score_of_nan_is_reported():
     assert np.isnan(float(tie_break(PROBLEM, Constant(np.nan)).value))

@@ -59,7 +59,7 @@ def config_of(episode):
 
 
 @pytest.mark.slow
-def test_no_turned_bit_of_a_view_passes(finished, tmp_path):
+def test_no_flipped_bit_of_a_view_passes(finished, tmp_path):
     """For any single bit the file is refused by name, or its arrays are the same (some bits have no meaning)."""
     episode, folder = finished
     config = config_of(episode)

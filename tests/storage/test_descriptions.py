@@ -185,7 +185,7 @@ def test_a_users_class_is_told_apart_by_its_methods():
     assert describe(acquisition(1)) == describe(acquisition(1)) != describe(acquisition(2))
 
 
-def test_what_refers_to_itself_ends():
+def test_a_value_that_refers_to_itself_is_described():
     loops = []
     for number in (1.0, 2.0):
         loop = [number]

@@ -142,7 +142,7 @@ def test_a_shorter_episode_is_not_saved_over_a_longer_one(finished, tmp_path):
         shorter.save(folder)
 
 
-def test_other_versions_are_told_of(finished, tmp_path):
+def test_a_folder_of_another_version_warns(finished, tmp_path):
     folder = shutil.copytree(finished[1], tmp_path / "copy")
     record = json.loads((folder / "episode.json").read_text())
     record["versions"]["jax"] = "0.0.1"
@@ -151,7 +151,7 @@ def test_other_versions_are_told_of(finished, tmp_path):
         run(folder, views=5)
 
 
-def test_a_first_view_that_fails_does_not_bind_its_folder(tmp_path, finished):
+def test_a_failed_first_view_leaves_the_folder_free(tmp_path, finished):
     with pytest.raises(InputError, match="the first scan is empty"):
         run(tmp_path, first=look_at((0.0, 0.0, 2.5), (0.0, 0.0, 9.0)))
     assert contents(tmp_path) == {}
@@ -159,7 +159,7 @@ def test_a_first_view_that_fails_does_not_bind_its_folder(tmp_path, finished):
     assert contents(tmp_path) == contents(finished[1])
 
 
-def test_a_record_without_views_binds_nobody(tmp_path, finished):
+def test_a_record_without_views_belongs_to_any_configuration(tmp_path, finished):
     """A run that was killed between the two files leaves such a folder."""
     run(tmp_path, views=1, key=jax.random.key(9))
     for name in ("view_00.npz", "end_00.npz", "cloud.ply"):
@@ -168,7 +168,7 @@ def test_a_record_without_views_binds_nobody(tmp_path, finished):
     assert contents(tmp_path) == contents(finished[1])
 
 
-def test_every_view_is_told_when_it_is_done(tmp_path):
+def test_each_is_called_when_a_view_is_done(tmp_path):
     """The view's file exists then, and the next one's does not. Views from the folder are passed too."""
     calls = []
 

@@ -85,7 +85,7 @@ def test_an_episode_is_loaded_as_it_was_saved(tmp_path_factory, planner, stop_re
     nbv.Episode.load(folder).save(folder)
 
 
-def test_what_cannot_be_made_again_is_given(tmp_path):
+def test_a_part_that_cannot_be_rebuilt_is_passed_to_load(tmp_path):
     """A utility without a name. The folder recognises it, but cannot make it again."""
     planner = nbv.Planner(lambda cloud: cloud.count * 1.0, nbv.FarthestView(9), nbv.Camera(height=8, width=8))
     episode = nbv.simulate(planner, nbv.sdf.Sphere(0.9), nbv.look_at((0.0, 0.0, 2.5)), 2, jax.random.key(0))

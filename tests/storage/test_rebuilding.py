@@ -122,13 +122,13 @@ def assert_same(one, other):
 
 
 @pytest.mark.parametrize("name", CONFIGURATIONS)
-def test_what_was_described_is_made_again(name):
+def test_a_described_value_is_rebuilt(name):
     thing = CONFIGURATIONS[name]()
     assert_same(thing, trip(thing))
 
 
 @pytest.mark.slow
-def test_everything_public_is_made_again():
+def test_every_public_class_is_rebuilt():
     skipped, count = {nbv.shape_bank, nbv.load_mesh, nbv.ShapeBank.from_meshes, readers.class_meshes}, 0
     for function, arguments in hostile.CALLS.items():
         if function not in skipped:
@@ -230,7 +230,7 @@ def test_a_record_that_names_other_code_is_refused_and_nothing_runs(told, proble
         (nbv.HostClassifier(len, 2, version="a"), r"stored without its function"),
     ],
 )
-def test_what_cannot_be_made_again_is_named_with_the_remedy(thing, problem):
+def test_a_value_that_cannot_be_rebuilt_is_named_with_the_remedy(thing, problem):
     with pytest.raises(InputError, match=rf"^planner.*{problem}.*give it again: load\(\.\.\., planner="):
         trip({"score": thing})
 
@@ -260,7 +260,7 @@ def test_a_folder_gives_its_configuration_back(tmp_path):
         RunFolder(tmp_path, "episode", again | {"planner": planner})
 
 
-def test_a_part_that_cannot_be_made_again_is_given(tmp_path):
+def test_a_part_that_cannot_be_rebuilt_is_passed(tmp_path):
     planner = planned(nbv.CrossEntropy(nbv.HostClassifier(len, 2, version="a"), 16))
     stored(tmp_path, planner=planner)
     with pytest.raises(InputError, match=r"planner\.acquisition\.classifier .*planner=\.\.\."):

@@ -150,7 +150,7 @@ def hypotheses_of(task, part, turn=None, none=0.0):
     return PartHypotheses(task.bank, placed, jnp.asarray([1.0 - none, none]), jnp.asarray(0.03))
 
 
-def test_what_is_measured_is_right_for_the_truth_and_its_symmetries_alone(folder):
+def test_the_measures_accept_only_the_truth_and_its_symmetries(folder):
     study = small_study(folder)
     index = next(index for index in range(6) if study.scene(index).name == "block")
     scene = study.scene(index)
@@ -176,7 +176,7 @@ def test_what_is_measured_is_right_for_the_truth_and_its_symmetries_alone(folder
     assert measures["p_true"] == pytest.approx(0.4)
 
 
-def test_names_that_are_level_share_what_is_right(folder):
+def test_tied_names_share_the_right_answer(folder):
     study = small_study(folder)
     scene = study.scene(0)
     task, truth = scene.task, study.truth(scene)

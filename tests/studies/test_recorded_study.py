@@ -137,7 +137,7 @@ def test_each_layout_takes_the_intrinsics_that_lie_there_and_the_unit_that_fits(
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("given", [INTRINSICS, INTRINSICS.tolist(), (40.0, 40.0, 23.5, 17.5)])
-def test_what_is_given_comes_before_what_is_stored(layout, given, sequence, tmp_path):
+def test_arguments_take_precedence_over_files(layout, given, sequence, tmp_path):
     layout(tmp_path, *sequence)
     np.savetxt(tmp_path / "camera-intrinsics.txt", 2.0 * INTRINSICS)
     scale = 1 / 5000 if layout is tum else 1e-3
@@ -163,7 +163,7 @@ def test_the_unit_is_the_one_with_which_frames_agree(layout, units, sequence, tm
     assert 1.0 / frames.depth_scale == pytest.approx(1000 * units)
 
 
-def test_a_unit_that_nothing_tells_is_asked_for(sequence, tmp_path):
+def test_an_undetermined_unit_must_be_given(sequence, tmp_path):
     """One frame, and a camera that does not move, agree with themselves in any unit."""
     depths, matrices = sequence
     for name, still in (("one", slice(0, 1)), ("still", [0, 0, 0])):
@@ -313,7 +313,7 @@ def test_what_is_broken_is_named(name, sequence, tmp_path):
         nbv.readers.RecordedFrames(tmp_path)
 
 
-def test_a_frame_that_is_not_there_and_an_up_that_is_none_are_named(sequence, tmp_path):
+def test_missing_frames_and_a_wrong_up_are_named(sequence, tmp_path):
     known_sensor(plain, tmp_path, sequence)
     with pytest.raises(ValueError, match="no frame 9"):
         nbv.readers.RecordedFrames(tmp_path).depth(COUNT)

@@ -28,7 +28,7 @@ def few(monkeypatch):
     monkeypatch.setattr(solver, "MOST_FACTORISED", 36)
 
 
-def test_all_that_is_offered_equals_the_factorisation_and_weight_space(x64, few):
+def test_every_method_equals_the_factorisation_and_weight_space(x64, few):
     model, key = nbv.GeometricSPSR(**SETTINGS), jax.random.key(0)
     posterior, factorised = model.condition(cloud(47)), model.condition(cloud(36))
     assert isinstance(posterior.solver, solver.ConjugateGradientSolver)

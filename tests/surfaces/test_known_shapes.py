@@ -128,7 +128,7 @@ def test_a_symmetric_shape_stands_in_all_the_ways_that_look_alike():
     assert sorted(np.round(np.abs(angles[good])).astype(int).tolist()) == pytest.approx([0, 180], abs=3)
 
 
-def test_what_was_seen_empty_is_among_what_shapes_are_fitted_to():
+def test_shapes_are_fitted_to_empty_space_too():
     observations = observations_of(nbv.SDFSurface(Cuboid([0.5, 0.3, 0.4])), AROUND)
     targets = FitTargets.of(observations)
     assert bool(targets.is_empty.all())
@@ -144,7 +144,7 @@ def test_shapes_of_a_kind_differ_by_their_number():
     assert {name: kind_of(name) for name in kinds} == kinds
 
 
-def test_where_no_shape_fits_none_is_the_answer():
+def test_without_a_fit_none_is_the_answer():
     observations = observations_of(nbv.SDFSurface(Sphere(1.2)), AROUND)
     posterior = model().condition(observations)
     assert posterior.hypotheses[0].name == "none of these"
@@ -165,7 +165,7 @@ def test_without_shapes_the_model_is_the_unknown_one_to_the_bit():
     )
 
 
-def test_of_one_exact_shape_samples_are_that_shape_to_the_noise():
+def test_samples_of_one_exact_shape_equal_it_to_the_noise():
     """Also on sides that no view has seen: points of the true surface lie within the noise of each sample's surface."""
     surface, _, _ = filling(0.65, UPRIGHT)
     truth = nbv.mesh_from_sdf(surface.sdf, nbv.Grid(100, 1.4))

@@ -96,7 +96,7 @@ def bracket(hole, middle=(0.0, 0.0, 0.0)):
     return trimesh.Trimesh(corners, faces).apply_translation(middle)
 
 
-def test_parts_that_are_the_same_are_told():
+def test_equal_parts_warn():
     """A part that is moved or drawn along other axes is the same. A smaller one, one with a deeper hole and a mirror
     image are not."""
     own = bracket(30.0)
@@ -232,7 +232,7 @@ def housing(x, z, radius):
     return Union(block, Translated(Cylinder(radius, 0.25), np.array([0.15 + x, 0.25, z])))
 
 
-def test_where_one_part_lies_all_that_look_alike_may():
+def test_look_alikes_share_a_placement():
     """From below no view shows the pin. A part without a placement of its own gets the true placement of the other."""
     pins = [(-0.25, 0.0, 0.12), (0.25, 0.0, 0.12), (0.0, 0.15, 0.12), (0.0, -0.15, 0.12), (0.0, 0.0, 0.22)]
     bank, box = nbv.ShapeBank.of([housing(*pin) for pin in pins], is_true_size=True), nbv.Box.cube(2.9)

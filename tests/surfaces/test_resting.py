@@ -36,7 +36,7 @@ def test_turns_are_about_the_vertical():
     assert np.array_equal(poses.rotations(60), starts)
 
 
-def test_what_topples_is_no_pose():
+def test_an_unstable_pose_is_not_used():
     """A tall post on a corner of a thin plate does not stand on the post's end."""
     tower = Union(
         Cuboid(np.array([1.0, 0.1, 1.0])), Translated(Cuboid(np.array([0.08, 0.9, 0.08])), np.array([0.9, 1.0, 0.9]))

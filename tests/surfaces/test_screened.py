@@ -58,7 +58,7 @@ def test_posterior_equals_one_regression_of_normals_and_values(x64, hyperparamet
         ("noise", -0.5, r"noise of -0\.5; it must not be negative"),
     ],
 )
-def test_rows_of_a_source_of_ones_own_are_checked(where, number, message):
+def test_rows_of_a_users_source_are_checked(where, number, message):
     """The first of two filled rows. If it cannot be checked, a point outside gives NaN."""
     rows = {
         "points": np.full((3, 3), 0.9, np.float32),
@@ -97,7 +97,7 @@ def test_values_are_reached_where_they_are_said_to_be():
     np.testing.assert_allclose(np.abs(rows.points[:60]).max(axis=1), 1.25, rtol=1e-5)
 
 
-def test_what_was_seen_empty_is_likelier_to_be_outside_and_so_is_what_is_near():
+def test_empty_space_and_its_surroundings_are_likelier_outside():
     """Nodes half a unit to the side of a scanned ball, places a tenth of a unit from them, and places far away. The
     corners of the grid lie outside the scene, and were seen too."""
     data, grid = ball(RNG, 80), nbv.Grid(20)

@@ -85,7 +85,7 @@ def test_what_cannot_be_used_is_named_and_left_out(tmp_path):
         bank_of(tmp_path / "broken.ply")
 
 
-def test_what_was_made_is_kept_and_what_changed_is_made_anew(tmp_path, cache, monkeypatch):
+def test_stored_shapes_are_reused_and_changed_meshes_recomputed(tmp_path, cache, monkeypatch):
     file = ball(tmp_path / "ball.ply")
     first = bank_of(file, resolution=16)
     assert len(list(cache.iterdir())) == 1
@@ -98,7 +98,7 @@ def test_what_was_made_is_kept_and_what_changed_is_made_anew(tmp_path, cache, mo
     assert not np.array_equal(first.shapes.solid.values, changed.shapes.solid.values)
 
 
-def test_what_is_kept_damaged_is_made_anew(tmp_path, cache):
+def test_a_damaged_cache_file_is_replaced(tmp_path, cache):
     file = ball(tmp_path / "ball.ply")
     first = bank_of(file, resolution=16)
     (cached,) = cache.iterdir()

@@ -62,7 +62,7 @@ def cloud_of(points, capacity=None):
     return nbv.PointCloud.from_arrays(points, points / np.linalg.norm(points, axis=1, keepdims=True), capacity)
 
 
-def test_the_score_is_the_area_weighed_by_how_far_it_is_to_d():
+def test_the_score_is_the_area_weighted_by_the_distance_to_d():
     ball, camera = looked_at()
     rng = np.random.default_rng(0)
     data = rng.normal(size=(40, 3)) + np.array([0.0, 4.0, 0.0])
@@ -104,7 +104,7 @@ def observed(points, capacity):
     return start.add_view(pose, scan, camera, nbv.Carving(), None)
 
 
-def test_what_is_new_does_not_depend_on_the_points_that_are_kept():
+def test_new_area_does_not_depend_on_the_kept_points():
     """Hits all over the visible ball except for a hole. The area of the hole is new, although D is too sparse to
     tell."""
     cloud, camera = looked_at(120, 120)
@@ -136,7 +136,7 @@ def test_between_the_rays_of_a_coarse_sensor_nothing_is_new():
 
 
 @pytest.mark.slow
-def test_it_can_be_climbed(x64):
+def test_its_derivative_is_the_central_difference(x64):
     """For a small step the derivative in the pose is the central difference of its smooth part."""
     surfaces, camera = balls(nbv.Grid(32), [0.7]), nbv.Camera(height=16, width=16)
     cloud = cloud_of([[0.0, 0.0, 0.7]])

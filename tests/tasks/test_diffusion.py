@@ -122,7 +122,7 @@ def test_only_the_piece_with_the_source_gets_warm():
     assert np.linalg.norm(ball[alone.argmax()] - ball[7]) < 0.15
 
 
-def test_a_source_that_nothing_is_near():
+def test_a_source_without_points_nearby():
     for heat in (
         nbv.tasks.HeatProblem(NOWHERE, initial=-2.0),
         nbv.tasks.HeatProblem(np.zeros(3), power=0.0, initial=-2.0),
@@ -213,7 +213,7 @@ def test_refinement_halves_edges_and_tears_nothing(longest):
     assert len(np.unique(vertices, axis=0)) == len(vertices)
 
 
-def test_bad_input_is_told():
+def test_bad_input_is_named():
     heat, bad = nbv.tasks.HeatProblem(np.zeros(3)), sphere_points(40)
     bad[5, 1] = np.nan
     for solve in (lambda: cloud_temperature(bad, heat), lambda: mesh_temperature(bad, np.array([[0, 1, 2]]), heat)):

@@ -68,7 +68,7 @@ def test_a_source_alone_is_heated_as_by_the_authors():
 
 
 @pytest.mark.slow
-def test_neither_workers_nor_the_order_of_the_points_change_a_bit():
+def test_workers_and_the_order_of_points_change_no_bit():
     points = np.stack([sphere(90) for _ in range(11)])
     clouds = nbv.PointCloud(jnp.asarray(points), jnp.asarray(points), jnp.asarray(RNG.uniform(size=(11, 90)) < 0.7))
     turned = jax.tree.map(lambda rows: rows[:, ::-1], clouds)
@@ -90,7 +90,7 @@ def test_scenes_that_differ_in_the_source_share_a_compilation(compilations):
     assert float(first) != float(second)
 
 
-def test_what_the_source_does_not_reach(x64):
+def test_points_that_heat_does_not_reach(x64):
     near, far = sphere(60), sphere(60) + np.array([9.0, 0.0, 0.0])
     everything, reached = (utility_of(HEAT, only, workers=1) for only in (False, True))
     alone = float(everything(cloud_of(near)))
@@ -145,7 +145,7 @@ def test_the_coldest_point_that_heat_reaches():
             nbv.tasks.coldest_point(body, HEAT, reached_only=True)
 
 
-def test_points_that_are_not_finite_and_wrong_numbers_of_workers_are_told():
+def test_points_that_are_not_finite_and_wrong_numbers_of_workers_are_refused():
     cloud = cloud_of(sphere(20))
     broken = eqx.tree_at(lambda c: c.points, cloud, cloud.points.at[3].set(jnp.nan))
     with pytest.raises(jax.errors.JaxRuntimeError, match="1 points are not finite"):

@@ -100,7 +100,7 @@ def test_derivative_in_the_pose():
     assert np.isfinite(float(slope))
 
 
-def test_what_it_needs():
+def test_its_requirements():
     with pytest.raises(nbv.InputError, match="needs known parts"):
         nbv.Planner(nbv.Identify())
     with pytest.raises(nbv.InputError, match="2 names for 3 parts"):

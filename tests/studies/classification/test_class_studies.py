@@ -39,7 +39,7 @@ def test_the_first_view_can_be_one_after_which_the_classifier_is_wrong(kind):
         dataclasses.replace(study, classifier=always_right).first_view(scene)
 
 
-def test_first_views_of_trucks_are_random_and_told_apart_by_what_they_show():
+def test_first_views_of_trucks_are_random_and_grouped_by_what_they_show():
     study = small_study(kind=TruckStudy)
     firsts = [study.first_view(study.scene(index)) for index in range(12)]
     assert len({*firsts}) > 5

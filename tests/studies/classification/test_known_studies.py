@@ -58,7 +58,7 @@ def test_a_choice_is_that_of_the_planner_with_the_same_key(record, method, view)
     np.testing.assert_allclose(poses[candidates[view]], proposed, atol=1e-5)
 
 
-def test_the_methods_that_know_no_shapes_are_those_of_a_study_without(record):
+def test_methods_without_shapes_equal_those_of_a_study_without(record):
     plain = run_scene(small_study(), SCENE, ("coverage", "uncertainty"))
     for method in ("coverage", "uncertainty"):
         assert without_time(record["methods"][f"{method}-screened"]) == without_time(plain["methods"][method])
@@ -92,7 +92,7 @@ def test_parts_are_planned_with_the_shapes_of_their_category():
     assert len(names) == 40
 
 
-def test_of_meshes_each_is_planned_by_who_has_seen_the_others(tmp_path, monkeypatch):
+def test_each_mesh_is_planned_with_a_bank_of_the_others(tmp_path, monkeypatch):
     monkeypatch.setattr(mesh_shapes.platformdirs, "user_cache_path", lambda name: tmp_path / "cache")
     for index in range(3):
         trimesh.creation.box((1.0, 0.5 + 0.1 * index, 0.4)).export(tmp_path / f"box{index}.ply")
@@ -103,7 +103,7 @@ def test_of_meshes_each_is_planned_by_who_has_seen_the_others(tmp_path, monkeypa
     assert plain.sampler_of(plain.scene(1)) == plain.sampler
 
 
-def test_one_who_knows_no_shapes_any_more_is_as_before():
+def test_a_planner_without_its_bank_equals_one_that_had_none():
     plain = nbv.SurfaceSampler.preset("screened", 1.25)
     with_bank = plain.with_bank(nbv.ShapeBank.of([nbv.sdf.Sphere(1.0)]), nbv.surfaces.AsGiven())
     assert with_bank.model.box == nbv.Box.cube(1.25)

@@ -129,7 +129,7 @@ def test_keys_that_are_numbers_are_read_as_text(tmp_path):
     assert records == [{"by view": {"10": 1.5, "9": 0.5}}]
 
 
-def test_a_study_that_fails_at_once_does_not_bind_its_folder(tmp_path):
+def test_a_failed_study_leaves_its_folder_free(tmp_path):
     def fail(index):
         raise KeyboardInterrupt
 
