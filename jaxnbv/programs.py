@@ -121,16 +121,17 @@ class _Program:
         name = hashlib.sha256(repr((_without_names(code), _settings(), _machine())).encode()).hexdigest()
         num_outputs = len(jax.tree.leaves(lowered.out_info))
         payload = _read(entry.parent / name)
-        if payload is None:
-            call = _without_cache(lowered)
+        call: Callable[[list], list]
+        if payload is not None:
+            call = _loaded(payload, leaves, num_outputs)
+        else:
+            call = compiled = _without_cache(lowered)
             try:
-                payload, _, _ = serialize_executable.serialize(call)
+                payload, _, _ = serialize_executable.serialize(compiled)
             except (ValueError, NotImplementedError):
                 # JAX cannot do this for every program, such as one with large constants in its later versions.
                 return _Executable(call, result)
             _write(entry.parent / name, payload)
-        else:
-            call = _loaded(payload, leaves, num_outputs)
         _write(entry, pickle.dumps((name, result, num_outputs)))
         return _Executable(call, result)
 
@@ -154,7 +155,7 @@ def _is_plain(leaf: Any) -> bool:
 
 def _is_plain_context() -> bool:
     """Whether programs run on one device, and JAX's debugging, which looks into functions, is off."""
-    config = jax.config
+    config: Any = jax.config
     debugs = config.jax_disable_jit or config.jax_debug_nans or config.jax_debug_infs
     return not debugs and config.jax_default_device is None and get_abstract_mesh().empty
 
@@ -229,7 +230,7 @@ def _without_names(code: str) -> str:
 def _without_cache(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
     """Compiled anew: what JAX's cache gives on a CPU cannot be written again whole."""
     with _compiling:
-        before = jax.config.jax_enable_compilation_cache
+        before = jax.config.values["jax_enable_compilation_cache"]
         jax.config.update("jax_enable_compilation_cache", False)
         compilation_cache.reset_cache()
         try:

@@ -60,21 +60,21 @@ class Pose(eqx.Module):
         axes = _axes(convention)
         matrices = as_floats(matrix, "the matrix of a pose")
         require(matrices.shape[-2:] == (4, 4), f"the matrix of a pose has shape {matrices.shape}; give (..., 4, 4)")
+        rotation: AnyArray = matrices[..., :3, :3]
+        position: AnyArray = matrices[..., :3, 3]
         if not is_traced(matrices):
-            matrices = np.asarray(matrices)
-            last = matrices[..., 3, :]
+            # NumPy, since each operation of JAX would be a program to compile.
+            numbers = np.asarray(matrices)
+            last, rotation, position = numbers[..., 3, :], numbers[..., :3, :3], numbers[..., :3, 3]
             require(
                 bool(np.all(np.abs(last - [0.0, 0.0, 0.0, 1.0]) < 1e-6)),
                 f"the last row of a pose's matrix is {last}, not (0, 0, 0, 1): give camera-to-world, not its transpose "
                 "or a projection",
             )
-            rotation = matrices[..., :3, :3]
             is_rounded = ((error := _off_rotation(rotation)) > _ORTHONORMAL) & (error <= _ROUNDED)
             if is_rounded.any():
-                matrices = matrices.copy()
-                matrices[..., :3, :3] = np.where(is_rounded[..., None, None], _nearest_rotation(rotation), rotation)
-        rotation, position = matrices[..., :3, :3] * axes.astype(matrices.dtype), matrices[..., :3, 3]
-        return cls(jnp.asarray(rotation), jnp.asarray(position))
+                rotation = np.where(is_rounded[..., None, None], _nearest_rotation(rotation), rotation)
+        return cls(jnp.asarray(rotation * axes.astype(matrices.dtype)), jnp.asarray(position))
 
     @property
     def matrix(self) -> Float[Array, "*batch 4 4"]:
