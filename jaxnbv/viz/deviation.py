@@ -1,4 +1,4 @@
-"""Inspection: how far a scanned surface lies from its CAD model, where most, and what was not scanned."""
+"""Inspection: distances of a scanned surface from its CAD model, the worst places, and the unscanned surface."""
 
 import dataclasses
 import warnings
@@ -56,12 +56,12 @@ class WorstPlace(NamedTuple):
 class Deviation(eqx.Module):
     """Signed distances of a scan from its CAD model, in the coordinates and units of the scan.
 
-    - `pose`: where the CAD lies, from its coordinates to the scan's.
+    - `pose`: pose of the CAD, from its coordinates to the scan's.
     - `points`: points of the scan, uniform by area if it is a mesh.
     - `distances`: from the CAD to each point, positive outside (too much material).
     - `feet`, `normals`: the nearest point of the CAD for each point, and its outward normal there.
-    - `cad`: the CAD where it lies.
-    - `area`, `missing_area`: surface of the CAD that the scan covers, and the rest, of which the distances say nothing.
+    - `cad`: the CAD at this pose.
+    - `area`, `missing_area`: area of the CAD that the scan covers, and of the rest, for which there are no distances.
     - `imagined`: share of the scanned mesh that no view measured, which is left out.
     - `radius`: a place of the CAD is covered if three of its four nearest `feet` are nearer than this, on its side.
     """
@@ -93,7 +93,7 @@ class Deviation(eqx.Module):
 
     @checked
     def worst(self, count: int = 5, apart: float | None = None) -> tuple[WorstPlace, ...]:
-        """The places of the largest deviation, the worst first; fewer where there are fewer.
+        """At most `count` places of the largest deviation, the worst first.
 
         Two extremes count as one if the deviation stays above half of the smaller one between them.
 
@@ -149,13 +149,16 @@ class Deviation(eqx.Module):
         count: int = 5,
         up: str = "z",
     ) -> Any:
-        """The CAD from two sides, coloured by the deviation and grey where it was not scanned: a `Figure` of
-        matplotlib. Numbers mark the worst place, and others of four times the median deviation or more.
+        """A matplotlib `Figure` of the CAD from two sides, coloured by the deviation.
 
-        - `unit`: name of the unit of the colours, and `scale`: what distances are multiplied by, 1000 for millimetres
-          if the scan is in metres.
-        - `limit`: deviation at the ends of the colours, in that unit; that of the worst place by default.
-        - `count`: how many places are numbered at most. `up`: the axis of the scan that is upward, see `Frame`.
+        The CAD is grey where it was not scanned. Numbers mark the worst place, and others of at least four times the
+        median deviation.
+
+        - `unit`: name of the unit of the colours.
+        - `scale`: factor from the scan's unit to it, 1000 for millimetres if the scan is in metres.
+        - `limit`: deviation at the ends of the colours, in this unit. By default that of the worst place.
+        - `count`: largest number of numbered places.
+        - `up`: upward axis of the scan, see `Frame`.
 
         **Raises:** `ValueError` for a scale or limit that is not positive, another axis, or if matplotlib is missing.
         """
@@ -184,8 +187,8 @@ def deviation(
 ) -> Deviation:
     """Compare a scanned surface, or a part of it, with a CAD model in the same units.
 
-    The CAD is laid on the scan by iterative closest points; a symmetric one has several poses that are equally right.
-    Distances are to the nearest surface: a dent deeper than half of a wall is measured from the wall's other side.
+    Iterative closest points align the CAD with the scan. A symmetric CAD has several equally good poses. Distances are
+    to the nearest surface, so that a dent deeper than half of a wall is measured from the wall's other side.
 
     - `mesh`: the scan, as a mesh whose faces are wound outward, a file of one, or a cloud with outward normals. If a
       mesh says which faces were measured, as `surface_mesh` and the PLY files of `save_mesh` do, only these are
@@ -193,7 +196,7 @@ def deviation(
     - `cad`: need not be closed. The outside of a sheet is where the normals of its faces point.
     - `pose`: from the CAD's coordinates to the scan's: a start, such as `session.object_pose.matrix`. Without it all
       rotations are tried.
-    - `register`: False if the CAD lies at `pose` (at the identity without one) and is not to be moved.
+    - `register`: False to leave the CAD at `pose`, or at the identity without one.
 
     A `UserWarning` says if no pose fits well, or if other poses fit nearly as well.
 

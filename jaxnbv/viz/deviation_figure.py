@@ -46,8 +46,8 @@ def deviation_figure(
 ) -> Figure:
     """The figure, 7.2 by 3.7 inches.
 
-    - `marks`: one at least, in the coordinates of `cad`.
-    - `limit`: deviation at the ends of the colours. `up`: the axis that is upward, see `Frame`.
+    - `marks`: at least one, in the coordinates of `cad`.
+    - `limit`: deviation at the ends of the colours. `up`: upward axis, see `Frame`.
     """
     scene = TriangleMesh.from_arrays(cad.vertices, cad.faces, up)
     positions = np.asarray(scene.frame.to_scene(np.stack([mark.position for mark in marks])))
@@ -76,7 +76,7 @@ def deviation_figure(
 def _two_eyes(
     scene: TriangleMesh, values_at: Values, positions: Float[np.ndarray, "k 3"], outward: Float[np.ndarray, "k 3"]
 ) -> Float[np.ndarray, "2 3"]:
-    """The direction from which most is seen of the places and of the scanned surface, and one that adds most to it."""
+    """The direction that shows most of the places and of the scanned surface, and the one that adds most to it."""
     mesh = scene.to_trimesh()
     samples, rows = trimesh.sample.sample_surface(mesh, _SAMPLES, seed=0)
     normals = mesh.face_normals[rows]
@@ -89,7 +89,7 @@ def _two_eyes(
     rays = np.repeat(eyes[None], len(samples), axis=0)
     origins = samples[:, None] + _CLEAR * (rays + normals[:, None])
     hits, _ = first_faces(scene.vertices, scene.faces)(origins.reshape(-1, 3), rays.reshape(-1, 3))
-    # Surface that is seen at a slant counts less.
+    # Oblique surface counts less.
     visible = np.clip(normals @ eyes.T, 0.0, 1.0) * (hits < 0).reshape(len(samples), -1)
     first = int(np.argmax(weight @ visible))
     more = np.maximum(visible - visible[:, [first]], 0.0)
@@ -118,7 +118,7 @@ def _painted(scene: TriangleMesh, eye: Float[np.ndarray, "3"], values_at: Values
 
 
 def _number(axes: Any, still: Still, positions: Float[np.ndarray, "k 3"], middle: Float[np.ndarray, "2"]) -> None:
-    """Numbers beside the places that are seen, on the side away from the middle of the picture."""
+    """Write numbers beside the visible places, on the side away from the middle of the picture."""
     pixels, in_front = still.project(positions)
     for number, (pixel, is_visible) in enumerate(zip(pixels, in_front, strict=True), start=1):
         if not is_visible:

@@ -1,4 +1,4 @@
-"""The surface of a posterior's mean as triangles, with how sure it is of each place."""
+"""The surface of a posterior's mean as triangles, with a standard deviation at each vertex."""
 
 import equinox as eqx
 import jax
@@ -15,15 +15,15 @@ from jaxnbv.sampler import StepInputs, SurfaceSampler
 from jaxnbv.scanning import Grid
 from jaxnbv.scanning.mesh import level_triangles
 
-# The variance of one point costs a triangular solve with the whole cloud, the slope two evaluations of the mean.
+# The variance of a point costs a triangular solve with the whole cloud. The slope costs two evaluations of the mean.
 _DEVIATION_ANCHORS = 256
 _SLOPE_ANCHORS = 1024
 _SLOPE_STEP = 0.005
-# Of the distance to the nearest point. On a cow after one to five views the surface is off by 0.2 to 0.3 of it (root
-# mean square) between 0.1 and 0.4 from the points, two to three of the posterior's standard deviations; the other way
-# round, from the truth to the surface, which may lack a part, by 0.4 to 0.7.
+# Deviation as a share of the distance to the nearest point. On a cow after one to five views, between 0.1 and 0.4 from
+# the points, the error of the surface is 0.2 to 0.3 of this distance (root mean square), which is two to three of the
+# posterior's standard deviations. Measured from the truth to the surface, which may lack a part, it is 0.4 to 0.7.
 _UNSEEN = 0.25
-# A piece of the surface is no guess if a point lies so near to it, in scene units.
+# A piece of the surface counts as measured if a point is nearer than this, in scene units.
 _HELD = 0.1
 
 
@@ -42,26 +42,28 @@ class MeanSurface(eqx.Module):
 
     @property
     def mesh(self) -> trimesh.Trimesh:
-        """Its triangles alone."""
+        """The triangles without normals and deviation."""
         return trimesh.Trimesh(self.vertices, self.faces, process=False)
 
 
 def mean_surface(sampler: SurfaceSampler, inputs: StepInputs) -> MeanSurface | None:
-    """The surface of the posterior's mean, carved as the samples are, with its standard deviation; None if the grid
-    holds none.
+    """The surface of the posterior's mean with its standard deviation. None if there is no surface.
 
-    - `inputs`: with a posterior; one without closed forms is drawn by the samples, by default under a fixed key.
+    The mean is carved like the samples.
+
+    - `inputs`: must have a posterior. If it has no closed forms, mean and deviation come from the samples, by default
+      under a fixed key.
     """
     observations, posterior, surfaces = inputs.observations, inputs.posterior, inputs.surfaces
     assert posterior is not None
     if not posterior.has_closed_forms:
         surfaces = sampler.sample(observations, jax.random.key(0), posterior) if surfaces is None else surfaces
         return _mean_of_samples(np.asarray(surfaces.values, np.float64), sampler.grid)
-    found = level_triangles(np.array(sampler.mean(observations, posterior)), sampler.grid)
-    if found is None:
+    triangles = level_triangles(np.array(sampler.mean(observations, posterior)), sampler.grid)
+    if triangles is None:
         return None
-    vertices, faces, normals = found
-    # Along the normals too, so that the two sides of a thin sheet are told apart.
+    vertices, faces, normals = triangles
+    # Normals are features too, so that the two sides of a thin sheet are far apart.
     features = np.concatenate([vertices, 0.1 * normals], axis=1)
     anchors = _spread(features, _SLOPE_ANCHORS)
     few = anchors[:_DEVIATION_ANCHORS]
@@ -77,10 +79,10 @@ def mean_surface(sampler: SurfaceSampler, inputs: StepInputs) -> MeanSurface | N
 
 def _mean_of_samples(values: Float[np.ndarray, "s g g g"], grid: Grid) -> MeanSurface | None:
     mean = values.mean(axis=0)
-    found = level_triangles(mean, grid)
-    if found is None:
+    triangles = level_triangles(mean, grid)
+    if triangles is None:
         return None
-    vertices, faces, normals = found
+    vertices, faces, normals = triangles
     place = (vertices + grid.half_extent).T / grid.spacing
     slope = np.linalg.norm([map_coordinates(part, place, order=1) for part in np.gradient(mean, grid.spacing)], axis=0)
     spread = map_coordinates(values.std(axis=0, ddof=min(1, len(values) - 1)), place, order=1)
@@ -88,27 +90,26 @@ def _mean_of_samples(values: Float[np.ndarray, "s g g g"], grid: Grid) -> MeanSu
 
 
 def as_shown(surface: MeanSurface | None, cloud: PointCloud) -> MeanSurface | None:
-    """The pieces of the surface that hold points of the cloud, for others are guesses; with the deviation
-    sqrt(sd^2 + (r / 4)^2), r the distance to the nearest point of the cloud. None where there are none.
+    """The pieces of the surface that hold points of the cloud, or None. Other pieces are guesses.
 
-    The posterior is too sure of what no ray has met, beside the image's border or behind the object: it takes its own
-    continuation of what was seen for known. An end that was not seen is to be shown as such.
+    The deviation becomes sqrt(sd^2 + (r / 4)^2), where r is the distance to the nearest point of the cloud. The
+    posterior's own deviation is too small where no ray has hit, beside the image's border or behind the object.
     """
     if surface is None:
         return None
     away, _ = cKDTree(cloud.to_numpy()[0]).query(surface.vertices)
     edges = np.concatenate([surface.faces[:, :2], surface.faces[:, 1:]])
     piece = trimesh.graph.connected_component_labels(edges, len(surface.vertices))
-    kept = np.isin(piece, piece[away < _HELD])
-    faces = surface.faces[kept[surface.faces[:, 0]]]
+    is_kept = np.isin(piece, piece[away < _HELD])
+    faces = surface.faces[is_kept[surface.faces[:, 0]]]
     if len(faces) == 0:
         return None
-    number, deviation = np.cumsum(kept) - 1, np.hypot(surface.deviation, _UNSEEN * away)
-    return MeanSurface(surface.vertices[kept], number[faces], surface.normals[kept], deviation[kept])
+    number, deviation = np.cumsum(is_kept) - 1, np.hypot(surface.deviation, _UNSEEN * away)
+    return MeanSurface(surface.vertices[is_kept], number[faces], surface.normals[is_kept], deviation[is_kept])
 
 
 def _spread(features: np.ndarray, count: int) -> np.ndarray:
-    """`count` rows far from each other, in order of choice; the first again and again where there are fewer rows."""
+    """Indices of `count` rows far from each other, in order of choice. Repeats the first if there are fewer rows."""
     # Padded to a power of two, so that surfaces of other sizes share a compilation.
     capacity = 1 << (len(features) - 1).bit_length()
     padded = np.pad(features.astype(np.float32), ((0, capacity - len(features)), (0, 0)))
@@ -116,7 +117,7 @@ def _spread(features: np.ndarray, count: int) -> np.ndarray:
 
 
 def _interpolate(features: np.ndarray, anchors: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Values at all rows from those at the anchors, positive throughout: a Gaussian mean of the nearest logarithms."""
+    """Interpolate positive values from the anchors to all rows: a Gaussian mean of the logarithms of the nearest."""
     distance, near = cKDTree(features[anchors]).query(features, k=min(8, len(anchors)))
     width = 0.5 * distance[:, -1:] + 1e-12
     weight = np.exp(-0.5 * (distance / width) ** 2) + 1e-12

@@ -1,4 +1,4 @@
-"""What stands in the scene after a view: told once, drawn by still pictures, the page in space and the live view."""
+"""Contents of the scene after a view, which still pictures, the page in space and the live view all draw."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -14,7 +14,7 @@ FRUSTUM_DEPTH = 0.45
 
 
 class Points(NamedTuple):
-    """Points of one colour, in scene coordinates; those of more `weight` are drawn larger."""
+    """Points of one colour in scene coordinates. A larger `weight` draws them larger."""
 
     name: str
     places: Float[np.ndarray, "n 3"]
@@ -23,7 +23,7 @@ class Points(NamedTuple):
 
 
 class Cameras(NamedTuple):
-    """Fields of view of one colour up to a depth, with their numbers, the first of which is `first`."""
+    """Fields of view of one colour up to a depth, with numbers that start at `first`."""
 
     name: str
     poses: Sequence[Pose]
@@ -41,7 +41,7 @@ def seen_items(
     camera: Camera,
     depth: float = FRUSTUM_DEPTH,
 ) -> tuple[Points | Cameras, ...]:
-    """The points before the last of some views, those that it added, and the cameras."""
+    """Points before the last view, points that it added, and the cameras."""
     return (
         Points("points before", before, BEFORE, 0.7),
         Points("new points", new, NEW, 1.1),

@@ -11,7 +11,7 @@ _ROWS = 90
 
 
 def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-    """Vectors at length 1; zero ones stay."""
+    """Vectors scaled to length 1. Zero vectors stay zero."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors / np.where(length > 0, length, 1.0)
 
@@ -25,27 +25,27 @@ def on_map(directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
 def smooth_map(
     directions: Float[np.ndarray, "c 3"], values: Float[np.ndarray, " c"]
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " n"], Float[np.ndarray, "n m"]]:
-    """The values of candidates carried over the map: longitudes, latitudes, and the values there; NaN farther from all
-    candidates than nine tenths of them are from the next.
+    """Interpolate the values of candidates over the map: longitudes, latitudes, and values there.
 
-    A spline over the chords of the sphere, which goes through the values (NaN ones are left out) and stays within
-    their range.
+    The interpolant is a spline over the chords of the sphere. It goes through the values (without NaN ones) and stays
+    within their range. It is NaN at places farther from all candidates than 90 % of candidates are from the nearest
+    other one.
     """
     longitudes = np.pi * ((np.arange(2 * _ROWS) + 0.5) / _ROWS - 1.0)
     latitudes = np.pi * ((np.arange(_ROWS) + 0.5) / _ROWS - 0.5)
     longitude, latitude = np.meshgrid(longitudes, latitudes)
     ring = np.cos(latitude)
     at = np.stack([ring * np.sin(longitude), np.sin(latitude), ring * np.cos(longitude)], axis=-1).reshape(-1, 3)
-    known = ~np.isnan(values)
-    spline = RBFInterpolator(directions[known], values[known], kernel="thin_plate_spline")
-    smooth = np.clip(spline(at), values[known].min(), values[known].max())
+    has_value = ~np.isnan(values)
+    spline = RBFInterpolator(directions[has_value], values[has_value], kernel="thin_plate_spline")
+    smooth = np.clip(spline(at), values[has_value].min(), values[has_value].max())
     tree = cKDTree(directions)
     near = tree.query(at)[0] <= np.quantile(tree.query(directions, k=2)[0][:, 1], 0.9)
     return longitudes, latitudes, np.where(near, smooth, np.nan).reshape(longitude.shape)
 
 
 def path(directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 2"]:
-    """A line on the map that joins directions by great circles, broken by NaN where it leaves the map at its rim."""
+    """A line on the map that joins directions by great circles. NaN where it crosses the map's rim."""
     steps = np.linspace(0.0, 1.0, 20)[:, None]
     fine = on_map(unit(np.concatenate([a + steps * (b - a) for a, b in pairwise(directions)])))
     leaps = np.flatnonzero(np.abs(np.diff(fine[:, 0])) > np.pi) + 1

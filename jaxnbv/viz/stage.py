@@ -1,4 +1,4 @@
-"""From where all views of an episode are drawn, and how its cameras are brought into the picture."""
+"""The viewpoint of all pictures of an episode, and the places at which its cameras are drawn."""
 
 import equinox as eqx
 import numpy as np
@@ -10,12 +10,12 @@ from jaxnbv.planning.episode import Episode
 from jaxnbv.scanning.triangle_rays import first_faces
 from jaxnbv.viz.sphere import unit
 
-# Fields of view are drawn so deep, in radii of the object, and end at so many of its extents in their direction, which
-# counts as so many radii at least.
+# Depth of drawn fields of view in radii of the object; place of their ends in extents of the object in their direction;
+# least value of this extent in radii.
 _DEPTH, _STAND, _CLOSEST = 0.2, 1.06, 0.35
 _SPREAD, _OUTLINE = 99.0, 1000
 _DIRECTIONS, _HIGHEST = 80, 0.8
-# Of the points that are to be seen so many, as seen from so many radii before them.
+# Number of points whose visibility is tested, and start of the test rays in front of them, in radii.
 _SEEN, _CLEAR = 300, 0.05
 # A camera nearer to the line of sight than this (cosine) would stand in front of the object.
 _IN_FRONT = 0.9
@@ -25,8 +25,9 @@ class Stage(eqx.Module):
     """One viewpoint for all pictures, near enough for the object to fill them.
 
     - `eye`: unit vector from the origin to the reader.
-    - `radius`: of the object about the origin, in scene units; `outline`: points of it.
-    - `depth`: of the fields of view that are drawn, in scene units.
+    - `radius`: of the object about the origin, in scene units.
+    - `outline`: points of the object.
+    - `depth`: of the drawn fields of view, in scene units.
     """
 
     eye: Float[np.ndarray, "3"]
@@ -36,11 +37,11 @@ class Stage(eqx.Module):
 
     @property
     def extent(self) -> float:
-        """Radius of what is drawn, numbers of cameras included."""
+        """Radius of the picture, with the numbers of the cameras."""
         return 1.1 * (_STAND * self.radius + self.depth)
 
     def pulled(self, pose: Pose) -> Pose:
-        """Where a camera is drawn: just beyond the object's extent in its direction."""
+        """The pose at which a camera is drawn, just beyond the object's extent in its direction."""
         position = np.asarray(pose.position, np.float64)
         distance = max(float(np.linalg.norm(position)), 1e-9)
         extent = max(float((self.outline @ position).max()) / distance, _CLOSEST * self.radius)
@@ -48,25 +49,25 @@ class Stage(eqx.Module):
 
 
 def stage_of(episode: Episode, surfaces: list[trimesh.Trimesh]) -> Stage:
-    """The stage of an episode with these surfaces of the mean, the last one last."""
+    """The stage of an episode with these mean surfaces, in the order of views."""
     outlines = episode.cloud.to_numpy()[0], *(np.asarray(surface.vertices) for surface in surfaces)
-    known = [np.asarray(rows, np.float64)[:: max(1, len(rows) // _OUTLINE)] for rows in outlines]
-    distances = [np.linalg.norm(rows, axis=1) for rows in known]
+    samples = [np.asarray(rows, np.float64)[:: max(1, len(rows) // _OUTLINE)] for rows in outlines]
+    distances = [np.linalg.norm(rows, axis=1) for rows in samples]
     radius = max(float(np.percentile(far, _SPREAD)) for far in distances)
-    outline = np.concatenate([rows[far <= radius] for rows, far in zip(known, distances, strict=True)])
+    outline = np.concatenate([rows[far <= radius] for rows, far in zip(samples, distances, strict=True)])
     cameras = np.stack([np.asarray(view.pose.position, np.float64) for view in episode.views])
     eyes = np.asarray(fibonacci_sphere(_DIRECTIONS), np.float64)
     eyes = eyes[np.abs(eyes[:, 1]) < _HIGHEST]
-    shown = _shown(episode, surfaces[-1] if surfaces else None, eyes, _CLEAR * radius)
+    visible = _shown(episode, surfaces[-1] if surfaces else None, eyes, _CLEAR * radius)
     # Cameras should not stand between the eye and the object.
     in_front = np.mean(unit(cameras) @ eyes.T > _IN_FRONT, axis=0)
-    return Stage(eyes[int(np.argmax(shown - in_front))], radius, outline, _DEPTH * radius)
+    return Stage(eyes[int(np.argmax(visible - in_front))], radius, outline, _DEPTH * radius)
 
 
 def _shown(
     episode: Episode, surface: trimesh.Trimesh | None, eyes: Float[np.ndarray, "e 3"], clear: float
 ) -> Float[np.ndarray, " e"]:
-    """The share of the points that the chosen views have seen which faces an eye, and is not hidden from it."""
+    """Share of the chosen views' points that face each eye and are not hidden from it."""
     first, *chosen = (view.scan.to_numpy() for view in episode.views)
     scans = [scan for scan in chosen if len(scan[0])] or [first]
     points, normals = (np.concatenate(rows).astype(np.float64) for rows in zip(*scans, strict=True))

@@ -1,4 +1,4 @@
-"""Surface that views looked at and did not measure: it is too dark or too shiny, or it is not there."""
+"""Surface that views looked at but did not measure, because it is too dark or too shiny, or does not exist."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -14,12 +14,12 @@ from jaxnbv.observations import Observations
 from jaxnbv.scanning import Carving, TriangleMesh
 from jaxnbv.viz.answers import coordinates, number
 
-# Once may be chance. Smaller patches than this share of the surface are not worth a sentence.
+# Least number of looks, since one may be chance. Least share of the surface in a patch. Most patches to report.
 _LOOKS, _SHARE, _PATCHES = 2, 0.005, 3
 
 
 class Patch(NamedTuple):
-    """One piece of surface that was not measured, in scene units: its area, its middle, how many views looked at it."""
+    """A piece of unmeasured surface: its area and middle in scene units, and the number of looks at it."""
 
     area: float
     middle: Float[np.ndarray, "3"]
@@ -27,10 +27,11 @@ class Patch(NamedTuple):
 
 
 def unmeasured(surface: trimesh.Trimesh, observations: Observations, carving: Carving | None) -> list[Patch]:
-    """The largest patches of a surface (scene coordinates) that at least two views looked at and did not measure, the
-    largest first. What the carving volume cuts is none.
+    """The largest patches of a surface that at least two views looked at but did not measure.
 
-    - `surface`: what the observations say of the object, such as the posterior's mean.
+    The largest comes first. Cuts by the carving volume do not count.
+
+    - `surface`: an estimate from the observations, such as the posterior's mean, in scene coordinates.
     """
     looks = observations.looks
     if looks is None or len(surface.faces) == 0:
@@ -40,8 +41,8 @@ def unmeasured(surface: trimesh.Trimesh, observations: Observations, carving: Ca
     times = np.zeros((looks.grid.resolution + 1,) * 3, int)
     for index in range(count):
         in_vain = np.zeros(times.shape, bool)
-        seen = np.asarray(looks.unmeasured_cells(mesh, index, observations.poses.rows[index]))
-        in_vain[tuple(seen[(seen < looks.grid.resolution).all(axis=1)].T)] = True
+        cells_of_view = np.asarray(looks.unmeasured_cells(mesh, index, observations.poses.rows[index]))
+        in_vain[tuple(cells_of_view[(cells_of_view < looks.grid.resolution).all(axis=1)].T)] = True
         # Rays are farther apart than cells.
         times += binary_dilation(in_vain, np.ones((3, 3, 3)))
     of_face = times[tuple(np.minimum(cells, looks.grid.resolution).T)]
@@ -57,14 +58,14 @@ def unmeasured(surface: trimesh.Trimesh, observations: Observations, carving: Ca
 
 
 def unmeasured_words(patches: Sequence[Patch], frame: Frame) -> str:
-    """What was looked at and not measured, in a sentence, in the world of a frame."""
-    said = [
+    """A sentence about the patches, in the world of a frame."""
+    parts = [
         f"{number(float(frame.length_to_world(patch.area, 2)))} {frame.unit}² about {coordinates(patch.middle, frame)} "
         f"({patch.looks} looks)"
         for patch in patches
     ]
     return (
-        f"Views looked at {', '.join(said)} and measured nothing there: the surface is too dark or too shiny for the "
+        f"Views looked at {', '.join(parts)} and measured nothing there: the surface is too dark or too shiny for the "
         "sensor, or it is not there."
     )
 
