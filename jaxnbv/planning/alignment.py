@@ -1,15 +1,16 @@
 """Disagreement of overlapping views, and the pose error that explains it.
 
-A robot knows the poses T_i of its hand, and the camera truly was at T_i X_i. If the camera's mount is off, X_i = X is
-the same for all views. If single poses are off, each view has its own X_i, and X_0 = I. The X_i make overlapping views
-agree best:
+The pose that the robot reports for view i is T_i, and the true pose of the camera is T_i X_i. If the mount of the
+camera is off, X_i = X is the same for all views. If single poses are off, each view has its own X_i, and X_0 = I. The
+X_i are estimated by minimising the disagreement of overlapping views,
 
-    minimise  the sum over points p of view i and their nearest q of view j of  rho(n_q . (T_i X_i p - T_j X_j q)),
+    the sum over points p of view i and the nearest point q of view j  of  rho(n_q . (T_i X_i p - T_j X_j q)),
 
-with rho(r) = c^2 log(1 + r^2 / c^2) and the normal n_q at q, all in the cameras' coordinates. A prior keeps small the
-errors that no view determines. Each round searches neighbours again, within a smaller distance (point-to-plane
-iterative closest points, Chen and Medioni 1992). If the views do not determine all of X, the smallest eigenvalue of
-J^T J is small.
+with rho(r) = c^2 log(1 + r^2 / c^2). The points p and q are in the coordinates of cameras i and j, and n_q is the normal
+at q in world coordinates. A prior keeps the components small that no view determines. The nearest points are searched
+again in each round, within a distance that decreases (point-to-plane iterative closest points, Chen and Medioni 1992).
+If the views do not determine all of X, the smallest eigenvalue of J^T J is small, where J is the derivative of the
+residuals.
 """
 
 from collections.abc import Sequence
@@ -26,46 +27,48 @@ from jaxnbv.checks import checked, require
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 
-# Number of points of a view that are compared, and of other views, those with the nearest directions.
+# Number of points of a view that are compared, and number of views with the nearest directions to compare it with.
 _POINTS, _OTHERS = 800, 4
 # Largest angle between the directions of a pair of views, and fewest neighbours of a pair that count as overlap.
 _WIDEST, _FEWEST = np.radians(70.0), 20
-# Rounding error of points, as a share of the distance from the cameras.
+# Rounding error of points, as a fraction of the distance from the cameras.
 _ROUNDING = 1e-6
-# Smallest cosine of the angle between the normals of two points of one surface.
+# Smallest cosine of the angle between the normals of two matched points.
 _ALIKE = 0.7
-# Largest distance between neighbours in each round, as a share of the distance from the cameras.
+# Largest distance between matched points in each round, as a fraction of the distance from the cameras.
 _REACHES = (0.08, 0.08, 0.08, 0.04, 0.04, 0.04, 0.02, 0.02, 0.01, 0.01)
-# c in medians of the disagreement, and number of steps in a round.
+# Ratio of c to the median disagreement, and number of least-squares steps in a round.
 _SCALE, _STEPS = 2.0, 3
-# Prior size of an error, in radians and as a share of the distance from the cameras. Errors of neighbouring points are
-# correlated, so that this many points count as one.
+# Prior standard deviation of an error, in radians and as a fraction of the distance from the cameras. The errors of
+# neighbouring points are correlated. Therefore _TOGETHER points count as one independent point.
 _ERROR, _TOGETHER = 0.03, 50
-# The views determine all of X if the smallest eigenvalue of J^T J is above this share of the largest. It is 4e-6 for
-# three views of a shelf from one side, and 1e-3 or more for views that determine X.
+# The views determine all of X if the smallest eigenvalue of J^T J exceeds this fraction of the largest. The ratio is
+# 4e-6 for three views of a shelf from one side, and 1e-3 or more for views that determine X.
 _TOLD = 3e-4
-# A correction that moves points by more than this share of their distance is not the small error of a mount.
+# A correction is rejected if it moves points by more than this fraction of their distance from the cameras.
 _MOST = 0.15
-# Views disagree if they differ by this multiple of the noise. A correction must reduce that by this factor.
+# Views disagree if they differ by more than _OFF times the noise. A correction must divide the difference by _LESS.
 _OFF, _LESS = 3.0, 1.5
 _Corrections: TypeAlias = Float[np.ndarray, "views 4 4"]
 
 
 class Alignment(eqx.Module):
-    """How far views disagree, and the pose error that explains it. Lengths are in the units of the poses.
+    """Disagreement of overlapping views, and the pose error that explains it. Lengths are in the units of the poses.
 
-    - `disagreement`: for each view and those that overlap it, the median distance of a point from the plane at its
-      nearest point in another view, with uncorrected poses. NaN for a view that overlaps no other.
-    - `angle`: the same for the angle between the two normals, in radians.
-    - `noise`: the median of the same distance between neighbours in one view.
-    - `corrected`: disagreement with the corrections.
-    - `corrections`: (views, 4, 4), X of each view: its camera was at `matrix @ X`. Identities if corrections improve
-      the agreement too little.
-    - `is_mount`: whether X is the same for all views, an error of the mount.
-    - `covariance`: covariance of the mount's turn (a rotation vector, radians) and shift, in the camera's axes.
-    - `is_determined`: whether the views determine all of the mount's error. Undetermined components count as zero.
-    - `weakest`: the turn and shift, in radians and lengths, that the views determine least.
-    - `num_pairs`: number of pairs of views that were compared: each view with up to four of similar direction.
+    - `disagreement`: median point-to-plane distance between the points of a view and the nearest points of the views
+      that overlap it, with uncorrected poses. NaN for a view that overlaps no other view.
+    - `angle`: median angle between the normals of these pairs of points, in radians.
+    - `noise`: median point-to-plane distance between neighbouring points of the same view.
+    - `corrected`: `disagreement` with corrected poses.
+    - `corrections`: (views, 4, 4), the correction X of each view. The true pose of the camera is `matrix @ X`. All X
+      are identities if corrected poses do not agree much better.
+    - `is_mount`: whether all views have the same X, which is then an error of the mount.
+    - `covariance`: covariance of the mount's error: a rotation vector (radians), then a shift, in the camera's axes.
+    - `is_determined`: whether the views determine all components of the mount's error. Undetermined components stay
+      close to zero.
+    - `weakest`: direction of the mount's error that the views determine least: a rotation vector, then a shift.
+    - `num_pairs`: number of pairs of views that were compared. Each view is compared with up to four other views of
+      similar direction.
     - `distance`: median distance of points from the cameras.
     """
 
@@ -83,7 +86,11 @@ class Alignment(eqx.Module):
 
     @property
     def disagrees(self) -> bool:
-        """Whether a view is off by more than three times the noise, and a correction helps or is undetermined."""
+        """Whether the poses seem wrong.
+
+        True if the disagreement of a view exceeds three times the noise, and either poses were corrected or the views
+        do not determine all of the mount's error.
+        """
         is_off = bool(np.any(self.disagreement > _OFF * self.noise))
         return is_off and (self.is_corrected or not self.is_determined)
 
@@ -94,14 +101,15 @@ class Alignment(eqx.Module):
 
     @property
     def errors(self) -> tuple[Float[np.ndarray, " views"], Float[np.ndarray, " views"]]:
-        """Error of each camera's pose: an angle in radians, and a length."""
+        """Angle in radians and length of each view's correction."""
         return errors_of(self.corrections)
 
     @property
     def motion(self) -> str:
-        """The motion of the camera that would best determine the weakest component of the mount's error.
+        """Description of the additional view that would best determine the weakest component of the mount's error.
 
-        A shift along an axis that no motion between the views rotates, or a turn about it, looks the same in all views.
+        If all motions between the views keep the direction of an axis, a shift along this axis or a rotation about it
+        looks the same in all views.
         """
         axis = self.weakest[3:] if np.linalg.norm(self.weakest[3:]) > 0 else self.weakest[:3]
         is_ahead = abs(axis[2]) > 0.8 * np.linalg.norm(axis)
@@ -109,7 +117,7 @@ class Alignment(eqx.Module):
 
 
 class _View(NamedTuple):
-    """A view: points and normals in the camera's coordinates, and the camera's matrix."""
+    """Points and normals of a view in the camera's coordinates, and the camera-to-world matrix."""
 
     points: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
@@ -121,10 +129,11 @@ class _View(NamedTuple):
 
 
 class _Matches(NamedTuple):
-    """Neighbouring points in pairs of views, in the coordinates of their cameras.
+    """Matched points of pairs of views, each in the coordinates of its own camera.
 
     - `views`: indices of the two views.
-    - `first`, `second`: the two points; `own_normals`, `normals`: the normals there.
+    - `first`, `own_normals`: point and normal in the first view.
+    - `second`, `normals`: point and normal in the second view.
     """
 
     views: Int[np.ndarray, "n 2"]
@@ -138,9 +147,10 @@ class _Matches(NamedTuple):
 def align_views(clouds: Sequence[PointCloud], poses: Sequence[Pose]) -> Alignment:
     """Compare overlapping views, and estimate the error of the camera's mount, or of single poses.
 
-    If no two views overlap, the disagreement is NaN and nothing is determined.
+    If no two views overlap, `disagreement` is NaN and `is_determined` is False.
 
-    - `clouds`: points and normals of each view, in the coordinates of the poses. Points around the object help.
+    - `clouds`: points and normals of each view, in the same frame as the poses. Include points around the object, since
+      more overlap gives better estimates.
     - `poses`: pose of each view, possibly with an error.
 
     **Raises:** `ValueError` for fewer than two views, different numbers of clouds and poses, or clouds without points.
@@ -155,7 +165,7 @@ def align_views(clouds: Sequence[PointCloud], poses: Sequence[Pose]) -> Alignmen
 
     off, angle = _compared(views, pairs, still, away)
     mount = _solved(views, pairs, still, away, is_mount=True)
-    # Units in which a turn and a shift of the same size move points by the same length.
+    # Scale shifts by the distance, so that a rotation and a shift of the same size move points by the same length.
     unit = np.repeat([1.0, away], 3)
     matches = _matched(views, pairs, mount, _REACHES[-1] * away)
     _, rows = _linearised(views, matches, mount, is_mount=True)
@@ -190,7 +200,7 @@ def align_views(clouds: Sequence[PointCloud], poses: Sequence[Pose]) -> Alignmen
 
 
 def _in_camera(cloud: PointCloud, pose: Pose) -> _View:
-    """A view in its camera's coordinates, with a random subset of the points."""
+    """Convert a view to its camera's coordinates, with a random subset of the points."""
     points, normals = (rows.astype(np.float64) for rows in cloud.to_numpy())
     rows = np.random.default_rng(0).permutation(len(points))[:_POINTS]
     matrix = np.asarray(pose.to_matrix(), np.float64)
@@ -198,7 +208,7 @@ def _in_camera(cloud: PointCloud, pose: Pose) -> _View:
 
 
 def _pairs(views: Sequence[_View]) -> list[tuple[int, int]]:
-    """Pairs of each view and the few others of the nearest directions that may show the same surface."""
+    """Pair each view with the few other views of the most similar direction, which may show the same surface."""
     ahead = np.stack([view.matrix[:3, 2] for view in views])
     angles = np.arccos(np.clip(ahead @ ahead.T, -1.0, 1.0))
     np.fill_diagonal(angles, np.inf)
@@ -209,7 +219,10 @@ def _pairs(views: Sequence[_View]) -> list[tuple[int, int]]:
 def _matched(
     views: Sequence[_View], pairs: Sequence[tuple[int, int]], corrections: _Corrections, reach: float
 ) -> _Matches:
-    """Match each point of a pair's first view with its nearest in the second, within `reach` and of similar normal."""
+    """Match each point of a pair's first view with the nearest point of the second view.
+
+    A match needs a distance of at most `reach` and similar normals. Pairs of views with few matches are left out.
+    """
     placed = [view.placed(correction) for view, correction in zip(views, corrections, strict=True)]
     trees = [cKDTree(points) for points, _ in placed]
     rows = [(np.zeros((0, 2), int), *[np.zeros((0, 3))] * 4)]
@@ -226,20 +239,20 @@ def _matched(
 
 
 def _is_plausible(corrections: _Corrections, away: float) -> bool:
-    """Whether the corrections move points by as little as a small error does."""
+    """Return whether the corrections are small enough to be errors of poses."""
     turn, shift = errors_of(corrections)
     return bool(np.max(away * turn + shift) < _MOST * away)
 
 
 def errors_of(corrections: _Corrections) -> tuple[Float[np.ndarray, " views"], Float[np.ndarray, " views"]]:
-    """Angle in radians and length of each correction."""
+    """Return the angle in radians and the length of each correction."""
     return Rotation.from_matrix(corrections[:, :3, :3]).magnitude(), np.linalg.norm(corrections[:, :3, 3], axis=1)
 
 
 def _solved(
     views: Sequence[_View], pairs: Sequence[tuple[int, int]], start: _Corrections, away: float, is_mount: bool
 ) -> _Corrections:
-    """The corrections with which views agree best."""
+    """Return the corrections that minimise the disagreement of the views."""
     corrections, num_steps = start, 1 if is_mount else len(views) - 1
     for reach in _REACHES:
         matches = _matched(views, pairs, corrections, reach * away)
@@ -262,9 +275,9 @@ def _robust(
     errors: Float[np.ndarray, " steps"],
     prior: Float[np.ndarray, " steps"],
 ) -> Float[np.ndarray, " steps"]:
-    """The step that minimises the sum of rho(off + rows @ step) and prior (errors + step)^2.
+    """Return the step that minimises the sum of rho(off + rows @ step) and prior (errors + step)^2.
 
-    By iteratively reweighted least squares.
+    The method is iteratively reweighted least squares.
     """
     step = np.zeros(rows.shape[1])
     for _ in range(_STEPS):
@@ -277,16 +290,16 @@ def _robust(
 def _linearised(
     views: Sequence[_View], matches: _Matches, corrections: _Corrections, is_mount: bool
 ) -> tuple[Float[np.ndarray, " n"], csr_array]:
-    """n_q . (T_i X_i p - T_j X_j q), and its derivative with respect to steps X <- X exp(step).
+    """Return n_q . (T_i X_i p - T_j X_j q), and its derivative with respect to steps X <- X exp(step).
 
-    The steps are one of the mount, or one of each view but the first. A view's part of a row is (p x m, m), with the
-    point p and the normal m in its camera's coordinates.
+    There is one step for the mount, or one step for each view but the first. The entries of a row for one view are
+    (p x m, m), where p is the point and m the normal in the coordinates of this view's camera.
     """
     true = np.stack([view.matrix for view in views]) @ corrections
     (first, second), count = matches.views.T, len(matches.views)
     normals = np.einsum("nij,nj->ni", true[second, :3, :3], matches.normals)
     apart = _placed(true[first], matches.first) - _placed(true[second], matches.second)
-    # The plane turns with its view, so the lever arm is the first point in the second camera's coordinates.
+    # The plane rotates with the second view, so p for this view is the first point in the second camera's coordinates.
     opposite = matches.second + np.einsum("nij,ni->nj", true[second, :3, :3], apart)
     shares = [
         (view, sign * np.concatenate([np.cross(points, turned), turned], axis=1))
@@ -307,7 +320,7 @@ def _placed(matrices: Float[np.ndarray, "n 4 4"], points: Float[np.ndarray, "n 3
 
 
 def _exponential(step: Float[np.ndarray, "6"]) -> Float[np.ndarray, "4 4"]:
-    """The motion matrix of a rotation vector and a shift."""
+    """Return the rigid motion, as a matrix, of a rotation vector and a shift."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = Rotation.from_rotvec(step[:3]).as_matrix(), step[3:]
     return matrix
@@ -320,7 +333,7 @@ def _logarithm(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6"]:
 def _compared(
     views: Sequence[_View], pairs: Sequence[tuple[int, int]], corrections: _Corrections, away: float
 ) -> tuple[Float[np.ndarray, " views"], Float[np.ndarray, " views"]]:
-    """For each view, the median distance from planes at the nearest points, and the median angle between normals."""
+    """Return the median point-to-plane distance and the median angle between normals for each view."""
     matches = _matched(views, pairs, corrections, _REACHES[0] * away)
     off, _ = _linearised(views, matches, corrections, is_mount=True)
     turns = np.stack([view.matrix for view in views])[:, :3, :3] @ corrections[:, :3, :3]
@@ -338,13 +351,13 @@ def _compared(
 
 
 def _median(values: Float[np.ndarray, " n"]) -> float:
-    """Median of the finite values; NaN if there are none."""
+    """Return the median of the finite values; NaN if there are none."""
     numbers = values[np.isfinite(values)]
     return float(np.median(numbers)) if len(numbers) else np.nan
 
 
 def _noise(views: Sequence[_View]) -> float:
-    """Median distance of a point from the plane at its nearest neighbour in the same view."""
+    """Return the median distance of a point from the tangent plane at its nearest neighbour in the same view."""
     off = [np.zeros(0)]
     for points, normals, _ in views:
         if len(points) < 2:

@@ -1,4 +1,4 @@
-"""Clutter around a session's box: coarse cells that images show to be occupied."""
+"""Clutter around the box of a session, as coarse cells that contain measured points."""
 
 from typing import NamedTuple
 
@@ -15,22 +15,22 @@ from jaxnbv.planning.images import Image
 from jaxnbv.scanning import Obstacles
 from jaxnbv.scanning.sdf import Sampled
 
-# Cells along a side: about 1.5 cm for an object of 20 cm.
+# Number of cells along a side of the cube. A cell is then about 1.5 cm wide for an object of 20 cm.
 _CELLS = 48
-# Fewest pixels of one image in an occupied cell. Fewer may be flying pixels at an edge.
+# Smallest number of an image's pixels in an occupied cell. Fewer pixels may be flying pixels at a depth edge.
 _FEWEST = 5
 
 
-# Largest tangent of the angle off the axis at which the distortion formula is used.
+# Largest normalised image coordinate (x / z or y / z) for which the distortion formula is used.
 _WIDEST = 3.0
 
 
 class Clutter(NamedTuple):
-    """Cells of a cube about the middle of the scene, in scene coordinates.
+    """Occupancy votes for the cells of a cube about the middle of the scene, in scene coordinates.
 
-    - `votes`: number of images that show a cell to be occupied, minus those that see through it.
+    - `votes`: for each cell, the number of images in which it is occupied minus the number that see through it.
     - `half_extent`: half the side of the cube.
-    - `box`: box of the object, whose cells do not count.
+    - `box`: box of the object. Cells in or near the box get no votes.
     """
 
     votes: Int[np.ndarray, "n n n"]
@@ -39,7 +39,7 @@ class Clutter(NamedTuple):
 
     @classmethod
     def empty(cls, half_extent: float, box: Box) -> "Clutter":
-        """Clutter before any image."""
+        """Return clutter without votes."""
         return cls(np.zeros((_CELLS,) * 3, np.int64), half_extent, box)
 
     def with_image(
@@ -50,10 +50,11 @@ class Clutter(NamedTuple):
         frame: Frame,
         obstacles: Obstacles,
     ) -> "Clutter":
-        """A copy with the votes of one more image.
+        """Return a copy with the votes of one more image.
 
-        - `image`, `camera`, `pose`: the image, in world units.
-        - `obstacles`: obstacles in scene units. Cells in or next to them do not count.
+        - `image`, `camera`, `pose`: the image, the sensor and the pose, in world units.
+        - `frame`: frame of the session's world.
+        - `obstacles`: obstacles in scene units. Cells in or next to an obstacle get no votes.
         """
         depth = np.where(np.isfinite(image.depth), image.scale * np.asarray(image.depth, np.float64), 0.0)
         if image.robot is not None:
@@ -71,18 +72,18 @@ class Clutter(NamedTuple):
         return self._replace(votes=np.where(is_near_box | is_of_obstacle, 0, votes))
 
     def solid(self) -> Sampled | None:
-        """The occupied cells as an obstacle; None if there are none."""
+        """Return the occupied cells as a solid in scene units; None if no cell is occupied."""
         is_occupied = self.votes > 0
         if not is_occupied.any():
             return None
-        # The transforms give distances to the middles of cells. The faces are half a cell nearer.
+        # The transforms give distances between the centres of cells. A face is half a cell nearer than a centre.
         inside, outside = distance_transform_edt(is_occupied), distance_transform_edt(~is_occupied)
         cells = np.where(is_occupied, 0.5 - inside, outside - 0.5)
         return Sampled((self.spacing * cells).astype(np.float32), self._centers()[0, 0, 0], self.spacing, 0.0)
 
     @property
     def spacing(self) -> float:
-        """The side of a cell."""
+        """Side length of a cell, in scene units."""
         return 2.0 * self.half_extent / _CELLS
 
     def _centers(self) -> Float[np.ndarray, "n n n 3"]:
@@ -92,7 +93,7 @@ class Clutter(NamedTuple):
     def _is_seen_through(
         self, depth: Float[np.ndarray, "height width"], camera: Camera, pose: Pose, frame: Frame
     ) -> Bool[np.ndarray, "n n n"]:
-        """Mask of the cells in front of the measured depth, by more than a cell."""
+        """Return a mask of the cells that lie in front of the measured depth by more than a cell."""
         cell = frame.length_to_world(self.spacing)
         centers = np.asarray(frame.to_world(self._centers().reshape(-1, 3)), np.float64)
         local = (centers - np.asarray(pose.position, np.float64)) @ np.asarray(pose.rotation, np.float64)

@@ -1,4 +1,4 @@
-"""Pose errors of a session: estimates from its images, and corrected poses."""
+"""Pose errors of a session, which are estimated from the session's images, and the corrected poses."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,20 +11,21 @@ from jaxnbv.planning.alignment import Alignment, align_views, errors_of
 from jaxnbv.planning.images import Image, stride_of
 from jaxnbv.planning.session_warnings import warn_of_mount
 
-# Stride over the rows and columns used for planning, when images are compared.
+# Images are compared at every third of the rows and columns that planning uses.
 _COARSER = 3
-# Fewest views for a correction or warning. Two may disagree by chance.
+# Smallest number of views for a correction or warning. Two views may disagree by chance.
 _ENOUGH = 3
-# Corrections are equal if they move points by at most this share of the noise.
+# New corrections are ignored if they move points by at most this fraction of the noise.
 _EQUAL = 0.5
 
 
 class MountError:
-    """The alignment of a session's images, and the corrections of their poses in use.
+    """Alignment of a session's images, and the pose corrections that the session currently uses.
 
     - `camera`: the sensor.
     - `convention`: axes of the images' matrices, see `Pose.from_matrix`.
-    - `corrections`: (views, 4, 4), X of each image: its camera was at `matrix @ X`, in OpenCV's axes.
+    - `corrections`: (views, 4, 4), the correction X of each image. The true pose of the camera is `matrix @ X`, in
+      OpenCV's axes.
     """
 
     def __init__(self, camera: Camera, convention: str):
@@ -35,12 +36,15 @@ class MountError:
         self._alignment: Alignment | None = None
 
     def add(self, image: Image, index: int) -> None:
-        """Add the image with this index, without values for "not measured". Repeated calls have no effect."""
+        """Add the image with this index. An image that was added before is ignored.
+
+        - `image`: image in which pixels without a measurement have depth zero, see `Image.cleaned`.
+        """
         if index == len(self._images):
             self._images.append(image)
 
     def alignment(self) -> Alignment:
-        """Alignment of the images so far, by all their points, including those around the object.
+        """Return the alignment of the images so far, from all measured points, also those outside the box.
 
         **Raises:** `ValueError` for fewer than two images.
         """
@@ -64,12 +68,12 @@ class MountError:
 
     @property
     def mount(self) -> Float[np.ndarray, "4 4"]:
-        """X of the mount; the identity if views have different corrections or none."""
+        """Correction X that all views share; the identity if the views have different corrections or none."""
         first = self.corrections[0] if len(self.corrections) else np.eye(4)
         return first if bool(np.all(self.corrections == first)) else np.eye(4)
 
     def pose(self, image: Image, index: int) -> Pose:
-        """The corrected pose of an image's camera."""
+        """Return the corrected pose of an image."""
         pose = Pose.from_matrix(image.matrix, self.convention)
         correction = self.corrections[index] if index < len(self.corrections) else self.mount
         if np.array_equal(correction, np.eye(4)):
@@ -77,13 +81,13 @@ class MountError:
         return Pose.from_matrix(np.asarray(pose.to_matrix(), np.float64) @ correction)
 
     def command_poses(self, poses: Pose) -> Pose:
-        """Poses to send the camera to, so that it arrives at poses (n,) despite the mount's error."""
+        """Return the poses to command so that the camera arrives at `poses` (n,) despite the mount's error."""
         if np.array_equal(self.mount, np.eye(4)):
             return poses
         return Pose.from_matrix(np.asarray(poses.to_matrix(), np.float64) @ np.linalg.inv(self.mount))
 
     def update(self) -> bool:
-        """Update the corrections by the images so far, and return whether that moves a camera."""
+        """Update the corrections from the images so far, and return whether the corrections changed noticeably."""
         if len(self._images) < _ENOUGH:
             return False
         alignment = self.alignment()

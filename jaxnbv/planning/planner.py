@@ -1,4 +1,4 @@
-"""The planner: proposes the next view and observes its scan, for simulations and real sensors."""
+"""The planner, which proposes the next view and adds its scan to the observations."""
 
 import dataclasses
 import math
@@ -49,23 +49,27 @@ else:
 
 
 class Planner(eqx.Module):
-    """Bayesian next-best-view selection (the paper's Algorithm 1) as ask/tell over immutable observations.
+    """Bayesian next-best-view selection (the paper's Algorithm 1), with the methods `init`, `propose` and `observe`.
 
-    - `acquisition`: the expected worth of a view. A plain function of a cloud becomes a utility to improve.
+    - `acquisition`: the expected value of a view. You can also pass a plain function of a cloud. Then a view's value is
+      the expected improvement of this utility.
     - `search`: method that finds the pose of the highest expected value.
-    - `camera`: the sensor whose scans are imagined.
+    - `camera`: the sensor whose scans are simulated.
     - `sampler`: draws the surfaces that fit the observations.
-    - `cost`: cost of going from the last view to the next; None to ignore it.
-    - `obstacles`: solids around the object, which hide it and which cameras keep clear of; None if there are none.
-    - `capacity`: largest number of points in D. Larger clouds are thinned by farthest point sampling.
-    - `max_views`: largest number of views that observations can hold.
+    - `cost`: cost of moving the camera from the last view to the next; None to ignore it.
+    - `obstacles`: solids around the object, or None. Obstacles may hide the object, and cameras keep clear of them.
+    - `capacity`: largest number of points in the cloud D. Larger clouds are thinned by farthest point sampling.
+    - `max_views`: largest number of views that the observations can hold.
 
-    All methods are pure and run under `jit`. A planner compiles at its first two views only. For a cloud without a
-    pose, use `planner.init(None, cloud)`.
+    No method changes the planner or the observations, and all methods run under `jit`. Programs are compiled at the
+    first two views only. For a cloud without a pose, use `planner.init(None, cloud)`.
 
-    **Raises:** `ValueError` for numbers below one, if the search cannot work with the acquisition or the camera (for
-    example a gradient search with an acquisition that JAX cannot differentiate), or for a utility, classifier or
-    segmenter that JAX cannot trace or that returns an array of the wrong shape.
+    **Raises:** `ValueError` in three cases:
+
+    - `capacity` or `max_views` is below one.
+    - The search cannot work with the acquisition, the camera or the cost. For example, a gradient search needs an
+      acquisition that JAX can differentiate.
+    - JAX cannot trace a utility, classifier or segmenter, or it returns an array of the wrong shape.
     """
 
     acquisition: AnyAcquisition = eqx.field(converter=as_acquisition)
@@ -100,12 +104,12 @@ class Planner(eqx.Module):
 
     @classmethod
     def for_parts(cls, bank: ShapeBank, poses: ShapePoses = FreeRotation(), acquisition: Any = Identify()) -> "Planner":  # noqa: B008
-        """A planner that finds out which part of a bank the object is, and its pose.
+        """Return a planner that identifies which part of a bank the object is, and estimates the part's pose.
 
-        - `bank`: parts at true size, `ShapeBank.from_meshes(folder, scale="m")`, in world units in a session and in
-          scene units in a simulation.
-        - `poses`: possible poses of the parts, by default in any rotation.
-        - `acquisition`: the expected worth of a view.
+        - `bank`: parts at true size, from `ShapeBank.from_meshes(folder, scale="m")`. Lengths are in world units in a
+          session, and in scene units in a simulation.
+        - `poses`: prior of the part's pose. The default allows every rotation.
+        - `acquisition`: the expected value of a view.
 
         **Raises:** `ValueError` for a bank without parts, or not at true size.
         """
@@ -114,22 +118,23 @@ class Planner(eqx.Module):
 
     @property
     def quantity(self) -> Quantity:
-        """Name, unit and power of length of the values of its proposals."""
+        """Name, unit and power of length of the proposals' values."""
         value = self.search.quantity(self.acquisition)
         return value if self.cost is None else self.cost.quantity(value)
 
     @own_settings()
     def init(self, pose: Pose | None, scan: PointCloud, camera: Camera | None = None) -> Observations:
-        """Start observations with a first scan, in scene coordinates.
+        """Return the observations after a first scan, in scene coordinates.
 
-        The acquisition is evaluated once, so that a classifier or utility with invalid results fails at once.
+        The acquisition is evaluated once. A classifier or utility that returns invalid values therefore fails here.
 
-        - `pose`: pose of the scan; None for a cloud without a pose.
+        - `pose`: pose from which the scan was taken; None for a cloud without a pose.
         - `camera`: the camera that took the scan, by default the planner's.
 
-        **Raises:** `ValueError` if the cloud is empty, a point is not finite or outside the scene's grid, more than a
-        few stray points are outside the carving's volume, a normal is not of unit length (to 1 %), or the scan is an
-        image of another camera. Also raises as the acquisition's `check` does.
+        **Raises:** `ValueError` if the cloud is empty, if a point is not finite or outside the scene's grid, if more
+        than a few stray points are outside the carving's volume, if a normal's length differs from 1 by more than 1 %,
+        or if the scan does not have one row for each ray of the camera. Also raises what the acquisition's `check`
+        raises.
         """
         camera = camera or self.camera
         self._check(pose, scan, camera, first=True)
@@ -152,14 +157,16 @@ class Planner(eqx.Module):
     def observe(
         self, observations: Observations, pose: Pose, scan: PointCloud, camera: Camera | None = None
     ) -> Observations:
-        """Add a scan from a pose to the observations, in scene coordinates.
+        """Return the observations with one more scan, in scene coordinates.
 
-        A scan that hit nothing adds no points.
+        A scan without hits adds no points, but its pose and rays still count as a view.
 
-        - `camera`: the camera that took the scan, by default the planner's. Scans of one capacity and camera share one
-          compilation.
+        - `pose`: pose from which the scan was taken.
+        - `camera`: the camera that took the scan, by default the planner's. Scans of the same capacity from the same
+          camera share one compiled program.
 
-        **Raises:** `ValueError` for a scan as `init` does, for observations of another grid, or if they are full.
+        **Raises:** `ValueError` if the scan is invalid (see `init`), if the observations were started on a different
+        grid than the sampler's, or if the observations already hold `max_views` views.
         """
         camera = camera or self.camera
         check_type(observations, Observations, "observations")
@@ -179,9 +186,12 @@ class Planner(eqx.Module):
         return self.sampler.model.add_state(after)
 
     def replay(self, views: Iterable[tuple[Pose, PointCloud]], camera: Camera | None = None) -> Iterator[Observations]:
-        """Yield the observations after each view: `init` with the first, then `observe`. Raises as these do.
+        """Yield the observations after each view, by `init` for the first view and `observe` for the others.
 
-        - `views`: poses and scans; `camera`: the camera that took the scans.
+        - `views`: pose and scan of each view.
+        - `camera`: the camera that took the scans, by default the planner's.
+
+        **Raises:** `ValueError` as `init` and `observe` do.
         """
         observations = None
         for pose, scan in views:
@@ -193,9 +203,10 @@ class Planner(eqx.Module):
     def propose(self, observations: Observations, key: PRNGKeyArray, pending: PoseList | None = None) -> Proposal:
         """Propose the next pose.
 
-        - `pending`: poses that were proposed before but not taken. They are not proposed again.
+        - `pending`: poses of earlier proposals without a view. These poses are not proposed again.
 
-        **Raises:** `ValueError` if every candidate has been visited, and for observations of another grid.
+        **Raises:** `ValueError` if every candidate has been visited, or if the observations were started on a different
+        grid than the sampler's.
         """
         check_key(key)
         sample_key, search_key = jax.random.split(key)
@@ -203,16 +214,19 @@ class Planner(eqx.Module):
 
     @own_settings()
     def step_inputs(self, observations: Observations, key: PRNGKeyArray) -> StepInputs:
-        """First half of `propose`: the posterior and samples, or only the observations if no samples are used."""
+        """Return the inputs of the search: `sampled`, or only the observations if the search uses no samples.
+
+        This is the first half of `propose`. The second half is `choose`.
+        """
         check_type(observations, Observations, "observations")
         return self.sampled(observations, key) if self.search.uses_samples else StepInputs(observations)
 
     @own_settings()
     def sampled(self, observations: Observations, key: PRNGKeyArray) -> StepInputs:
-        """Condition the model on the observations, and draw the samples of a step.
+        """Condition the model on the observations, and draw samples of the surface.
 
-        If the acquisition is `measurable_only`, surface that a view should have measured and did not is left out of the
-        samples. If it is about hypotheses, the only sample is the likeliest part.
+        If the acquisition is `measurable_only`, the samples omit surface that an earlier view should have measured but
+        did not. If the acquisition needs hypotheses, the only sample is the most probable part.
         """
         if self.acquisition.needs_hypotheses:
             return StepInputs(observations, None, hypotheses_of(observations).surfaces(self.sampler.grid, 1))
@@ -224,9 +238,12 @@ class Planner(eqx.Module):
 
     @own_settings()
     def choose(self, inputs: StepInputs, key: PRNGKeyArray, pending: PoseList | None = None) -> Proposal:
-        """Second half of `propose`: search, given the step's inputs, for example with samples of your own.
+        """Search for the next pose, given the inputs of the search. This is the second half of `propose`.
 
-        **Raises:** `ValueError` if every candidate has been visited, or a score is not finite.
+        - `inputs`: result of `step_inputs`, or inputs with samples of your own.
+        - `pending`: as in `propose`.
+
+        **Raises:** `ValueError` if every candidate has been visited, or if the value of a candidate is not finite.
         """
         check_key(key)
         check_type(inputs, StepInputs, "the inputs of a step")
@@ -240,7 +257,7 @@ class Planner(eqx.Module):
     @jax.debug_nans(False)
     @program
     def values_at(self, inputs: StepInputs, poses: Pose) -> Float[Array, " poses"]:
-        """Values that the search maximises, with the cost of going there, at poses (n,) of the scene.
+        """Return the values that the search maximises, including the cost of the move, at scene poses (n,).
 
         **Raises:** `ValueError` for inputs without samples.
         """
@@ -250,25 +267,28 @@ class Planner(eqx.Module):
     @jax.debug_nans(False)
     @program
     def expected_depth(self, surfaces: GridSurface, pose: Pose) -> Float[Array, "h w"]:
-        """Expected depth image from a pose, in scene units: `mean_depth` over the samples."""
+        """Return the expected depth image from a pose in scene units, see `mean_depth`."""
         scans = scan_samples(surfaces, self.camera, pose[None], barrier_of(self.obstacles, self.camera, pose[None]))
         depth = mean_depth(jax.tree.map(lambda rows: rows[:, 0], scans), pose)
         return depth.reshape(self.camera.height, self.camera.width)
 
     def _with_view(self, observations: Observations, pose: Pose, scan: PointCloud, camera: Camera) -> Observations:
-        # Without clutter: the scan itself shows where clutter blocked a ray.
+        # Clutter is left out, because the scan itself shows where clutter blocked a ray.
         obstacles = None if self.obstacles is None else self.obstacles.with_clutter(None)
         return observations.add_view(pose, scan, camera, self.sampler.carving, obstacles)
 
     def _check(self, pose: Pose | None, scan: PointCloud, camera: Camera, first: bool) -> None:
-        """**Raises:** `ValueError` for a scan that is not valid for `init` (`first`) or `observe`."""
+        """Check the arguments of `init` (if `first`) or `observe`.
+
+        **Raises:** `ValueError` for invalid arguments.
+        """
         for value, hint, name in ((scan, PointCloud, "scan"), (pose, Pose | None, "pose"), (camera, Camera, "camera")):
             check_type(value, hint, f"the {name}")
         check_single(scan, "the scan")
         require(pose is None or pose.position.ndim == 1, "the pose is a batch of poses: give one, poses[0] say")
         if is_traced(scan, pose):
             return
-        # Under jit, arrays that are not traced still have values.
+        # Under jit, operations on concrete arrays would also be traced. This context evaluates them.
         with jax.ensure_compile_time_eval():
             problem = None if pose is None else distance_problem(pose)
             require(problem is None, f"the pose is not of the scene: {problem}")
@@ -290,10 +310,9 @@ def _propose(search: Search, problem: Problem, key: PRNGKeyArray) -> Proposal:
 
 
 def _checked_proposal(planner: Planner, problem: Problem, proposal: Proposal) -> Proposal:
-    """The proposal, unchanged.
+    """Check a proposal, and return the proposal unchanged.
 
-    **Raises:** `ValueError` if its value is not finite, with the name of the cause, or if every candidate has been
-    visited.
+    **Raises:** `ValueError` that names the cause if the value is not finite, or if every candidate has been visited.
     """
     if is_traced(proposal):
         return proposal
@@ -315,9 +334,9 @@ def _checked_proposal(planner: Planner, problem: Problem, proposal: Proposal) ->
 
 
 def _check_parts(planner: Planner, problem: Problem, proposal: Proposal) -> None:
-    """**Raises:** `ValueError` that names the cost or the part of the acquisition that is not finite.
+    """Find why a value is not finite, at the first candidate with such a value.
 
-    Checks the first candidate whose value is not finite.
+    **Raises:** `ValueError` that names the cost or the component of the acquisition that is not finite.
     """
     values = proposal.values
     wrong = jnp.isnan(values) | (values == jnp.inf)
