@@ -26,22 +26,24 @@ _FAR = 8.0
 
 
 class Obstacles(eqx.Module):
-    """Known solids, and the distance that a camera keeps from things; in scene units within a `Planner`.
+    """Known solids beside the object, and the distance that cameras keep from them and from the object.
 
-    An obstacle hides everything behind it, both from the sensor and in scans of samples. It never counts as the object,
-    and samples are empty inside it.
+    Lengths are in scene units within a `Planner`. An obstacle hides everything behind it, both from the sensor and in
+    scans of samples. Points of an obstacle are removed from scans, and samples have no surface inside an obstacle.
 
-    - `solids`: solids of `jaxnbv.scanning.sdf`, such as a `HalfSpace` for a table or `solid_of_mesh` for a mesh.
-    - `margin`: points nearer than this to a solid count as points of the solid.
+    - `solids`: a tuple of solids of `jaxnbv.scanning.sdf`, such as a `HalfSpace` for a table, or `solid_of_mesh` for a
+      mesh.
+    - `margin`: a scanned point nearer than this to a solid counts as a point of the solid.
     - `clearance`: least distance of a camera from an obstacle and from a scanned point.
-    - `clutter`: other things nearby, known coarsely. Clutter hides and keeps cameras away as solids do, but no point
-      counts as its own and samples may go through it. A session derives it from its images.
+    - `clutter`: a solid for other things nearby whose shape is known only roughly. Clutter hides what is behind it and
+      keeps cameras away, as solids do. But points near clutter are not removed, and samples may have surface inside
+      it. A session computes the clutter from its images.
 
-    **Raises:** `ValueError` if `solids` holds anything else, or for a negative length.
+    **Raises:** `ValueError` if `solids` is not a tuple of solids, or for a negative length.
     """
 
     solids: tuple[SignedDistance, ...] = ()
-    # Arrays, so that a program compiled for one scale runs for any.
+    # The lengths are arrays, so that a program compiled for one scale of the scene runs for any scale.
     margin: float = eqx.field(converter=np.float64, default=0.03)
     clearance: float = eqx.field(converter=np.float64, default=0.1)
     clutter: SignedDistance | None = None
@@ -56,7 +58,7 @@ class Obstacles(eqx.Module):
             require(value >= 0, f"the {name} is {value}; it must not be negative")
 
     def in_scene(self, frame: Frame) -> "Obstacles":
-        """A copy in scene coordinates of obstacles in world coordinates."""
+        """Convert obstacles in world coordinates to scene coordinates."""
 
         def moved(solid: SignedDistance) -> SignedDistance:
             return Rotated(solid.translate(-np.asarray(frame.center)), frame.rotation).scale(frame.scale)
@@ -66,18 +68,18 @@ class Obstacles(eqx.Module):
         return Obstacles(solids, frame.scale * self.margin, frame.scale * self.clearance, clutter)
 
     def with_clutter(self, clutter: SignedDistance | None) -> "Obstacles":
-        """A copy with other clutter; None removes it."""
-        # Not the constructor, whose conversion of lengths fails under jit.
+        """Return a copy whose clutter is replaced by `clutter`; None removes the clutter."""
+        # The constructor would convert the lengths with NumPy, which fails under jit.
         return eqx.tree_at(lambda obstacles: obstacles.clutter, self, clutter, is_leaf=lambda leaf: leaf is None)
 
     def distance(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
-        """Signed distance from each point to the nearest solid; infinite if there is none."""
+        """Return the signed distance from each point to the nearest solid; infinite if there are no solids."""
         return _distance(self.solids, x)
 
     def barrier(self, camera: Camera, poses: Pose) -> Float[Array, "*batch rays"] | None:
-        """Distance along each ray of a camera to the first obstacle, clutter included.
+        """Return the distance along each ray of a camera to the first obstacle, clutter included.
 
-        Infinite for a ray that meets none; None if there are no obstacles.
+        The distance is infinite for a ray that meets no obstacle. Returns None if there are no obstacles at all.
         """
         if not self._all:
             return None
@@ -89,21 +91,21 @@ class Obstacles(eqx.Module):
 
     @program
     def remove_points(self, scan: PointCloud) -> PointCloud:
-        """The scan without the points that belong to solids. In a sensor's image their rays become missed."""
+        """Remove the points that belong to solids from a scan. In a sensor's image, their rays become missed."""
         own = scan.mask & (self.distance(scan.points) < self.margin)
         missed = None if scan.missed is None else scan.missed | own
         return dataclasses.replace(scan.only(~own), missed=missed)
 
     @program
     def within(self, grid: Grid) -> Bool[Array, "g g g"]:
-        """Whether each node of a grid lies inside a solid."""
+        """Return, for each node of a grid, whether it lies inside a solid."""
         axis = jnp.asarray(grid.axis, jnp.result_type(float))
         return on_tensor_grid(lambda x: self.distance(x) < 0, axis)
 
     def violation(self, poses: Pose, cloud: PointCloud) -> Float[Array, " poses"]:
-        """How far each camera violates `clearance` to the obstacles and the cloud D, in scene units.
+        """Return the length by which each camera is closer to an obstacle or to the cloud D than `clearance`.
 
-        It is zero for a camera that is far enough away. Differentiable.
+        The length is in scene units, zero for a camera that is far enough away, and differentiable in the poses.
         """
         to_cloud = jnp.sqrt(jnp.maximum(nearest_squared_distance(poses.position, cloud), 1e-12))
         return jnp.maximum(self.clearance - jnp.minimum(_distance(self._all, poses.position), to_cloud), 0.0)
@@ -120,5 +122,5 @@ def _distance(solids: tuple[SignedDistance, ...], x: Float[AnyArray, "*n 3"]) ->
 
 
 def barrier_of(obstacles: Obstacles | None, camera: Camera, poses: Pose) -> Float[Array, "*batch rays"] | None:
-    """`Obstacles.barrier` of these obstacles; None if there are none."""
+    """Return `obstacles.barrier(camera, poses)`; None if there are no obstacles."""
     return None if obstacles is None else obstacles.barrier(camera, poses)

@@ -1,5 +1,7 @@
-"""Surfaces that rays can hit, the paper's scan(theta; f) (the oriented points that a depth camera sees), sensor noise,
-and the derivatives of hits."""
+"""Surfaces that rays can hit, simulated scans of them, sensor noise, and the derivatives of hits.
+
+A scan is the paper's scan(theta; f): the oriented points of surface f that a depth camera sees from pose theta.
+"""
 
 import math
 import warnings
@@ -20,16 +22,17 @@ from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.programs import program
 
-# In scene units: forty times the longest side of an object.
+# A camera farther than this from the scene's origin probably has its pose in other units. The limit, in scene units, is
+# forty times the longest side of an object.
 _FAR_OFF = 100.0
 
 
 class Hits(eqx.Module):
-    """First hits of rays on a surface.
+    """The first point at which each ray hits a surface.
 
     - `points`: the hits, in scene coordinates; zero where the ray misses.
-    - `normals`: unit normals on the side of the ray's origin; zero where the ray misses.
-    - `mask`: whether the ray hits at all.
+    - `normals`: unit normals that point to the side of the ray's origin; zero where the ray misses.
+    - `mask`: whether the ray hits the surface.
     """
 
     points: Float[Array, "rays 3"]
@@ -38,9 +41,9 @@ class Hits(eqx.Module):
 
 
 class Surface(eqx.Module):
-    """Anything that rays can hit.
+    """Base class of everything that rays can hit.
 
-    `in_jit` says whether `trace` runs under JAX transformations; a surface that needs host code says False.
+    `in_jit` is True if `trace` runs under JAX transformations, and False for a surface that is traced by host code.
     """
 
     in_jit: eqx.AbstractClassVar[bool]
@@ -52,40 +55,44 @@ class Surface(eqx.Module):
 
     @abstractmethod
     def trace(self, origins: Float[AnyArray, "rays 3"], directions: Float[AnyArray, "rays 3"]) -> Hits:
-        """First hits of the rays origin + t direction, t >= 0, with unit directions.
+        """Return the first hits of the rays origin + t direction, t >= 0, with unit directions.
 
-        Rays hit both sides of the surface, so a ray that starts inside hits it from within. Normals point to the side
-        of the origin there too.
+        A ray can hit a surface from both sides, so a ray that starts inside a solid hits its boundary from within. The
+        normal then points inward, to the side of the ray's origin.
         """
 
     def contains(self, points: Float[AnyArray, "n 3"]) -> Bool[AnyArray, " n"]:
-        """Whether each point (scene coordinates) lies inside. All False for a surface that encloses nothing."""
+        """Return, for each point (scene coordinates), whether the surface encloses it.
+
+        The default returns False for all points, which is right for a surface that encloses nothing.
+        """
         return np.zeros(len(points), bool)
 
     @property
     def class_label(self) -> Int[AnyArray, ""] | None:
-        """Index of the object's class; None if it has none."""
+        """Index of the object's class; None if the object has no class."""
         return None
 
     def part_labels(self, points: Float[Array, "n 3"]) -> Int[Array, " n"] | None:
-        """Index of the part that each surface point belongs to; None for an object without parts."""
+        """Return the index of the part that each surface point belongs to; None for an object without parts."""
         return None
 
     @property
     def world_frame(self) -> Frame | None:
-        """The frame that maps the surface's world to the scene; None if it was built in scene coordinates."""
+        """The frame that maps the surface's world to the scene; None if the surface is given in scene coordinates."""
         return None
 
 
 class SensorNoise(eqx.Module):
-    """Gaussian sensor noise: x + eps with eps ~ N(0, points^2 I).
+    """Independent Gaussian noise on the points and normals of a scan.
 
-    Normals become n + eps, with noise of their own, and are normalised again.
+    A point x becomes x + eps with eps ~ N(0, points^2 I). A normal n becomes n + eta with eta ~ N(0, normals^2 I), and
+    is then normalised.
 
     - `points`: standard deviation of each coordinate, in scene units.
     - `normals`: standard deviation of each component of the unit normals.
 
-    The defaults are the authors'.
+    The defaults are those of the paper's authors.
     """
 
     points: float = eqx.field(static=True, default=0.01)
@@ -102,9 +109,10 @@ class SensorNoise(eqx.Module):
     def __call__(
         self, cloud: PointCloud, key: PRNGKeyArray, camera: Camera | None = None, pose: Pose | None = None
     ) -> PointCloud:
-        """The cloud with noise on its filled rows. The camera does not matter.
+        """Return the cloud with noise on its filled rows. `camera` is ignored.
 
-        If there is a pose, `sight` becomes the distance to the noisy points, so that it does not reveal exact ranges.
+        If `pose` is given, `sight` becomes the distance from the pose to the noisy points, because the old `sight`
+        would reveal the exact ranges.
         """
         point_key, normal_key = jax.random.split(key)
         points = cloud.points + self.points * jax.random.normal(point_key, cloud.points.shape, cloud.points.dtype)
@@ -120,14 +128,15 @@ class SensorNoise(eqx.Module):
 
 
 class DepthNoise(eqx.Module):
-    """Noise and rounding of a depth camera that triangulates.
+    """Noise and rounding of a depth camera that triangulates, such as a stereo camera.
 
-    A disparity is 1/z times a constant, so both are the same at all depths z in 1/z and grow as z^2 in z:
+    Such a camera measures a disparity, which is 1/z times a constant. So the noise and the step of 1/z are the same at
+    all depths z, and the errors of z itself grow as z^2:
 
         1/z' = step round((1/z + deviation eps) / step),   eps ~ N(0, 1).
 
-    `PointCloud.from_depth` then computes points and normals, as for any depth image. The camera's range and
-    `max_incidence` decide which hits return at all.
+    `PointCloud.from_depth` then computes points and normals from the noisy image, as for any depth image. `scan` has
+    already removed hits outside the camera's range or beyond its `max_incidence`.
 
     - `deviation`, `step`: standard deviation and step of 1/z, in 1 / metre; a step of 0 does not round.
     - `scale`: scene units per metre; `frame.scale` if the world is in metres.
@@ -147,14 +156,14 @@ class DepthNoise(eqx.Module):
 
     @classmethod
     def kinect_v1(cls, scale: float = 1.0) -> "DepthNoise":
-        """Noise of 1.4 mm at 1 m, in steps of 2.85 mm (Khoshelham and Oude Elberink, Sensors 12, 2012)."""
+        """Return noise of 1.4 mm at 1 m, in steps of 2.85 mm (Khoshelham and Oude Elberink, Sensors 12, 2012)."""
         return cls(1.425e-3, 2.85e-3, scale)
 
     @classmethod
     def realsense_d435(cls, scale: float = 1.0) -> "DepthNoise":
-        """Noise of 3.8 mm at 1 m, in steps of 1.5 mm (Intel's papers on tuning and on subpixel linearity).
+        """Return noise of 3.8 mm at 1 m, in steps of 1.5 mm (Intel's papers on tuning and subpixel linearity).
 
-        Disparities have an error of 0.08 pixels and steps of 1/32, with a baseline of 50 mm and 848 pixels across 90
+        Disparities have an error of 0.08 pixels and steps of 1/32 pixel. The baseline is 50 mm, and 848 pixels span 90
         degrees.
         """
         pixels_times_metres = 848 / 2 / math.tan(math.radians(45.0)) * 0.05
@@ -162,7 +171,7 @@ class DepthNoise(eqx.Module):
 
     @checked
     def apply(self, depth: Float[Array, " n"], key: PRNGKeyArray) -> Float[Array, " n"]:
-        """Noisy depths for exact ones, in scene units. In both, zero stands for no depth."""
+        """Add noise to exact depths (scene units). A depth of zero means "no depth", before and after."""
         has_depth = depth > 0
         inverse = jnp.where(has_depth, self.scale / jnp.where(has_depth, depth, 1.0), 0.0)
         inverse = inverse + self.deviation * jax.random.normal(key, inverse.shape, inverse.dtype)
@@ -173,8 +182,9 @@ class DepthNoise(eqx.Module):
 
     @checked
     def __call__(self, scan: PointCloud, key: PRNGKeyArray, camera: Camera, pose: Pose) -> PointCloud:
-        """The noisy scan for a scan without noise, again one row per pixel. A pixel is invalid if its inverse depth
-        becomes zero or negative, or if no plane fits its neighbours.
+        """Add noise to a scan, which has one row per pixel before and after.
+
+        A pixel becomes invalid if its noisy inverse depth is zero or negative, or if no plane fits its neighbours.
 
         **Raises:** `ValueError` if the scan does not have one row per ray of the camera.
         """
@@ -191,11 +201,14 @@ class DepthNoise(eqx.Module):
 
 
 Noise: TypeAlias = SensorNoise | DepthNoise
-"""Sensor noise: a function of a scan without noise, a key, the camera and the pose that returns the noisy scan."""
+"""Sensor noise: a callable that takes an exact scan, a key, the camera and the pose, and returns the noisy scan."""
 
 
 def distance_problem(pose: Pose) -> str | None:
-    """A message if a pose is too far from the scene to be meant, else None. Poses must not be traced."""
+    """Return a message if a pose is so far from the scene that its unit must be wrong, else None.
+
+    Accepts a pose or a batch of poses, which JAX must not be tracing.
+    """
     distance = float(np.linalg.norm(np.asarray(pose.position), axis=-1).max(initial=0.0))
     if distance <= _FAR_OFF:
         return None
@@ -209,16 +222,18 @@ def distance_problem(pose: Pose) -> str | None:
 def scan(
     surface: Surface, camera: Camera, pose: Pose, barrier: Float[Array, "*batch rays"] | None = None
 ) -> PointCloud:
-    """The scan of a surface from a pose, one row per pixel, without noise.
+    """Return the scan of a surface from a pose: one row per pixel, without noise.
 
-    A row is missed if its ray hits nothing within the camera's range. It is invalid if the hit is too near or at too
-    large an angle of incidence. Points are in scene coordinates. Normals are unit and point towards the sensor. Poses
-    with leading axes give clouds with the same leading axes. Apply a `SensorNoise` to the result for noise.
+    A row is missed if its ray hits nothing within the camera's range. A row is invalid if the hit is nearer than the
+    range, or if its angle of incidence is too large. Points are in scene coordinates. Normals have unit length and
+    point towards the sensor. Poses with leading axes give clouds with the same leading axes. To add noise, apply a
+    `SensorNoise` or `DepthNoise` to the result.
 
-    - `barrier`: distance along each ray to an obstacle (`Obstacles.barrier`); hits behind it are missed.
+    - `barrier`: distance along each ray to an obstacle (`Obstacles.barrier`). A ray that reaches the obstacle before
+      the surface counts as missed.
 
-    Runs under `jit` if `surface.in_jit`. Warns if the scan is empty and the camera so far away that its pose must be in
-    other units.
+    Runs under `jit` if `surface.in_jit`. Warns if the scan is empty and the camera is so far away that the unit of its
+    pose must be wrong.
     """
     origins, directions = camera.rays(pose)
     hits = surface.trace(origins.reshape(-1, 3), directions.reshape(-1, 3))
@@ -237,7 +252,7 @@ def _returns(
     pose: Pose,
     barrier: Float[Array, "*batch rays"] | None,
 ) -> PointCloud:
-    """The hits that return to the sensor, as a scan."""
+    """Return the scan that consists of the hits that the sensor measures."""
     shape = origins.shape[:-1]
     mask = hits.mask.reshape(shape)
     points, normals = hits.points.reshape(*shape, 3), hits.normals.reshape(*shape, 3)
@@ -267,16 +282,16 @@ def implicit_depth(
     mask: Bool[Array, " n"],
     grazing: Float[Array, " n"],
 ) -> Float[Array, " n"]:
-    """The depths t at which n rays meet a surface, differentiable in the arrays of `along`.
+    """Return the depths t at which n rays meet a surface, with derivatives in the arrays of `along`.
 
-    From f(theta, t(theta)) = 0 follows dt = -(df/dtheta dtheta) / (df/dt). The rule applies to itself for derivatives
-    of higher order.
+    The derivative dt = -(df/dtheta dtheta) / (df/dt) follows from f(theta, t(theta)) = 0. This rule can itself be
+    differentiated, so derivatives of higher order are right too.
 
     - `along`: a module that returns f at a depth along each ray. Its arrays are the parameters theta.
-    - `depth`: the roots, f = 0, from any method. They are returned unchanged.
-    - `mask`: whether each ray hits; the others have derivative zero.
-    - `grazing`: least slope |df/dt|. Smaller ones are set to it and keep their sign, since the derivative is unbounded
-      for a ray that runs along the surface.
+    - `depth`: the roots of f, computed by any method. They are returned unchanged.
+    - `mask`: whether each ray hits. The derivative is zero for rays that do not hit.
+    - `grazing`: least slope |df/dt|. A smaller slope is replaced by this value with the slope's sign, since the
+      derivative is unbounded for a ray that runs along the surface.
     """
     return depth
 
@@ -292,12 +307,13 @@ def _implicit_depth_jvp(primals, tangents):
 
 
 def pixel_area(scan: PointCloud, camera: Camera, pose: Pose, steepest: float) -> Float[Array, " rays"]:
-    """The area of surface that each pixel shows, in squared scene units; zero for pixels without a point.
+    """Return the surface area that each pixel shows, in squared scene units; zero for pixels without a point.
 
-    With focal lengths fx and fy, depth z and distance r it is r^2 omega / cos = z^3 / (r fx fy cos).
+    The area is r^2 omega / cos = z^3 / (r fx fy cos), with focal lengths fx and fy, depth z, distance r, the pixel's
+    solid angle omega and the cosine of incidence cos.
 
-    - `scan`: the scan of this camera from this pose.
-    - `steepest`: least cosine of incidence. Smaller ones count as this one.
+    - `scan`: the scan that this camera took from this pose.
+    - `steepest`: least cosine of incidence. A smaller cosine is replaced by this value.
     """
     offset = jnp.where(scan.mask[:, None], scan.points - pose.position, pose.forward)
     depth = jnp.matmul(offset, pose.forward, precision="highest")

@@ -1,4 +1,4 @@
-"""Evenly spread points on a sampled surface, and whether a camera sees each from a pose."""
+"""Evenly spread points on a sampled surface, and a test of which points a camera sees from a pose."""
 
 import math
 from typing import NamedTuple
@@ -20,10 +20,10 @@ _POSES = 32
 
 
 class SurfacePoints(NamedTuple):
-    """Points of a surface, in scene units.
+    """Points of a surface with their normals and areas, in scene units.
 
-    - `points`, `normals`: the normals are unit and point outward.
-    - `areas`: area that each point stands for, in squared scene units; zero if the surface is empty.
+    - `points`, `normals`: positions, and unit normals that point outward.
+    - `areas`: area of the surface that each point represents, in squared scene units; zero if the surface is empty.
     """
 
     points: Float[Array, "n 3"]
@@ -33,10 +33,10 @@ class SurfacePoints(NamedTuple):
 
 @program
 def spread_points(surface: GridSurface, count: int) -> SurfacePoints:
-    """Points where edges of the grid cross a surface, evenly spread over these edges.
+    """Return points where edges of the grid cross a surface, chosen evenly among these edges.
 
-    A plane with the unit normal n crosses |n_x| + |n_y| + |n_z| edges per squared grid spacing. So each edge stands for
-    an area of the inverse, in squared spacings (Cauchy-Crofton formula).
+    A plane with unit normal n crosses |n_x| + |n_y| + |n_z| edges per squared grid spacing. So each crossed edge
+    represents an area of 1 / (|n_x| + |n_y| + |n_z|) squared spacings (Cauchy-Crofton formula).
 
     - `count`: number of points. Points repeat if the surface crosses fewer edges.
     """
@@ -45,7 +45,8 @@ def spread_points(surface: GridSurface, count: int) -> SurfacePoints:
     # The last node along an axis has no neighbour ahead.
     crossed = [jnp.pad(jnp.diff(inside, axis=axis), [(0, int(own == axis)) for own in range(3)]) for axis in range(3)]
     reached = jnp.cumsum(jnp.stack(crossed).reshape(-1))
-    # One random edge in each of `count` equal intervals. A fixed stride could fall into step with the grid's rows.
+    # Take one random edge in each of `count` equal intervals. With a fixed stride, the points could line up along the
+    # grid's rows.
     apart = jax.random.uniform(jax.random.key(0), (count,))
     ranks = (jnp.arange(count) + apart) / count * reached[-1]
     edge = jnp.searchsorted(reached, ranks, side="right").clip(0, reached.size - 1)
@@ -73,12 +74,13 @@ def is_visible(
     tolerance: float,
     barrier: Float[Array, "poses rays"] | None = None,
 ) -> Bool[Array, "poses n"]:
-    """Whether a camera sees each point of a surface from each pose of a batch.
+    """Return, for each pose of a batch and each point of a surface, whether a camera at the pose sees the point.
 
-    A point is seen if it is within the image and the range, is not at a grazing angle, and nothing is in front of it.
+    A camera sees a point if the point lies in its image and range, is not at a grazing angle, and nothing hides it.
 
-    - `tolerance`: largest distance in front of a point at which its ray may hit the surface, in scene units.
-    - `barrier`: see `scan`.
+    - `tolerance`: the surface hides a point if the ray to the point hits the surface more than this length before the
+      point, in scene units.
+    - `barrier`: distance along each ray of the camera to an obstacle, see `Obstacles.barrier`.
     """
 
     def from_pose(inputs: tuple[Pose, Float[Array, " rays"] | None]) -> Bool[Array, " n"]:
@@ -102,5 +104,5 @@ def is_visible(
         pixel = jnp.where(inside, row * camera.width + column, 0).astype(jnp.int32)
         return inside & (distance < barrier[pixel])
 
-    # Batches keep the rays through one sample in a CPU's cache.
+    # Poses are processed in batches of `_POSES`, so that the rays through one sample fit a CPU's cache.
     return jax.lax.map(from_pose, (poses, barrier), batch_size=_POSES)
