@@ -1,7 +1,7 @@
-"""Space that a sensor has seen to be empty, and carving of surfaces by it.
+"""Space that a sensor has seen to be empty, and carving: removal of sampled surface from this space.
 
-A ray is one of three: it hit and is empty up to the hit, it missed and is empty all the way, or it is invalid and says
-nothing. A node of the grid is *seen empty* once all rays near it went past it.
+A ray that hits shows that space is empty up to its hit. A ray that misses shows that space is empty along all of its
+length. An invalid ray shows nothing. A node of the grid is *seen empty* if all rays near it went past it.
 """
 
 import functools
@@ -22,20 +22,21 @@ from jaxnbv.geometry.volume import Box, Volume
 from jaxnbv.programs import program
 from jaxnbv.scanning.grid import Grid
 
-# Share of points that may lie outside the volume. Noise moves fewer points of a face two voxels out of the volume.
+# Fraction of points that may lie more than two margins outside the volume. Noise moves fewer points of a face that far.
 _STRAY = 0.01
 
 
 class Carving(eqx.Module):
-    """Makes samples empty where the sensor saw empty space, and outside the volume that holds the object.
+    """Removal of sampled surface where the sensor saw empty space, and outside the volume that holds the object.
 
-    - `volume`: where the object can be, see `jaxnbv.geometry.volume`; by default the box that scenes are scaled to.
-    - `margin_voxels`: margin in spacings of the grid. A node is seen empty if every ray that passes within the margin
-      of it, and the neighbours of these rays in the image, went on for the margin beyond it. A node is outside if it
-      is more than two margins from the volume.
+    - `volume`: the region that can hold the object, see `jaxnbv.geometry.volume`. The default is the box that
+      `Frame.fit` scales scenes to.
+    - `margin_voxels`: the margin, in spacings of the grid. A node is seen empty if every ray that passes the node
+      within the margin, and every neighbour of such a ray in the image, stayed empty to at least the margin beyond the
+      node. A node counts as outside if it lies more than two margins outside the volume.
 
-    The margin keeps the surface of a sheet thinner than a voxel that was seen from both sides. Noise on a hit does not
-    carve while its standard deviation is below a third of the margin.
+    Because of the margin, a sheet thinner than a voxel keeps its surface when it is seen from both sides. Noise on hits
+    does not remove surface if its standard deviation is below a third of the margin.
 
     **Raises:** `ValueError` if the margin is below half a voxel or not finite.
     """
@@ -65,13 +66,15 @@ class Carving(eqx.Module):
         camera: Camera,
         barrier: Float[Array, " rays"] | None = None,
     ) -> Bool[Array, "g g g"]:
-        """Whether one scan shows each node to be empty. All False for a cloud that is not a sensor's image.
+        """Return, for each node, whether one scan shows that the node is empty.
 
-        - `barrier`: distance along each ray to an obstacle, behind which nothing is known.
+        All nodes are False if the scan is a cloud that is not a sensor's image (`missed` is None).
+
+        - `barrier`: distance along each ray to an obstacle. A ray that misses shows nothing behind the obstacle.
         """
         if scan.missed is None:
             return jnp.zeros((grid.resolution,) * 3, bool)
-        # Depth along the camera's axis up to which each pixel's ray was empty.
+        # `depth` is the depth along the camera's axis up to which each pixel's ray was empty.
         along = jnp.matmul(scan.points - pose.position, pose.forward, precision="highest")
         limit = jnp.asarray(jnp.inf if camera.farthest is None else camera.farthest)
         if barrier is not None:
@@ -81,14 +84,16 @@ class Carving(eqx.Module):
 
     @program
     def outside(self, grid: Grid) -> Bool[Array, "g g g"]:
-        """Whether each node is more than two margins outside the volume."""
+        """Return, for each node, whether it lies more than two margins outside the volume."""
         axis = jnp.asarray(grid.axis, jnp.result_type(float))
         return on_tensor_grid(self.volume, axis) > self._beyond_volume(grid)
 
     def with_room(self, box: Box, grid: Grid, frame: Frame) -> Box:
-        """The box (world coordinates), widened by the distance at which points still count as the object's.
+        """Move all faces of a box (world coordinates) but the lower one outward by two margins / sqrt(3).
 
-        A scan cropped to the wider box shows that the surface goes on where the box cuts it.
+        The corners of the wider box are then at most two margins from the original box, so points in the wider box
+        still count as inside the volume. A scan cropped to the wider box shows that the surface goes on where the
+        original box cuts it.
         """
         return frame.to_world(frame.to_scene(box).widened(self._beyond_volume(grid) / math.sqrt(3.0)))
 
@@ -97,15 +102,15 @@ class Carving(eqx.Module):
 
     @program
     def inside(self, grid: Grid) -> Bool[Array, "g g g"]:
-        """Whether each node is inside the volume."""
+        """Return, for each node, whether it lies inside the volume."""
         return on_tensor_grid(self.volume, jnp.asarray(grid.axis, jnp.result_type(float))) < 0
 
     def check_inside(self, cloud: PointCloud, grid: Grid) -> None:
-        """Check that the volume, widened by two margins, holds the cloud, so that no object is cut silently.
+        """Check that the volume, widened by two margins, holds the cloud. Otherwise carving would cut the object.
 
-        One point in a hundred may lie outside because of noise.
+        Because of noise, up to 1 % of the points may lie outside.
 
-        **Raises:** `ValueError` if more do.
+        **Raises:** `ValueError` if more points lie outside.
         """
         limit = self._beyond_volume(grid)
         outside, farthest = _beyond(self.volume, cloud, limit)
@@ -120,10 +125,10 @@ class Carving(eqx.Module):
 
 @jax.jit
 def carve(values: Float[Array, "*s g g g"], empty: Bool[Array, "g g g"]) -> Float[Array, "*s g g g"]:
-    """Values of f minus its level, made positive (outside) at the empty nodes.
+    """Return values of f minus its level in which the empty nodes are positive, that is, outside the surface.
 
-    The new value is twice the largest magnitude among the node and its neighbours. So where a surface crosses an edge
-    between an inside node and an empty one, it does so within a third of the edge from the inside node.
+    The new value of an empty node is twice the largest magnitude among the node and its neighbours. So the surface
+    crosses an edge between an inside node and an empty node within a third of the edge from the inside node.
     """
     magnitude = jnp.maximum(jnp.abs(values), jnp.finfo(values.dtype).tiny)
     for axis in (-3, -2, -1):
@@ -135,16 +140,20 @@ def carve(values: Float[Array, "*s g g g"], empty: Bool[Array, "g g g"]) -> Floa
 
 @program
 def _beyond(volume: Volume, cloud: PointCloud, limit: float) -> tuple[Int[Array, ""], Float[Array, ""]]:
-    """The number of points farther than the limit outside the volume, and the distance of the farthest point."""
-    # All rows, so that clouds with different counts share a compilation.
+    """Return the number of points farther than `limit` outside the volume, and the distance of the farthest point."""
+    # Evaluate all rows, so that clouds with different counts share a compilation.
     distance = jnp.where(cloud.mask, volume(cloud.points), -jnp.inf)
-    # Negated so that NaN counts as outside.
+    # The comparison is negated so that NaN counts as outside.
     return jnp.sum(~(distance <= limit)), jnp.max(distance, initial=-jnp.inf)
 
 
 def _crossed(grid: Grid, depth: Float[Array, "h w"], camera: Camera, pose: Pose, margin: float) -> Bool[Array, "g g g"]:
-    """Whether all rays within `margin` (scene units) of each node went on for the margin beyond it."""
-    # nearest[k] is the least depth within 2^k pixels inside the image.
+    """Return, for each node, whether all rays that pass it within `margin` stayed empty to `margin` beyond it.
+
+    - `depth`: depth along the camera's axis up to which each pixel's ray was empty.
+    - `margin`: in scene units.
+    """
+    # nearest[k] is the least depth within 2^k pixels of each pixel. Pixels beyond the border are ignored.
     nearest = [_least_within(depth, 1)]
     while 2 ** len(nearest) < max(depth.shape):
         nearest.append(_least_within(nearest[-1], 2 ** (len(nearest) - 1)))
@@ -163,14 +172,14 @@ def _crossed(grid: Grid, depth: Float[Array, "h w"], camera: Camera, pose: Pose,
         # The node must have rays on all sides.
         inside = (place >= 0.5) & (place <= jnp.array([[camera.width - 0.5], [camera.height - 0.5]]))
         column, row = jnp.floor(place).astype(jnp.int32)
-        # The factor 1 + a^2 + b^2 bounds the stretch of a ball's image off the axis. One more pixel includes the rays
-        # on both sides.
+        # The image of a ball about the node lies within this radius, in pixels. The factor 1 + a^2 + b^2 bounds its
+        # stretch off the axis. One pixel is added to include the rays on both sides.
         radius = max(camera.focal_lengths) * margin / (safe - margin) * (1.0 + a**2 + b**2) + 1.0
         radius = jnp.ceil(radius)
         level = jnp.floor(jnp.log2(radius)).astype(jnp.int32)
         has_rays = in_front & inside.all(axis=0) & (level < len(nearest))
         level = jnp.where(has_rays, level, 0)
-        # Four overlapping squares, whose size is the power of two below, cover a square of any size.
+        # Four overlapping squares of half width 2^level <= radius cover the square of half width `radius`.
         aside = jnp.where(has_rays, radius.astype(jnp.int32) - 2**level, 0)
         corners = [
             pyramid[level, jnp.clip(row + down, 0, camera.height - 1), jnp.clip(column + across, 0, camera.width - 1)]
@@ -184,7 +193,10 @@ def _crossed(grid: Grid, depth: Float[Array, "h w"], camera: Camera, pose: Pose,
 
 
 def _least_within(image: Float[Array, "h w"], pixels: int) -> Float[Array, "h w"]:
-    """The minimum of each pixel and the eight that are `pixels` rows or columns away; infinite beyond the border."""
+    """Return the minimum of each pixel and the eight pixels that are `pixels` rows or columns away from it.
+
+    Pixels beyond the border count as infinite.
+    """
     for axis in (0, 1):
         pad = [(0, 0), (0, 0)]
         pad[axis] = (pixels, pixels)

@@ -1,4 +1,4 @@
-"""GridSurface: the level set of a function on a regular grid, the form in which posterior samples are traced."""
+"""`GridSurface`, the level set of a function on a regular grid. Posterior samples are traced in this form."""
 
 import dataclasses
 import warnings
@@ -20,15 +20,16 @@ from jaxnbv.scanning import tracing
 from jaxnbv.scanning.scanner import Hits, Surface, scan
 from jaxnbv.sharding import on_cpu, shared_map
 
-# Normals with a smaller cosine point in opposite directions; the share of points on thin parts that gives a warning.
+# Two normals count as opposite if the cosine between them is below `_OPPOSITE`. `Grid.check` warns if more than this
+# fraction of the points lies on thin parts.
 _OPPOSITE, _THIN_SHARE = -0.8, 0.05
 
 
 class Grid(eqx.Module):
-    """The regular grid of `resolution`^3 nodes that spans [-half_extent, half_extent]^3 of the scene.
+    """A regular grid of `resolution`^3 nodes that spans [-half_extent, half_extent]^3 of the scene.
 
-    The defaults are the paper's: 100^3 nodes on [-1.75, 1.75]^3. A part thinner than a cell (`spacing`) may lie between
-    nodes and be missed. Use a finer grid for thin parts.
+    The defaults are the paper's: 100^3 nodes on [-1.75, 1.75]^3. Samples may miss a part of the object that is thinner
+    than a cell (`spacing`), since the part may lie between nodes. Use a finer grid for thin parts.
     """
 
     resolution: int = eqx.field(static=True, default=100)
@@ -45,16 +46,19 @@ class Grid(eqx.Module):
         return 2.0 * self.half_extent / (self.resolution - 1)
 
     def cell_of(self, points: Float[Array, "*n 3"]) -> Int[Array, "*n 3"]:
-        """Index of the cell that holds each point (scene units).
+        """Return the index of the cell that holds each point (scene coordinates).
 
-        Along an axis on which the point is outside the grid, the index is `resolution - 1` or more, which is no cell.
-        It is never negative, since that would count from the other end.
+        Cells have the indices 0 to `resolution - 2` along each axis. For a point outside the grid, at least one index
+        is larger than that. No index is negative, since JAX would count a negative index from the other end.
         """
         cell = jnp.floor((points + self.half_extent) / self.spacing).astype(jnp.int32)
         return jnp.where(cell < 0, self.resolution, cell)
 
     def check(self, cloud: PointCloud) -> None:
-        """Warn of parts thinner than a cell, where points closer than a cell have opposite normals."""
+        """Warn if many points lie on parts thinner than a cell.
+
+        A point counts as such if a point with the opposite normal is closer than a cell.
+        """
         points, normals = cloud.to_numpy()
         pairs = cKDTree(points).query_pairs(self.spacing, output_type="ndarray")
         opposite = np.sum(normals[pairs[:, 0]] * normals[pairs[:, 1]], axis=1) < _OPPOSITE
@@ -73,16 +77,16 @@ class Grid(eqx.Module):
 
 
 class GridSurface(Surface):
-    """The zero set of the trilinear interpolant of node values, traced exactly.
+    """The zero set of a trilinear interpolant of node values, or a batch of zero sets along leading axes.
 
-    Leading axes make a batch of surfaces.
+    Rays are traced exactly. They hit nothing outside the grid's box. A ray that starts outside the box is traced from
+    the point where it enters the box.
 
-    - `values`: f minus its level at the nodes; positive outside.
-    - `distance`: number of cells from each cell to one with a change of sign (`tracing.free_distance`).
-    - `is_void`: cells whose surface a sensor does not see. A ray whose first zero is in such a cell misses. None if
-      there are none.
-
-    Rays hit nothing outside the grid's box. A ray that starts outside is traced from the point where it enters.
+    - `values`: f minus its level at the nodes; positive outside the solid.
+    - `distance`: lower bound, in cells, on the distance from each cell to the nearest cell in which f changes sign,
+      with the sign of f (`tracing.free_distance`).
+    - `is_void`: whether a sensor cannot see the surface in each cell. A ray whose first zero is in such a cell misses.
+      None if there are no such cells.
     """
 
     in_jit: ClassVar[bool] = True
@@ -96,7 +100,9 @@ class GridSurface(Surface):
     def from_values(
         cls, values: Float[AnyArray, "*s g g g"], level: Float[AnyArray, ""] | float, grid: Grid
     ) -> "GridSurface":
-        """The surface, or batch of surfaces, where a function with these node values equals `level`.
+        """Return the surface where a function with these node values equals `level`.
+
+        - `values`: one value per node. Leading axes give a batch of surfaces.
 
         **Raises:** `ValueError` if the values do not fit the grid, or if a value or the level is not finite.
         """
@@ -112,20 +118,20 @@ class GridSurface(Surface):
         return cls(relative, distances, grid)
 
     def without_cells(self, cells: Bool[Array, "*s m m m"]) -> "GridSurface":
-        """The surface without the parts in these cells: rays that hit them miss."""
+        """Return the surface without its parts in these cells. Rays that would hit these parts miss."""
         return dataclasses.replace(self, is_void=cells if self.is_void is None else self.is_void | cells)
 
     @program
     def trace(self, origins: Float[AnyArray, "rays 3"], directions: Float[AnyArray, "rays 3"]) -> Hits:
-        """First zeros along the rays inside the box; see `Surface.trace`.
+        """Return the first zeros along the rays inside the box; see `Surface.trace`.
 
-        A hit is where the interpolant first differs in sign from its sign at the ray's start (its origin, or where it
-        enters the box). Zero counts as negative. Normals are central differences interpolated linearly, so they are
-        continuous.
+        A ray starts at its origin or, if the origin is outside the box, where the ray enters the box. The hit is the
+        first point at which the sign of the interpolant differs from its sign at the start. Zero counts as negative.
+        Normals are central differences at the nodes, interpolated linearly, so they are continuous.
 
-        Differentiable in origins, directions and values: at a hit x = o + t d the implicit function theorem gives
-        dt = -(df + grad f . (do + t dd)) / (grad f . d). The denominator is kept away from zero for grazing rays, so
-        that |dt| is at most about 34 |dx|.
+        Hits are differentiable in origins, directions and values. At a hit x = o + t d the implicit function theorem
+        gives dt = -(df + grad f . (do + t dd)) / (grad f . d). The denominator is kept away from zero for grazing
+        rays, so |dt| is at most about 34 |dx|.
 
         **Raises:** `ValueError` for a batch of surfaces.
         """
@@ -154,14 +160,15 @@ class GridSurface(Surface):
 def scan_samples(
     surfaces: GridSurface, camera: Camera, poses: Pose, barrier: Float[Array, "poses rays"] | None = None
 ) -> PointCloud:
-    """The `scan` of each surface of a batch from each pose of a batch: leading axes (surfaces, poses)."""
+    """Scan each surface of a batch from each pose of a batch. The result has leading axes (surfaces, poses)."""
     return shared_map(scan, surfaces, camera, poses, barrier, at_once=samples_at_once(camera, poses))
 
 
 def samples_at_once(camera: Camera, poses: Pose) -> int:
-    """The number of samples to scan together from a batch of poses.
+    """Return the number of samples to scan together from a batch of poses.
 
-    It is one on a CPU, so that the scans stay in its cache. On a GPU it is as many as make eight million rays.
+    On a CPU this is one, so that the scans of a sample stay in the cache. On a GPU it is the number that gives about
+    eight million rays, and at least one.
     """
     return 1 if on_cpu() else max(1, 2**23 // (poses.position.shape[0] * camera.num_rays))
 
@@ -169,7 +176,9 @@ def samples_at_once(camera: Camera, poses: Pose) -> int:
 @jax.debug_nans(False)
 @program
 def mean_depth(scans: PointCloud, pose: Pose) -> Float[Array, " rays"]:
-    """Mean depth along the camera's axis over the samples that a ray hits (scene units); NaN if most miss.
+    """Return each ray's mean depth over the samples that it hits (scene units); NaN if it misses most samples.
+
+    The depth is measured along the camera's axis.
 
     - `scans`: scans of all samples from the pose, along a leading axis.
     """
@@ -183,13 +192,13 @@ def mean_depth(scans: PointCloud, pose: Pose) -> Float[Array, " rays"]:
 def _prepared(
     values: Float[Array, "*s g g g"], level: Float[Array, ""]
 ) -> tuple[Float[Array, "*s g g g"], Bool[Array, ""], Int8[Array, "*s m m m"]]:
-    """Values minus the level, whether all are finite, and `tracing.free_distance` of each cell."""
+    """Return the values minus the level, whether all of them are finite, and `tracing.free_distance` of each cell."""
     values = values - level
     distances = shared_map(tracing.free_distance, values.reshape(-1, *values.shape[-3:]))
     return values, jnp.isfinite(values).all(), distances.reshape(*values.shape[:-3], *distances.shape[1:])
 
 
 def touched_cells(nodes: Bool[Array, "*s g g g"]) -> Bool[Array, "*s m m m"]:
-    """Whether each cell of a grid has a corner among the nodes that are True."""
+    """Return, for each cell of a grid, whether `nodes` is True at one of its corners."""
     windows = (1,) * (nodes.ndim - 3) + (2,) * 3, (1,) * nodes.ndim
     return jax.lax.reduce_window(nodes, False, jax.lax.bitwise_or, *windows, "VALID")

@@ -1,8 +1,9 @@
 """The surface that earlier views have measured, and how far each view saw.
 
-D is thinned to its capacity, so surface between its points may have been measured too. The hits of all rays show what
-has been measured, at the resolution of the sensor. If a view should have seen a sampled surface but did not measure it,
-the sensor cannot measure it: the surface is not there, or too dark, or too shiny.
+The cloud D is thinned to its capacity, so surface between its points may have been measured too. This module stores the
+hits of all rays instead, which show the measured surface at the resolution of the sensor. If a view should have seen a
+sampled surface but did not measure it, later views will not measure it either: the surface does not exist, or it is too
+dark or too shiny for the sensor.
 """
 
 import dataclasses
@@ -24,21 +25,24 @@ from jaxnbv.scanning.grid import Grid, GridSurface
 from jaxnbv.scanning.scanner import Surface, pixel_area, scan
 from jaxnbv.sharding import shared_map
 
-# Largest distance to a hit that is kept, in spacings of the grid.
+# Largest stored distance to a hit, in spacings of the grid.
 _REACH = 3
 STEEP = 0.5
-"""The cosine of incidence below which little is expected. Sensors measure little of steeper surface, so a missing hit
-there proves nothing, and imagined slopes are uncertain."""
+"""The cosine of incidence below which a surface counts as steep. Sensors measure little of a steep surface, so a
+missing hit on it proves nothing. The slopes of samples are also uncertain."""
 
-# Most rays kept of a view. More would slow down the scans of sampled surfaces.
+# Largest number of rays that is stored for a view. More rays would slow down the scans of sampled surfaces.
 _RAYS = 5_000
 
 
 class Looks(eqx.Module):
     """The measured surface and the lines of sight of all views. Immutable, with fixed shapes.
 
-    - `distance`: from each node of the grid to the nearest pixel on the surface, in scene units, at most `reach`.
-    - `sight`: how far each view saw along the rays of `camera`, see `PointCloud`; zero outside its image.
+    - `distance`: distance from each node of the grid to the nearest surface that a pixel measured, in scene units, at
+      most `reach`.
+    - `sight`: how far each view saw along the rays of `camera` (see `PointCloud`); zero for a ray outside the image of
+      the view.
+    - `camera`: the sensor with fewer rows and columns.
     """
 
     distance: Float[Array, "g g g"]
@@ -48,7 +52,7 @@ class Looks(eqx.Module):
 
     @classmethod
     def empty(cls, grid: Grid, camera: Camera, max_views: int) -> "Looks":
-        """The `Looks` before the first view, with rays of every few rows and columns of the sensor."""
+        """Return the `Looks` before the first view, for a sensor `camera` and at most `max_views` views."""
         camera = camera.strided(math.ceil(math.sqrt(camera.num_rays / _RAYS)))
         far = jnp.full((grid.resolution,) * 3, _REACH * grid.spacing, jnp.result_type(float))
         return cls(far, jnp.zeros((max_views, camera.num_rays), far.dtype), camera, grid)
@@ -60,9 +64,10 @@ class Looks(eqx.Module):
 
     @program
     def with_points(self, cloud: PointCloud, radii: Float[Array, " n"] | float = 0.0) -> "Looks":
-        """A copy with the points of a cloud added as hits.
+        """Return a copy with the points of a cloud added as hits.
 
-        - `radii`: radius of the measured surface around each point, in scene units; limited to a spacing of the grid.
+        - `radii`: radius of the surface that was measured around each point, in scene units. Radii above a spacing of
+          the grid are reduced to it.
         """
         radii = jnp.minimum(radii, self.grid.spacing)
         place = (cloud.points + self.grid.half_extent) / self.grid.spacing
@@ -71,7 +76,7 @@ class Looks(eqx.Module):
         def near(distance, offset):
             node = low + offset
             to_point = jnp.maximum(self.grid.spacing * jnp.linalg.norm(node - place, axis=-1) - radii, 0.0)
-            # A negative index would count from the other end.
+            # JAX would count a negative index from the other end, so such rows get an index beyond the grid.
             is_node = cloud.mask & jnp.all(node >= 0, axis=-1)
             index = jnp.where(is_node[:, None], node, self.grid.resolution)
             return distance.at[tuple(index.T)].min(to_point, mode="drop"), None
@@ -87,13 +92,14 @@ class Looks(eqx.Module):
         camera: Camera,
         barrier: Float[Array, " rays"] | None = None,
     ) -> "Looks":
-        """A copy with one more view.
+        """Return a copy with one more view.
 
         - `index`: index of the view, from 0.
-        - `pose`, `scan`, `camera`: the view's pose, its scan, and the camera that took it.
-        - `barrier`: distance along each of its rays to an obstacle; the view saw nothing behind it.
+        - `pose`, `scan`, `camera`: the view's pose, its scan, and the camera that took the scan.
+        - `barrier`: distance along each ray of the camera to an obstacle. The view saw nothing behind the obstacle.
         """
-        # Half the diagonal of a pixel on the surface, so that surface between the rays of a coarse image is not new.
+        # The radius is half the diagonal of a pixel on the surface, so that surface between the rays of a coarse image
+        # counts as measured.
         looks = self.with_points(scan, jnp.sqrt(jnp.maximum(0.5 * pixel_area(scan, camera, pose, STEEP), 0.0)))
         if scan.sight is None:
             return looks
@@ -104,16 +110,18 @@ class Looks(eqx.Module):
         return dataclasses.replace(looks, sight=looks.sight.at[index].set(sight.astype(looks.sight.dtype)))
 
     def __call__(self, x: Float[Array, "*n 3"]) -> Float[Array, "*n"]:
-        """Distance from each point to the nearest hit, at most `reach`. Linear between nodes, so it can be up to half a
-        spacing at a hit itself. Differentiable in x."""
+        """Return the distance from each point x to the nearest hit, at most `reach`. Differentiable in x.
+
+        The distance is interpolated linearly between nodes, so it can be up to half a spacing at a hit.
+        """
         places = list(jnp.moveaxis((x + self.grid.half_extent) / self.grid.spacing, -1, 0))
         return jax.scipy.ndimage.map_coordinates(self.distance, places, order=1, mode="nearest")
 
     @program
     def without_unmeasured(self, surfaces: GridSurface, poses: PoseList) -> GridSurface:
-        """The sampled surfaces without the cells that a view should have measured and did not.
+        """Return the sampled surfaces without the cells that a view should have measured but did not.
 
-        These are the cells of `unmeasured_cells` for all views, and the cells next to them.
+        The removed cells are those of `unmeasured_cells` for all views, and the cells next to them.
 
         - `surfaces`: a batch along a leading axis.
         - `poses`: the poses of the views.
@@ -121,11 +129,13 @@ class Looks(eqx.Module):
         return surfaces.without_cells(shared_map(_unmeasured_by_any, surfaces, self, poses))
 
     def unmeasured_cells(self, surface: Surface, index: Int[Array, ""] | int, pose: Pose) -> Int[Array, "rays 3"]:
-        """The cell of each ray's hit on a surface, if the view should have measured it and did not.
+        """Return the cell of each ray's hit on a sampled surface that the view should have measured but did not.
 
-        That is, the view saw as far as the surface, which faces it, but no measured hit lies within a spacing. Other
-        rays get an index beyond the grid's cells.
+        The view should have measured the hit if the surface faces the camera and the ray saw as far as the hit, or if
+        the ray passed the hit and went on to something deeper. The view did not measure the hit if no stored hit lies
+        within a spacing of it. Other rays get an index beyond the grid's cells.
 
+        - `surface`: the sampled surface.
         - `index`: index of the view, from 0.
         - `pose`: the view's pose.
         """
@@ -134,7 +144,7 @@ class Looks(eqx.Module):
         offset = hits.points - pose.position
         distance = jnp.linalg.norm(offset, axis=-1)
         cosine, sight = -jnp.sum(offset * hits.normals, axis=-1) / distance, self.sight[index]
-        # Steep surface may return nothing. But a ray that hit something deeper has passed through it.
+        # A steep surface may return no hit. But if the ray hit something deeper, the surface cannot be there.
         passed = jnp.isfinite(sight) & ((sight - distance) * cosine > spacing)
         is_unmeasured = hits.mask & (passed | (cosine >= STEEP) & (distance <= sight + spacing))
         is_unmeasured &= self(hits.points) > spacing
@@ -147,7 +157,7 @@ def _unmeasured_by_any(surface: GridSurface, looks: Looks, poses: PoseList) -> B
         return is_unmeasured.at[tuple(cells.T)].set(True, mode="drop")
 
     is_unmeasured = jax.lax.fori_loop(0, poses.count, look, jnp.zeros(surface.distance.shape, bool))
-    # Include neighbouring cells, since rays are farther apart than cells.
+    # Include neighbouring cells, since the distance between rays can exceed the size of a cell.
     for axis in range(3):
         window = tuple(3 if own == axis else 1 for own in range(3))
         is_unmeasured = jax.lax.reduce_window(is_unmeasured, False, jax.lax.bitwise_or, window, (1, 1, 1), "SAME")
