@@ -1,6 +1,7 @@
-"""The trilinear interpolant of a grid cell along a ray, which is a cubic, and its first root.
+"""The cubic polynomial that a cell's trilinear interpolant is along a ray, and the first root of this cubic.
 
-Vectors are lists of their components (n,), in coordinates local to the cell.
+A batch of n vectors is a list of components (n,), in coordinates local to the cell. A batch of n cubics is a list of
+coefficients (n,), constant first.
 """
 
 import jax
@@ -13,9 +14,10 @@ _ROOT_ITERATIONS = 8
 
 
 def cubic(corners: list, a: list, b: list) -> list[Float[Array, " n"]]:
-    """Coefficients c_0, ..., c_3 in s of the trilinear function along a + s b.
+    """Return the coefficients c_0, ..., c_3 in s of the trilinear function along a + s b.
 
-    Interpolates linearly along z, y and x in turn. Each step raises the degree of the polynomials by one.
+    The corner values are interpolated linearly along z, y and x in turn. Each step raises the degree of the polynomials
+    by one.
 
     - `corners`: values at the cell's corners, in the order of `CORNERS`.
     - `a`, `b`: start and direction of the rays, in coordinates local to the cell.
@@ -33,14 +35,16 @@ def cubic(corners: list, a: list, b: list) -> list[Float[Array, " n"]]:
 
 
 def first_bracket(c: list) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
-    """For cubics positive at 0: an s with only the first root in [0, s], and whether [0, 1] holds a root.
+    """Return an s such that [0, s] holds only the first root of each cubic, and whether [0, 1] holds a root.
 
-    A cubic that is positive at 0 but not at its local minimum has one root before the minimum. Otherwise it has at most
-    one root in [0, 1], and only if it is not positive at 1. A cubic that is not positive at 0 counts as zero there.
+    If a cubic is positive at 0 but not at its local minimum, there is exactly one root before the minimum, and s is the
+    minimum. Otherwise s is 1: a cubic that is positive at 0 then has one root in [0, 1] if it is not positive at 1, and
+    none if it is. A cubic that is not positive at 0 counts as having its first root there.
     """
     discriminant = c[2] * c[2] - 3.0 * c[3] * c[1]
     root = jnp.sqrt(jnp.maximum(discriminant, 0.0))
-    # The minimum is a root of the derivative. Each of the two forms avoids cancellation for one sign of c_2.
+    # The minimum is a root of the derivative. There are two formulas for it, and each avoids cancellation for one sign
+    # of c_2.
     numerator = jnp.where(c[2] > 0, -c[1], root - c[2])
     denominator = jnp.where(c[2] > 0, c[2] + root, 3.0 * c[3])
     minimum = numerator / jnp.where(denominator == 0, 1.0, denominator)
@@ -50,10 +54,11 @@ def first_bracket(c: list) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
 
 
 def first_root(c: list) -> Float[Array, " n"]:
-    """The first root in [0, 1] of cubics that have one; 0 for cubics that are not positive at 0.
+    """Return the first root in [0, 1] of cubics that have one; 0 for cubics that are not positive at 0.
 
-    Newton's method, with bisection for steps that leave the bracket by more than rounding. Compiled code may compute a
-    value twice with different rounding, so that the bracket ends beside the root.
+    The root is found by Newton's method. A step that leaves the bracket by more than the rounding error is replaced by
+    bisection. The tolerance is needed because compiled code may compute the same value twice with different rounding,
+    and then the bracket may end just beside the root.
     """
     high, _ = first_bracket(c)
     drop = c[0] - _polynomial(c, high)

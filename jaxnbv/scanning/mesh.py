@@ -1,4 +1,4 @@
-"""TriangleMesh: meshes of any quality, triangle soups and open sheets included, traced on the host."""
+"""`TriangleMesh`: meshes of any quality, including triangle soups and open sheets, traced by host code."""
 
 import dataclasses
 import warnings
@@ -24,16 +24,16 @@ from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.scanning.sdf.sampled import checked_triangles, winding_number
 from jaxnbv.scanning.triangle_rays import FirstFaces, first_faces
 
-# A piece of a mesh with fewer points may be due to stray points alone.
+# A connected component of a mesh that is supported by fewer points may come from stray points alone.
 _FEWEST_POINTS = 4
 
 
 @dataclasses.dataclass(unsafe_hash=True)
 class _Tree:
-    """Cache of the ray tracer for the triangles of the last call. It is not an array, so it is no leaf of the pytree.
+    """Cache of the ray tracer for the triangles of the last call.
 
-    It has no fields, since its content follows from the triangles: all instances are equal and have the same repr, and
-    a copy is empty.
+    The cache is a static field of `TriangleMesh`, since it is not an array. It has no dataclass fields, since its
+    content follows from the triangles. So all instances are equal and have the same repr. A copy starts empty.
     """
 
     _built = None
@@ -49,13 +49,13 @@ class _Tree:
 
 
 class TriangleMesh(Surface):
-    """Triangles of any quality: closed or open, consistently wound or not, connected or a soup.
+    """A mesh of triangles, which may be open, inconsistently wound or disconnected.
 
-    Build it with `load_mesh` or `from_arrays`, which check the triangles and fit the frame.
+    Build a mesh with `load_mesh` or `from_arrays`, which check the triangles and fit the frame.
 
-    - `vertices`: corners in scene coordinates, float64 on the host.
-    - `faces`: indices of three rows of `vertices` for each triangle.
-    - `frame`: maps the mesh's original world coordinates to the scene.
+    - `vertices`: corners of the triangles in scene coordinates, a NumPy array of float64.
+    - `faces`: three row indices into `vertices` for each triangle.
+    - `frame`: the frame that maps the mesh's original world coordinates to the scene.
 
     Host code traces the rays, so `trace` cannot run under JAX transformations.
     """
@@ -80,17 +80,17 @@ class TriangleMesh(Surface):
     def from_arrays(
         cls, vertices: Float[AnyArray, "v 3"] | list, faces: Int[AnyArray, "f 3"] | list, up: str = "y"
     ) -> "TriangleMesh":
-        """The mesh with these vertices (world coordinates) and faces, in a frame of longest side 2.5.
+        """Build a mesh from vertices (world coordinates) and faces, scaled to a longest side of 2.5 scene units.
+
+        Vertices that no face uses are dropped. Faces of zero area are dropped with a `UserWarning`.
 
         - `up`: the world's axis that is upward, see `Frame`.
 
-        Vertices that no face uses are dropped. So are faces of zero area, with a `UserWarning`.
-
-        **Raises:** `ValueError` for other shapes, no faces, indices that are not integers or out of range, vertices
-        that are not finite, or no face of positive area.
+        **Raises:** `ValueError` if `vertices` or `faces` is not (n, 3), there are no faces, an index is not an integer
+        or out of range, a vertex is not finite, or no face has a positive area.
         """
         vertices, faces = checked_triangles(vertices, faces)
-        # Half of the cross product, compared with the size of the mesh so that the unit of length does not matter.
+        # Areas are compared with the squared size of the mesh, so that the unit of length does not matter.
         corners = vertices[faces]
         area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
         solid = area > 1e-14 * np.ptp(corners.reshape(-1, 3), axis=0).max() ** 2
@@ -102,7 +102,7 @@ class TriangleMesh(Surface):
         return cls(frame.to_scene(vertices[used]), faces.reshape(-1, 3), frame)
 
     def trace(self, origins: Float[AnyArray, "rays 3"], directions: Float[AnyArray, "rays 3"]) -> Hits:
-        """First hits, exact on the triangles' planes.
+        """Return the first hits of the rays (see `Surface.trace`), which lie exactly in the triangles' planes.
 
         **Raises:** `ValueError` under `jit`, `vmap` or `grad`.
         """
@@ -121,7 +121,7 @@ class TriangleMesh(Surface):
         cosine = np.sum(normals * directions, axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = np.sum(normals * (a - origins), axis=1) / cosine
-        # For a triangle seen edge-on, the intersection with its plane is ill-defined. The tracer's distance is not.
+        # For a triangle seen edge-on, the intersection with its plane is ill-defined, so the tracer's distance is used.
         depth = np.where(np.abs(depth - near) < 1e-3, depth, near)
         mask = np.zeros(len(rows), dtype=bool)
         mask[hit] = True
@@ -132,7 +132,7 @@ class TriangleMesh(Surface):
         return Hits(jnp.asarray(points, dtype), jnp.asarray(outward, dtype), jnp.asarray(mask))
 
     def sample_points(self, key: PRNGKeyArray, count: int) -> Float[np.ndarray, "count 3"]:
-        """`count` random points of the surface, uniform by area, in scene coordinates.
+        """Draw `count` random points on the surface, uniform by area, in scene coordinates.
 
         **Raises:** `ValueError` if `count` < 1.
         """
@@ -145,7 +145,7 @@ class TriangleMesh(Surface):
 
     @property
     def bounding_radius(self) -> float:
-        """Distance from the scene's origin to the farthest corner."""
+        """Distance from the scene's origin to the farthest vertex."""
         return float(np.linalg.norm(self.vertices, axis=1).max())
 
     @property
@@ -154,24 +154,26 @@ class TriangleMesh(Surface):
 
     @checked
     def contains(self, points: Float[AnyArray, "n 3"]) -> Bool[np.ndarray, " n"]:
-        """Whether each point (scene coordinates) lies inside: the winding number's magnitude is above 1/2.
+        """Return, for each point (scene coordinates), whether its winding number has a magnitude above 1/2.
 
-        So a mesh that is wound inside out has an inside too. An open sheet encloses nothing.
+        A mesh that is wound inside out encloses the same points as a mesh that is wound outward. An open sheet encloses
+        nothing.
         """
         points = np.asarray(points, dtype=np.float64)
         return np.abs(winding_number(points, self.vertices, self.faces)) > 0.5
 
     def to_trimesh(self) -> trimesh.Trimesh:
-        """The mesh in scene coordinates as a `trimesh.Trimesh`, to show, measure or export."""
+        """Return the mesh in scene coordinates as a `trimesh.Trimesh`, to show, measure or export it."""
         return trimesh.Trimesh(self.vertices, self.faces, process=False)
 
 
 def level_triangles(
     values: Float[np.ndarray, "g g g"], grid: Grid
 ) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"], Float[np.ndarray, "v 3"]] | None:
-    """Vertices, faces and vertex normals of a grid function's zero set; None if it does not change sign.
+    """Return vertices, faces and vertex normals of the zero set of `values`; None if `values` does not change sign.
 
-    By marching cubes. Values are positive outside, faces are wound outward, and normals are unit and point outward.
+    The triangles come from marching cubes. Values are positive outside. Faces are wound outward, and normals have unit
+    length and point outward.
     """
     if not values.min() < 0 < values.max():
         return None
@@ -184,11 +186,11 @@ def level_triangles(
 def supported_pieces(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], points: Float[np.ndarray, "n 3"], size: float
 ) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "k 3"], int]:
-    """Vertices and faces of connected pieces with at least four points, and the number of other pieces.
+    """Return the connected components of a mesh that have at least four points nearby.
 
-    If no piece has four points, the pieces with the most are kept.
-
-    - `size`: largest distance from a point to the nearest vertex of its piece.
+    A point belongs to the component of its nearest vertex, if that vertex is within `size` of the point. If no
+    component has four points, the components with the largest number of points are kept. Returns the vertices and faces
+    of the kept components, and the number of dropped components.
     """
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
     graph = coo_array((np.ones(len(edges), bool), edges.T), (len(vertices), len(vertices)))
@@ -202,7 +204,7 @@ def supported_pieces(
 
 @checked
 def mesh_from_sdf(sdf: SignedDistance, grid: Grid) -> TriangleMesh:
-    """The surface of a solid as a mesh in scene coordinates (identity frame), by marching cubes.
+    """Convert the surface of a solid to a mesh in scene coordinates (identity frame), by marching cubes on a grid.
 
     **Raises:** `ValueError` if no surface lies within the grid.
     """

@@ -1,4 +1,4 @@
-"""Metrics that compare views or a reconstruction with the true surface: coverage, Chamfer and Hausdorff distance."""
+"""Comparison of views or of a reconstruction with the true surface: coverage, Chamfer and Hausdorff distance."""
 
 import math
 from collections.abc import Iterable
@@ -19,18 +19,21 @@ from jaxnbv.scanning.sphere_tracing import SDFSurface
 
 # The authors' number of sample points on each of the two surfaces.
 SURFACE_POINTS = 20_000
-# Least cosine of incidence. Pixels that are steeper show no more than they would at this one.
+# Least cosine of incidence. A pixel whose cosine is smaller is treated as if its cosine had this value.
 GRAZING = 0.2
 
 
 def coverage(views: Iterable[Any], truth: Float[AnyArray, "n 3"], size: float = 0.05) -> list[float]:
-    """Share in [0, 1] of the n points of `truth` that this view or an earlier one shows, after each view.
+    """Return, for each view, the fraction of true surface points that this or an earlier view shows.
 
-    - `views`: the views of an episode, or other objects with a `scan`, its `camera` and its `pose`.
-    - `size`: largest distance along the ray between a point and its pixel's hit. Sensor noise must be well below it.
+    If the points are uniform by area, the result is a fraction of the area. Surface that no camera can see, such as the
+    walls of a closed cavity, counts as not covered. A view from either side covers both sides of a sheet thinner than
+    `size`.
 
-    If the points are uniform by area, the result is a share of area. Surface that no camera can see, such as the walls
-    of a closed cavity, counts as not covered. A sheet thinner than `size` is covered from either side.
+    - `views`: the views of an episode, or other objects with the attributes `scan`, `camera` and `pose`.
+    - `truth`: points on the true surface, in scene coordinates.
+    - `size`: largest distance along the ray between a point and the hit of its pixel, in scene units. It must be well
+      above the sensor noise.
 
     **Raises:** `ValueError` if `truth` is empty or not finite, `size` <= 0, or a scan does not have one row per ray of
     its camera.
@@ -48,10 +51,10 @@ def coverage(views: Iterable[Any], truth: Float[AnyArray, "n 3"], size: float = 
 def is_shown(
     scan: PointCloud, camera: Camera, pose: Pose, truth: Float[np.ndarray, "n 3"], size: float
 ) -> Bool[np.ndarray, " n"]:
-    """Whether a scan shows each point of the true surface.
+    """Return, for each point of the true surface, whether a scan shows the point.
 
-    It does if the point's distance from the camera differs from that of its pixel's hit by at most `size` plus the
-    change of distance on the hit's plane within half a pixel.
+    The scan shows a point if the distances from the camera to the point and to the hit of its pixel differ by at most
+    `size` plus a tolerance. The tolerance is the change of distance within half a pixel on the plane of the hit.
 
     **Raises:** `ValueError` if the scan does not have one row per ray of the camera.
     """
@@ -77,15 +80,18 @@ def is_shown(
 
 
 def truth_points(scene: Surface, key: PRNGKeyArray, count: int = SURFACE_POINTS) -> Float[np.ndarray, "count 3"] | None:
-    """`count` points of the `true_mesh`, uniform by area, in scene coordinates; None if there is no mesh."""
+    """Draw `count` points on `true_mesh(scene)`, uniform by area; None if the scene has no such mesh.
+
+    Points are in scene coordinates.
+    """
     mesh = true_mesh(scene)
     return None if mesh is None else mesh.sample_points(key, count)
 
 
 def true_mesh(scene: Surface) -> TriangleMesh | None:
-    """The surface as triangles in scene coordinates; None for a surface of another kind.
+    """Convert a mesh or a solid to triangles in scene coordinates; None for any other surface.
 
-    A mesh is returned unchanged. A signed distance goes through marching cubes on the default grid.
+    A `TriangleMesh` is returned unchanged. An `SDFSurface` is meshed by marching cubes on the default grid.
     """
     if isinstance(scene, SDFSurface):
         return mesh_from_sdf(scene.sdf, Grid())
@@ -95,10 +101,10 @@ def true_mesh(scene: Surface) -> TriangleMesh | None:
 class SurfaceDistance(NamedTuple):
     """Distances between points of a reconstruction R and points of the true surface T, in scene units.
 
-    With d(x, Y) = min_{y in Y} |x - y|, not squared:
+    The distance from a point to a set is d(x, Y) = min_{y in Y} |x - y|, which is not squared.
 
-    - `accuracy`: mean_{x in R} d(x, T), large if the reconstruction has surface that is not there;
-    - `completeness`: mean_{y in T} d(y, R), large if surface is missing from the reconstruction;
+    - `accuracy`: mean_{x in R} d(x, T). It is large if the reconstruction has surface that does not exist.
+    - `completeness`: mean_{y in T} d(y, R). It is large if the reconstruction lacks surface.
     - `hausdorff`: max(max_{x in R} d(x, T), max_{y in T} d(y, R)).
     """
 
@@ -108,18 +114,18 @@ class SurfaceDistance(NamedTuple):
 
     @property
     def chamfer(self) -> float:
-        """accuracy + completeness, the sum of both directions. The paper's numbers have this size."""
+        """Chamfer distance: accuracy + completeness. The paper's numbers have the size of this sum."""
         return self.accuracy + self.completeness
 
 
 def surface_distance(reconstruction: Float[AnyArray, "n 3"], truth: Float[AnyArray, "m 3"]) -> SurfaceDistance:
-    """Chamfer and Hausdorff distance between two surfaces, from points of each.
+    """Compute the Chamfer and Hausdorff distance between two surfaces from points on each surface.
 
     Sample the points with `TriangleMesh.sample_points`. The distance between two samples of the same surface is not
-    zero: n points that are uniform on an area A have a mean distance of about sqrt(A / n) / 2 to another sample. Their
+    zero: if both have n points, uniform on an area A, `accuracy` and `completeness` are about sqrt(A / n) / 2, and the
     Chamfer distance is twice that.
 
-    **Raises:** `ValueError` if either has no points or points that are not finite.
+    **Raises:** `ValueError` if `reconstruction` or `truth` has no points or has points that are not finite.
     """
     points, true = _points(reconstruction, "reconstruction"), _points(truth, "true surface")
     from_points, from_true = cKDTree(true).query(points)[0], cKDTree(points).query(true)[0]
