@@ -2,7 +2,7 @@
 
 import dataclasses
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -71,14 +71,18 @@ class Episode(eqx.Module):
         require(1 <= views <= len(self.views), f"asked for {views} of {len(self.views)} views; ask for at least one")
         return next(itertools.islice(self.observations(), views - 1, None))
 
-    def actual_scores(self) -> Iterator[float | None]:
+    def actual_scores(self, observations: Iterable[Observations] | None = None) -> Iterator[float | None]:
         """Yield the score of each view's actual scan, given the observations before it.
 
         In scene units; None for the first view. Compare it with the value that the proposal expected.
+
+        - `observations`: the result of `observations()`, if it is already computed.
         """
         yield None
         acquisition = self.planner.acquisition
-        for before, view in zip(self.observations(), self.views[1:], strict=False):
+        for before, view in zip(
+            self.observations() if observations is None else observations, self.views[1:], strict=False
+        ):
             context = context_of(acquisition, before)
             yield float(_score(acquisition, context, ImaginedView(view.scan, view.camera, view.pose)))
 

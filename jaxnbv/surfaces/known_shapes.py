@@ -105,6 +105,11 @@ class KnownShapes(SurfaceModel):
             observations, hypotheses=identify(self.bank, self.poses, self.box, observations, previous)
         )
 
+    def fit(self, observations: Observations) -> tuple[Hypotheses, Float[Array, " h_and_none"]]:
+        """The shapes registered to the observations, and the weight of each, last of "none of these"."""
+        fits = register(self.bank, Prior(self.poses, self.box), FitTargets.of(observations), self.num_starts)
+        return fits, _weights(fits, self.inverse_temperature, self.misfit_of_none)
+
     def condition(self, observations: Observations | PointCloud) -> SurfacePosterior:
         """The posterior p(f | observations), with the shapes registered to the cloud and to empty space.
 
@@ -121,8 +126,7 @@ class KnownShapes(SurfaceModel):
             assert isinstance(hypotheses, PartHypotheses)
             fits, weights = hypotheses.placed, hypotheses.weights
         else:
-            fits = register(self.bank, Prior(self.poses, self.box), FitTargets.of(observations), self.num_starts)
-            weights = _weights(fits, self.inverse_temperature, self.misfit_of_none)
+            fits, weights = self.fit(observations)
         return KnownShapesPosterior(
             jnp.zeros_like(of_none.level), self, fits, weights, self.residual.condition(observations), of_none
         )

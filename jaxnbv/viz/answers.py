@@ -1,6 +1,6 @@
-"""What answers and quantities say, in words and charts; the task that gives them knows numbers only.
+"""Words and charts of answers and quantities. The tasks themselves hold only numbers.
 
-`words_of` dispatches on the kind of answer. One of your own is shown by its names and values, or as you register it:
+`words_of` dispatches on the kind of answer. Your own kind is shown by its names and values, or as you register it:
 
     @words_of.register
     def _(answer: MyAnswer) -> Words: ...
@@ -52,27 +52,27 @@ class Chart(NamedTuple):
 
 
 class Words:
-    """What any answer says; a kind that reads otherwise overrides a part."""
+    """Words and charts of any answer. Kinds of answers override parts of it."""
 
     def __init__(self, answer: Answer):
         self.answer = answer
 
     @property
     def shown(self) -> Sequence[int]:
-        """Which of the numbers are said."""
+        """Indices of the numbers to show."""
         return range(len(self.answer.names))
 
     @property
     def question(self) -> str:
-        """What was asked, for the head of the report."""
+        """The question, for the head of the report."""
         return f"{capital(' and '.join(self.answer.names[index] for index in self.shown))}?"
 
     def value(self, answer: Answer, index: int) -> str:
-        """How a number is written."""
+        """A number as text."""
         return answer.form.format(answer.values[index])
 
     def said(self, before: Answer | None = None) -> str:
-        """Each number, with what it was in the answer before."""
+        """Each number, with its value in the previous answer."""
 
         def one(index: int) -> str:
             was = "" if before is None else f" (was {self.value(before, index)})"
@@ -87,7 +87,7 @@ class Words:
 
     @property
     def settled_means(self) -> str:
-        """What `settled` asks."""
+        """The condition of `settled` in words."""
         return f"within {100 * _SETTLED:.0f} % of the view before"
 
     def settled(self, answers: Sequence[Answer], holds: Holds) -> list[bool]:
@@ -98,9 +98,9 @@ class Words:
         return [False, *(np.allclose(now.values, was.values, rtol=_SETTLED) for was, now in pairwise(answers))]
 
     def charts(self, answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...]:
-        """Those of the answers of all views, of which this is the last.
+        """Charts of the answers after all views. The last of them is this answer.
 
-        `truth`: the answer if all of the surface had been seen; None where that is not known.
+        `truth`: the answer if all of the surface had been seen, or None.
         """
         names = self.answer.names
         return (Chart(", ".join(names), names, _rows(answers), None if truth is None else truth.values),)
@@ -112,7 +112,7 @@ def _rows(answers: Sequence[Answer]) -> Float[np.ndarray, "views n"]:
 
 @functools.singledispatch
 def words_of(answer: Answer) -> Words:
-    """What an answer says."""
+    """Words and charts of an answer, by its type."""
     return Words(answer)
 
 
@@ -120,7 +120,7 @@ def words_of(answer: Answer) -> Words:
 class _ClassWords(Words):
     """The likeliest three are said, in percent."""
 
-    question = "Which class is it?"
+    question = "What is it?"
     rule = Sure()
     settled_means = f"probability {rule.probability} or more, given half of the points too"
 
@@ -161,7 +161,7 @@ class _IdentityWords(_ClassWords):
     settled_means = f"probability {least} or more"
 
     def settled(self, answers: Sequence[Answer], holds: Holds) -> list[bool]:
-        """As of a class, by the probability alone."""
+        """See `_ClassWords`, by the probability alone."""
         return super().settled(answers, lambda _, index: bool(answers[index].values.max() >= self.least))
 
     def charts(self, answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...]:
@@ -240,13 +240,13 @@ class _ColdestWords(Words):
 
 
 class CoverageAnswer(Answer):
-    """How much of the surface was seen, its one value: percent of the true one or, where that is not known, area."""
+    """Surface seen: percent of the true surface, or the area if the truth is not known."""
 
     unit: str = "%"
 
     @property
     def amount(self) -> str:
-        """In words."""
+        """The value in words."""
         value = float(self.values[0])
         return f"{value:.0f} %" if self.unit == "%" else f"{number(value)} {self.unit}"
 
@@ -297,7 +297,7 @@ def number(value: float) -> str:
 
 
 def may_be_words(kinds: Sequence[tuple[str, float]]) -> str:
-    """What the known shapes say that the object may be, of which the surfaces are imagined; the likeliest first."""
+    """A sentence with the kinds of known shapes in the samples, the likeliest first."""
     shown = [f"{name} {100 * weight:.0f} %" for name, weight in kinds[:_KINDS_SAID]]
     rest = sum(weight for _, weight in kinds[_KINDS_SAID:])
     return f"Imagined, as known shapes fit: {', '.join(shown)}{f', others {100 * rest:.0f} %' if rest else ''}."

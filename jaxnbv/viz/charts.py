@@ -1,4 +1,4 @@
-"""The charts of an episode: its task by view, how much was seen, what the chosen views were worth."""
+"""The charts of an episode by view: answers, surface seen, and values of the chosen views."""
 
 import textwrap
 from typing import Any
@@ -15,25 +15,44 @@ from jaxnbv.viz.data import ReportData
 from jaxnbv.viz.style import GREY, INK, LINE, NEW, SERIES
 
 _MOST_NAMES, _LONGEST_NAME, _MOST_NUMBERS = 6, 22, 10
-_LARGE, _SMALL = (4.4, 2.6), (3.1, 2.6)
-_BELOW: dict[str, Any] = {"loc": "outside lower center", "frameon": False, "fontsize": 8, "handlelength": 1.4}
+# Lines nearer to each other than this share of the range look like one.
+_SAME_LINE = 0.02
+# Inches. On a telephone's page of 390 pixels the letters of a large chart are eleven pixels tall.
+_LARGE, _SMALL = (4.0, 2.6), (3.1, 2.6)
+_BELOW: dict[str, Any] = {"loc": "outside lower center", "frameon": False, "fontsize": 9, "handlelength": 1.4}
 
 
-def shown_names(chart: Chart) -> list[int]:
-    """Which numbers of a chart are drawn: all if they are few, else those that are ever the largest, or true."""
+def shown_names(chart: Chart) -> dict[int, int]:
+    """Indices of the numbers of a chart that are drawn, each with how many others its line hides.
+
+    All are drawn if they are few, and otherwise those that are true or become the largest.
+    """
     reached = chart.values.max(axis=0)
     reached = reached if chart.true is None else np.maximum(reached, chart.true)
-    return sorted(np.argsort(-reached, kind="stable")[:_MOST_NAMES].tolist())
+    near = _SAME_LINE * max(float(np.ptp(chart.values)), 1e-12)
+    hidden = dict[int, int]()
+    for index in np.argsort(-reached, kind="stable").tolist():
+        same = (other for other in hidden if np.abs(chart.values[:, other] - chart.values[:, index]).max() < near)
+        # The line of the true one, and lines with a truth of their own, stand for themselves.
+        over = next(same, None) if chart.true is None or chart.one_true else None
+        if over is not None and not (chart.one_true and chart.true is not None and chart.true[over] > 0):
+            hidden[over] += 1
+        elif len(hidden) < _MOST_NAMES:
+            hidden[index] = 0
+    return dict(sorted(hidden.items()))
 
 
 def draw_chart(axes: Axes, chart: Chart, rival: Chart | None = None, rival_name: str = "") -> list[Line2D]:
-    """Draw the numbers as lines over the views, with what is true; of a rival the number that the chart is about, where
-    it is about one. Returns what a legend needs."""
+    """Draw the numbers and the truth as lines over the views, and return the entries of a legend.
+
+    - `rival`: the chart of another search. Its line of the true number is drawn, or its only line.
+    """
     views, is_one = np.arange(1, len(chart.values) + 1), len(chart.names) == 1
     marked = None if chart.true is None or not chart.one_true else int(np.argmax(chart.true))
     others, handles = iter(SERIES * 2), list[Line2D]()
-    for index in shown_names(chart):
+    for index, num_hidden in shown_names(chart).items():
         name = textwrap.shorten(chart.names[index], _LONGEST_NAME, placeholder="…")
+        name += f" and {num_hidden} more" if num_hidden else ""
         colour, label = (NEW, f"{name} (true)") if index == marked else (next(others), name)
         style: dict[str, Any] = {"color": colour, "lw": 1.6, "marker": "o", "ms": 5, "markeredgecolor": "white"}
         lines = axes.plot(views, chart.values[:, index], label=label, zorder=3, **style)
@@ -59,7 +78,7 @@ def draw_chart(axes: Axes, chart: Chart, rival: Chart | None = None, rival_name:
 
 
 def over_views(axes: Axes, count: int) -> None:
-    """An axis of views, from half a view before the first to half a view behind the last."""
+    """Set the horizontal axis to views, with half a view of room on both sides."""
     axes.set(xlabel="view", xlim=(0.5, count + 0.5))
     axes.xaxis.set_major_locator(MaxNLocator(min(count, 10), integer=True, min_n_ticks=1))
     axes.yaxis.set_major_locator(MaxNLocator(5))
@@ -67,7 +86,7 @@ def over_views(axes: Axes, count: int) -> None:
 
 
 def draw_values(axes: Axes, data: ReportData) -> list[Line2D]:
-    """Draw the value of each chosen view, with its standard error, over that of the median candidate."""
+    """Draw the value of each chosen view, its standard error, and the value of the median candidate."""
     for view, shown in enumerate(data.views, start=1):
         if shown.proposal is None:
             axes.annotate("given", (view, 0), (0, 4), textcoords="offset points", ha="center", color=GREY, fontsize=8)
@@ -89,14 +108,14 @@ def draw_values(axes: Axes, data: ReportData) -> list[Line2D]:
 
 
 def task_charts(data: ReportData) -> list[tuple[str, Figure]]:
-    """The charts of the task, with their titles."""
+    """Charts of the task, with their titles."""
     task, size = data.task, _LARGE if len(data.task.charts) == 1 else _SMALL
     others = [None] * len(task.charts) if task.rival is None else task.rival.charts
     return [_drawn(data, chart, other, size) for chart, other in zip(task.charts, others, strict=True)]
 
 
 def other_charts(data: ReportData) -> list[tuple[str, Figure]]:
-    """Those that say more: how much was seen, where that is not the task, and the values, where views were chosen."""
+    """Charts, with titles, of the surface seen (unless this is the task) and of values of chosen views."""
     task, charts = data.task, []
     if not task.is_coverage:
         charts.append(_drawn(data, task.seen, None if task.rival is None else task.rival.seen, _LARGE))
@@ -111,8 +130,8 @@ def _drawn(data: ReportData, chart: Chart, rival: Chart | None, size: tuple[floa
     figure = Figure(figsize=size, layout="constrained")
     handles = draw_chart(figure.subplots(), chart, rival, "" if data.task.rival is None else data.task.rival.name)
     if handles:
-        # Thirteen letters take an inch, and so do a mark and the gap by it six of them.
+        # An inch holds twelve letters. A mark with its gap is six letters wide.
         longest = max(len(str(handle.get_label())) for handle in handles) + 6
-        columns = max(1, min(len(handles), int(13 * size[0]) // longest))
+        columns = max(1, min(len(handles), int(12 * size[0]) // longest))
         figure.legend(handles=handles, ncols=columns, columnspacing=1.2, **_BELOW)
     return chart.label, figure

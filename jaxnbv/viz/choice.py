@@ -1,4 +1,4 @@
-"""Why a view was chosen: candidates and ascents on a map of the sphere, and the candidates by value."""
+"""Why a view was chosen: candidates and ascents on a map of the sphere, and candidates by value."""
 
 import textwrap
 from typing import Any
@@ -16,12 +16,12 @@ from jaxnbv.geometry.pose import Pose
 from jaxnbv.search import Proposal
 from jaxnbv.utility import Quantity
 from jaxnbv.viz import sphere
-from jaxnbv.viz.answers import label_of, number
+from jaxnbv.viz.answers import number
 from jaxnbv.viz.style import GREY, INK, LINE, NEW, VALUE
 
 # Fewer candidates than this say little about what lies between them.
 _FEWEST_OF_A_MAP = 12
-_LETTERS = 64
+_LETTERS = 56
 
 
 def open_values(proposal: Proposal) -> Float[np.ndarray, " c"]:
@@ -37,31 +37,33 @@ def best_first(proposal: Proposal) -> Float[np.ndarray, " o"]:
 
 
 def colour_range(values: Float[np.ndarray, "*n"]) -> tuple[float, float]:
-    """The least and the greatest of some values, of which NaN ones are left out; not empty."""
-    found = values[~np.isnan(values)]
-    if not found.size:
+    """Smallest and largest value except NaN; widened if they are equal."""
+    numbers = values[~np.isnan(values)]
+    if not numbers.size:
         return 0.0, 1.0
-    low, high = float(found.min()), float(found.max())
+    low, high = float(numbers.min()), float(numbers.max())
     return (low, high) if high > low else (low - 0.5, low + 0.5)
 
 
 def has_rings(proposal: Proposal) -> bool:
-    """Whether the candidates that are tied with the best are marked: they must be known, and not most of all."""
+    """Whether to mark the candidates tied with the best: some, but at most a third of all."""
     return 0 < (proposal.num_tied or 0) <= len(proposal.values) // 3
 
 
 def marks(*proposals: Proposal) -> list[str]:
-    """The marks on some maps that not every map has."""
+    """Legend entries for the marks that some maps lack."""
     visited = any(np.isnan(open_values(proposal)).any() for proposal in proposals)
-    found = ["× visited"] * visited + ["◯ tied with the best"] * any(map(has_rings, proposals))
+    entries = ["× visited"] * visited + ["◯ tied with the best"] * any(map(has_rings, proposals))
     climbed = any(proposal.trajectories is not None for proposal in proposals)
-    return found + ["○ start, ● end of an ascent"] * climbed
+    return entries + ["○ start, ● end of an ascent"] * climbed
 
 
 def draw_choice(figure: Figure, proposal: Proposal | None, quantity: Quantity, frame: Frame) -> None:
-    """Draw the map, and under it the candidates by value over a colour bar; of a given view the map's grid alone.
+    """Draw the map, and under it the candidates by value over a colour bar.
 
-    - `frame`: of the world in whose units the values are.
+    For a given view only the grid is drawn.
+
+    - `frame`: frame of the world; values are in its units.
     """
     colours = draw_acquisition(figure.add_axes((0.06, 0.4, 0.88, 0.58)), proposal, quantity)
     if proposal is None or colours is None:
@@ -71,13 +73,14 @@ def draw_choice(figure: Figure, proposal: Proposal | None, quantity: Quantity, f
     bar.outline.set_visible(False)
     bar.locator = MaxNLocator(5)
     bar.formatter = FuncFormatter(lambda value, _: number(value))
-    errors = "" if proposal.standard_errors is None else "; lines: standard errors"
-    figure.text(0.5, 0.04, textwrap.fill(label_of(quantity, frame) + errors, _LETTERS), ha="center", va="center")
+    errors = "" if proposal.standard_errors is None else ", lines: standard errors"
+    unit = f" in {quantity.unit_in(frame)}" if quantity.length_power else ""
+    caption = f"all candidates by their value{unit}, best on top{errors}"
+    figure.text(0.5, 0.04, textwrap.fill(caption, _LETTERS), ha="center", va="center")
 
 
 def draw_candidates(axes: Axes, proposal: Proposal) -> None:
-    """Draw the values of the open candidates, the best on top, with their standard errors, over a colour bar of the
-    same range."""
+    """Draw the open candidates by value with standard errors, best on top, above the colour bar."""
     best = best_first(proposal)
     order = np.argsort(-open_values(proposal))[: len(best)]
     rows = -np.arange(len(best))
@@ -93,9 +96,10 @@ def draw_candidates(axes: Axes, proposal: Proposal) -> None:
 def draw_acquisition(
     axes: Axes, proposal: Proposal | None, quantity: Quantity, weight: float = 1.0
 ) -> ScalarMappable | None:
-    """Draw the candidates' values as a map of the sphere; returns what a colour bar needs, None for a given view.
+    """Draw the candidates' values as a map of the sphere.
 
-    Between the candidates it is coloured where these are many, and their values no lots.
+    Returns the colours for a colour bar, or None for a given view. The map is coloured between candidates if these are
+    many and their values are not random.
     """
     axes.axis("off")
     globe: Any = axes.inset_axes((0.0, 0.0, 1.0, 1.0), projection="mollweide")

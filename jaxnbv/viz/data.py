@@ -1,4 +1,4 @@
-"""What the pictures of an episode show, as plain arrays: computed once a view, drawn by `report` and `figures`."""
+"""Data of the pictures of an episode as plain arrays, computed once a view and drawn by `report` and `figures`."""
 
 import dataclasses
 import itertools
@@ -14,13 +14,15 @@ from jaxnbv.geometry.pose import Pose
 from jaxnbv.planning.episode import Episode
 from jaxnbv.planning.loop import View
 from jaxnbv.progress import progress_bar
-from jaxnbv.scanning.metrics import truth_points
+from jaxnbv.scanning import TriangleMesh
+from jaxnbv.scanning.metrics import true_mesh, truth_points
 from jaxnbv.search import Proposal
 from jaxnbv.surfaces.part_hypotheses import PartHypotheses
 from jaxnbv.utility import Quantity
 from jaxnbv.viz.answers import CoverageAnswer, capital, words_of
 from jaxnbv.viz.imagined import Imagined, Look, taken_look
 from jaxnbv.viz.mean_surface import MeanSurface
+from jaxnbv.viz.placed_shape import PlacedShape
 from jaxnbv.viz.sketches import Sketch, Sketches, sketches_of
 from jaxnbv.viz.stage import Stage, stage_of
 from jaxnbv.viz.style import middle_range
@@ -51,22 +53,27 @@ class ViewData(eqx.Module):
     look: Look | None
 
     @property
+    def has_shape(self) -> bool:
+        """Whether its surface is a known shape."""
+        return isinstance(self.surface, PlacedShape)
+
+    @property
     def pose(self) -> Pose:
         return self.view.pose
 
     @property
     def proposal(self) -> Proposal | None:
-        """What the search looked at; None for a view that was given."""
+        """The proposal of the search, or None for a given view."""
         return self.view.proposal
 
     @property
     def new(self) -> Float[np.ndarray, "m 3"]:
-        """The points that it added, in scene coordinates."""
+        """The points that the view added, in scene coordinates."""
         return self.view.scan.to_numpy()[0]
 
 
 class ReportData(eqx.Module):
-    """All views of an episode, what the values of its search mean, what the views were for, whence they are drawn."""
+    """All views of an episode, the quantity of its search, its task, and the viewpoint of its pictures."""
 
     episode: Episode
     views: tuple[ViewData, ...]
@@ -76,19 +83,35 @@ class ReportData(eqx.Module):
 
     @property
     def camera(self) -> Camera:
-        """Which took the views."""
+        """The camera of the views."""
         return self.episode.sensor
 
     @property
     def deviations(self) -> tuple[float, float]:
         """One range of standard deviations for all views."""
-        found = [view.surface.deviation for view in self.views if view.surface is not None and self.has_deviations]
-        return middle_range(np.concatenate(found)) if found else (1e-3, 1.0)
+        by_view = [view.surface.deviation for view in self.views if view.surface is not None and not view.has_shape]
+        return middle_range(np.concatenate(by_view)) if by_view else (1e-3, 1.0)
 
     @property
     def has_deviations(self) -> bool:
-        """Whether surfaces are coloured by their deviations; known parts are not."""
+        """Whether any surface is coloured by its deviation; known shapes are not."""
+        is_mean = [view.surface is not None and not view.has_shape for view in self.views]
+        return any(is_mean) or (self.samples_surfaces and not self.has_shapes)
+
+    @property
+    def samples_surfaces(self) -> bool:
+        """Whether the steps imagined sampled surfaces, not known parts."""
         return not isinstance(self.episode.views[0].hypotheses, PartHypotheses)
+
+    @property
+    def has_shapes(self) -> bool:
+        """Whether any view shows a known shape."""
+        return any(view.has_shape for view in self.views)
+
+    @property
+    def true_surface(self) -> TriangleMesh | None:
+        """The true surface; None if it is not known."""
+        return None if self.episode.scene is None else true_mesh(self.episode.scene)
 
 
 def report_data(
@@ -110,10 +133,11 @@ def report_data(
     planner, frame = episode.planner, episode.frame
     if truth is None and episode.scene is not None:
         truth = truth_points(episode.scene, jax.random.key(0))
-    task = task_of(episode, truth, rival)
+    replayed = tuple(episode.observations())
+    task = task_of(episode, truth, rival, replayed)
     held = {} if sketches is None else sketches.held
     following = progress_bar(
-        sketches_of(episode, held, imagine), progress, desc="drawing views", total=len(episode.views)
+        sketches_of(episode, replayed, held, imagine), progress, desc="drawing views", total=len(episode.views)
     )
     power, drawn = planner.quantity.length_power, list[ViewData]()
     views = [
@@ -121,8 +145,8 @@ def report_data(
         for view in episode.views
     ]
     leading = Sketch(None, None)
-    # Only then is what was promised what one view can give.
-    actual = episode.actual_scores() if planner.acquisition.gains_once else itertools.repeat(None)
+    # Only such an acquisition promises what one view can give.
+    actual = episode.actual_scores(replayed) if planner.acquisition.gains_once else itertools.repeat(None)
     for index, (next_one, gain) in enumerate(zip(following, actual, strict=False)):
         view, gain = views[index], None if gain is None else float(frame.length_to_world(gain, power))
         words = told(planner.quantity, views[: index + 1], task.amounts[: index + 1], frame, gain)

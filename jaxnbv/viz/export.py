@@ -1,4 +1,4 @@
-"""What an episode leaves, as files in world units: its points, and the surface that they lie on."""
+"""Points and surface of an episode, as files in world units."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,15 +16,16 @@ from jaxnbv.sampler import StepInputs, SurfaceSampler
 from jaxnbv.storage.files import write_bytes
 from jaxnbv.surfaces.part_hypotheses import PartHypotheses
 from jaxnbv.viz.mean_surface import MeanSurface, as_shown, mean_surface
-from jaxnbv.viz.placed_part import likeliest_part
+from jaxnbv.viz.placed_shape import likeliest_part
 
 _CLOUDS, _MESHES = ("ply", "obj", "glb", "xyz"), ("ply", "obj", "glb", "stl", "off")
 
 
 @checked
 def scanned_cloud(episode: Episode) -> PointCloud:
-    """All points that the views measured of the object, in world units: at the resolution of the scans, where
-    `Episode.cloud` has those that planning keeps.
+    """All points that the views measured on the object, in world units.
+
+    They have the resolution of the scans. `Episode.cloud` has the points that planning keeps.
 
     **Raises:** `ValueError` for an episode without views.
     """
@@ -37,14 +38,12 @@ def scanned_cloud(episode: Episode) -> PointCloud:
 
 @checked
 def surface_mesh(episode: Episode, imagined: bool = True) -> trimesh.Trimesh:
-    """The surface after the last view, in world units: of the posterior's mean, or of the likeliest part where parts
-    are known.
+    """The surface after the last view in world units: the posterior's mean, or the likeliest known part.
 
-    - `imagined`: whether to keep what no view measured.
+    - `imagined`: whether to keep surface that no view measured.
 
-    For each vertex, `vertex_attributes["deviation"]` is by how far the surface may be off along its normal, a standard
-    deviation; for each face, `face_attributes["measured"]` is 1 if points lie at it, within a cell of the sampler's
-    grid, and else 0.
+    `vertex_attributes["deviation"]` is the standard deviation of each vertex along its normal.
+    `face_attributes["measured"]` is 1 for a face with points within a cell of the sampler's grid, else 0.
 
     **Raises:** `ValueError` for an episode without views, or whose grid holds no surface.
     """
@@ -81,8 +80,9 @@ class Region(NamedTuple):
 
 @checked
 def missing_regions(episode: Episode, smallest: float = 0.0) -> list[Region]:
-    """What is missing: connected parts of the expected surface that no view measured, the largest first. Where the
-    object stands on an obstacle, nothing can be measured and nothing is missing.
+    """Connected parts of the expected surface that no view measured, the largest first.
+
+    Surface on which the object stands on an obstacle cannot be measured, and does not count as missing.
 
     - `smallest`: the least area of a region, in world units.
 
@@ -126,8 +126,9 @@ def save_cloud(episode: Episode, path: str | Path) -> Path:
 
 @checked
 def save_mesh(episode: Episode, path: str | Path, imagined: bool = True) -> Path:
-    """Write `surface_mesh` as a PLY, OBJ, GLB, STL or OFF file, by its ending; PLY holds the deviation of each vertex,
-    and of each face whether it was measured.
+    """Write `surface_mesh` as a PLY, OBJ, GLB, STL or OFF file, by its ending.
+
+    PLY holds the deviation of each vertex, and whether each face was measured.
 
     **Raises:** `ValueError` as `surface_mesh` does, for another ending, or if the file cannot be written.
     """

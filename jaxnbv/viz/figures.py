@@ -1,4 +1,4 @@
-"""All views of an episode in one picture, and the style of figures."""
+"""The picture of all views of an episode, and the style of figures."""
 
 from typing import Any
 
@@ -33,11 +33,12 @@ _ROW, _LINE = 5.0, 0.26
 
 
 def overview_figure(data: ReportData) -> Figure:
-    """Scenes over acquisition maps, at most five to a row, and what their marks and colours mean."""
+    """Scenes over acquisition maps, at most five to a row, and a legend."""
     columns = min(len(data.views), 5)
     rows, width = -(-len(data.views) // columns), max(3.0 * columns, 6.0)
     chosen = [view.proposal for view in data.views if view.proposal is not None]
-    legend = [] if data.has_deviations else [("■ likeliest part", PART)]
+    shapes = [("■ scanned", PART), ("■ imagined", "#a5cfc0"), ("■ others disagree", "#b3a9dc")]
+    legend = shapes if data.has_shapes else []
     legend += [("● points before", BEFORE), ("● new points and camera", NEW), ("★ chosen view", NEW)]
     legend += [(mark, INK) for mark in marks(*chosen)]
     beside = int(width // 3)
@@ -66,7 +67,7 @@ def overview_figure(data: ReportData) -> Figure:
 
 
 def _draw_deviations(axes: Any, data: ReportData) -> None:
-    """What the colours of the surfaces mean."""
+    """Draw the colour bar of the surfaces' deviations."""
     low, high = data.deviations
     bar = axes.figure.colorbar(ScalarMappable(LogNorm(low, high), DEVIATION), cax=axes, orientation="horizontal")
     bar.outline.set_visible(False)

@@ -1,4 +1,4 @@
-"""What a step imagined: sampled surfaces as the chosen camera would see them."""
+"""Sampled surfaces of a step, as the chosen camera would see them."""
 
 import math
 from typing import NamedTuple
@@ -19,23 +19,24 @@ from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning import TriangleMesh, barrier_of, scan
 from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.surfaces.part_hypotheses import PartHypotheses
-from jaxnbv.viz.placed_part import placed_parts
+from jaxnbv.viz.placed_shape import placed_parts
 from jaxnbv.viz.sphere import unit
 from jaxnbv.viz.style import BEFORE, NEW
 
 SHOWN = 4
 _PIXELS = 96
-# What had been seen before; and what was imagined elsewhere, lighter than the points, so that its shape shows.
+# Colours of surface seen before, and of other imagined surface. The latter is light, so that its shape shows.
 _KNOWN, _UNSEEN = "#c3c9d2", "#5b8fc7"
-# Nearer to the cloud than this, or than so many of its own spacings, a surface was seen before.
+# A surface counts as seen before if it is nearer to the cloud than this, or than this many spacings of the cloud.
 _SEEN, _SPACINGS = 0.05, 3.0
 
 
 class Look(eqx.Module):
     """An image of a surface from a camera.
 
-    - `mask`: which rays hit it.
-    - `lit`: brightness by a lamp beside the camera, in [0, 1]; `known`: whether that place had been seen before.
+    - `mask`: whether each ray hits the surface.
+    - `lit`: brightness by a lamp beside the camera, in [0, 1].
+    - `known`: whether the place was seen before.
     """
 
     mask: Bool[np.ndarray, "h w"]
@@ -44,11 +45,11 @@ class Look(eqx.Module):
 
 
 class Imagined(eqx.Module):
-    """What a step knew of its view before it was taken.
+    """Imagined surfaces of a step before its view.
 
-    - `samples`: some of its sampled surfaces, or the likeliest parts, from the chosen pose; `names`: what each is
-      about.
-    - `kinds`: what the object may be, and how likely that is; empty where no shapes are known.
+    - `samples`: some sampled surfaces, or the likeliest parts, seen from the chosen pose.
+    - `names`: name of each sample.
+    - `kinds`: kinds of known shapes with their probabilities. Empty without known shapes.
     """
 
     samples: tuple[Look, ...]
@@ -57,7 +58,7 @@ class Imagined(eqx.Module):
 
 
 def imagined(episode: Episode, index: int, inputs: StepInputs) -> Imagined | None:
-    """What was imagined before view `index` (from 0) was taken; None for one that was not chosen.
+    """Imagined surfaces before view `index` (from 0), or None if the view was not chosen.
 
     - `inputs`: of the view's step, with its samples.
     """
@@ -67,7 +68,7 @@ def imagined(episode: Episode, index: int, inputs: StepInputs) -> Imagined | Non
         return None
     camera, cloud = _finer(planner.camera), inputs.observations.cloud.to_numpy()[0]
     barrier, samples = barrier_of(planner.obstacles, camera, view.pose), list[Look]()
-    # Of triangles: a picture is no reason to compile a scan of so many pixels.
+    # Scans of triangles need no compilation, which a picture of this size is not worth.
     if isinstance(parts, PartHypotheses):
         likely = placed_parts(parts, SHOWN)
         names, kinds = [part.name for part in likely], parts.names()
@@ -91,13 +92,13 @@ def imagined(episode: Episode, index: int, inputs: StepInputs) -> Imagined | Non
 
 
 def taken_look(view: View, cloud: Float[np.ndarray, "n 3"]) -> Look | None:
-    """What a view saw; None where its scan is no image. `cloud`: what had been seen before it."""
+    """The look of a view, or None if its scan is no image. `cloud`: points seen before."""
     is_image = view.scan.capacity == view.camera.num_rays
     return look(view.scan, view.camera, view.pose, cloud) if is_image else None
 
 
 def look(seen: PointCloud, camera: Camera, pose: Pose, cloud: Float[np.ndarray, "n 3"]) -> Look:
-    """The image that a scan is, row by row; `cloud`: what had been seen before it."""
+    """The look of a scan, whose rows are pixels. `cloud`: points seen before."""
     points, normals = (np.asarray(rows, np.float64) for rows in (seen.points, seen.normals))
     mask = np.asarray(seen.mask)
     lit = np.clip(0.35 + 0.65 * normals @ lamp(pose), 0.0, 1.0)
@@ -115,14 +116,16 @@ def lamp(pose: Pose) -> Float[np.ndarray, "3"]:
 
 
 def _finer(camera: Camera) -> Camera:
-    """The camera with about as many pixels along its longer side as are shown."""
+    """The camera with about as many pixels along its longer side as the picture."""
     factor = math.ceil(_PIXELS / max(camera.height, camera.width))
     return camera if factor == 1 else camera.resized(factor * camera.height, factor * camera.width)
 
 
 def look_picture(look: Look, hidden: str = BEFORE, plain: bool = False) -> UInt8[np.ndarray, "h w 3"]:
-    """A lit image of a look: grey where it had been seen before, in a colour of `hidden` elsewhere; white where a ray
-    met nothing. `plain`: all in grey."""
+    """A lit image of a look: grey where seen before, `hidden` elsewhere, and white without a hit.
+
+    - `plain`: whether all is grey.
+    """
     tints = np.array([mpl.colors.to_rgb(colour) for colour in (hidden, _KNOWN)])
     colours = tints[(look.known | plain).astype(int)] * (0.25 + 0.75 * look.lit[..., None])
     return np.round(255.0 * np.where(look.mask[..., None], colours, 1.0)).astype(np.uint8)

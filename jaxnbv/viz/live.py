@@ -1,4 +1,4 @@
-"""A live view in the browser, by viser: what has been seen, what is imagined, and where to look next."""
+"""A live view in the browser, by viser: scanned points, imagined surfaces, and the next view."""
 
 import dataclasses
 import html
@@ -23,7 +23,7 @@ from jaxnbv.observations import Observations
 from jaxnbv.planning.episode import Episode
 from jaxnbv.planning.loop import view_keys
 from jaxnbv.planning.session import Session
-from jaxnbv.sampler import SurfaceSampler
+from jaxnbv.sampler import StepInputs, SurfaceSampler
 from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.search import Proposal
 from jaxnbv.storage.files import write_text
@@ -31,13 +31,15 @@ from jaxnbv.surfaces.part_hypotheses import PartHypotheses
 from jaxnbv.utility import Quantity
 from jaxnbv.viz.answers import capital, may_be_words, shown_value, words_of
 from jaxnbv.viz.choice import colour_range, open_values
-from jaxnbv.viz.mean_surface import MeanSurface, as_shown, mean_surface
-from jaxnbv.viz.placed_part import PlacedPart, likeliest_part, placed_parts
+from jaxnbv.viz.mean_surface import MeanSurface
+from jaxnbv.viz.placed_shape import PlacedShape, placed_parts
 from jaxnbv.viz.scene import Cameras, Points, seen_items
-from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, NEW, PART, VALUE, gradient, middle_range
+from jaxnbv.viz.shown_surface import shown_surface
+from jaxnbv.viz.style import BEFORE, DEVIATION, GHOST, GREY, IMAGINED, NEW, OPEN, PART, VALUE, gradient, middle_range
 from jaxnbv.viz.task import seen_after
+from jaxnbv.viz.words import place
 
-# Vertices and faces; what the object may be, and how likely that is.
+# Vertices and faces; kinds of object with their probabilities.
 Triangles: TypeAlias = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
 Kinds: TypeAlias = tuple[tuple[str, float], ...]
 
@@ -45,17 +47,20 @@ _SAMPLES = 4
 _NEXT = "#009e73"
 _EYE = (2.6, 1.7, 2.6)
 _POINT, _CANDIDATE, _FRUSTUM = 0.012, 0.05, 0.22
-_ASIDE = "position:fixed;left:0;bottom:0;max-width:22em;padding:0 1em;background:#fffd;color:#222;font:15px sans-serif"
+_ASIDE = (
+    "position:fixed;left:0;top:0;max-height:100vh;overflow:auto;max-width:22em;padding:0 1em;background:#fffd;"
+    "color:#222;font:15px sans-serif"
+)
 
 
 class LiveView:
-    """A page that shows an episode, or a session, and changes with it. All in scene coordinates, y up.
+    """A page that shows an episode or a session, and changes with it.
 
-    Switched on in its scene tree: points, cameras, the surface of the posterior's mean coloured by how uncertain it is,
-    candidates coloured by value, the next view with the depth that is expected of it; to be switched on: some imagined
-    surfaces. A slider goes back to earlier views.
+    Coordinates are those of the scene, with y up. The page shows points, cameras, candidates coloured by value, and the
+    next view with its expected depth. The surface is the likeliest known shape, or else the posterior mean coloured by
+    its uncertainty. Imagined surfaces can be switched on in the scene tree. A slider goes back to earlier views.
 
-    - `port`, `host`: where the page is served, by default for this machine alone.
+    - `port`, `host`: address of the page, by default for this machine alone.
 
     **Raises:** `ValueError` if viser is not installed.
     """
@@ -71,16 +76,16 @@ class LiveView:
         self._image: Any = None
         self._slider: Any = None
         self._drawn: list[Any] = []
-        # A reader may move the slider while the next view comes.
+        # A reader may move the slider while the next view is drawn.
         self._drawing = threading.RLock()
 
     @property
     def address(self) -> str:
-        """Of the page."""
+        """Address of the page."""
         return f"http://{self._server.get_host()}:{self._server.get_port()}"
 
     def update(self, shown: Episode | Session) -> None:
-        """Show an episode as it is now, or a session and where it asks for the next image."""
+        """Show an episode, or a session with the pose of its next image."""
         episode = shown.episode if isinstance(shown, Session) else shown
         proposal, expected, observations = None, None, None
         if isinstance(shown, Session):
@@ -118,7 +123,7 @@ class LiveView:
         before = views[-2].cloud.to_numpy()[0] if len(views) > 1 else new[:0]
         scene, picture = self._server.scene, None if expected is None else _depth_picture(expected)
         with self._drawing:
-            # What was seen is there at once.
+            # Points appear at once; surfaces take longer.
             with self._server.atomic():
                 for handle in self._drawn:
                     handle.remove()
@@ -138,73 +143,90 @@ class LiveView:
                 self._legend.content = _legend(surface, proposal, planner.quantity, episode.frame)
 
     def save(self, path: str | Path) -> Path:
-        """Write the scene as it is now, with its text and legend, as one HTML file, which opens offline."""
+        """Write the present scene with its text and legend to one HTML file, which opens offline."""
         page, end, rest = self._server.get_scene_serializer().as_html().rpartition("</body>")
         said = "".join(f"<p>{html.escape(line.replace('**', ''))}</p>" for line in self._text.content.split("\n\n"))
         write_text(Path(path), f'{page}<aside style="{_ASIDE}">{said}{self._legend.content}</aside>{end}{rest}')
         return Path(path)
 
     def stop(self) -> None:
-        """Serve it no more."""
+        """Stop the server."""
         self._server.stop()
 
 
 def _surfaces(
     sampler: SurfaceSampler, observations: Observations, key: PRNGKeyArray
 ) -> tuple[MeanSurface | None, list[tuple[str, Triangles]], Kinds]:
-    """The likeliest surface, some that are imagined, by their names, and what known shapes say that the object may be.
-    Where parts are known, these are the likeliest part and the others."""
+    """The surface that pictures show, names and triangles of some imagined ones, and what the object may be.
+
+    With known parts, the imagined surfaces are the likeliest parts.
+    """
     if isinstance(observations.hypotheses, PartHypotheses):
         parts = placed_parts(observations.hypotheses, _SAMPLES)
-        return likeliest_part(observations.hypotheses), [(p.name, (p.vertices, p.faces)) for p in parts], ()
+        surface = shown_surface(sampler, StepInputs(observations))
+        return surface, [(part.name, (part.vertices, part.faces)) for part in parts], ()
     inputs = sampler.step_inputs(observations, key)
     posterior, samples = inputs.posterior, inputs.surfaces
     assert posterior is not None
     assert samples is not None
-    surface = as_shown(mean_surface(sampler, inputs), observations.cloud)
-    # Marching cubes asks for an array that it could write to.
-    found = [level_triangles(values, sampler.grid) for values in np.array(samples.values[:_SAMPLES])]
+    surface = shown_surface(sampler, inputs)
+    # Marching cubes needs a writable array.
+    meshes = [level_triangles(values, sampler.grid) for values in np.array(samples.values[:_SAMPLES])]
     names = posterior.names_of_samples(key, sampler.num_samples)
-    imagined = [(name, triangles[:2]) for name, triangles in zip(names, found, strict=False) if triangles is not None]
+    imagined = [(name, triangles[:2]) for name, triangles in zip(names, meshes, strict=False) if triangles is not None]
     return surface, imagined, tuple(posterior.kinds().items())
 
 
 def _told(episode: Episode, kinds: Kinds, proposal: Proposal | None) -> str:
-    """What is known, and what is asked, as Markdown."""
-    views, sought, acquisition = len(episode.views), episode.planner.quantity, episode.planner.acquisition
-    seen = seen_after(episode, None)[-1]
-    lines = [f"**{views} view{'s' if views > 1 else ''}**, {seen.amount} of surface seen"]
-    answer = episode.views[-1].answer(acquisition)
-    lines += [] if answer is None else [f"{capital(words_of(answer.in_world(episode.frame)).said())}."]
-    lines += [may_be_words(kinds)] if kinds else []
+    """The answer, the next view, and what else is known, as Markdown.
+
+    - `proposal`: the next view, with values in world units.
+    """
+    views, quantity, frame = len(episode.views), episode.planner.quantity, episode.frame
+    answer, lines = episode.views[-1].answer(episode.planner.acquisition), list[str]()
+    if answer is not None:
+        words = words_of(answer.in_world(frame))
+        lines += [f"**{words.question} {capital(words.found)}.**", f"{capital(words.said())}."]
     if proposal is not None:
-        frame, error = episode.frame, proposal.standard_error
+        error = proposal.standard_error
         about = "" if error is None else f" ± {float(error):.2g}"
-        value = shown_value(sought, float(proposal.value), frame)
-        lines.append(f"The next view: {sought.name} {value}{about}.")
+        value = shown_value(quantity, float(proposal.value), frame)
+        lines.append(f"**The next view** looks from {place(proposal.pose, frame)}: {quantity.name} {value}{about}.")
+    seen = seen_after(episode, None)[-1]
+    lines.append(f"**{views} view{'s' if views > 1 else ''}**, {seen.amount} of surface seen")
+    lines += [may_be_words(kinds)] if kinds else []
     return "\n\n".join(lines)
 
 
 def _drawn(scene: Any, items: Iterable[Points | Cameras]) -> list[Any]:
-    found = []
+    handles = []
     for item in items:
         if isinstance(item, Cameras):
             for number, pose in enumerate(item.poses, start=item.first):
-                found.append(_frustum(scene, f"/cameras/view {number}", item.camera, pose, item.colour))
-                # It goes with its camera.
+                handles.append(_frustum(scene, f"/cameras/view {number}", item.camera, pose, item.colour))
+                # Removing the camera removes its number too.
                 scene.add_label(f"/cameras/view {number}/number", str(number))
         elif len(item.places):
             settings: dict[str, Any] = {"point_size": _POINT, "point_shape": "circle"}
-            found.append(scene.add_point_cloud(f"/{item.name}", item.places, to_rgb(item.colour), **settings))
-    return found
+            handles.append(scene.add_point_cloud(f"/{item.name}", item.places, to_rgb(item.colour), **settings))
+    return handles
 
 
 def _surface(scene: Any, surface: MeanSurface | None) -> list[Any]:
     if surface is None:
         return []
-    if isinstance(surface, PlacedPart):
-        place, colour = f"/likeliest part, {surface.caption}", to_rgb(PART)
-        return [scene.add_mesh_simple(place, surface.vertices, surface.faces, color=colour)]
+    if isinstance(surface, PlacedShape):
+        measured, agreed = surface.measured[:, None], surface.agreed[:, None]
+        scanned, imagined, rest = (np.array(to_rgb(colour)) for colour in (PART, IMAGINED, OPEN))
+        colours = measured * scanned + (1.0 - measured) * (agreed * imagined + (1.0 - agreed) * rest)
+        vertex_colors = np.round(255.0 * colours).astype(np.uint8)
+        mesh = trimesh.Trimesh(surface.vertices, surface.faces, vertex_colors=vertex_colors, process=False)
+        name = f"/likeliest {'part' if surface.is_part else 'shape'}, {surface.caption}"
+        handles = [scene.add_mesh_trimesh(name, mesh)]
+        if (ghost := surface.ghost) is not None:
+            glass: dict[str, Any] = {"color": to_rgb(GHOST), "opacity": 0.25}
+            handles.append(scene.add_mesh_simple("/other shapes", ghost.vertices, ghost.faces, **glass))
+        return handles
     colours = DEVIATION(LogNorm(*middle_range(surface.deviation))(surface.deviation), bytes=True)
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, vertex_colors=colours, process=False)
     return [scene.add_mesh_trimesh("/surface of the mean", mesh)]
@@ -226,23 +248,26 @@ def _depth_picture(depth: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"
 
 
 def _choice(scene: Any, camera: Camera, proposal: Proposal, picture: np.ndarray | None) -> list[Any]:
-    values, found = open_values(proposal), []
+    values, handles = open_values(proposal), []
     is_open = np.isfinite(values)
     if is_open.any():
         places = np.asarray(proposal.candidates.position)[is_open]
         colours = VALUE(Normalize(*colour_range(values))(values[is_open]), bytes=True)[:, :3]
-        found.append(scene.add_point_cloud("/candidates", places, colours, point_size=_CANDIDATE, point_shape="circle"))
-    return [*found, _frustum(scene, "/next view", camera, proposal.pose, _NEXT, picture)]
+        settings: dict[str, Any] = {"point_size": _CANDIDATE, "point_shape": "circle"}
+        handles.append(scene.add_point_cloud("/candidates", places, colours, **settings))
+    return [*handles, _frustum(scene, "/next view", camera, proposal.pose, _NEXT, picture)]
 
 
 def _legend(surface: MeanSurface | None, proposal: Proposal | None, sought: Quantity, frame: Frame) -> str:
-    """What the colours mean, as HTML."""
+    """The legend of colours, as HTML."""
     marks = [("points before", BEFORE), ("new points, last camera", NEW), ("earlier cameras", GREY)]
     marks += [] if proposal is None else [("next view", _NEXT)]
-    if isinstance(surface, PlacedPart):
-        marks.insert(0, (f"likeliest part: {html.escape(surface.caption)}", PART))
+    if isinstance(surface, PlacedShape):
+        kind = "part" if surface.is_part else "known shape"
+        shapes = [(f"likeliest {kind}: {html.escape(surface.caption)}", PART), ("its imagined parts", IMAGINED)]
+        marks[:0] = [*shapes, ("where other shapes disagree", GHOST)]
     rows = [f'<div><b style="color:{colour}">&#9679;</b> {name}</div>' for name, colour in marks]
-    if surface is not None and not isinstance(surface, PlacedPart):
+    if surface is not None and not isinstance(surface, PlacedShape):
         low, high = middle_range(frame.length_to_world(surface.deviation))
         rows.append(_bar(f"the surface is known to, in {frame.unit}", DEVIATION, f"{low:g}", f"{high:g}"))
     if proposal is not None and np.isfinite(proposal.values).any():

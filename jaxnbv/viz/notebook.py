@@ -1,9 +1,11 @@
-"""What a notebook shows: of clouds, posteriors, proposals, episodes a picture, and of more a line of facts."""
+"""Representations in notebooks: pictures of clouds, posteriors, proposals and episodes, and lines of facts."""
 
 import base64
+import builtins
 import functools
 import html
 import io
+import tempfile
 import textwrap
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -30,13 +32,13 @@ from jaxnbv.utility import Quantity
 from jaxnbv.viz.choice import draw_acquisition
 from jaxnbv.viz.data import report_data
 from jaxnbv.viz.figures import STYLE, overview_figure
-from jaxnbv.viz.placed_part import PlacedPart, likeliest_part
+from jaxnbv.viz.placed_shape import PlacedShape, likeliest_part
 from jaxnbv.viz.render import Still, beside, draw_items, frame
 from jaxnbv.viz.scene import seen_items
 from jaxnbv.viz.style import BEFORE, VALUE
 
 _INCHES, _LARGE, _LETTERS, _DPI = 2.4, 4.8, 62, 110
-# Of clouds whose normals look everywhere.
+# Viewpoint for clouds whose normals look in all directions.
 _USUAL_EYE = np.array([0.8, 0.9, 2.2])
 # Half the side of the slice of a posterior, in scene units, and its pixels along a side.
 _REACH, _PIXELS = 1.5, 48
@@ -82,7 +84,7 @@ def html_of(shown: Any) -> str:
 
 @functools.singledispatch
 def drawing_of(shown: Any) -> Drawing:
-    """What is drawn and said of an object."""
+    """Picture and caption of an object, by its type."""
     return Drawing(None, repr(shown))
 
 
@@ -150,13 +152,13 @@ def _(episode: Episode) -> Drawing:
     count = len(episode.views)
     facts = f"{count} view{'s' * (count != 1)} by {episode.planner.quantity.name}, {int(episode.cloud.count):,} points"
     hypotheses = episode.views[-1].hypotheses if count else None
-    part = likeliest_part(hypotheses) if isinstance(hypotheses, PartHypotheses) else None
+    part = likeliest_part(hypotheses, episode.cloud) if isinstance(hypotheses, PartHypotheses) else None
     facts += "" if part is None else f"; {part.caption}"
     drawn = functools.partial(_draw_views, episode, part)
     return Drawing(drawn, facts + (f"; {episode.stop_reason}" if episode.stop_reason else ""))
 
 
-def _draw_views(episode: Episode, part: PlacedPart | None, axes: Axes) -> None:
+def _draw_views(episode: Episode, part: PlacedShape | None, axes: Axes) -> None:
     """The points, those of the last view told apart, the likeliest part, and where the cameras stood."""
     poses = [view.pose for view in episode.views]
     extent = max(1.8, *(float(np.linalg.norm(pose.position)) for pose in poses))
@@ -197,11 +199,21 @@ def _(planner: Planner) -> Drawing:
 def show(
     shown: PointCloud | Observations | SurfacePosterior | Proposal | Episode | Session | Planner, progress: bool = True
 ) -> Picture:
-    """A picture that a notebook shows: of an episode or a session all views in a strip, the surface as it became known
-    and what the search looked at; of others what a notebook draws small, large.
+    """A large picture for a notebook. Elsewhere it is saved as a PNG file, and its path is printed.
 
-    **Raises:** `ValueError` for what has no picture: a planner, a batch of clouds, and what holds no points.
+    For an episode or a session it shows all views, with the surface and the candidates of each.
+
+    **Raises:** `ValueError` for a planner, a batch of clouds, or a value without points: these have no picture.
     """
+    picture = _large(shown, progress)
+    if not hasattr(builtins, "__IPYTHON__"):
+        with tempfile.NamedTemporaryFile(prefix="jaxnbv-", suffix=".png", delete=False) as file:
+            file.write(picture.png)
+        print(f"no notebook shows the picture; it is saved as {file.name}")
+    return picture
+
+
+def _large(shown: Any, progress: bool) -> Picture:
     episode = shown.episode if isinstance(shown, Session) and shown.views else shown
     with mpl.rc_context(STYLE):
         if isinstance(episode, Episode):

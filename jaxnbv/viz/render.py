@@ -1,4 +1,4 @@
-"""A still picture of one view's scene: the mean surface, ray-traced, with points and cameras before and behind it."""
+"""A still picture of one view's scene: the ray-traced surface, with points and cameras before and behind it."""
 
 import math
 from collections.abc import Iterable
@@ -6,24 +6,23 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+import trimesh
 from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LogNorm
 from scipy.ndimage import uniform_filter
-from scipy.spatial import cKDTree
 
 from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose, look_at
-from jaxnbv.scanning import TriangleMesh
+from jaxnbv.scanning.triangle_rays import first_faces
 from jaxnbv.viz.data import ReportData
 from jaxnbv.viz.imagined import lamp, look_picture
 from jaxnbv.viz.mean_surface import MeanSurface
-from jaxnbv.viz.placed_part import PlacedPart
+from jaxnbv.viz.placed_shape import PlacedShape
 from jaxnbv.viz.scene import Cameras, Points, frustum, seen_items
 from jaxnbv.viz.sphere import unit
-from jaxnbv.viz.style import DEVIATION, LINE, NEW, PART, framed
+from jaxnbv.viz.style import DEVIATION, GHOST, IMAGINED, LINE, NEW, OPEN, PART, framed
 
 _DISTANCE = 11.0
 _SLACK = 0.04  # Noise and the mean's own error must not hide a point behind the surface that it lies on.
@@ -31,11 +30,15 @@ _HIDDEN = 0.18
 # How wide a hollow is darkened, as a share of the picture; how much at most, and how deep a hollow is then.
 _HOLLOW, _DARKEST, _DEEP = 0.05, 0.4, 0.25
 _INSET = 0.24
-_STILL = 640
+# Opacity of what is still open.
+_GHOST = 0.3
+_STILL, _SMALL = 640, 280
+# Longest edge of the triangles of a true surface, in scene units.
+_EDGE = 0.05
 
 
 def beside(pose: Pose) -> Float[np.ndarray, "3"]:
-    """Where to look from so as to see what a camera sees, and the camera itself from the side: 40 degrees around."""
+    """A direction 40 degrees beside a camera, from which its scan and the camera itself are visible."""
     away = unit(np.asarray(pose.position, dtype=np.float64))
     across = np.cross([0.0, 1.0, 0.0], away)
     across = unit(across) if np.linalg.norm(across) >= 1e-3 else np.array([1.0, 0.0, 0.0])
@@ -43,9 +46,15 @@ def beside(pose: Pose) -> Float[np.ndarray, "3"]:
 
 
 class Still:
-    """A perspective picture of a surface from one place, `size` pixels a side, in which all cameras of the scene have
-    room: coloured by its standard deviation, or plain without a range of it, lit from beside the eye, darker in
-    hollows, clear where there is no surface.
+    """A perspective picture of a surface, with room for all cameras of the scene.
+
+    The picture is clear where there is no surface. The light comes from beside the eye, and hollows are darker. A known
+    shape is coloured by what is measured, imagined and open. Other surfaces are coloured by their standard deviation.
+
+    - `eye`: direction from the origin to the reader.
+    - `size`: pixels along each side.
+    - `extent`: radius of the content, in scene units.
+    - `deviation`: range of the colours; None for one plain colour.
     """
 
     def __init__(
@@ -64,36 +73,72 @@ class Still:
             self._paint(surface, deviation)
 
     def _paint(self, surface: MeanSurface, deviation: LogNorm | None) -> None:
-        mesh = TriangleMesh(surface.vertices.astype(np.float64), surface.faces.astype(np.int64), Frame())
+        mask, colours, depth = self._traced(surface, deviation)
+        if isinstance(surface, PlacedShape) and surface.ghost is not None:
+            mask, colours, depth = self._with_ghost(surface.ghost, mask, colours, depth)
+        self.show(mask, colours, depth)
+
+    def _traced(
+        self, surface: MeanSurface, deviation: LogNorm | None
+    ) -> tuple[Bool[np.ndarray, " rays"], Float[np.ndarray, "hits 4"], Float[np.ndarray, " hits"]]:
+        """Mask of rays that hit the surface, with its colour and depth at the hits."""
         # Not by the camera's compiled rays: of millions of pixels, XLA takes seconds over the constants.
-        directions = np.asarray(self.fine_camera.pixel_directions()) @ np.asarray(self.pose.rotation).T
-        hits = mesh.trace(np.broadcast_to(np.asarray(self.pose.position), directions.shape), unit(directions))
-        mask = np.asarray(hits.mask)
-        points = np.asarray(hits.points)[mask]
-        distance, near = cKDTree(surface.vertices).query(points, k=3)
-        weight = 1.0 / (distance + 1e-4)
-        weight /= weight.sum(axis=1, keepdims=True)
+        directions = unit(np.asarray(self.fine_camera.pixel_directions()) @ np.asarray(self.pose.rotation).T)
+        origin, vertices = np.asarray(self.pose.position, np.float64), surface.vertices.astype(np.float64)
+        rows, distances = first_faces(vertices, surface.faces.astype(np.int64))(
+            np.broadcast_to(origin, directions.shape), directions
+        )
+        mask = rows >= 0
+        points = origin + distances[mask, None] * directions[mask]
+        near = surface.faces[rows[mask]]
+        weight = _barycentric(points, vertices[near])
         normals = unit(np.sum(weight[..., None] * surface.normals[near], axis=1))
         lit = 0.72 + 0.34 * np.clip(normals @ lamp(self.pose), -0.4, 1.0)
         colours = np.tile(mpl.colors.to_rgba(LINE), (len(points), 1))
-        if isinstance(surface, PlacedPart):
-            colours[:, :3] = mpl.colors.to_rgb(PART)
+        if isinstance(surface, PlacedShape):
+            scanned, imagined, open_ = (np.array(mpl.colors.to_rgb(colour)) for colour in (PART, IMAGINED, OPEN))
+            measured, agreed = (
+                np.sum(weight * one[near], axis=1)[:, None] for one in (surface.measured, surface.agreed)
+            )
+            colours[:, :3] = measured * scanned + (1.0 - measured) * (agreed * imagined + (1.0 - agreed) * open_)
         elif deviation is not None:
             colours = DEVIATION(deviation(np.exp(np.sum(weight * np.log(surface.deviation)[near], axis=1))))
         depth = (points - np.asarray(self.pose.position)) @ np.asarray(self.pose.forward)
         shaded = lit * (1.0 - _occlusion(mask.reshape(2 * self.size, -1), depth))
         colours[:, :3] = np.clip(colours[:, :3] * shaded[:, None], 0.0, 1.0)
-        self.show(mask, colours, depth)
+        return mask, colours, depth
+
+    def _with_ghost(
+        self,
+        ghost: MeanSurface,
+        mask: Bool[np.ndarray, " rays"],
+        colours: Float[np.ndarray, "hits 4"],
+        depth: Float[np.ndarray, " hits"],
+    ) -> tuple[Bool[np.ndarray, " rays"], Float[np.ndarray, "all 4"], Float[np.ndarray, " all"]]:
+        """The same with a translucent surface before it, which hides no point."""
+        is_ghost, over, ghost_depth = self._traced(ghost, None)
+        under, front = np.zeros((len(mask), 4)), np.zeros((len(mask), 4))
+        deep, near = np.full(len(mask), np.inf), np.full(len(mask), np.inf)
+        under[mask], deep[mask], near[is_ghost] = colours, depth, ghost_depth
+        # Brightness of the ghost's own shading, relative to a lit face.
+        front[is_ghost, :3] = np.array(mpl.colors.to_rgb(GHOST)) * (over[:, :3] / np.array(mpl.colors.to_rgb(LINE)))
+        front[is_ghost, 3] = _GHOST
+        front[near > deep] = 0.0
+        alpha = front[:, 3:] + under[:, 3:] * (1.0 - front[:, 3:])
+        mixed = front[:, :3] * front[:, 3:] + under[:, :3] * under[:, 3:] * (1.0 - front[:, 3:])
+        both = mask | (front[:, 3] > 0)
+        result = np.concatenate([np.clip(mixed / np.maximum(alpha, 1e-9), 0.0, 1.0), alpha], axis=1)
+        return both, result[both], deep[both]
 
     @property
     def fine_camera(self) -> Camera:
-        """Whose rays make the picture, four a pixel."""
+        """The camera of the picture with four rays per pixel."""
         return Camera(self.camera.fov, 2 * self.size, 2 * self.size)
 
     def show(
         self, mask: Bool[np.ndarray, " rays"], colours: Float[np.ndarray, "hits 4"], depth: Float[np.ndarray, " hits"]
     ) -> None:
-        """Make the picture from what the rays of `fine_camera` hit, and how deep; clear where they miss."""
+        """Make the picture from the colours and depths of the rays of `fine_camera` that hit."""
         image = np.zeros((len(mask), 4))
         image[mask] = colours
         image[:, :3] *= image[:, 3:]
@@ -112,9 +157,19 @@ class Still:
         return pixels - 0.5, local[:, 2] < self.depth[row, column] + _SLACK
 
 
+def _barycentric(points: Float[np.ndarray, "n 3"], corners: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3"]:
+    """Weights of the corners of triangles at points in them."""
+    a, b, p = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], points - corners[:, 0]
+    aa, ab, bb, pa, pb = (np.einsum("nd,nd->n", *pair) for pair in ((a, a), (a, b), (b, b), (p, a), (p, b)))
+    area = np.maximum(aa * bb - ab**2, 1e-30)
+    second, third = (bb * pa - ab * pb) / area, (aa * pb - ab * pa) / area
+    weights = np.clip(np.stack([1.0 - second - third, second, third], axis=1), 0.0, 1.0)
+    return weights / weights.sum(axis=1, keepdims=True)
+
+
 def _occlusion(mask: Bool[np.ndarray, "h w"], depth: Float[np.ndarray, " hits"]) -> Float[np.ndarray, " hits"]:
-    """By how much hits are darkened: those that lie deeper than the mean about them, as corners and hollows do (Luft,
-    Colditz and Deussen 2006)."""
+    """Share by which each hit is darkened: more the deeper it lies below the mean depth about it (Luft, Colditz and
+    Deussen 2006)."""
     width, deep = round(_HOLLOW * len(mask)), np.zeros(mask.shape)
     deep[mask] = depth
     # The mean of a mean falls off with distance.
@@ -123,8 +178,23 @@ def _occlusion(mask: Bool[np.ndarray, "h w"], depth: Float[np.ndarray, " hits"])
     return _DARKEST * np.clip((depth - mean) / _DEEP, 0.0, 1.0)
 
 
+def draw_truth(axes: Axes, data: ReportData) -> bool:
+    """Draw the true surface from where the views are drawn; False if it is not known."""
+    mesh = data.true_surface
+    if mesh is None:
+        return False
+    # Colours are interpolated between vertices, which must be near each other.
+    vertices, faces = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, _EDGE, max_iter=12)
+    fine = trimesh.Trimesh(vertices, faces)
+    normals, flat = np.asarray(fine.vertex_normals), np.ones(len(fine.vertices))
+    still = Still(data.stage.eye, MeanSurface(fine.vertices, fine.faces, normals, flat), _SMALL, data.stage.extent)
+    axes.imshow(still.image, interpolation="bilinear")
+    frame(axes, still, [still.project(np.asarray(fine.vertices))[0]])
+    return True
+
+
 def painted(data: ReportData, index: int) -> Still:
-    """The surface after view `index` (from 0), from where all views of an episode are drawn."""
+    """A still of the surface after view `index` (from 0), from the direction that all views share."""
     stage, norm = data.stage, LogNorm(*data.deviations)
     return Still(stage.eye, data.views[index].surface, _STILL, stage.extent, norm)
 
@@ -132,24 +202,26 @@ def painted(data: ReportData, index: int) -> Still:
 def draw_scene(
     axes: Axes, data: ReportData, index: int, still: Still, weight: float = 1.0, inset: bool = True, aspect: float = 1.0
 ) -> None:
-    """Draw the scene after view `index` (from 0) into an empty axes: the painted surface, points, the cameras so far,
-    of which the last is new, and in the corner where the least stands in any view what that one saw. The likeliest part
-    is named below.
+    """Draw the scene after view `index` (from 0) into empty axes: surface, points and cameras so far.
 
-    `weight` scales lines, dots and letters; `aspect` is width over height.
+    The emptiest corner shows what the last view saw. The likeliest part is named below.
+
+    - `weight`: scales lines, dots and letters.
+    - `aspect`: width over height.
     """
     view, stage = data.views[index], data.stage
     axes.imshow(still.image, interpolation="bilinear", zorder=1)
     poses = [stage.pulled(other.pose) for other in data.views[: index + 1]]
     items = seen_items(view.before, view.new, poses, data.camera, stage.depth)
-    if isinstance(view.surface, PlacedPart):
-        # What is scanned is to be seen on what is not.
-        items = tuple(item._replace(weight=3.0 * item.weight) if isinstance(item, Points) else item for item in items)
+    if isinstance(view.surface, PlacedShape):
+        # Scanned points must stand out on the imagined surface.
+        items = tuple(item._replace(weight=2.0 * item.weight) if isinstance(item, Points) else item for item in items)
     draw_items(axes, still, items, weight)
     extent = _extent(data, still)
     frame(axes, still, extent, aspect)
-    if isinstance(view.surface, PlacedPart):
+    if isinstance(view.surface, PlacedShape) and view.surface.is_part:
         style: dict[str, Any] = {"ha": "center", "va": "bottom", "fontsize": 10 * weight, "fontweight": "bold"}
+        style["bbox"] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 2}
         axes.text(0.5, 0.01, view.surface.caption, transform=axes.transAxes, zorder=5, **style)
     if inset and view.look is not None:
         across, up = _free_corner(axes, extent)
@@ -160,19 +232,18 @@ def draw_scene(
 
 
 def _free_corner(axes: Axes, extent: list[Float[np.ndarray, "_ 2"]]) -> tuple[int, int]:
-    """The corner of a framed axes in which the least share of each of some groups of pixels lies: 0 or 1 from the left,
-    and from below."""
+    """The emptiest corner of a framed axes, given groups of pixels: 0 or 1 from the left, and from below."""
     (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
     places = [(pixels - [left, bottom]) / [right - left, top - bottom] for pixels in extent]
 
-    def taken(corner: tuple[int, int]) -> float:
+    def share_in(corner: tuple[int, int]) -> float:
         return sum(float(np.mean((np.abs(at - corner) < 1.25 * _INSET).all(axis=1))) for at in places)
 
-    return min(((0, 0), (0, 1), (1, 0), (1, 1)), key=taken)
+    return min(((0, 0), (0, 1), (1, 0), (1, 1)), key=share_in)
 
 
 def _extent(data: ReportData, still: Still) -> list[Float[np.ndarray, "_ 2"]]:
-    """The pixels that anything takes in any view, so that all views are cropped alike."""
+    """The pixels of the content of all views, so that all are cropped alike."""
     surfaces = [view.surface.vertices for view in data.views if view.surface is not None]
     shown = [still.project(rows)[0] for rows in (*surfaces, *(view.new for view in data.views)) if len(rows)]
     for view in data.views:
@@ -186,24 +257,24 @@ def draw_items(
     axes: Axes, still: Still, items: Iterable[Points | Cameras], weight: float = 1.0
 ) -> list[Float[np.ndarray, "_ 2"]]:
     """Draw points that the surface does not hide, and numbered cameras; returns the pixels of all."""
-    taken = []
+    drawn = []
     for item in items:
         if isinstance(item, Points):
             pixels, in_front = still.project(item.places)
             x, y = pixels[in_front].T
             axes.scatter(x, y, s=item.weight * weight, c=item.colour, linewidths=0, zorder=2)
-            taken.append(pixels)
+            drawn.append(pixels)
             continue
         for number, pose in enumerate(item.poses, start=item.first):
             ends = frustum(pose, item.camera, item.depth)
-            taken.append(_draw_segments(axes, still, ends, item.colour, item.weight * weight))
+            drawn.append(_draw_segments(axes, still, ends, item.colour, item.weight * weight))
             beyond = 1.09 * np.asarray(pose.position, np.float64)[None]
             (apex,), (apex_in_front,) = still.project(beyond)
-            taken.append(apex[None])
+            drawn.append(apex[None])
             style: dict[str, Any] = {"fontweight": "bold" if item.weight > 1.0 else "normal", "color": item.colour}
             style |= {"alpha": 1.0 if apex_in_front else 0.4, "fontsize": 9 * weight, "zorder": 4}
             axes.text(apex[0], apex[1], str(number), ha="center", va="center", **style)
-    return taken
+    return drawn
 
 
 def _draw_segments(
@@ -223,9 +294,9 @@ def _draw_segments(
 
 
 def frame(axes: Axes, still: Still, shown: list[Float[np.ndarray, "_ 2"]], aspect: float = 1.0) -> None:
-    """Crop the picture about the pixels that are to be seen, to a width of `aspect` heights."""
-    seen = np.concatenate(shown)
-    (left, top), (right, bottom) = seen.min(axis=0), seen.max(axis=0)
+    """Crop the picture about these pixels, to a width of `aspect` heights."""
+    pixels = np.concatenate(shown)
+    (left, top), (right, bottom) = pixels.min(axis=0), pixels.max(axis=0)
     half = 0.53 * max((right - left) / aspect, bottom - top) + 0.03 * still.size
     x, y = 0.5 * (left + right), 0.5 * (top + bottom)
     axes.set(xlim=(x - aspect * half, x + aspect * half), ylim=(y + half, y - half), aspect="equal")

@@ -30,13 +30,15 @@ from jaxnbv.viz.data import ReportData, report_data
 from jaxnbv.viz.figures import STYLE
 from jaxnbv.viz.html import render
 from jaxnbv.viz.imagined import looks
-from jaxnbv.viz.render import draw_scene, painted
+from jaxnbv.viz.render import draw_scene, draw_truth, painted
 from jaxnbv.viz.sketches import Sketches
 from jaxnbv.viz.space import figures_in_space
-from jaxnbv.viz.style import DEVIATION, PART, bar_ticks, gradient
+from jaxnbv.viz.style import DEVIATION, GHOST, IMAGINED, OPEN, PART, bar_ticks, gradient
 
-_SCENE, _SCENE_DPI = (6.8, 5.9), 100
-_WHY, _WHY_DPI = (5.2, 4.3), 150
+# Inches, small so that letters are legible on a telephone.
+_SCENE, _SCENE_DPI = (5.2, 4.5), 131
+_TRUTH, _TRUTH_DPI = (1.8, 1.8), 150
+_WHY, _WHY_DPI = (4.2, 3.5), 185
 _QUALITY = 82
 
 
@@ -49,27 +51,28 @@ def write_report(
     progress: bool = True,
     rival: Episode | None = None,
     sketches: Sketches | None = None,
+    question: str | None = None,
 ) -> Path:
-    """Write `report.html` into a folder, which is made where it is missing, and return its path. An earlier report is
-    replaced.
+    """Write `report.html` into a folder, replacing an earlier report, and return its path.
 
-    - `truth`: points of the true surface in scene coordinates, for the chart of coverage; by default sampled from the
-      scene, where it can be. Without truth the chart is of the area that the scans have shown.
-    - `title`: what the object is called.
-    - `rival`: an episode of another search from the same first view, to be told of.
-    - `sketches`: those of the episode's steps, which else are made again.
+    - `truth`: points of the true surface in scene coordinates, for the chart of coverage. By default they are sampled
+      from the scene if possible. Without truth the chart shows the area that the scans have seen.
+    - `title`: name of the object.
+    - `rival`: an episode of another search from the same first view, for comparison.
+    - `sketches`: sketches of the episode's steps. Missing ones are drawn again.
+    - `question`: the question in words, such as "What does the truck carry?"; by default that of the task.
 
     **Raises:** `ValueError` if the folder cannot be written, or another process writes in it.
     """
     path = make_folder(folder) / "report.html"
     data = report_data(episode, truth, progress, rival=rival, sketches=sketches)
     with writing_in(path.parent):
-        write_text(path, report_html(data, title))
+        write_text(path, report_html(data, title, question))
     return path
 
 
-def report_html(data: ReportData, title: str) -> str:
-    """The page as text: a template with the data, the pictures and plotly's own code put in."""
+def report_html(data: ReportData, title: str, question: str | None = None) -> str:
+    """The page as text: the template filled with the data, the pictures and plotly's code."""
     with mpl.rc_context(STYLE):
         pictures = [(_scene(data, index), _why(data, index)) for index in range(len(data.views))]
         charts = [[_chart(*chart) for chart in drawn(data)] for drawn in (task_charts, other_charts)]
@@ -85,7 +88,9 @@ def report_html(data: ReportData, title: str) -> str:
         units=_world_of(data.episode)[1],
         length=data.episode.frame.unit,
         gradient=gradient(DEVIATION),
-        part=PART,
+        shapes={"scanned": PART, "imagined": IMAGINED, "imagined, but others disagree": OPEN, "other shapes": GHOST},
+        truth=_truth(data),
+        question=data.task.question if question is None else question,
         ticks=_deviation_ticks(data),
         # Plotly writes a figure with its numbers packed.
         space=_zipped(f"[{','.join(str(figure.to_json()) for figure in figures_in_space(data))}]"),
@@ -97,28 +102,27 @@ def report_html(data: ReportData, title: str) -> str:
 
 
 def picture_address(picture: UInt8[np.ndarray, "h w _"]) -> str:
-    """An image as a data address; one of few pixels, each of which counts, without loss."""
+    """An image as a data address; lossless if it is small."""
     file = io.BytesIO()
     Image.fromarray(picture).save(file, format="WEBP", quality=_QUALITY, lossless=min(picture.shape[:2]) < 64)
     return "data:image/webp;base64," + base64.b64encode(file.getvalue()).decode()
 
 
 def _matrix(data: ReportData, index: int) -> str:
-    """Camera to world, by OpenCV's axes; as JSON."""
+    """Camera to world with OpenCV's axes, as JSON."""
     placed = _world_of(data.episode)[0].to_world(data.views[index].pose)
     return json.dumps(np.asarray(placed.to_matrix(), np.float64).round(6).tolist())
 
 
 def _world_of(episode: Episode) -> tuple[Frame, str]:
-    """The frame of the world in which poses are copied, and its units: the session's, that of the object's file, or
-    the scene."""
+    """Frame of the copied poses, and its units: those of the session, the object's file, or the scene."""
     if episode.scene is not None and (own := episode.scene.world_frame) is not None:
         return own, "the units of the object's file"
     return episode.frame, episode.frame.unit
 
 
 def _deviation_ticks(data: ReportData) -> list[tuple[float, str]]:
-    """The numbers under the bar of deviations, and where they stand, in percent of its width."""
+    """Positions in percent of the width, and labels, of the ticks under the bar of deviations."""
     low, high = data.deviations
     return [(round(100.0 * math.log(tick / low, high / low), 2), f"{tick:g}") for tick in bar_ticks(low, high)]
 
@@ -128,16 +132,23 @@ def _zipped(text: str) -> bytes:
 
 
 def _scene(data: ReportData, index: int) -> str:
-    """The picture of one view's scene."""
+    """The picture of a view's scene."""
     figure = Figure(figsize=_SCENE, facecolor="none")
     # The frame in the corner is not cut.
     axes = figure.add_axes((0.002, 0.002, 0.996, 0.996))
-    draw_scene(axes, data, index, painted(data, index), weight=1.2, aspect=_SCENE[0] / _SCENE[1])
+    draw_scene(axes, data, index, painted(data, index), weight=1.1, aspect=_SCENE[0] / _SCENE[1])
     return picture_address(_pixels(figure, _SCENE_DPI))
 
 
+def _truth(data: ReportData) -> str | None:
+    """The picture of the true surface; None if it is not known."""
+    figure = Figure(figsize=_TRUTH, facecolor="none")
+    is_known = draw_truth(figure.add_axes((0.0, 0.0, 1.0, 1.0)), data)
+    return picture_address(_pixels(figure, _TRUTH_DPI)) if is_known else None
+
+
 def _why(data: ReportData, index: int) -> str:
-    """Why a view was chosen."""
+    """The picture of the reasons for a view."""
     figure = Figure(figsize=_WHY, facecolor="none")
     draw_choice(figure, data.views[index].proposal, data.quantity, data.episode.frame)
     return picture_address(_pixels(figure, _WHY_DPI))
@@ -151,8 +162,7 @@ def _pixels(figure: Figure, dpi: int) -> UInt8[np.ndarray, "h w 4"]:
 
 
 def _chart(title: str, figure: Figure) -> tuple[str, bytes, str]:
-    """A chart's name, its drawing, and where its first view begins and how wide each is, in the page's style, which
-    marks one."""
+    """A chart's name, its drawing, and CSS variables that place the mark of the current view on it."""
     file = io.BytesIO()
     with mpl.rc_context({"svg.hashsalt": "jaxnbv"}):
         figure.savefig(file, format="svg", metadata={"Date": None}, transparent=True)

@@ -1,26 +1,25 @@
-"""What costs most of an episode's pictures, drawn step by step while what a step imagined is at hand."""
+"""Sketches: the costly parts of an episode's pictures, drawn after each step while its samples are in memory."""
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
+from jaxnbv.observations import Observations
 from jaxnbv.planning.episode import Episode
 from jaxnbv.planning.loop import Step, view_keys
 from jaxnbv.sampler import StepInputs
-from jaxnbv.surfaces.part_hypotheses import PartHypotheses
 from jaxnbv.viz.imagined import Imagined, imagined
-from jaxnbv.viz.mean_surface import MeanSurface, as_shown, mean_surface
-from jaxnbv.viz.placed_part import likeliest_part
+from jaxnbv.viz.mean_surface import MeanSurface
+from jaxnbv.viz.shown_surface import has_bank, shown_surface
 from jaxnbv.viz.unmeasured import Patch, unmeasured
 
 
 class Sketch(NamedTuple):
-    """What a step knew before its view was taken.
+    """The state of a step before its view was taken.
 
-    - `surface`: of the likeliest part, where parts are known; else of the posterior mean, where it holds points, with a
-      deviation that allows for what was not seen. None where there is none.
-    - `imagined`: None for a view that was not chosen, or not taken.
-    - `unmeasured`: patches of that surface that views looked at and did not measure.
+    - `surface`: the surface that pictures show, see `shown_surface`.
+    - `imagined`: samples of the step; None for a view that was not chosen, or not taken.
+    - `unmeasured`: patches of the surface that views looked at and did not measure.
     """
 
     surface: MeanSurface | None
@@ -29,54 +28,56 @@ class Sketch(NamedTuple):
 
 
 class Sketches:
-    """Those of an episode that is under way: give `add` to `simulate(each=...)`, and the whole to `write_report`.
+    """Sketches of a running episode: `add` is for `simulate(each=...)`, the object for `write_report`.
 
-    - `episode`: without its views, which come one by one.
-    - `held`: sketches by the index of the view, from 0; none of views that were given or read from a folder.
+    - `episode`: the episode without views.
+    - `held`: sketches by the index of the view, from 0. First and stored views have none.
     """
 
     def __init__(self, episode: Episode):
         self.episode, self.held = episode, dict[int, Sketch]()
 
     def add(self, step: Step) -> None:
-        """The step to the next view."""
+        """Add the step to the next view."""
         self.episode = dataclasses.replace(self.episode, views=(*self.episode.views, step.view))
         if step.inputs is not None:
             index = len(self.episode.views) - 1
             self.held[index] = _sketch(self.episode, index, step.inputs)
 
 
-def sketches_of(episode: Episode, held: Mapping[int, Sketch], imagine: bool) -> Iterator[Sketch]:
-    """The sketch of the step that follows each view, that of the one after the last included, which was not taken.
+def sketches_of(
+    episode: Episode, replayed: Iterable[Observations], held: Mapping[int, Sketch], imagine: bool
+) -> Iterator[Sketch]:
+    """The sketch of the step after each view, including the one after the last view.
 
-    `held`: those that there are; `imagine`: whether the others show what was imagined.
+    - `replayed`: observations after each view.
+    - `held`: sketches that exist already.
+    - `imagine`: whether the others show what was imagined.
     """
-    for index, observations in enumerate(episode.observations(), start=1):
+    for index, observations in enumerate(replayed, start=1):
         if index in held:
             yield held[index]
             continue
         if episode.planner.acquisition.needs_hypotheses:
             yield _sketch(episode, index, StepInputs(observations), imagine)
             continue
-        posterior = episode.planner.sampler.posterior(observations)
+        sampler, is_imagined = episode.planner.sampler, imagine and index < len(episode.views)
+        if has_bank(sampler) and not is_imagined:
+            yield _sketch(episode, index, StepInputs(observations), imagine)
+            continue
+        posterior = sampler.posterior(observations)
         inputs = StepInputs(observations, posterior)
-        # With the key of the step: what it imagined, and moments where the posterior has no closed ones.
-        if (imagine and index < len(episode.views)) or not posterior.has_closed_forms:
+        # The step's own key gives the samples that it imagined, and moments without a closed form.
+        if is_imagined or not posterior.has_closed_forms:
             sample_key, *_ = view_keys(episode.key, index)
-            surfaces = episode.planner.sampler.sample(observations, sample_key, posterior)
+            surfaces = sampler.sample(observations, sample_key, posterior)
             inputs = dataclasses.replace(inputs, surfaces=surfaces)
         yield _sketch(episode, index, inputs, imagine)
 
 
 def _sketch(episode: Episode, index: int, inputs: StepInputs, imagine: bool = True) -> Sketch:
     sampler, observations = episode.planner.sampler, inputs.observations
-    surface: MeanSurface | None
-    if isinstance(observations.hypotheses, PartHypotheses):
-        surface = likeliest_part(observations.hypotheses)
-    else:
-        surface = as_shown(mean_surface(sampler, inputs), observations.cloud)
+    surface = shown_surface(sampler, inputs)
     patches = [] if surface is None else unmeasured(surface.mesh, observations, sampler.carving)
-    seen = None
-    if imagine and index < len(episode.views):
-        seen = imagined(episode, index, inputs)
-    return Sketch(surface, seen, patches)
+    samples = imagined(episode, index, inputs) if imagine and index < len(episode.views) else None
+    return Sketch(surface, samples, patches)

@@ -1,4 +1,4 @@
-"""The scene in space, for a reader of the page who turns it: plotly's figures of what stands in it."""
+"""The scene in 3-D, which a reader of the page can turn: figures of plotly."""
 
 from typing import Any
 
@@ -8,25 +8,28 @@ from jaxtyping import Float, Int
 
 from jaxnbv.viz.data import ReportData
 from jaxnbv.viz.mean_surface import MeanSurface
-from jaxnbv.viz.placed_part import PlacedPart
+from jaxnbv.viz.placed_shape import PlacedShape
 from jaxnbv.viz.scene import Cameras, Points, frustum, seen_items
-from jaxnbv.viz.style import DEVIATION, INK, PART, colour_scale
+from jaxnbv.viz.style import DEVIATION, GHOST, IMAGINED, INK, OPEN, PART, colour_scale
 
-# Of all views together, so that a long episode stays a small page.
+# Limits for all views together, so that a long episode has a small page.
 _POINTS, _VERTICES, _FEWEST_VERTICES = 18_000, 24_000, 1500
 # Coordinates are rounded to this, in scene units: a power of two, whose multiples pack well.
 _GRAIN = 1 / 256
+_GLASS = {"color": GHOST, "opacity": 0.25}
 _LIGHT = {"ambient": 0.72, "diffuse": 0.45, "specular": 0.04, "roughness": 0.9}
 
 
 def figures_in_space(data: ReportData) -> list[go.Figure]:
-    """One figure a view. Its legend switches what is shown, which stays from one view to the next."""
+    """One figure per view. What its legend hides stays hidden in the next view."""
     stage, count, figures = data.stage, max(len(data.views), 6), []
     points, vertices = _POINTS // count, max(_VERTICES // count, _FEWEST_VERTICES)
     grades = np.log10(data.deviations)
     for index, view in enumerate(data.views):
         poses = [stage.pulled(other.pose) for other in data.views[: index + 1]]
         drawn = [] if view.surface is None else [_mesh(view.surface, vertices, grades)]
+        if isinstance(view.surface, PlacedShape) and view.surface.ghost is not None:
+            drawn.append(_triangles(view.surface.ghost, vertices // 2, _named("other shapes") | _GLASS))
         for item in seen_items(view.before, view.new, poses, data.camera, stage.depth):
             drawn += _points(item, points) if isinstance(item, Points) else _cameras(item)
         figures.append(go.Figure(drawn, _layout(stage.eye, stage.extent)))
@@ -50,7 +53,7 @@ def _layout(eye: Float[np.ndarray, "3"], extent: float) -> dict[str, Any]:
 
 
 def _placed(places: Float[np.ndarray, "n 3"]) -> dict[str, Any]:
-    """Coordinates by plotly's names: it turns a scene about its own z, which is our y."""
+    """Coordinates by plotly's names. Plotly turns a scene about its own z, which is our y."""
     x, y, z = (_GRAIN * np.round(np.asarray(places, np.float64).T / _GRAIN)).astype(np.float32)
     return {"x": z, "y": x, "z": y}
 
@@ -83,21 +86,28 @@ def _cameras(item: Cameras) -> list[dict[str, Any]]:
 
 
 def _mesh(surface: MeanSurface, limit: int, grades: Float[np.ndarray, "2"]) -> dict[str, Any]:
-    """A coarser mesh, coloured by the logarithm of its deviation; a known part plain."""
+    """A coarser mesh, coloured by the logarithm of its deviation; a known shape by what is measured of it."""
+    if isinstance(surface, PlacedShape):
+        # Open, imagined, scanned.
+        scale = [[0.0, OPEN], [0.5, IMAGINED], [1.0, PART]]
+        grade = np.maximum(surface.measured, 0.5 * surface.agreed)
+        looks = _named("likeliest shape") | {"cmin": 0.0, "cmax": 1.0, "colorscale": scale}
+    else:
+        grade = np.log10(surface.deviation)
+        looks = _named("surface of the mean")
+        looks |= {"cmin": grades[0], "cmax": grades[1], "colorscale": colour_scale(DEVIATION)}
+    return _triangles(surface, limit, looks | {"showscale": False}, grade)
+
+
+def _triangles(
+    surface: MeanSurface, limit: int, looks: dict[str, Any], grade: Float[np.ndarray, " v"] | None = None
+) -> dict[str, Any]:
+    """A coarser mesh of at most `limit` vertices, coloured by a grade if there is one."""
     own, faces = clustered(surface.vertices, surface.faces, limit)
     count = np.bincount(own)
     vertices = np.stack([np.bincount(own, column) / count for column in surface.vertices.T], axis=1)
-    looks: dict[str, Any] = {**_named("likeliest part"), "color": PART}
-    if not isinstance(surface, PlacedPart):
-        deviation = np.bincount(own, np.log10(surface.deviation)) / count
-        looks = {
-            **_named("surface of the mean"),
-            "intensity": np.round(deviation, 2).astype(np.float32),
-            "cmin": grades[0],
-            "cmax": grades[1],
-            "colorscale": colour_scale(DEVIATION),
-            "showscale": False,
-        }
+    if grade is not None:
+        looks = looks | {"intensity": np.round(np.bincount(own, grade) / count, 2).astype(np.float32)}
     return {
         "type": "mesh3d",
         **looks,
@@ -111,8 +121,10 @@ def _mesh(surface: MeanSurface, limit: int, grades: Float[np.ndarray, "2"]) -> d
 def clustered(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], limit: int
 ) -> tuple[Int[np.ndarray, " v"], Int[np.ndarray, "g 3"]]:
-    """A coarser mesh of at most `limit` vertices: the cluster of each vertex, those within one cell of a lattice, and
-    the faces between clusters (Rossignac and Borrel 1993)."""
+    """A coarser mesh of at most `limit` vertices, one per cell of a lattice (Rossignac and Borrel 1993).
+
+    Returns the new index of each vertex, and the faces.
+    """
     own = np.arange(len(vertices))
     cell = 0.01
     while own.max(initial=-1) + 1 > limit:

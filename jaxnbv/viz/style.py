@@ -13,8 +13,8 @@ from jaxnbv.storage.files import write_whole
 
 INK, GREY, LINE = "#1f2733", "#7a8494", "#d9dee6"
 BEFORE, NEW = "#26344d", "#d55e00"
-# A known part, where it is taken to lie.
-PART = "#8fd6bd"
+# A known shape where it was registered: what was scanned, what is imagined, what is still open, and other shapes there.
+PART, IMAGINED, OPEN, GHOST = "#6cc5a6", "#d7efe6", "#d5d0ec", "#8c7fc0"
 # For several numbers in one chart (Okabe and Ito), apart from NEW, which marks the true one.
 SERIES = ["#0072b2", "#56b4e9", "#009e73", "#e69f00", "#cc79a7", "#7a8494", "#26344d", "#b8b04a"]
 # Pale where the surface is known, dark where it is not: the scanned points stand out on what is known.
@@ -35,7 +35,7 @@ def gradient(colours: Colormap) -> str:
 
 
 def middle_range(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
-    """The range of some positive values in steps of 1, 2, 5; it leaves out a fiftieth of them at either end."""
+    """Range of positive values, rounded to 1, 2, 5, without the outer 2 % at either end."""
     low, high = np.percentile(values, [2.0, 98.0])
     ticks = log_ticks(low / 10.0, high * 10.0)
     return float(ticks[ticks <= low * 1.0001].max()), float(ticks[ticks >= high * 0.9999].min())
@@ -49,8 +49,7 @@ def log_ticks(low: float, high: float) -> Float[np.ndarray, " n"]:
 
 
 def bar_ticks(low: float, high: float) -> list[float]:
-    """Numbers under a bar of logarithms from `low` to `high`: at most five powers of ten, or both ends where there is
-    one at most."""
+    """Ticks of a logarithmic colour bar: two to five powers of ten, or else both ends."""
     decades = [tick for tick in log_ticks(low, high).tolist() if round(np.log10(tick), 9).is_integer()]
     return decades[:: -(-len(decades) // 5)] if len(decades) > 1 else [low, high]
 
@@ -62,5 +61,5 @@ def framed(axes: Axes, colour: str, width: float) -> None:
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """As a PNG file that is whole or not there."""
+    """Write a figure as a PNG file, which is complete or absent."""
     write_whole(path, lambda file: figure.savefig(file, format="png", dpi=200))

@@ -27,7 +27,7 @@ from jaxnbv.viz.answers import Chart, CoverageAnswer, capital, words_of
 
 
 class Rival(NamedTuple):
-    """Another search from the same first view: its name and how it fared, in words; its charts, as of a `Task`."""
+    """Another search from the same first view: its name, its result in words, and charts as of a `Task`."""
 
     name: str
     words: str
@@ -36,13 +36,13 @@ class Rival(NamedTuple):
 
 
 class Task(NamedTuple):
-    """What the views were for.
+    """The task of an episode, with its answers after each view.
 
-    - `amounts`: how much of the surface was seen after each view, and `seen`, the chart of it.
-    - `answers`: after each view, and their `charts`; they are the amounts, where nothing else is asked.
-    - `question`, `asked`, `found`, `sure`: what was asked and how, what was found and since when, for the head of the
-      report.
-    - `rival`: how another search fared; None without one.
+    - `amounts`, `seen`: surface seen after each view, and its chart.
+    - `answers`, `charts`: answers after each view, and their charts. Without a question these are the amounts.
+    - `question`, `asked`, `found`, `sure`: for the head of the report, the question, how views were chosen, the answer,
+      and since when it is reliable.
+    - `rival`: result of another search, or None.
     """
 
     amounts: Sequence[CoverageAnswer]
@@ -61,14 +61,20 @@ class Task(NamedTuple):
         return self.answers is self.amounts
 
 
-def task_of(episode: Episode, truth: Float[AnyArray, "n 3"] | None = None, rival: Episode | None = None) -> Task:
-    """The task of an episode's acquisition; that of seeing all of the surface, where it answers nothing.
+def task_of(
+    episode: Episode,
+    truth: Float[AnyArray, "n 3"] | None = None,
+    rival: Episode | None = None,
+    replayed: Sequence[Observations] | None = None,
+) -> Task:
+    """The task of an episode's acquisition, or to see all of the surface if the acquisition has no answer.
 
     - `truth`: points of the true surface, in scene coordinates.
     - `rival`: an episode of another search from the same first view.
+    - `replayed`: observations after each view, if they are already computed.
     """
     planner = episode.planner
-    seen, true = seen_after(episode, truth), None
+    seen, true = seen_after(episode, truth, replayed), None
     answers = _answers(episode, episode.views) or seen
     if episode.scene is not None and answers is not seen:
         cloud = true_cloud(episode.scene, planner.capacity)
@@ -102,17 +108,24 @@ def _answers(episode: Episode, views: Sequence[View]) -> Sequence[Answer]:
     return said if len(said) == len(answers) else []
 
 
-def seen_after(episode: Episode, truth: Float[AnyArray, "n 3"] | None) -> list[CoverageAnswer]:
-    """How much of the surface was seen after each view: the share of the true one, of which points are given in scene
-    coordinates; else the area that each scan shows and none before it has shown, summed up: what is new to the
-    acquisition where it is a `NewSurface`, and to the default one where not. What was measured at a slant counts for
-    all of its area here, and for less where it is promised. Areas are in world units."""
+def seen_after(
+    episode: Episode, truth: Float[AnyArray, "n 3"] | None, replayed: Sequence[Observations] | None = None
+) -> list[CoverageAnswer]:
+    """How much of the surface was seen after each view.
+
+    With a true surface this is the seen share of it. Without one it is the sum of the new areas that scans show, in
+    world units. New is what `NewSurface` counts as new, with the settings of the acquisition if it is one. An area
+    measured at a slant counts in full here, but for less in the acquisition.
+
+    - `truth`: points of the true surface, in scene coordinates.
+    - `replayed`: observations after each view, if they are already computed.
+    """
     views, acquisition = episode.views, episode.planner.acquisition
     if truth is not None:
         shares = [100.0 * float(share) for share in coverage(views, truth)]
         return [CoverageAnswer(("of the surface seen",), np.array([share])) for share in shares]
     of = new_surface_of(acquisition)
-    before = itertools.chain([None], episode.observations())
+    before = itertools.chain([None], episode.observations() if replayed is None else replayed)
     new = [
         float(_new_area(of, seen, ImaginedView(view.scan, view.camera, view.pose)))
         for seen, view in zip(before, views, strict=False)
@@ -128,7 +141,7 @@ def _new_area(of: NewSurface, before: Observations | None, view: ImaginedView) -
 
 
 def true_cloud(scene: Surface, count: int) -> PointCloud | None:
-    """Points all over a known surface with their normals, uniform by area; None for a kind that cannot be sampled."""
+    """Points with normals, uniform by area, of a known surface. None if it cannot be sampled."""
     mesh = true_mesh(scene)
     if mesh is None:
         return None
@@ -164,8 +177,10 @@ def search_name(episode: Episode) -> str:
 
 
 def race_words(rival: Episode, episode: Episode) -> str:
-    """How many views another search took, from the same first view, or that they were not enough for the rule that
-    ended the episode; of an acquisition that answers, what was found."""
+    """A sentence about another search from the same first view: its number of views, and its answer.
+
+    It says if they were not enough for the rule that ended the episode.
+    """
     name, count = search_name(rival).capitalize(), len(rival.views)
     answers = _answers(episode, rival.views)
     views = f"{count} view{'s' * (count > 1)}"

@@ -1,4 +1,4 @@
-"""What happened at every view, in words."""
+"""Words about each view: where it looks from, why it was chosen, what came of it."""
 
 from collections.abc import Sequence
 
@@ -21,19 +21,19 @@ def told(
     frame: Frame,
     gain: float | None = None,
 ) -> dict[str, str]:
-    """What happened at the last of some views: where it looks from, what was expected of it, how that stands beside the
-    other candidates, what came; each by its heading, and left out where there is none.
+    """Sentences about the last of some views, by heading: pose, expectation, other candidates, result.
 
-    - `views`: with the values of their proposals in world units; `frame`: of that world.
-    - `seen`: how much was seen after each view; `gain`: what the last one truly gave of what it promised, in world
-      units, where that is known.
+    - `views`: views with the values of their proposals in world units.
+    - `seen`: how much was seen after each view.
+    - `frame`: frame of the world.
+    - `gain`: what the last view truly gave of its promise, in world units; None if unknown.
     """
     *earlier, view = views
     points, amount = int(view.scan.count), seen[-1].amount
     if view.proposal is None or not earlier:
         of = "the true surface" if seen[-1].unit == "%" else "surface"
-        found = f"It found {points:,} points, {amount} of {of}."
-        return {"Where": f"It was given. It looks from {place(view.pose, frame)}.", "What came": found}
+        result = f"It found {points:,} points, {amount} of {of}."
+        return {"Where": f"It was given. It looks from {place(view.pose, frame)}.", "What came": result}
     here, there = directions_of(view.pose), np.stack([directions_of(other.pose) for other in earlier])
     nearest = np.degrees(np.arccos(np.clip((there @ here).max(), -1.0, 1.0)))
     added = f"It added {points:,} points ({int(view.cloud.count):,} are kept)" if points else "It saw nothing"
@@ -49,7 +49,7 @@ def told(
 
 
 def _reason(quantity: Quantity, proposal: Proposal, frame: Frame) -> dict[str, str]:
-    """What was expected of a view, and how that stands beside the other candidates."""
+    """Sentences about the value of a view and those of the other candidates."""
     value, others, tied = float(proposal.value), best_first(proposal).tolist(), proposal.num_tied
     if not quantity.smooth:
         return {"What it promised": f"It was drawn at random from {len(others)} open candidates."}
@@ -61,7 +61,9 @@ def _reason(quantity: Quantity, proposal: Proposal, frame: Frame) -> dict[str, s
     if climbed and proposal.trajectories is not None:
         starts = len(proposal.trajectories.values)
         how = f"found by gradient ascent from {starts} start{'s' * (starts > 1)}"
-    said = {"What it promised": f"Its {quantity.name}, {shown_value(quantity, value, frame)}, was {how}."}
+    # A reader knows areas and lengths, but not nats.
+    amount = f"Its value, {shown_value(quantity, value, frame)}," if quantity.length_power else "Its value"
+    said = {"What it promised": f"{amount} was {how}."}
     rest = others if climbed or rank > 1 else others[1:]
     if rest:
         vain = 0.0 if proposal.value_at_visited is None else float(proposal.value_at_visited)
@@ -73,8 +75,7 @@ def _reason(quantity: Quantity, proposal: Proposal, frame: Frame) -> dict[str, s
 
 
 def place(pose: Pose, frame: Frame) -> str:
-    """A camera's position in the world of a frame, and its elevation over the horizon; by how much it looks past the
-    scene's origin, where it does."""
+    """A camera's position in the world of a frame, its elevation, and how far it aims off the origin."""
     position, forward = (np.asarray(vector, dtype=np.float64) for vector in (pose.position, pose.forward))
     elevation = np.degrees(np.arcsin(unit(position)[1]))
     side = "above" if elevation >= 0 else "below"

@@ -1,4 +1,4 @@
-"""Pictures that can be read: letters that do not collide and are not cut; a page that stays small."""
+"""Legible pictures: letters that neither collide nor are cut, and a small page."""
 
 import dataclasses
 import gzip
@@ -31,27 +31,28 @@ from jaxnbv.viz.task import Rival
 
 @pytest.fixture(scope="module")
 def episode():
-    """Of 13 candidates: the second view stands out; the third is tied with another, which its picture marks."""
+    """An episode over 13 candidates. The second view stands out. The third is tied with another, which its picture
+    marks."""
     return small_run(nbv.DiscreteSearch(13))
 
 
 @pytest.fixture(scope="module")
 def data(episode):
-    """Without surfaces, which take long to paint and have no letters."""
+    """Data without surfaces, which take long to paint and have no letters."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("jaxnbv.viz.sketches.mean_surface", lambda *arguments: None)
+        patch.setattr("jaxnbv.viz.shown_surface.mean_surface", lambda *arguments: None)
         return report_data(episode, progress=False)
 
 
 def of_views(data, count):
-    """The data of an episode of so many views, the same ones again and again."""
+    """The data of an episode with `count` views, the same ones repeated."""
     views = tuple(itertools.islice(itertools.cycle(data.views), count))
     charts = tuple(chart._replace(values=np.resize(chart.values, (count, 1))) for chart in data.task.charts)
     return dataclasses.replace(data, views=views, task=data.task._replace(charts=charts, seen=charts[0]))
 
 
 def texts(figure):
-    """What is written in a figure and where, but for the numbers of cameras, which stand where these do."""
+    """Texts of a figure and their places, without the numbers of cameras."""
     scenes = [axes for axes in figure.axes if axes.images and not axes.axison]
     numbers = {id(text) for axes in scenes for text in axes.texts}
     renderer = FigureCanvasAgg(figure).get_renderer()
@@ -60,15 +61,15 @@ def texts(figure):
         for axis in (axes.xaxis, axes.yaxis):
             low, high = sorted(axis.get_view_interval())
             beyond = [not low - 1e-9 <= at <= high + 1e-9 for at in axis.get_majorticklocs()]
-            # Ticks beyond the axis are not drawn, though they say that they are visible.
+            # Ticks beyond the axis are not drawn, although they claim to be visible.
             numbers |= {id(tick.label1) for tick, is_off in zip(axis.get_major_ticks(), beyond, strict=True) if is_off}
-    shown = [
+    labels = [
         text
         for text in figure.findobj(Text)
         if text.get_visible() and text.get_text().strip() and id(text) not in numbers
     ]
     drawn = []
-    for text in shown:
+    for text in labels:
         axis_off = text.axes is not None and not text.axes.axison
         if not axis_off or text in text.axes.texts:
             drawn.append((text.get_text(), text.get_window_extent(renderer)))
@@ -76,12 +77,12 @@ def texts(figure):
 
 
 def check_letters(figure):
-    found = texts(figure)
-    assert found
-    for text, box in found:
+    labels = texts(figure)
+    assert labels
+    for text, box in labels:
         inside = box.x0 >= -1 and box.y0 >= -1 and box.x1 <= figure.bbox.width + 1 and box.y1 <= figure.bbox.height + 1
         assert inside, f"{text!r} is cut: {box.extents} of {figure.bbox.size}"
-    for (one, here), (other, there) in itertools.combinations(found, 2):
+    for (one, here), (other, there) in itertools.combinations(labels, 2):
         width = min(here.x1, there.x1) - max(here.x0, there.x0)
         height = min(here.y1, there.y1) - max(here.y0, there.y0)
         assert width < 1 or height < 1, f"{one!r} and {other!r} collide: {here.extents}, {there.extents}"
@@ -93,7 +94,7 @@ LONG = Quantity(
 
 
 def why(data, index):
-    """Why a view was chosen, as the page draws it."""
+    """The figure of why a view was chosen, as on the page."""
     figure = Figure(figsize=(5.2, 4.3))
     draw_choice(figure, data.views[index].proposal, data.quantity, nbv.Frame())
     return figure
@@ -102,14 +103,14 @@ def why(data, index):
 @pytest.mark.parametrize("count", [1, 2, 3, 7])
 @pytest.mark.parametrize("quantity", [None, LONG])
 def test_letters_neither_collide_nor_are_cut(data, count, quantity):
-    shown = of_views(data, count)
-    shown = shown if quantity is None else dataclasses.replace(shown, quantity=quantity)
+    subset = of_views(data, count)
+    subset = subset if quantity is None else dataclasses.replace(subset, quantity=quantity)
     with mpl.rc_context(STYLE):
-        check_letters(overview_figure(shown))
-        for _, figure in (*task_charts(shown), *other_charts(shown)):
+        check_letters(overview_figure(subset))
+        for _, figure in (*task_charts(subset), *other_charts(subset)):
             check_letters(figure)
         if count <= 3:
-            check_letters(why(shown, count - 1))
+            check_letters(why(subset, count - 1))
 
 
 @pytest.mark.parametrize("low", [1e-4, 2e-3, 0.04])
@@ -139,7 +140,7 @@ def test_ticks_are_powers_of_ten_or_both_ends():
 
 
 def ball():
-    """A fine mesh of the unit sphere, which is known to 0.01 above and 0.1 below."""
+    """A fine mesh of the unit sphere, known to 0.01 above and to 0.1 below."""
     mesh = trimesh.creation.icosphere(subdivisions=6)
     vertices = np.asarray(mesh.vertices)
     return MeanSurface(vertices, np.asarray(mesh.faces), vertices, np.where(vertices[:, 1] > 0, 0.01, 0.1))
@@ -156,24 +157,24 @@ def test_a_clustered_mesh_keeps_its_shape():
     volume = abs(np.sum(np.einsum("ij,ij->i", a, np.cross(b, c)))) / 6.0
     assert volume == pytest.approx(4 * np.pi / 3, rel=0.03)
     assert len(np.unique(faces)) <= own.max() + 1
-    same, kept = clustered(surface.vertices, surface.faces, 10**6)
+    same, same_surface = clustered(surface.vertices, surface.faces, 10**6)
     np.testing.assert_array_equal(same, np.arange(len(surface.vertices)))
-    np.testing.assert_array_equal(kept, np.unique(surface.faces, axis=0))
+    np.testing.assert_array_equal(same_surface, np.unique(surface.faces, axis=0))
 
 
 def test_ten_views_of_fine_surfaces_make_a_small_page(data):
-    """Plotly takes 2 MB, packed, and the pictures of a view less than 0.1 MB."""
-    shown = of_views(data, 10)
-    views = tuple(dataclasses.replace(view, surface=ball()) for view in shown.views)
-    figures = figures_in_space(dataclasses.replace(shown, views=views))
+    """Plotly takes 2 MB, compressed, and the pictures of a view less than 0.1 MB."""
+    subset = of_views(data, 10)
+    views = tuple(dataclasses.replace(view, surface=ball()) for view in subset.views)
+    figures = figures_in_space(dataclasses.replace(subset, views=views))
     assert sum(len(gzip.compress(figure.to_json().encode())) for figure in figures) < 5e5
     mesh = figures[9].data[0]
-    # Plotly's z is our y.
+    # Plotly's z is the scene's y.
     vertices, faces = np.stack([mesh.y, mesh.z, mesh.x], axis=1), np.stack([mesh.i, mesh.j, mesh.k], axis=1)
     assert faces.max() < len(vertices) == len(mesh.intensity)
     corners = vertices[faces]
     areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    # All of the sphere, and its outside outside.
+    # The mesh covers the whole sphere, with its outside outwards.
     assert 0.5 * np.linalg.norm(areas, axis=1).sum() == pytest.approx(4.0 * np.pi, rel=0.03)
     assert np.mean(np.sum(areas * corners.mean(axis=1), axis=1) > 0) > 0.99
     np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 1.0, atol=0.02)
@@ -193,18 +194,18 @@ def test_all_cameras_stand_beside_the_object_in_one_picture(episode):
 
 
 def test_the_picture_is_drawn_from_where_what_the_chosen_views_saw_is_not_hidden(episode):
-    """Points at the end of a box that is open to +x are seen from there only."""
+    """Points at the end of a box that is open to +x are visible only from there."""
     end = np.stack([*np.mgrid[0.0:0.1:1j, -0.4:0.4:8j, -0.4:0.4:8j]], axis=-1).reshape(-1, 3)
     scan = nbv.PointCloud.from_arrays(end, np.tile([1.0, 0.0, 0.0], (len(end), 1)))
-    seen = eqx.tree_at(lambda e: [v.scan for v in e.views], episode, [scan] * 3, is_leaf=lambda x: x is None)
+    scanned = eqx.tree_at(lambda e: [v.scan for v in e.views], episode, [scan] * 3, is_leaf=lambda x: x is None)
     sides = trimesh.creation.box((1.0, 1.0, 1.0))
     sides.apply_translation((0.5, 0.0, 0.0))
     sides.update_faces(sides.face_normals[:, 0] < 0.5)
-    assert stage_of(seen, [sides]).eye[0] > 0.8 > stage_of(seen, []).eye[0] > 0.2
+    assert stage_of(scanned, [sides]).eye[0] > 0.8 > stage_of(scanned, []).eye[0] > 0.2
 
 
 def test_a_record_without_standard_errors_is_drawn_too(data):
-    """As of a folder of an earlier version."""
+    """Records of earlier versions have none."""
     errors = [view.view.proposal for view in data.views[1:]]
     bare = [dataclasses.replace(one, standard_errors=None, difference_errors=None) for one in errors]
     old = eqx.tree_at(lambda d: [view.view.proposal for view in d.views[1:]], data, bare)

@@ -1,4 +1,4 @@
-"""What a notebook shows."""
+"""Representations in notebooks."""
 
 import base64
 import importlib
@@ -25,21 +25,21 @@ from jaxnbv.viz.notebook import drawing_of, html_of
 
 @pytest.fixture(scope="module")
 def episode():
-    """Of a ball of radius 1, seen from two sides."""
+    """An episode of a ball of radius 1, seen from two sides."""
     scene, first = nbv.SDFSurface(Sphere(1.0)), nbv.look_at((0.0, 0.0, 2.5))
     return small_run(nbv.DiscreteSearch(12), 2, scene, noise=nbv.SensorNoise(0.0, 0.0), first=first)
 
 
-def parts(shown):
+def parts(value):
     """The size of the picture, and the caption."""
-    text = html_of(shown)
+    text = html_of(value)
     image = Image.open(io.BytesIO(base64.b64decode(re.search('base64,([^"]+)"', text).group(1))))
     return image.size, re.search("<figcaption>(.*)</figcaption>", text).group(1)
 
 
-def drawn(shown):
+def drawn(value):
     axes = Figure().add_axes((0, 0, 1, 1))
-    drawing_of(shown).draw(axes)
+    drawing_of(value).draw(axes)
     return axes
 
 
@@ -53,16 +53,16 @@ def test_each_is_a_small_picture_and_a_line(episode):
         (episode, f"2 views by expected coverage gain, {count:,} points"),
         (episode.planner.sampler.model.condition(episode.cloud), "level "),
     )
-    for shown, expected in facts:
-        size, caption = parts(shown)
+    for value, expected in facts:
+        size, caption = parts(value)
         assert size == (264, 264)
         assert expected in caption
-        assert len(html_of(shown)) < 100_000
+        assert len(html_of(value)) < 100_000
     assert "12 candidates" in parts(proposal)[1]
 
 
 def test_a_cloud_is_seen_from_where_its_normals_look(episode):
-    """A half of the ball: its middle is the brightest, its rim dark; the box is as wide as what was seen."""
+    """A half of the ball is brightest in its middle and dark at its rim. The box is as wide as the scanned part."""
     scan = episode.views[0].scan
     points = scan.to_numpy()[0]
     (dots,) = drawn(scan).collections
@@ -96,13 +96,13 @@ def test_a_proposal_has_its_star_and_an_episode_its_cameras(episode):
 def test_what_has_no_picture_has_its_facts():
     none = nbv.PointCloud(jnp.zeros((7, 3)), jnp.zeros((7, 3)), jnp.zeros(7, bool))
     assert html_of(none) == "<div>0 points of at most 7</div>"
-    several = jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), none)
-    assert html_of(several) == "<div>a batch (3,) of clouds of up to 7 points</div>"
+    batch = jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), none)
+    assert html_of(batch) == "<div>a batch (3,) of clouds of up to 7 points</div>"
 
 
 def test_an_episode_is_shown_in_a_strip(episode, monkeypatch):
-    """Without surfaces, which take long; the figure is tested with the report's."""
-    monkeypatch.setattr("jaxnbv.viz.sketches.mean_surface", lambda *arguments: None)
+    """Without surfaces, which take long. The tests of the report cover the figure."""
+    monkeypatch.setattr("jaxnbv.viz.shown_surface.mean_surface", lambda *arguments: None)
     image = Image.open(io.BytesIO(nbv.show(episode, progress=False)._repr_png_()))
     assert image.width == 480
     assert image.height > 300
@@ -110,8 +110,8 @@ def test_an_episode_is_shown_in_a_strip(episode, monkeypatch):
 
 def test_others_are_shown_large(episode):
     posterior = episode.planner.sampler.model.condition(episode.cloud)
-    for shown in (episode.cloud, episode.observations_after(2), episode.views[1].proposal, posterior):
-        assert Image.open(io.BytesIO(nbv.show(shown)._repr_png_())).size == (528, 528)
+    for value in (episode.cloud, episode.observations_after(2), episode.views[1].proposal, posterior):
+        assert Image.open(io.BytesIO(nbv.show(value)._repr_png_())).size == (528, 528)
     with pytest.raises(nbv.InputError, match="no picture: DiscreteSearch by expected coverage gain over"):
         nbv.show(episode.planner)
 
@@ -124,19 +124,19 @@ def test_a_session_tells_its_images_and_the_next_view():
     scan = nbv.scan(nbv.SDFSurface(Sphere(1.0)), camera, pose)
     session.add(np.asarray((scan.points - pose.position) @ pose.forward).reshape(12, 12), np.asarray(pose.matrix))
     assert "1 view by" in parts(session)[1]
-    asked = session.next()
-    assert parts(session)[1].endswith(f"the next view is worth {asked.value:.4g}")
+    proposal = session.next()
+    assert parts(session)[1].endswith(f"the next view is worth {proposal.value:.4g}")
     assert [text.get_text() for text in drawn(session).texts] == ["1"]
 
 
 def test_ipython_is_told_how_they_are_shown(monkeypatch, episode):
-    """By its own formatter, as a notebook asks it; a subclass is shown as its parent."""
+    """Through IPython's own formatter, as in a notebook. A subclass has the representation of its parent."""
     formatter = HTMLFormatter()
     shell = SimpleNamespace(display_formatter=SimpleNamespace(formatters={"text/html": formatter}))
     monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))
     importlib.reload(nbv)
     posterior = episode.planner.sampler.model.condition(episode.cloud)
     observations, proposal = episode.observations_after(2), episode.views[1].proposal
-    for shown in (episode, episode.cloud, observations, proposal, posterior, episode.planner):
-        assert formatter(shown) == html_of(shown)
+    for value in (episode, episode.cloud, observations, proposal, posterior, episode.planner):
+        assert formatter(value) == html_of(value)
     assert formatter(episode.planner.camera) is None

@@ -1,4 +1,5 @@
-"""The task by view: its numbers, what is true, since when it is sure; in the answers and on the page."""
+"""The task by view: its numbers, the truth, and the view from which the answer is sure, in the answers and on the
+page."""
 
 import dataclasses
 import html
@@ -34,7 +35,7 @@ NAMES = ("left", "right", "up")
 
 
 class Leaning(Classifier):
-    """A classifier that looks at where the points are."""
+    """A classifier by the positions of the points."""
 
     @property
     def classes(self):
@@ -55,9 +56,9 @@ def run(score, scene, views=3):
 
 @pytest.fixture(scope="module")
 def plain(request):
-    """Pictures of surfaces take long, and have nothing to do with the numbers."""
+    """No pictures of surfaces, which take long and do not affect the numbers."""
     patch = pytest.MonkeyPatch()
-    patch.setattr("jaxnbv.viz.sketches.mean_surface", lambda *arguments: None)
+    patch.setattr("jaxnbv.viz.shown_surface.mean_surface", lambda *arguments: None)
     yield
     patch.undo()
 
@@ -68,7 +69,7 @@ def page_of(episode):
 
 
 def head(text):
-    """The rows at the head of the page."""
+    """Rows at the head of the page."""
     return {name: html.unescape(value) for name, value in re.findall(r"<dt>(\w+)</dt><dd[^>]*>([^<]*)</dd>", text)}
 
 
@@ -91,7 +92,7 @@ def test_probabilities_by_view_are_those_of_the_classifier(plain):
     best = int(np.argmax(expected[-1]))
     assert head(text)["Found"].startswith(f"{NAMES[best].capitalize()}, probability {expected[-1][best]:.2f}")
     assert head(text)["Found"].endswith("In truth: right")
-    assert "Which class is it?" in text
+    assert "What is it?" in text
 
 
 def test_a_utility_of_ones_own_has_its_chart_and_its_truth(plain):
@@ -137,34 +138,34 @@ def test_a_class_is_not_known_of_a_scene_without_one():
     ball, cloud = nbv.SDFSurface(Sphere(0.9)), nbv.PointCloud.from_arrays([[0.0, 0.9, 0.0]], [[0.0, 1.0, 0.0]])
     for score in (nbv.CrossEntropy(Leaning()), nbv.tasks.EntropyReduction(Leaning())):
         assert score.true_answer(ball, cloud) is None
-        known = score.true_answer(nbv.SDFSurface(pyramid_scene(Split.TEST, 2)), cloud)
-        np.testing.assert_array_equal(known.values, [0.0, 0.0, 1.0])
-        # The classifier tells three classes apart: a fourth is none of its.
+        true_answer = score.true_answer(nbv.SDFSurface(pyramid_scene(Split.TEST, 2)), cloud)
+        np.testing.assert_array_equal(true_answer.values, [0.0, 0.0, 1.0])
+        # The classifier knows three classes. The fourth is none of them.
         assert score.true_answer(nbv.SDFSurface(pyramid_scene(Split.TEST, 3)), cloud) is None
 
 
 def test_heat_is_charted_by_temperature_and_distance():
-    found = Coldest(("coldest",), np.array([0.4]), point=np.array([1.0, 0.0, 2.0]))
+    answer = Coldest(("coldest",), np.array([0.4]), point=np.array([1.0, 0.0, 2.0]))
     truth = Coldest(("coldest",), np.array([0.1]), point=np.array([1.0, 3.0, -2.0]))
-    temperature, distance = words_of(found).charts([truth, found], truth)
+    temperature, distance = words_of(answer).charts([truth, answer], truth)
     np.testing.assert_array_equal(temperature.values, [[0.1], [0.4]])
     assert temperature.true == [0.1]
     np.testing.assert_array_equal(distance.values, [[0.0], [5.0]])
-    (alone,) = words_of(found).charts([found], None)
+    (alone,) = words_of(answer).charts([answer], None)
     assert alone.true is None
 
 
 def test_parts_are_found_by_their_points():
-    found = PartAnswer(("a", "b", "c", "d"), np.array([70.0, 59.0, 60.0, 500.0]), parts=(0, 1, 2))
+    answer = PartAnswer(("a", "b", "c", "d"), np.array([70.0, 59.0, 60.0, 500.0]), parts=(0, 1, 2))
     truth = PartAnswer(("a", "b", "c", "d"), np.array([4.0, 9.0, 0.0, 0.0]), parts=(0, 1, 2), target=1.0)
-    count, points = words_of(found).charts([truth, found], truth)
+    count, points = words_of(answer).charts([truth, answer], truth)
     np.testing.assert_array_equal(count.values, [[0.0], [2.0]])
     assert count.true == [2.0]
     np.testing.assert_array_equal(points.values, [[4.0, 9.0, 0.0], [70.0, 59.0, 60.0]])
-    assert words_of(found).found == "a, c"
-    # However few points a part has of the whole surface, the object has it.
+    assert words_of(answer).found == "a, c"
+    # Any part with points on the whole surface belongs to the object.
     assert words_of(truth).found == "a, b"
-    assert words_of(found).settled([truth, found], never) == [False, False]
+    assert words_of(answer).settled([truth, answer], never) == [False, False]
     last = PartAnswer(("a",), np.array([60.0]), parts=(0,))
     assert words_of(last).settled([last], never) == [True]
 
@@ -174,7 +175,7 @@ def classes(*rows):
 
 
 def settled(answers):
-    """By a rule that asks nothing but the probability."""
+    """By a rule that uses only the probability."""
     return words_of(answers[-1]).settled(
         answers, lambda rule, index: bool(answers[index].values.max() >= rule.probability)
     )
@@ -187,7 +188,7 @@ def settled(answers):
         (classes(0.96, 0.9, 0.97), 3),
         (classes(0.96, 0.97), 1),
         (classes(0.96, 0.94), None),
-        # Sure of one class, then of the other: not to be relied on before it says so twice.
+        # Sure of one class, then of the other. The second is reliable only once it is repeated.
         (classes(0.96, 0.03), None),
         (classes(0.96, 0.03, 0.02), 3),
         ([Answer(("x",), np.array([value])) for value in (1.0, 2.0, 2.05, 2.06)], 3),
@@ -207,7 +208,7 @@ def test_an_answer_that_was_lost_again_is_told(answers, view):
 
 
 def test_a_class_that_halves_of_the_points_do_not_tell_is_sure_nowhere():
-    """Certain of one class given all points, of the other given some halves of them."""
+    """Certain of one class given all points, and of the other given some halves of them."""
 
     def by_count(cloud):
         return jnp.log(jnp.where(cloud.count >= 40, jnp.array([0.99, 0.01]), jnp.array([0.01, 0.99])))
@@ -219,7 +220,7 @@ def test_a_class_that_halves_of_the_points_do_not_tell_is_sure_nowhere():
     task = task_of(episode)
     assert task.answers[-1].values.max() > 0.95
     assert task.sure.startswith("Not yet after 2 views")
-    # With no halves to ask, the first view is enough.
+    # Without halves to classify, the first view is enough.
     assert nbv.Sure(0.95, 0).reason(planner.acquisition, episode.cloud, KEY) is not None
 
 
@@ -230,10 +231,10 @@ def test_a_rival_is_told_of_and_drawn(plain):
     data = report_data(episode, progress=False, imagine=False, rival=other)
     rival = data.task.rival
     p = np.exp(np.asarray(Leaning()(other.cloud), np.float64))
-    found = f"{NAMES[int(np.argmax(p))]}, probability {p.max():.2f}"
-    assert rival.words == f"Farthest view took 3 views from the same start ({found})."
+    text = f"{NAMES[int(np.argmax(p))]}, probability {p.max():.2f}"
+    assert rival.words == f"Farthest view took 3 views from the same start ({text})."
     ended = dataclasses.replace(episode, stop_reason="sure of it")
-    assert race_words(other, ended) == f"Farthest view was not done after 3 views from the same start ({found})."
+    assert race_words(other, ended) == f"Farthest view was not done after 3 views from the same start ({text})."
     assert race_words(dataclasses.replace(other, stop_reason="sure of it"), ended).startswith(
         "Farthest view needed 3 views"
     )
@@ -252,7 +253,7 @@ def test_a_rival_is_told_of_and_drawn(plain):
 
 
 def test_a_rival_is_asked_what_the_episode_is_asked(plain):
-    """Though it would answer something else itself; without an answer it is told how many views it took."""
+    """Even if it would give another answer itself. Without an answer the number of its views is given."""
     scene, score = nbv.SDFSurface(pyramid_scene(Split.TEST, 1)), nbv.CrossEntropy(Leaning(), 512)
     other = small_run(nbv.FarthestView(8), 2, scene, nbv.Coverage(), nbv.SensorNoise(0.0, 0.0))
     (chart,) = report_data(run(score, scene, 2), progress=False, imagine=False, rival=other).task.rival.charts
@@ -266,9 +267,9 @@ def test_the_page_opens_with_the_answer_and_folds_the_settings_away(plain):
     episode = run(nbv.ExpectedUtilityImprovement(greatest_height), nbv.SDFSurface(Sphere(0.9)), views=2)
     _, text = page_of(episode)
     body = text[text.index("<body>") :]
-    asked, slider = body.index("<h1>"), body.index('id="slider"')
+    title, slider = body.index("<h1>"), body.index('id="slider"')
     folded = body.index("<summary>Settings and versions")
-    assert asked < body.index("<dt>Found</dt>") < body.index("<dt>Sure</dt>") < slider < folded
+    assert title < body.index("<dt>Found</dt>") < body.index("<dt>Sure</dt>") < slider < folded
     for setting in ("GeometricSPSR(", "RandomView(", "equinox "):
         assert setting in body[folded:]
         assert setting not in body[:folded]
@@ -281,7 +282,7 @@ def test_the_page_can_be_read_and_used_without_a_mouse_or_eyes(plain):
     assert len(ids) == len(set(ids))
     (slider,) = page.of("input")
     assert (slider["type"], slider["min"], slider["max"], slider["aria-label"]) == ("range", "1", "2", "View")
-    (spoken,) = (made for _, made, _ in page.elements if made.get("aria-live") == "polite")
+    (spoken,) = (element for _, element, _ in page.elements if element.get("aria-live") == "polite")
     assert spoken["id"] == slider["aria-describedby"]
     assert len(page.of("img")) >= 4
     assert all(len(attributes["alt"]) > 5 for attributes in page.of("img"))

@@ -1,4 +1,4 @@
-"""Which part it is, in words and pictures, against hypotheses that are given."""
+"""The identity and pose of a part in words and pictures, for given hypotheses."""
 
 import dataclasses
 
@@ -17,7 +17,7 @@ from jaxnbv.tasks.identification import identity_answer
 from jaxnbv.viz.answers import words_of
 from jaxnbv.viz.data import report_data
 from jaxnbv.viz.notebook import html_of
-from jaxnbv.viz.placed_part import likeliest_part, placed_parts
+from jaxnbv.viz.placed_shape import likeliest_part, likeliest_shape, placed_parts
 from jaxnbv.viz.report import report_html
 from jaxnbv.viz.task import task_of
 
@@ -27,7 +27,7 @@ TURN = np.asarray(rotation_about(np.array([0.0, 1.0, 0.0]), 0.4))
 
 
 def hypotheses(*weights):
-    """The slab in two places, then the left cube."""
+    """Hypotheses: the slab in two places, and the left cube."""
     shapes, shifts = jnp.array([1, 1, 0]), jnp.array([[0.2, 0.1, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     places = Placement(jnp.tile(jnp.asarray(TURN), (3, 1, 1)), shifts, jnp.ones((3, 3)))
     return PartHypotheses(
@@ -39,7 +39,7 @@ SLAB = hypotheses(0.5, 0.25, 0.2, 0.05)
 
 
 class Told(nbv.SurfaceModel):
-    """Knows the hypotheses, whatever was observed."""
+    """A model with these hypotheses for any observations."""
 
     hypotheses: PartHypotheses
     carries_hypotheses = True
@@ -65,6 +65,24 @@ def test_a_part_is_drawn_where_it_lies():
 def test_nothing_is_drawn_of_what_is_none_of_these():
     assert likeliest_part(hypotheses(0.3, 0.1, 0.1, 0.5)) is None
     assert likeliest_part(hypotheses(0.3, 0.2, 0.1, 0.4)).name == "slab"
+
+
+def test_a_shape_of_a_bank_is_drawn_as_registered_and_the_others_as_a_ghost():
+    """The slab is the likelier kind; the cube is taller, and so is the ghost. Points lie on the slab's top."""
+    bank = nbv.ShapeBank.of([Cuboid([0.7, 0.7, 0.7]), Cuboid([0.9, 0.3, 0.5])], ("cube 1", "slab 1"))
+    scale, still = jnp.array([[1.0, 1.0, 1.0], [1.0, 2.0, 1.0]]), jnp.tile(jnp.eye(3), (2, 1, 1))
+    placed = Hypotheses(jnp.array([0, 1]), Placement(still, jnp.zeros((2, 3)), scale), jnp.zeros(2), jnp.ones(2, bool))
+    corner = [[0.5, 0.6, 0.2], [0.6, 0.6, 0.2]]
+    cloud = nbv.PointCloud.from_arrays(corner, [[0.0, 1.0, 0.0]] * 2)
+    shape = likeliest_shape(bank, placed, np.array([0.2, 0.3, 0.5]), cloud)
+    assert (shape.name, shape.is_part) == ("slab", False)
+    assert shape.probability == pytest.approx(0.3)
+    np.testing.assert_allclose(np.abs(shape.vertices).max(axis=0), [0.9, 0.6, 0.5], atol=0.01)
+    near = np.linalg.norm(shape.vertices - corner[0], axis=1)
+    assert shape.measured[near < 0.05].min() == 1.0
+    assert shape.measured[near > 0.3].max() == 0.0
+    np.testing.assert_allclose(np.abs(shape.ghost.vertices).max(axis=0), 0.7, atol=0.05)
+    assert likeliest_shape(bank, placed, np.array([0.02, 0.03, 0.95]), cloud) is None
 
 
 def test_words_name_the_likeliest_and_none_of_these():
@@ -101,10 +119,10 @@ def test_a_report_shows_the_part_over_the_scan(episode):
     assert task_of(episode).asked.endswith("over the likeliest parts and how they may lie.")
     page = report_html(data, "thing")
     assert Page(page).tables["Probability"][1][0] == "view 1"
-    for words in ("Which part is it?", "Slab, probability 0.75", "The likeliest part where it is taken to lie"):
+    for words in ("Which part is it?", "Slab, probability 0.75", "The likeliest known shape where it fits"):
         assert words in page
     assert "What the colour measures" not in page
-    assert "likeliest part" in {drawn["name"] for drawn in scene_in_space(page)[1]["data"]}
+    assert "likeliest shape" in {drawn["name"] for drawn in scene_in_space(page)[1]["data"]}
     assert nbv.show(episode, progress=False).png.startswith(b"\x89PNG")
     assert "; slab  75 %" in html_of(episode)
 
@@ -114,10 +132,9 @@ def test_the_live_view_holds_the_part(episode):
     page = nbv.viz.LiveView(port=0)
     try:
         page.update(episode)
-        shown = {handle.name: handle for handle in page._drawn}
-        part = shown["/likeliest part, slab  75 %"]
-        np.testing.assert_allclose(part.vertices, likeliest_part(SLAB).vertices, atol=1e-5)
-        assert not shown["/imagined/2 cube left"].visible
+        by_name = {handle.name: handle for handle in page._drawn}
+        assert {"/likeliest part, slab  75 %", "/other shapes"} <= set(by_name)
+        assert not by_name["/imagined/2 cube left"].visible
         assert "slab 75 %" in page._text.content.lower()
         assert "likeliest part: slab" in page._legend.content
     finally:

@@ -1,0 +1,233 @@
+"""The known shape that the object most likely is, where it was registered, and what is still open about it."""
+
+import dataclasses
+from typing import NamedTuple, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+from jaxtyping import Array, Float
+from scipy.ndimage import map_coordinates
+from scipy.spatial import cKDTree
+
+from jaxnbv.checks import AnyArray
+from jaxnbv.geometry.cloud import PointCloud
+from jaxnbv.geometry.tensor_grid import on_tensor_grid
+from jaxnbv.programs import program
+from jaxnbv.scanning import Grid
+from jaxnbv.scanning.mesh import level_triangles
+from jaxnbv.scanning.sdf import SignedDistance
+from jaxnbv.surfaces.known_shapes import kind_of
+from jaxnbv.surfaces.part_hypotheses import NONE, PartHypotheses
+from jaxnbv.surfaces.registration import Hypotheses
+from jaxnbv.surfaces.shape_bank import ShapeBank
+from jaxnbv.viz.mean_surface import MeanSurface
+from jaxnbv.viz.sphere import unit
+
+_Values: TypeAlias = Float[np.ndarray, "_ _ _"]
+
+# Nodes of the grids on which a shape, and what is open about it, are extracted, and hypotheses compared; their half
+# extent relative to the shapes'.
+_NODES, _FINE, _COARSE, _ROOM = 128, 96, 48, 1.05
+# Probability of "none of these" from which no shape of a bank of examples is drawn: few objects fit an example exactly.
+_SURELY_NONE = 0.9
+# Number of hypotheses that say what is open, and the least share of their probability that makes space open.
+_RIVALS, _OPEN = 12, 0.1
+# Registrations differ by this much where they agree, and the surface of a share is this soft, in scene units.
+_TOLERANCE, _SOFTNESS = 0.05, 0.012
+# Open pieces smaller than this share of the shape's area are left out.
+_SMALLEST = 0.01
+# Surface this near to a scanned point counts as measured, and beyond twice this distance as imagined, in scene units.
+_NEAR = 0.06
+# Weight of normals in that distance: it separates the two sides of a sheet.
+_FACING = 0.1
+
+
+class PlacedShape(MeanSurface):
+    """A known shape where it was registered, in scene coordinates. Its deviation is zero.
+
+    - `name`, `probability`: name and probability of the part, or of the kind of shape.
+    - `measured`: for each vertex 1 where points were scanned, 0 where the shape is imagined.
+    - `agreed`: for each vertex 1 where most hypotheses have the same surface, 0 where few do.
+    - `ghost`: surface of the space that other hypotheses fill; None if there is no such space.
+    - `is_part`: whether it is a part at true size.
+    """
+
+    name: str
+    probability: float
+    measured: Float[np.ndarray, " v"]
+    agreed: Float[np.ndarray, " v"]
+    ghost: MeanSurface | None = None
+    is_part: bool = True
+
+    @property
+    def caption(self) -> str:
+        """Name and probability."""
+        return f"{self.name}  {100 * self.probability:.0f} %"
+
+
+class _Fits(NamedTuple):
+    """Some registered shapes with their probabilities, the one to be drawn first."""
+
+    bank: ShapeBank
+    placed: Hypotheses
+    weights: Float[np.ndarray, " h"]
+
+    @classmethod
+    def of(cls, bank: ShapeBank, placed: Hypotheses, weights: Float[np.ndarray, " h"], rows: list[int]) -> "_Fits":
+        """The fits in these rows."""
+        chosen = np.asarray(rows)
+        return cls(bank, jax.tree.map(lambda leaf: leaf[chosen], placed), weights / max(weights.sum(), 1e-30))
+
+
+def placed_parts(hypotheses: PartHypotheses, count: int) -> list[PlacedShape]:
+    """The likeliest parts, each in the likeliest of its placements."""
+    shapes, weights = np.asarray(hypotheses.placed.shape), np.asarray(hypotheses.shape_weights)
+    return [
+        _placed(hypotheses.bank, hypotheses.placed, int(np.argmax(shapes == part)), float(weights[part]))
+        for part in np.argsort(-weights)[:count]
+        if weights[part] > 0
+    ]
+
+
+def likeliest_part(hypotheses: PartHypotheses, cloud: PointCloud | None = None) -> PlacedShape | None:
+    """The likeliest part; None if the object is more likely none of the bank's.
+
+    - `cloud`: points that were scanned. Without it all of the part counts as measured, and nothing is open.
+    """
+    if next(iter(hypotheses.names())) == NONE:
+        return None
+    (part,) = placed_parts(hypotheses, 1)
+    if cloud is None:
+        return part
+    weights, shapes = np.asarray(hypotheses.weights, np.float64)[:-1], np.asarray(hypotheses.placed.shape)
+    first = int(np.argmax(shapes == hypotheses.most_likely[0]))
+    rows = [
+        first,
+        *(row for row in np.argsort(-weights, kind="stable")[:_RIVALS].tolist() if row != first and weights[row] > 0),
+    ]
+    return _compared(part, _Fits.of(hypotheses.bank, hypotheses.placed, weights[rows], rows), cloud)
+
+
+def likeliest_shape(
+    bank: ShapeBank, placed: Hypotheses, weights: Float[AnyArray, " h_and_none"], cloud: PointCloud
+) -> PlacedShape | None:
+    """The likeliest shape of the likeliest kind; None if the object is almost surely none of the bank's.
+
+    - `bank`: examples of categories.
+    - `placed`, `weights`: the registered shapes, and the weight of each, last of "none of these".
+    - `cloud`: points that were scanned.
+    """
+    weights = np.asarray(weights, np.float64)
+    if weights[-1] > _SURELY_NONE:
+        return None
+    names = [kind_of(bank.names[shape]) for shape in np.asarray(placed.shape)]
+    rows, kinds = dict[str, int](), dict[str, float]()
+    for row in np.argsort(-weights[:-1], kind="stable").tolist():
+        rows.setdefault(names[row], row)
+        kinds[names[row]] = kinds.get(names[row], 0.0) + weights[row]
+    likely = sorted(kinds, key=lambda kind: -kinds[kind])[:_RIVALS]
+    first = _placed(bank, placed, rows[likely[0]], kinds[likely[0]])
+    shape = dataclasses.replace(first, name=likely[0], is_part=False)
+    by_kind = np.array([kinds[kind] for kind in likely])
+    return _compared(shape, _Fits.of(bank, placed, by_kind, [rows[kind] for kind in likely]), cloud)
+
+
+def _placed(bank: ShapeBank, placed: Hypotheses, row: int, probability: float) -> PlacedShape:
+    shape = bank.shape(placed.shape[row])
+    grid = Grid(_NODES, _ROOM * float(jnp.max(jnp.abs(shape.extremes))))
+    triangles = level_triangles(np.array(_own_distances(shape.solid, jnp.asarray(grid.axis, jnp.float32))), grid)
+    assert triangles is not None
+    vertices, faces, normals = triangles
+    place = jax.tree.map(lambda rows: np.asarray(rows[row], np.float64), placed.placement)
+    return PlacedShape(
+        (place.scale * vertices) @ place.rotation.T + place.shift,
+        faces,
+        unit(normals / place.scale) @ place.rotation.T,
+        np.zeros(len(vertices)),
+        bank.names[int(placed.shape[row])],
+        probability,
+        np.ones(len(vertices)),
+        np.ones(len(vertices)),
+    )
+
+
+def _compared(shape: PlacedShape, fits: _Fits, cloud: PointCloud) -> PlacedShape:
+    """The shape with what the scan has measured of it, what other hypotheses share, and what they have elsewhere."""
+    half = min(_ROOM * float(_extent(fits.bank, fits.placed)) + _TOLERANCE, np.pi)
+    grid, coarse = Grid(_FINE, half), Grid(_COARSE, half)
+    # Distances are compared on a coarse grid: they are smooth, and each costs as much as the whole shape.
+    others = np.array(_distances(fits.bank, fits.placed, jnp.asarray(coarse.axis, jnp.float32)))
+    filled, own = np.zeros((_FINE,) * 3, others.dtype), _resampled(others[0], coarse, grid)
+    at, agreed = (shape.vertices + half).T / coarse.spacing, np.zeros(len(shape.vertices))
+    for weight, distance in zip(fits.weights.tolist(), others, strict=True):
+        filled += weight * _step(-_resampled(distance, coarse, grid))
+        agreed += weight * _step(2.0 * _TOLERANCE - np.abs(map_coordinates(distance, at, order=1)))
+    # Positive outside of what is open, and near the shape itself.
+    outside = np.maximum(4.0 * _SOFTNESS * (_OPEN - filled), _TOLERANCE - own)
+    ghost = _pieces(outside, grid, _SMALLEST * shape.mesh.area)
+    agreed = np.clip(4.0 * agreed - 1.5, 0.0, 1.0)
+    return dataclasses.replace(shape, measured=_measured(shape, cloud), agreed=agreed, ghost=ghost)
+
+
+def _step(x: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    return np.clip(0.5 + x / (4.0 * _SOFTNESS), 0.0, 1.0)
+
+
+def _resampled(values: _Values, coarse: Grid, fine: Grid) -> _Values:
+    """Values on a finer grid of the same extent, by linear interpolation along each axis."""
+    hats = np.stack([np.interp(fine.axis, coarse.axis, row) for row in np.eye(coarse.resolution)], axis=1)
+    hats = hats.astype(values.dtype)
+    for _ in range(3):
+        # The axis that is done goes to the end.
+        values = np.tensordot(values, hats, ([0], [1]))
+    return values
+
+
+@program
+def _extent(bank: ShapeBank, placed: Hypotheses) -> Float[Array, ""]:
+    """Largest coordinate of the placed shapes."""
+    corners = bank.shape(placed.shape).extremes * placed.placement.scale[:, None]
+    turned = jnp.einsum("hpj,hij->hpi", corners, placed.placement.rotation) + placed.placement.shift[:, None]
+    return jnp.max(jnp.abs(turned))
+
+
+@program
+def _own_distances(solid: SignedDistance, axis: Float[AnyArray, " g"]) -> Float[Array, "g g g"]:
+    return on_tensor_grid(solid, axis)
+
+
+@program
+def _distances(bank: ShapeBank, placed: Hypotheses, axis: Float[AnyArray, " g"]) -> Float[Array, "h g g g"]:
+    solids = bank.shape(placed.shape).solid
+
+    def of_shape(one):
+        solid, placement = one
+        return on_tensor_grid(lambda x: placement.distance(solid, x), axis)
+
+    return jax.lax.map(of_shape, (solids, placed.placement))
+
+
+def _measured(surface: MeanSurface, cloud: PointCloud) -> Float[np.ndarray, " v"]:
+    points, normals = cloud.to_numpy()
+    if len(points) == 0:
+        return np.zeros(len(surface.vertices))
+    tree = cKDTree(np.concatenate([points, _FACING * normals], axis=1))
+    away, _ = tree.query(np.concatenate([surface.vertices, _FACING * surface.normals], axis=1))
+    return np.clip(2.0 - away / _NEAR, 0.0, 1.0)
+
+
+def _pieces(values: Float[np.ndarray, "g g g"], grid: Grid, smallest: float) -> MeanSurface | None:
+    """The surface of the pieces of at least this area; None if there are none."""
+    triangles = level_triangles(values, grid)
+    if triangles is None:
+        return None
+    vertices, faces, normals = triangles
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    label = trimesh.graph.connected_component_labels(mesh.edges_unique, len(vertices))
+    area = np.bincount(label[faces[:, 0]], mesh.area_faces, label.max() + 1)
+    used, rows = np.unique(faces[area[label[faces[:, 0]]] >= smallest], return_inverse=True)
+    if len(used) == 0:
+        return None
+    return MeanSurface(vertices[used], rows.reshape(-1, 3), normals[used], np.zeros(len(used)))

@@ -1,0 +1,48 @@
+"""The surface that pictures show: the likeliest known shape, or else the posterior mean."""
+
+import dataclasses
+
+from jaxnbv.observations import Observations
+from jaxnbv.sampler import StepInputs, SurfaceSampler
+from jaxnbv.surfaces.known_shapes import KnownShapes, KnownShapesPosterior
+from jaxnbv.surfaces.part_hypotheses import PartHypotheses
+from jaxnbv.viz.mean_surface import MeanSurface, as_shown, mean_surface
+from jaxnbv.viz.placed_shape import likeliest_part, likeliest_shape
+
+
+def has_bank(sampler: SurfaceSampler) -> bool:
+    """Whether the model knows examples of shapes, so that a surface needs no posterior."""
+    return isinstance(sampler.model, KnownShapes) and sampler.model.bank.solids is not None
+
+
+def shown_surface(sampler: SurfaceSampler, inputs: StepInputs) -> MeanSurface | None:
+    """The likeliest known shape as registered, else the posterior mean where it holds points.
+
+    None if there is no such surface. The mean over several known shapes is the shape of none of them, so it is not
+    shown. If the object is none of them, the mean is that of the model for this case.
+
+    - `inputs`: with a posterior, which a model with a bank does not need.
+    """
+    observations, posterior, model = inputs.observations, inputs.posterior, sampler.model
+    if isinstance(observations.hypotheses, PartHypotheses):
+        return likeliest_part(observations.hypotheses, observations.cloud)
+    if isinstance(model, KnownShapes) and has_bank(sampler):
+        if isinstance(posterior, KnownShapesPosterior):
+            fits, weights = posterior.fits, posterior.weights
+        else:
+            fits, weights = model.fit(_within_volume(sampler, observations))
+        if (shape := likeliest_shape(model.bank, fits, weights, observations.cloud)) is not None:
+            return shape
+        sampler = sampler.without_bank
+        of_none = posterior.of_none if isinstance(posterior, KnownShapesPosterior) else sampler.posterior(observations)
+        inputs = StepInputs(observations, of_none)
+    return as_shown(mean_surface(sampler, inputs), observations.cloud)
+
+
+def _within_volume(sampler: SurfaceSampler, observations: Observations) -> Observations:
+    """The observations that the model is conditioned on: only empty nodes within the volume count."""
+    observations = sampler.adapt(observations)
+    if sampler.carving is None or observations.empty_nodes is None:
+        return observations
+    inside = observations.empty_nodes & sampler.carving.inside(sampler.grid)
+    return dataclasses.replace(observations, empty_nodes=inside)
