@@ -66,7 +66,8 @@ def chart(table: pd.DataFrame, study: type[Study]) -> bytes:
         panels = figure.subplots(tall, wide, squeeze=False).ravel()
         for axes, measure in zip(panels, shown, strict=False):
             _draw(axes, rows[rows["quantity"] == measure.name], measure, rows["method"].unique().tolist())
-            unit = f"share of scenes (%), n = {scenes}" if measure.unit == "%" else measure.unit
+            # A share may be of scenes or of surface, which the title says.
+            unit = f"%, mean of {scenes} scenes" if measure.unit == "%" else measure.unit
             axes.set(title=measure.title, xlabel=measure.by, ylabel=unit)
         for axes in panels[len(shown) :]:
             axes.axis("off")

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.lines import Line2D
@@ -17,6 +18,8 @@ from jaxnbv.viz.style import LINE, framed, save_figure
 
 # Inches: size of a tile, and the margins beside and above the grid.
 _TILE, _BESIDE, _ABOVE = (1.75, 1.95), 0.35, 0.75
+# Tiles in a row if there is one column, and the least width of such a picture, in tiles.
+_MOST_A_ROW, _FEWEST_WIDE = 5, 3
 
 
 def write_pictures(
@@ -41,6 +44,8 @@ def write_pictures(
 def _drawn(tiles: Tiles, record: Record, methods: Sequence[str]) -> Figure:
     runs = [record["methods"][method] for method in methods]
     columns = tiles.columns or tuple(f"view {view + 1}" for view in range(max(len(run["views"]) for run in runs)))
+    if len(columns) == 1:
+        return _of_one_column(tiles, record, methods, columns[0])
     start, tall = int(tiles.truth is not None), len(methods)
     wide = start + len(columns)
     size = wide * _TILE[0] + _BESIDE * (3 if tiles.scale else 1), tall * _TILE[1] + _ABOVE
@@ -60,6 +65,36 @@ def _drawn(tiles: Tiles, record: Record, methods: Sequence[str]) -> Figure:
             else:
                 axes.axis("off")
         grid[row, start].set_ylabel(method, fontsize=9, fontweight="bold")
+    _explain(figure, tiles, grid)
+    return figure
+
+
+def _of_one_column(tiles: Tiles, record: Record, methods: Sequence[str], column: str) -> Figure:
+    """The tiles of a column side by side, several methods to a row."""
+    cells = ([("truth", None)] if tiles.truth is not None else []) + [(method, method) for method in methods]
+    wide = min(len(cells), _MOST_A_ROW)
+    tall = -(-len(cells) // wide)
+    size = max(wide, _FEWEST_WIDE) * _TILE[0] + _BESIDE * (3 if tiles.scale else 1), tall * _TILE[1] + _ABOVE
+    figure = Figure(figsize=size, layout="constrained")
+    title = f"Scene {record['scene']}: {record['name']}, {column}"
+    figure.suptitle(title, x=0.01, ha="left", fontsize=10, fontweight="bold")
+    grid = figure.subplots(tall, wide, squeeze=False)
+    for axes in grid.ravel()[len(cells) :]:
+        axes.axis("off")
+    for axes, (name, method) in zip(grid.ravel(), cells, strict=False):
+        framed(axes, LINE, 0.8)
+        axes.set_title(name, fontsize=9, loc="center", pad=4)
+        if method is not None:
+            tiles.tile(axes, method, 0)
+        elif tiles.truth is not None:
+            tiles.truth(axes)
+    _explain(figure, tiles, grid)
+    return figure
+
+
+def _explain(figure: Figure, tiles: Tiles, grid: np.ndarray) -> None:
+    """Draw the legend with the caption, and the colour bar."""
+    tall = len(grid)
     handles = [Line2D([], [], ls="none", label=name, **look) for name, look in tiles.marks.items()]
     legend = figure.legend(handles=handles, loc="outside lower left", ncols=max(len(handles), 1), frameon=False)
     legend.set_title(tiles.caption, prop=FontProperties(size=8))
@@ -70,4 +105,3 @@ def _drawn(tiles: Tiles, record: Record, methods: Sequence[str]) -> Figure:
         bar.set_label(label, fontsize=8)
         bar.ax.tick_params(labelsize=7, length=2)
         bar.outline.set_visible(False)
-    return figure
