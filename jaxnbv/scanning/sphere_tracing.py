@@ -1,4 +1,4 @@
-"""SDFSurface: the boundary of a solid with a signed distance function, traced by sphere tracing."""
+"""`SDFSurface`: the boundary of a solid with a signed distance function, traced by sphere tracing."""
 
 import math
 from typing import ClassVar
@@ -13,16 +13,17 @@ from jaxnbv.programs import program
 from jaxnbv.scanning.scanner import Hits, Surface, implicit_depth
 from jaxnbv.scanning.sdf import SignedDistance
 
-# Far above the rounding of float32 distances in the scene (4e-7), far below any part worth seeing.
+# The shortest stride, in scene units, is far above the rounding of float32 distances in the scene (4e-7) and far below
+# the size of relevant detail.
 _SHORTEST_STRIDE = 1e-3
 _MAX_STRIDES = 512
-# Once at most this fraction of the rays is unfinished, these continue in a smaller batch.
+# Once at most this fraction of the rays is unfinished, the unfinished rays continue in a smaller batch.
 _FEW = 1 / 8
 _CHORDS = 2
-# Slopes are evaluated this far before a hit along the ray, in units of rounding. It is 1e-5 in float32, above the
-# rounding of a hit and below any detail.
+# Slopes are evaluated this far before a hit along the ray, in units of the machine epsilon. The length is 1e-5 scene
+# units in float32, which is above the rounding of a hit and below the size of any detail.
 _FRONT = 84
-# Least sine of the angle between a ray and the surface for which the exact derivative of the hit is given.
+# Derivatives of hits are exact if the sine of the angle between the ray and the surface is at least this.
 _GRAZING = 0.05
 
 
@@ -30,15 +31,15 @@ class SDFSurface(Surface):
     """The boundary of a solid, traced by sphere tracing (Hart 1996).
 
     - `sdf`: the solid.
-    - `bounding_radius`: radius of a ball about the origin; rays hit nothing outside. The default holds the whole scene,
-      [-pi/2, pi/2]^3.
+    - `bounding_radius`: radius of a ball about the scene's origin. Rays hit nothing outside the ball. The default ball
+      holds the whole scene, [-pi/2, pi/2]^3.
 
-    A ray strides by |sdf|, but at least by 0.001, until the sign changes. The root is then located within the last
-    stride. A part thinner than 0.001 along a ray may be missed. A ray along a flat face, at an angle of less than a
-    degree, may use up its 512 strides and miss.
+    A ray advances by |sdf|, but by at least 0.001, until the sign changes. The root is then located within the last
+    stride. A ray may miss a part that is thinner than 0.001 along the ray. A ray at an angle of less than a degree to a
+    flat face may use up its 512 strides and miss the face.
 
-    Hits are differentiable in the rays and in the solid's parameters by `implicit_depth`, with slopes of at least 0.05
-    for grazing rays.
+    Hits are differentiable in the rays and in the solid's parameters, see `implicit_depth`. For grazing rays, the slope
+    in the derivative is at least 0.05.
 
     **Raises:** `ValueError` if the bounding radius is not positive.
     """
@@ -67,12 +68,12 @@ class SDFSurface(Surface):
         along = _Along(self.sdf, origins, directions)
         fixed = jax.lax.stop_gradient(along)
         depth, mask = _first_root(fixed.sdf, fixed.origins, fixed.directions, self.bounding_radius)
-        # Slopes are evaluated just in front of the surface. On it a solid's formula may be at the border of two cases,
-        # where rounding may give the slope of neither.
+        # Slopes are evaluated just in front of the surface. On the surface, a solid's formula may be at the border of
+        # two cases, and rounding may give a slope that belongs to neither case.
         before = _Along(self.sdf, origins - _FRONT * jnp.finfo(origins.dtype).eps * directions, directions)
         depth = implicit_depth(before, fixed.newton(depth), mask, jnp.full_like(depth, _GRAZING))
         points, front = along.points(depth), before.points(depth)
-        # Forward mode fuses into one pass over the points. The scatters of reverse mode would prevent that.
+        # Forward mode compiles to one pass over the points. Reverse mode would not, because of its scatter operations.
         axes = jnp.broadcast_to(jnp.eye(3, dtype=points.dtype)[:, None], (3, *points.shape))
         gradient = jax.vmap(lambda axis: jax.jvp(self.sdf, (front,), (axis,))[1], out_axes=-1)(axes)
         gradient = jnp.where(jnp.any(gradient != 0, axis=-1, keepdims=True), gradient, -directions)
@@ -82,7 +83,7 @@ class SDFSurface(Surface):
 
 
 class _Along(eqx.Module):
-    """A solid's distance along rays."""
+    """The signed distance of a solid as a function of depth along rays."""
 
     sdf: SignedDistance
     origins: Float[Array, "n 3"]
@@ -103,7 +104,7 @@ class _Along(eqx.Module):
 def _first_root(
     sdf: SignedDistance, origins: Float[Array, "n 3"], directions: Float[Array, "n 3"], radius: float
 ) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
-    """Depth along each ray at which the signed distance first changes sign within the ball, and whether it does."""
+    """Return the depth along each ray at which the sign first changes within the ball, and whether it changes."""
     middle = -jnp.sum(origins * directions, axis=-1)
     squared = middle**2 - jnp.sum(origins**2, axis=-1) + radius**2
     half_chord = jnp.sqrt(jnp.maximum(squared, 0.0))
@@ -113,7 +114,7 @@ def _first_root(
     alive = (squared > 0) & (leave > 0)
     march = _March(origins, directions, jnp.where(start < 0, -1.0, 1.0), leave, enter, start, enter, start, alive)
 
-    # Nearly all rays finish within a few strides. The rest continue in a smaller batch.
+    # Nearly all rays finish within a few strides. The unfinished rays continue in a smaller batch.
     few = math.ceil(len(origins) * _FEW)
     march, count = _advance(sdf, march, 0, few)
     (rest,) = jnp.nonzero(march.alive, size=few, fill_value=len(origins))
@@ -126,12 +127,12 @@ def _first_root(
 
 
 class _March(eqx.Module):
-    """State of the rays.
+    """State of the rays during sphere tracing.
 
-    - `side`: sign of the distance at the start.
+    - `side`: sign of the signed distance at the start of each ray.
     - `leave`: depth at which the ray leaves the ball.
-    - `depth`, `f`: current depth, and the signed distance there.
-    - `before`, `f_before`: the same a stride earlier.
+    - `depth`, `f`: current depth, and the signed distance at this depth.
+    - `before`, `f_before`: depth one stride earlier, and the signed distance at that depth.
     - `alive`: whether the ray is unfinished.
     """
 
@@ -147,7 +148,10 @@ class _March(eqx.Module):
 
 
 def _advance(sdf: SignedDistance, march: _March, count, enough: int):
-    """The rays once at most `enough` are alive or `_MAX_STRIDES` are used up, and the number of strides so far."""
+    """Advance the rays until at most `enough` of them are alive or `_MAX_STRIDES` strides are used up.
+
+    Returns the rays and the total number of strides, which starts at `count`.
+    """
     along = _Along(sdf, march.origins, march.directions)
 
     def body(carry):
@@ -163,8 +167,10 @@ def _advance(sdf: SignedDistance, march: _March, count, enough: int):
 
 
 def _refine(sdf: SignedDistance, march: _March) -> Float[Array, " n"]:
-    """The root within the last stride, by regula falsi. A few chords reach rounding error, as the bracket is short."""
+    """Return the root within the last stride by regula falsi.
 
+    The interval is short, so a few chords are enough to reach the rounding error.
+    """
     along = _Along(sdf, march.origins, march.directions)
 
     def chord(_, bracket):

@@ -1,8 +1,9 @@
-"""First zeros of a trilinear interpolant along rays: a march to the cell that holds one, then the root of a cubic.
+"""First zeros of a trilinear interpolant f along rays.
 
-Coordinates are the grid's: nodes at the integers 0, ..., g - 1 along every axis, cells between them. Vectors are lists
-of their components (n,). A zero is where f first differs in sign from its sign at the start of the ray. The value zero
-counts as negative.
+A ray marches to the cell that holds its first zero. The zero is then the root of a cubic within the cell. Coordinates
+are grid coordinates: the nodes have the integers 0, ..., g - 1 along every axis. A batch of n vectors is a list of
+three components (n,). The first zero of a ray is the first point at which the sign of f differs from its sign at the
+start of the ray. The value zero counts as negative.
 """
 
 import functools
@@ -17,12 +18,14 @@ from jaxnbv.geometry.volume import ray_interval
 from jaxnbv.scanning.cubic import CORNERS, cubic, first_bracket, first_root
 from jaxnbv.scanning.scanner import implicit_depth
 
-# Once at most a fifth of its rays is unfinished, a march continues with only these. Batches smaller than an image are
-# not reduced. Each size is compiled: reducing to a quarter runs as fast but takes a third longer to compile.
+# Once at most a fifth of the rays of a march is unfinished, the march continues with the unfinished rays only. Batches
+# smaller than an image are not reduced. Each batch size is compiled. If batches are reduced at a quarter instead of a
+# fifth, a march is as fast but takes a third longer to compile.
 _SHRINK = 5
 _SMALLEST = 2500
 
-# A ray grazes where the slope of f along it is below this fraction of the spread of f over the cell's corners.
+# A ray grazes the surface if the slope of f along the ray, per cell, is below this fraction of the spread of f over the
+# cell's corners.
 _GRAZING = 0.03
 
 # The x, y and z components of n vectors as three arrays, which XLA fuses better than one.
@@ -32,10 +35,11 @@ Triple = list[Float[Array, " n"]]
 class March(NamedTuple):
     """State of a march along rays u + t du.
 
-    - `t`: the ray's current place.
-    - `end`: t at which the ray leaves the box or, once it is at a zero, the cell of the zero. So t < end after the
-      march means that there is a zero between the two.
-    - `sign`: sign of f at the start, zero while unknown.
+    - `u`, `du`: point at which each ray enters the box, and its direction.
+    - `t`: the ray's current position.
+    - `end`: t at which the ray leaves the box. Once the ray has reached a cell with a zero, `end` is the t at which it
+      leaves this cell. So if t < end after the march, there is a zero between t and end.
+    - `sign`: sign of f at the start; zero until it has been computed.
     - `alive`: whether the ray is unfinished.
     """
 
@@ -48,7 +52,7 @@ class March(NamedTuple):
 
 
 class Field(eqx.Module):
-    """A function on g^3 nodes and the `free_distance` of its (g - 1)^3 cells, both flat."""
+    """A function on g^3 nodes and the `free_distance` of its (g - 1)^3 cells, both as flat arrays."""
 
     values: Float[Array, " nodes"]
     distance: Int8[Array, " cells"]
@@ -56,19 +60,21 @@ class Field(eqx.Module):
 
     @property
     def ahead(self) -> float:
-        """Offset, in cells along every axis, by which positions move ahead before their cell is computed.
+        """Distance, in cells along every axis, by which a position moves forward before its cell is computed.
 
-        It exceeds the rounding of coordinates, so a ray on a border is always in the cell that it enters. It cannot
-        stall, and skips at most a sliver of this width. A zero in a sliver shows as a difference from the start's sign.
+        The offset exceeds the rounding of coordinates, so a ray on the border of two cells is always assigned to the
+        cell that it enters, and the march cannot stall. A ray skips at most a sliver of this width. A zero in the
+        sliver is still detected, because the sign in the next cell then differs from the sign at the start.
         """
         return 16 * float(jnp.finfo(self.values.dtype).eps) * self.g
 
 
 def free_distance(values: Float[Array, "g g g"]) -> Int8[Array, "m m m"]:
-    """Distance in cells from each of the m^3 = (g - 1)^3 cells to a change of sign, with the sign of f.
+    """Return the signed distance, in cells, from each of the m^3 = (g - 1)^3 cells to a change of sign of f.
 
-    It is 0 for a cell whose own corners differ in sign. Otherwise the magnitude is a lower bound on the Chebyshev
-    distance to the nearest cell with a change of sign, one of 1, 2, 3, 5, 9 and 17. Zero counts as negative.
+    The distance is 0 for a cell whose own corners differ in sign. Otherwise it has the sign of f in the cell, and its
+    magnitude is a lower bound on the Chebyshev distance to the nearest cell with a change of sign. The magnitude is 1,
+    2, 3, 5, 9 or 17. The value zero counts as negative.
     """
     maximum = functools.partial(
         jax.lax.reduce_window, init_value=jnp.int8(-1), computation=jax.lax.max, window_strides=(1, 1, 1)
@@ -89,7 +95,7 @@ def free_distance(values: Float[Array, "g g g"]) -> Int8[Array, "m m m"]:
 
 
 class _InCell(eqx.Module):
-    """The trilinear function of a fixed cell along rays u + t du."""
+    """The trilinear function of one fixed cell per ray, along the rays u + t du."""
 
     field: Field
     u: Triple
@@ -107,10 +113,11 @@ class _InCell(eqx.Module):
 
 
 def first_zero(field: Field, u: Triple, du: Triple) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
-    """t of the first zero along each ray from its origin or its entry into the box, and whether it exists.
+    """Return the t of the first zero along each ray u + t du, and whether there is a zero.
 
-    t is differentiable in values and rays. Slopes are kept away from zero for grazing rays (`implicit_depth`). If there
-    is no zero, t and its derivatives are zero.
+    A ray starts at its origin u or, if u is outside the box, where it enters the box. t is differentiable in the values
+    of the field and in the rays. Slopes are kept away from zero for grazing rays (`implicit_depth`). If there is no
+    zero, t and its derivatives are zero.
     """
     t, mask, cell = _traced_zero(*jax.lax.stop_gradient((field, u, du)))
     along = _InCell(field, u, du, cell)
@@ -118,7 +125,7 @@ def first_zero(field: Field, u: Triple, du: Triple) -> tuple[Float[Array, " n"],
 
 
 def _first_zero(field: Field, u: Triple, du: Triple):
-    """t of the first zero of each ray, whether there is one, and its cell."""
+    """Return the t of the first zero of each ray, whether there is a zero, and the cell of the zero."""
     rays, start = enter(u, du, field)
     rays = march(rays, field)
     mask = rays.t < rays.end
@@ -135,7 +142,7 @@ _traced_zero = jax.custom_batching.custom_vmap(_first_zero)
 
 @_traced_zero.def_vmap
 def _traced_zero_batched(size: int, batched, field: Field, u: list[Array], du: list[Array]):
-    """Joins batches of rays through one field into one batch, which is faster than a batch of marches."""
+    """Join batches of rays through one field into one batch, which is faster than a batch of marches."""
     u, du = jax.tree.map(
         lambda x, has: x if has else jnp.broadcast_to(x, (size, *x.shape)), (u, du), tuple(batched[1:])
     )
@@ -149,10 +156,10 @@ def _traced_zero_batched(size: int, batched, field: Field, u: list[Array], du: l
 
 
 def smooth_gradient(field: Field, x: Triple) -> Triple:
-    """Continuous gradient of the function, per cell, at points x within the grid.
+    """Return a continuous gradient of f, in change per cell, at points x within the grid.
 
-    Central differences at the nodes (one-sided on the border) are interpolated linearly, since the interpolant's own
-    gradient jumps between cells.
+    The gradient is interpolated linearly from central differences at the nodes (one-sided on the border). The gradient
+    of the trilinear interpolant itself would jump between cells.
     """
     last = field.g - 1
     cell = [jnp.clip(jnp.floor(jax.lax.stop_gradient(p)).astype(jnp.int32), 0, last - 1) for p in x]
@@ -176,8 +183,12 @@ def smooth_gradient(field: Field, x: Triple) -> Triple:
 
 
 def enter(u: Triple, du: Triple, field: Field) -> tuple[March, Float[Array, " n"]]:
-    """Rays at their entry into the box, and t of the entry, from which the march counts."""
-    # The box is smaller by a sliver, so that no rounded position that moved ahead lies outside the grid.
+    """Return a march whose rays are where they enter the box, and the t of this point on the original rays.
+
+    The `t` of the march counts from this point.
+    """
+    # The box is smaller than the grid by a sliver, so that no position lies outside the grid after it is rounded and
+    # moved forward.
     low, high = 2 * field.ahead, field.g - 1 - 2 * field.ahead
     du = [jnp.where(jnp.abs(d) < 1e-9, 1e-9, d) for d in du]
     start, end = ray_interval(u, du, 3 * [low], 3 * [high])
@@ -188,7 +199,7 @@ def enter(u: Triple, du: Triple, field: Field) -> tuple[March, Float[Array, " n"
 
 
 def march(rays: March, field: Field) -> March:
-    """The rays at their first zeros or outside the box (see `March.end`). None is unfinished."""
+    """March all rays until each ray has reached the cell of its first zero or has left the box (see `March.end`)."""
     count = rays.t.size
     remainder = count // _SHRINK if count > _SMALLEST else 0
     rays = jax.lax.while_loop(
@@ -206,7 +217,7 @@ def march(rays: March, field: Field) -> March:
 
 
 def _stride(rays: March, field: Field) -> March:
-    """The rays after moving through cells without a change of sign, until most are at a change or outside the box."""
+    """Move rays through cells without a change of sign, until most rays are at a change of sign or outside the box."""
 
     def step(state):
         rays, _ = state
@@ -224,8 +235,10 @@ def _stride(rays: March, field: Field) -> March:
 
 
 def _search_cell(rays: March, field: Field) -> March:
-    """The rays after a search of their cells. A ray in a cell with a change of sign stops if the cell holds its zero,
-    and leaves the cell otherwise."""
+    """Search the cells that rays are in for zeros.
+
+    A ray in a cell with a change of sign stops if the cell holds its first zero. Otherwise it leaves the cell.
+    """
     local, cell = cell_at(rays, field)
     distance = _take(field.distance, _flat(cell, field.g - 1))
     here = rays.alive & (distance * rays.sign <= 0)
@@ -240,7 +253,10 @@ def _search_cell(rays: March, field: Field) -> March:
 
 
 def cell_at(rays: March, field: Field) -> tuple[Triple, list[Int[Array, " n"]]]:
-    """Position of each ray within its cell, in [0, 1], and the cell, which it is in or about to enter."""
+    """Return each ray's position within its cell, in [0, 1], and the index of this cell.
+
+    A ray on the border of two cells is assigned to the cell that it is about to enter.
+    """
     position = [x + rays.t * d for x, d in zip(rays.u, rays.du, strict=True)]
     cell = [
         jnp.floor(x + jnp.where(d > 0, field.ahead, -field.ahead)).astype(jnp.int32)
@@ -250,7 +266,7 @@ def cell_at(rays: March, field: Field) -> tuple[Triple, list[Int[Array, " n"]]]:
 
 
 def _leave(rays: March, cell: list[Int[Array, " n"]], cells) -> Float[Array, " n"]:
-    """t at which rays leave the cube of all cells within Chebyshev distance `cells` of this cell."""
+    """Return the t at which each ray leaves the cube of all cells within Chebyshev distance `cells` of its cell."""
     sides = [c + jnp.where(d > 0, cells + 1, -cells) for c, d in zip(cell, rays.du, strict=True)]
     return _smallest([(side - x) / d for side, x, d in zip(sides, rays.u, rays.du, strict=True)])
 
@@ -260,7 +276,7 @@ def _flat(index: list[Int[Array, " n"]], side: int) -> Int[Array, " n"]:
 
 
 def corner_values(cell: list[Int[Array, " n"]], field: Field) -> list[Float[Array, " n"]]:
-    """Values at the corners of cells, in the order of `CORNERS`."""
+    """Return the values at the corners of cells, in the order of `CORNERS`."""
     base = _flat(cell, field.g)
     return [_take(field.values, base + ((i * field.g + j) * field.g + k)) for i, j, k in CORNERS]
 
