@@ -6,11 +6,10 @@ X_i are estimated by minimising the disagreement of overlapping views,
 
     the sum over points p of view i and the nearest point q of view j  of  rho(n_q . (T_i X_i p - T_j X_j q)),
 
-with rho(r) = c^2 log(1 + r^2 / c^2). The points p and q are in the coordinates of cameras i and j, and n_q is the normal
-at q in world coordinates. A prior keeps the components small that no view determines. The nearest points are searched
-again in each round, within a distance that decreases (point-to-plane iterative closest points, Chen and Medioni 1992).
-If the views do not determine all of X, the smallest eigenvalue of J^T J is small, where J is the derivative of the
-residuals.
+with rho(r) = c^2 log(1 + r^2 / c^2). The points p and q are in the coordinates of cameras i and j, and the normal n_q
+is in world coordinates. A prior keeps the components small that no view determines. The nearest points are searched again
+in each round, within a distance that decreases (point-to-plane iterative closest points, Chen and Medioni 1992). If the
+views do not determine all of X, the smallest eigenvalue of J^T J is small, where J is the derivative of the residuals.
 """
 
 from collections.abc import Sequence
@@ -53,7 +52,9 @@ _Corrections: TypeAlias = Float[np.ndarray, "views 4 4"]
 
 
 class Alignment(eqx.Module):
-    """Disagreement of overlapping views, and the pose error that explains it. Lengths are in the units of the poses.
+    """Disagreement of overlapping views, and the pose error that explains it.
+
+    Lengths are in the units of the poses.
 
     - `disagreement`: median point-to-plane distance between the points of a view and the nearest points of the views
       that overlap it, with uncorrected poses. NaN for a view that overlaps no other view.
@@ -106,7 +107,7 @@ class Alignment(eqx.Module):
 
     @property
     def motion(self) -> str:
-        """Description of the additional view that would best determine the weakest component of the mount's error.
+        """Description of the view that would best determine the weakest component of the mount's error.
 
         If all motions between the views keep the direction of an axis, a shift along this axis or a rotation about it
         looks the same in all views.

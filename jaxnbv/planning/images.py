@@ -1,4 +1,4 @@
-"""Depth images with their poses, as added to a session."""
+"""Depth images with their poses, as the user adds them to a session."""
 
 import math
 from collections.abc import Callable
@@ -17,21 +17,22 @@ from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
 
 Ignore: TypeAlias = Callable[[Float[np.ndarray, "n 3"]], Any]
-"""Function of world points (n, 3) that returns which of them to leave out, for example those of the robot."""
+"""Function of world points (n, 3) that returns a bool for each point: True to ignore it, as a point of the robot."""
 
-# Most rays of an image that are used. A cloud holds a few thousand points, so that more rays only take time.
+# Largest number of rays of an image that are used. A cloud holds a few thousand points, so more rays only cost time.
 _MOST_RAYS = 20_000
-# Largest difference between entries of two equal pose matrices, which may be stored in 32 bits.
+# Two pose matrices are equal if their entries differ by at most this. They may have been stored in 32 bits.
 _SAME_PLACE = 1e-5
 
 
 class Image(NamedTuple):
     """A depth image as the user added it.
 
-    - `depth`: depth image; `scale` times it is in world units.
-    - `matrix`: the camera's pose by the user.
-    - `mask`: mask of the pixels that show the object; None for all.
-    - `robot`: mask of the pixels that show the robot; None for none.
+    - `depth`: depth image in the user's unit.
+    - `matrix`: camera-to-world matrix from the user.
+    - `scale`: factor from `depth` to world units.
+    - `mask`: mask of the pixels that show the object; None if every pixel may show it.
+    - `robot`: mask of the pixels that show the robot; None if no pixel is known to show it.
     """
 
     depth: Real[np.ndarray, "height width"]
@@ -42,9 +43,10 @@ class Image(NamedTuple):
 
     @classmethod
     def of(cls, depth: AnyArray, matrix: AnyArray | list, scale: float, mask: AnyArray | None) -> "Image":
-        """Convert the arguments and check them.
+        """Check the user's arguments and convert them to an image.
 
-        **Raises:** `ValueError` unless they are an image, a matrix, and a mask of the image's shape.
+        **Raises:** `ValueError` for a depth image or matrix that is not numeric, or a mask that is not a boolean array
+        of the image's shape.
         """
         pixels = as_numbers(depth, "the depth image", None)
         pixel_mask = None if mask is None else np.asarray(mask)
@@ -53,15 +55,15 @@ class Image(NamedTuple):
             require(
                 proper, f"the mask is {short_text(mask)}: give a boolean array of the image's shape, {pixels.shape}"
             )
-        # Copy, since a driver may write its next image into the same memory.
+        # The pixels are copied, because a driver may write its next image into the same memory.
         return cls(pixels.copy(), as_numbers(matrix, "the matrix of a pose", np.float64), scale, pixel_mask)
 
     def cleaned(self, camera: Camera, pose: Pose, box: Box) -> "Image":
-        """A copy with zero depth where a value means "not measured", see `without_sentinels`."""
+        """Return a copy with depth zero at pixels whose value stands for "not measured", see `without_sentinels`."""
         return self._replace(depth=without_sentinels(self.depth, camera, pose, self.scale, box))
 
     def points(self, camera: Camera, pose: Pose) -> Float[np.ndarray, "height width 3"]:
-        """The point of each pixel, in world units; the camera's position where nothing was measured."""
+        """Return the world point of each pixel, or the camera's position for a pixel without a measurement."""
         depth = np.where(np.isfinite(self.depth), self.scale * np.asarray(self.depth, np.float64), 0.0)
         ahead = np.asarray(camera.pixel_directions(), np.float64).reshape(*depth.shape, 3)
         if camera.distortion:
@@ -72,9 +74,11 @@ class Image(NamedTuple):
         return local @ np.asarray(pose.rotation, np.float64).T + np.asarray(pose.position, np.float64)
 
     def with_robot(self, ignore: Ignore, camera: Camera, pose: Pose) -> "Image":
-        """A copy with the mask of the robot's pixels, by a function of their points.
+        """Return a copy with the mask of the robot's pixels.
 
-        **Raises:** `ValueError` if the function does not return a bool for each point.
+        - `ignore`: function that is called with the measured world points, and returns which belong to the robot.
+
+        **Raises:** `ValueError` if `ignore` does not return a bool for each point.
         """
         measured = np.isfinite(self.depth) & (self.depth > 0)
         is_robot = np.asarray(ignore(self.points(camera, pose)[measured]))
@@ -87,19 +91,29 @@ class Image(NamedTuple):
         return self._replace(robot=robot)
 
     def cloud(self, camera: Camera, pose: Pose, stride: int, box: Box | None = None) -> PointCloud:
-        """The image as a cloud without the robot, see `PointCloud.from_depth`. The mask is not applied."""
+        """Convert the image to a cloud without the robot's points, see `PointCloud.from_depth`. Ignore `mask`."""
         cloud = PointCloud.from_depth(self.depth, camera, pose, self.scale, stride, box)
         return cloud if self.robot is None else only_where(cloud, ~self.robot, camera, stride)
 
     def is_blank(self, cloud: PointCloud) -> bool:
-        """Whether the image measured nothing: no pixel is valid, or all have one value and show no surface."""
+        """Return whether the image has no measurement.
+
+        True if `cloud` is empty, and either no pixel is valid or all valid pixels have the same value. Such a value
+        means "not measured".
+
+        - `cloud`: the points of the image in the box.
+        """
         if bool(cloud.mask.any()):
             return False
         values = np.unique(self.depth[self.depth > 0])
         return not bool(np.any(cloud.missed)) or (len(values) == 1 and bool(np.isfinite(values[0])))
 
     def check_moved(self, earlier: "tuple[Image, ...]") -> None:
-        """**Raises:** `ValueError` if an earlier image is equal and not blank, but has another pose."""
+        """Check that the image is not an old frame of the driver.
+
+        **Raises:** `ValueError` if an earlier image has the same depth but a different pose. Images without a positive
+        depth are not checked.
+        """
         if not (self.depth > 0).any():
             return
         for number, image in enumerate(earlier, start=1):
@@ -112,9 +126,13 @@ class Image(NamedTuple):
 
 
 def only_where(cloud: PointCloud, pixels: Bool[np.ndarray, "height width"], camera: Camera, stride: int) -> PointCloud:
-    """A cloud with only the points of some pixels of its image. Other rays still end where they did."""
+    """Return a cloud with the points of some pixels only. The other rays keep their lengths.
+
+    - `pixels`: mask of the pixels to keep, at the image's full resolution.
+    - `stride`: stride of the rows and columns from which the cloud was made.
+    """
     if camera.distortion:
-        # The rows of a cloud are pixels of a pinhole camera.
+        # The rays of a cloud belong to a camera without distortion, so the mask must be resampled.
         place = np.asarray(camera.pixel_directions(), np.float64).reshape(*pixels.shape, 3)[..., :2]
         column, row = pixels_of(place, camera.intrinsics, camera.distortion)
         across = np.clip(np.round(column).astype(int), 0, camera.width - 1)
@@ -124,5 +142,5 @@ def only_where(cloud: PointCloud, pixels: Bool[np.ndarray, "height width"], came
 
 
 def stride_of(camera: Camera) -> int:
-    """Stride of rows and columns that leaves at most `_MOST_RAYS` rays of an image."""
+    """Return the stride of rows and columns at which an image has at most about `_MOST_RAYS` rays."""
     return math.ceil(math.sqrt(camera.num_rays / _MOST_RAYS))

@@ -1,4 +1,4 @@
-"""Intake of a session's images: turns each into a view, and finds table, clutter and mount error."""
+"""Conversion of a session's images to views, with detection of the table, clutter and pose errors."""
 
 import copy
 import dataclasses
@@ -24,12 +24,12 @@ from jaxnbv.scanning import Obstacles
 
 
 class Intake:
-    """The images so far, and the table, clutter and mount error that they show.
+    """The images of a session so far, and the table, clutter and pose errors that were detected in these images.
 
     - `camera`, `box`, `convention`: as in the session, in world units.
     - `frame`: frame of the session's world.
-    - `planner`: planner in scene coordinates. If it has no obstacles, the first image is searched for a table, and all
-      images for clutter.
+    - `planner`: planner in scene coordinates. If the planner's `obstacles` is None, the first image is searched for a
+      table, and all images for clutter.
     """
 
     def __init__(self, camera: Camera, box: Box, frame: Frame, convention: str, planner: Planner):
@@ -38,20 +38,22 @@ class Intake:
         self.images: tuple[Image, ...] = ()
         self.mount_error = MountError(camera, convention)
         self.table: Obstacles | None = None
-        # Other axes that would give a table if they were upward, if the session's axis gives none.
+        # If there is no table with the session's upward axis, the axes with which there would be one.
         self.other_ups: tuple[str, ...] = ()
         self.clutter = self._no_clutter()
 
     def without_images(self) -> "Intake":
-        """A copy without images, to add them again. It keeps the corrections of the mount's error."""
+        """Return a copy without images, to which the images can be added again with the current pose corrections."""
         intake = copy.copy(self)
         intake.images, intake.clutter = (), self._no_clutter()
         return intake
 
     def add(self, loop: Loop, image: Image, accepted: Callable[[], None] = lambda: None) -> Loop | None:
-        """Add an image to the loop as a view, and return the loop; None for a later blank image.
+        """Add an image to the loop as a view, and return the loop.
 
-        - `accepted`: called after all checks and before the view is added.
+        Return None, and change nothing, if the image is blank and is not the first image.
+
+        - `accepted`: function that is called after all checks and before the view is added.
 
         **Raises:** `ValueError` as `Session.add` does. Nothing changes then.
         """
@@ -67,7 +69,7 @@ class Intake:
             whole = clean.cloud(self.camera, pose, self.stride)
             table = table_under(self.frame.to_scene(whole), self.frame.to_scene(self.box))
             ups = other_ups(whole, self.box, self.frame.up) if table is None else ()
-            # Without a table, cameras still keep clear of the points of D.
+            # Obstacles without a solid still keep cameras clear of the points of D.
             loop = loop.without_views(dataclasses.replace(self.planner, obstacles=table or Obstacles()))
         if image.mask is not None:
             cloud = only_where(cloud, image.mask, self.camera, self.stride)
@@ -84,7 +86,7 @@ class Intake:
         return loop
 
     def _cloud(self, image: Image, pose: Pose, is_first: bool) -> PointCloud:
-        """The points of an image in the box, and in the room around it that the planner's carving needs.
+        """Return the points of an image that lie in the box, or in the margin around the box that carving needs.
 
         **Raises:** `ValueError` if the first image shows nothing of the box.
         """
@@ -100,7 +102,7 @@ class Intake:
                 raise InputError(f"the first image shows nothing of the box: {problem}") from problem
 
     def _no_clutter(self) -> Clutter | None:
-        """Clutter before any image; None if the user gave the obstacles."""
+        """Return clutter without votes; None if the user passed obstacles."""
         if self.planner.obstacles is not None:
             return None
         reach = float(np.abs(np.asarray(self.planner.search.poses_around().position)).max())

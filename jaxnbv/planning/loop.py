@@ -1,7 +1,7 @@
-"""The loop of an episode: propose a pose, take the view, add its scan, check the stop rule.
+"""The loop of an episode: propose a pose, take the view, add the scan, and check the stop rule.
 
-Simulations, studies and sessions at a real sensor use the same `Loop`. It holds all state that depends on the views so
-far: observations, proposals, random keys, clock and stop rule.
+Simulations, studies and sessions at a real sensor use the same `Loop`. A loop holds all state that depends on the views
+so far: observations, proposals, random keys, clock and stop rule.
 """
 
 import copy
@@ -45,9 +45,9 @@ class View(eqx.Module):
 
     - `pose`: pose of the sensor.
     - `scan`: the scan, with noise; one row for each pixel.
-    - `cloud`: D after this view.
-    - `proposal`: the proposal of the search; None for the first view, which the user chose.
-    - `camera`: the camera that took it, in scene units.
+    - `cloud`: the cloud D after this view.
+    - `proposal`: the proposal of the search; None if the view was not proposed, such as the first view.
+    - `camera`: the camera that took the scan, in scene units.
     - `hypotheses`: hypotheses of the model after this view, see `Observations`.
     """
 
@@ -59,7 +59,10 @@ class View(eqx.Module):
     hypotheses: eqx.Module | None = None
 
     def answer(self, acquisition: Acquisition) -> Answer | None:
-        """The acquisition's answer after this view; if it has none, the part's identity if parts are known."""
+        """Return the acquisition's answer after this view.
+
+        If the acquisition has no answer but the model has known parts, return the probability of each part instead.
+        """
         answer = acquisition.answer(self.cloud)
         if answer is None and isinstance(self.hypotheses, PartHypotheses):
             return identity_answer(self.hypotheses, acquisition)
@@ -67,12 +70,12 @@ class View(eqx.Module):
 
 
 class Step(NamedTuple):
-    """A view of an episode, with the search that led to it.
+    """A view of an episode, with the inputs and the time of the search that proposed the view.
 
     - `observations`: observations after the view.
-    - `inputs`: posterior and samples that the view was chosen by. None if the search needs none, and for a first or
+    - `inputs`: inputs of the search: posterior and samples. None if the search uses no samples, and for a first or
       stored view.
-    - `seconds`: time of the search; zero for a first or stored view.
+    - `seconds`: duration of the search; zero for a first or stored view.
     """
 
     view: View
@@ -83,10 +86,11 @@ class Step(NamedTuple):
 
 @dataclasses.dataclass
 class _StepState:
-    """Results for the next view so far.
+    """Intermediate results for the next view.
 
-    - `is_proposed`: whether a caller received the proposal, so that it was not computed only for the stop rule.
-    - `stop`: reason to stop, once the rule `is_asked`.
+    - `is_proposed`: whether a caller received the proposal. False if the proposal was computed for the stop rule only.
+    - `stop`: reason to stop, or None. Valid once `is_asked` is True.
+    - `is_asked`: whether the stop rule was evaluated.
     """
 
     inputs: StepInputs | None = None
@@ -100,15 +104,15 @@ class _StepState:
 class Loop:
     """A running episode.
 
-    Travel and the distance to earlier cameras count from the poses of views, not from proposals. A pose is proposed
-    only once, whether or not the view was taken there.
+    The cost of the next move and the distance to earlier cameras refer to the actual poses of views, not to proposed
+    poses. No pose is proposed twice, even if the view was taken elsewhere.
 
     - `planner`: the planner, in scene coordinates.
-    - `key`: random key. The keys of view i depend only on it and on i.
-    - `until`: stop rule; None to continue for ever.
-    - `frame`: frame of the user's world, which gives the units of the stop rule.
+    - `key`: random key. The random keys of view i depend only on `key` and i.
+    - `until`: stop rule; None for no stop rule.
+    - `frame`: frame of the user's world. The stop rule uses the units of this world.
     - `camera`: the sensor's camera in scene units, by default the planner's.
-    - `begin`: called with each of `STAGES` when it begins.
+    - `begin`: function that is called with a name from `STAGES` when this stage begins.
 
     **Raises:** `ValueError` if the rule does not apply to the planner's acquisition.
     """
@@ -134,17 +138,23 @@ class Loop:
         self._next = _StepState()
 
     def without_views(self, planner: Planner) -> "Loop":
-        """A copy without views, to add them again with this planner. The clock keeps running."""
+        """Return a copy without views and with a different planner, to which the views can be added again.
+
+        The copy keeps the time of the first view.
+        """
         loop = copy.copy(self)
         loop.planner, loop.views, loop._observations = planner, (), None
         loop._pending, loop._next = PoseList.empty(planner.max_views), _StepState()
         return loop
 
     def with_clutter(self, clutter: SignedDistance | None) -> "Loop":
-        """A copy with this clutter in the planner's obstacles, in scene units; None for no clutter."""
+        """Return a copy whose planner has this clutter in its obstacles.
+
+        - `clutter`: solid in scene units; None for no clutter.
+        """
         assert self.planner.obstacles is not None
         loop = copy.copy(self)
-        # tree_at skips the planner's checks, which take time and have passed already.
+        # tree_at skips the planner's checks, which take time and passed when the planner was created.
         where = lambda planner: planner.obstacles.clutter  # noqa: E731
         loop.planner = eqx.tree_at(where, self.planner, clutter, is_leaf=lambda leaf: leaf is None)
         return loop
@@ -161,12 +171,12 @@ class Loop:
 
     @own_settings()
     def add(self, pose: Pose, scan: PointCloud, accepted: Callable[[], None] = lambda: None) -> View:
-        """Add a view. Its proposal is the result of `propose` since the last view, if that was called.
+        """Add a view. If `propose` was called since the last view, the view records that proposal.
 
-        - `pose`: actual pose of the sensor, which may differ from the proposed one.
-        - `accepted`: called after all checks and before the view is added, for example to store it.
+        - `pose`: actual pose of the sensor, which may differ from the proposed pose.
+        - `accepted`: function that is called after all checks and before the view is added, for example to store it.
 
-        **Raises:** `ValueError` as `Planner.init` and `Planner.observe` do; the loop does not change then.
+        **Raises:** `ValueError` as `Planner.init` and `Planner.observe` do. The loop does not change then.
         """
         if self._observations is None:
             observations = self.planner.init(pose, scan, self.camera)
@@ -185,7 +195,7 @@ class Loop:
 
     @own_settings()
     def take(self, sensor: Sensor, first: Pose) -> Step | None:
-        """Take the next view with a sensor at the proposed pose, and add it; None if the episode has ended.
+        """Take the next view with a sensor at the proposed pose, and add the view. Return None if the episode ended.
 
         - `first`: pose of the first view.
 
@@ -205,9 +215,10 @@ class Loop:
     def steps(
         self, sensor: Sensor, first: Pose, stored: Iterable[tuple[Pose, PointCloud, Proposal | None]] = ()
     ) -> Iterator[Step]:
-        """Take views, the first at `first`, until the stop rule ends the episode or `max_views` is reached.
+        """Take views until the stop rule ends the episode or `max_views` is reached, and yield the step of each view.
 
-        - `stored`: earlier views in order. They are added first, without the sensor.
+        - `first`: pose of the first view.
+        - `stored`: stored views of the same episode, in order. They are added first, and the sensor is not used.
 
         **Raises:** `ValueError` as `take` does, for example when every candidate has been visited.
         """
@@ -217,12 +228,12 @@ class Loop:
             yield Step(self.add(pose, scan), self.observations, None, 0.0)
         while len(self.views) < self.planner.max_views and (step := self.take(sensor, first)) is not None:
             yield step
-            # A posterior may be large: free it before the next step computes another.
+            # A posterior may be large, so it is freed before the next step computes a new one.
             del step
 
     @own_settings()
     def propose(self) -> Proposal:
-        """The proposal for the next view: the same until a view is added.
+        """Return the proposal for the next view. The proposal stays the same until a view is added.
 
         **Raises:** `ValueError` before the first view, and as `Planner.propose` does.
         """
@@ -240,24 +251,24 @@ class Loop:
         return self._next.proposal
 
     def settle(self, proposal: Proposal) -> None:
-        """Replace the search's proposal by another one from the same samples."""
+        """Replace the search's proposal by `proposal`, which has a different pose of the same search."""
         self._next.proposal = proposal
 
     def resume(self, proposal: Proposal) -> None:
-        """Use a stored proposal for the next view."""
+        """Use a stored proposal for the next view, without a new search."""
         self._next = _StepState(proposal=proposal, is_proposed=True)
 
     def inputs(self) -> StepInputs:
-        """Inputs of the search for the next view, computed once."""
+        """Return the inputs of the search for the next view. They are computed once for each view."""
         if not self.planner.search.uses_samples:
             return StepInputs(self.observations)
         return self._sampled()
 
     @own_settings()
     def done(self) -> str | None:
-        """The reason to stop, by the stop rule; None to continue.
+        """Return the stop rule's reason to stop; None to continue.
 
-        The rule is evaluated once for each view. If it needs samples or a proposal, `propose` uses the same ones.
+        The rule is evaluated once for each view. If the rule needs samples or a proposal, `propose` reuses these.
 
         **Raises:** `ValueError` as `propose` does, if the rule needs the next proposal.
         """
@@ -278,11 +289,11 @@ class Loop:
 
     @property
     def stop_reason(self) -> str | None:
-        """The reason to stop, if `done` has found one; otherwise None."""
+        """Reason to stop that `done` returned since the last view; None without a reason or a call."""
         return self._next.stop
 
     def in_world(self, value: Float[Array, ""]) -> float:
-        """A value of the search, or its standard error, with lengths in world units."""
+        """Convert a value of the search, or the value's standard error, to world units."""
         return float(self.frame.length_to_world(value, self.planner.quantity.length_power))
 
     def _surfaces(self) -> GridSurface:
@@ -299,7 +310,7 @@ class Loop:
 
 
 def view_keys(key: PRNGKeyArray, index: int | Int[Array, ""]) -> tuple[PRNGKeyArray, PRNGKeyArray, PRNGKeyArray]:
-    """Keys for view `index` (from 0) of an episode: for posterior samples, search and sensor noise."""
+    """Return the random keys of view `index` (counted from 0): for posterior samples, search and sensor noise."""
     return _view_keys(key, index if isinstance(index, Array) else np.int32(index))
 
 

@@ -87,7 +87,7 @@ class MountError:
         return Pose.from_matrix(np.asarray(poses.to_matrix(), np.float64) @ np.linalg.inv(self.mount))
 
     def update(self) -> bool:
-        """Update the corrections from the images so far, and return whether the corrections changed noticeably."""
+        """Update the corrections from the images so far. Returns whether they changed noticeably."""
         if len(self._images) < _ENOUGH:
             return False
         alignment = self.alignment()

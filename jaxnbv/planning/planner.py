@@ -49,7 +49,7 @@ else:
 
 
 class Planner(eqx.Module):
-    """Bayesian next-best-view selection (the paper's Algorithm 1), with the methods `init`, `propose` and `observe`.
+    """Bayesian next-best-view selection (the paper's Algorithm 1): `init`, `propose` and `observe`.
 
     - `acquisition`: the expected value of a view. You can also pass a plain function of a cloud. Then a view's value is
       the expected improvement of this utility.

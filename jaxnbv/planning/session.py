@@ -1,4 +1,4 @@
-"""Live sessions: add images of a real sensor, and get the next camera pose, in world coordinates."""
+"""Live sessions, which take images of a real sensor and return the next camera pose in world coordinates."""
 
 import math
 import threading
@@ -53,12 +53,12 @@ _NO_IMAGE = "the session has no image yet: add one first, session.add(depth, mat
 class NextView(eqx.Module):
     """The proposed pose for the next image.
 
-    - `matrix`: the pose to send the camera to: camera to world, in the session's convention. With `correct_mount` it
-      compensates for the error of the mount, so that the camera arrives where it should.
-    - `value`: the value that the search maximises, with lengths or areas in world units.
-    - `standard_error`: standard error of the value, a mean over posterior samples; None with fewer than two samples.
-    - `proposal`: the search's full result, in scene coordinates.
-    - `refusals`: number of poses that were tried and cannot be reached, by reason.
+    - `matrix`: camera-to-world matrix of the pose to command, in the session's convention. With `correct_mount`, the
+      matrix compensates for the error of the camera's mount.
+    - `value`: value of the pose in the search, with lengths or areas in world units.
+    - `standard_error`: standard error of the value as a mean over posterior samples; None with fewer than two samples.
+    - `proposal`: full result of the search, in scene coordinates.
+    - `refusals`: for each reason, the number of poses that were tried but cannot be reached.
     """
 
     matrix: Float[np.ndarray, "4 4"]
@@ -72,38 +72,44 @@ class Session:
     """The planning loop at a real sensor.
 
     Matrices are 4 x 4, camera to world. Matrices, the box, stop rules, costs and values are in world units. Planning
-    uses evenly spaced rows and columns of each image, at most 20,000 rays; the folder stores whole images.
+    uses evenly spaced rows and columns of each image, at most 20,000 rays. The folder stores whole images.
 
     - `camera`: the sensor, with its range in world units.
-    - `box`: two corners of a box about the object, without the table.
+    - `box`: two corners of a box around the object. The box should not contain the table.
     - `planner`: a planner in scene coordinates, as for a simulation. The scene is the scaled box. The sensor's camera
-      replaces the planner's, at the planner's resolution, and the box replaces the default volume `Box()`. The default
-      planner uses `NewSurface`, `DiscreteSearch`, eight samples, 24 x 32 rays and 2,000 points.
-    - `up`: the world's upward axis, for example "z". Required, because no default is right for all.
-    - `obstacles`: solids around the object, in world units, for example `Obstacles((table,), margin=0.005)`. By default
-      the session looks in the first image for the plane that the object stands on, and takes it for a table: its points
-      are removed, and cameras keep clear of it. A warning names the plane, or says that there is none and which other
-      `up` would give one. Other things that images show outside the box become coarse obstacles: they hide the object
-      and keep cameras away. `Obstacles()` says that there are none.
-    - `poses`: (n, 4, 4), the poses where the sensor can be held. The default is the candidates of the planner's search,
-      in scene units about the box's centre. Only the upper half of a whole sphere is used, since the table may be
-      below. To scan a room from inside, give the poses: the default ones are outside the box.
-    - `folder`: folder that stores images and proposals before they are used. A killed session continues from it.
+      replaces the planner's camera, at the planner's resolution. The box replaces the default volume `Box()` of the
+      carving. The default planner uses `NewSurface`, `DiscreteSearch`, eight samples, 24 x 32 rays and 2,000 points.
+    - `up`: the world's upward axis, for example "z". Required, because no default is right for all robots.
+    - `obstacles`: solids around the object, in world units, for example `Obstacles((table,), margin=0.005)`. Pass
+      `Obstacles()` if there are no obstacles. By default the session detects obstacles:
+
+      - A plane under the object in the first image counts as a table. Its points are removed, and cameras keep clear
+        of it. A warning names the plane. If there is no such plane, the warning names other values of `up` with which a
+        plane would be detected.
+      - Surfaces outside the box become coarse obstacles. They may hide the object, and cameras keep clear of them.
+
+    - `poses`: (n, 4, 4), poses at which the sensor can be held. The default is the candidates of the planner's search,
+      in scene units around the centre of the box. If these are a whole sphere, only the upper half is used, because a
+      table may be below. Give poses to scan a room from inside, because the default poses are outside the box.
+    - `folder`: folder in which images and proposals are stored before they are used. If the process is killed, the
+      session continues from this folder.
     - `convention`: axes of the matrices, see `Pose.from_matrix`.
     - `key`: random key of the posterior samples.
     - `until`: stop rule, for example `Sure(0.95) | Budget(seconds=600)`; see `jaxnbv.planning.stopping`.
-    - `correct_mount`: True corrects the poses by the errors that the images show, from the third image on; see
-      `alignment`. False warns once if the poses seem off. None skips the check.
-    - `reachable`: function of matrices (n, 4, 4), in the session's convention, that returns for each whether the arm
-      can go there: a bool, or None if it can and otherwise the reason ("joint limit"), or a score from 0 to 1 that
-      multiplies the value, for example 1 / (1 + seconds of motion). It gets the best poses of the search in batches. An
-      unreachable pose is tried again with the camera turned about its optical axis.
-    - `ignore`: function of points (n, 3) in the world that returns for each whether it belongs to the robot. Such
-      points are not part of the object, but hide what is behind them. Called once an image, with all measured points.
-    - `progress`: whether a bar shows the stages of planning.
+    - `correct_mount`: True corrects the poses from the third image on, by the errors that `alignment` estimates. False
+      warns once if the poses seem wrong. None skips the check.
+    - `reachable`: function of matrices (n, 4, 4) in the session's convention, see
+      `jaxnbv.planning.reachability.Reachable`. For each matrix it returns whether the arm can go there. A score from 0
+      to 1 multiplies the value of the pose, for example 1 / (1 + seconds of motion). The function is called with
+      batches of poses in the order of their value. If a pose cannot be reached, the session tries the same pose with
+      the camera rotated about its optical axis.
+    - `ignore`: function of world points (n, 3) that returns, for each point, whether it belongs to the robot. Points of
+      the robot are not part of the object, but hide the space behind them. The function is called once for each image,
+      with all measured points.
+    - `progress`: whether to show the stages of planning on a progress bar.
 
-    **Raises:** `ValueError` for an empty box, a missing `up`, poses that the search cannot use, or a folder of another
-    session.
+    **Raises:** `ValueError` for an empty box, a missing `up`, poses that the search cannot use, or a folder whose
+    session has different arguments.
     """
 
     @checked
@@ -146,7 +152,7 @@ class Session:
         self._rehearsing = threading.RLock()
         self._folder: SessionFolder | None = None
         if folder is not None:
-            # `load` makes the session again from these arguments.
+            # `load` passes these arguments to the new session.
             config = {"camera": camera, "box": self.box, "planner": planner, "up": up, "poses": matrices}
             config |= {"convention": convention, "key": self.key, "obstacles": obstacles}
             config |= {"correct_mount": correct_mount}
@@ -165,11 +171,11 @@ class Session:
     ) -> "Session":
         """Load a session from its folder, to continue after its last image.
 
-        - `planner`: replaces the stored planner. Needed if that holds a function or network that cannot be restored
-          from its description. Both must have the same description.
-        - `until`, `progress`, `reachable`, `ignore`: as for a new session; they are not stored.
+        - `planner`: planner to use in place of the stored one. It is needed if the stored planner contains a function
+          or network that cannot be restored. It must have the same description as the stored planner.
+        - `until`, `progress`, `reachable`, `ignore`: as for a new session. A session's folder does not store them.
 
-        **Raises:** `ValueError` if the folder holds no session, or its planner cannot be restored.
+        **Raises:** `ValueError` if the folder holds no session, or if the stored planner cannot be restored.
         """
         config = SessionFolder.config_of(path, **({} if planner is None else {"planner": planner}))
         return cls(**config, folder=path, until=until, progress=progress, reachable=reachable, ignore=ignore)
@@ -183,9 +189,9 @@ class Session:
     def rehearse(self) -> Rehearsal:
         """Compile the programs of the first views, by planning with simulated images of a ball on a table.
 
-        It takes half a minute to a minute, or a few seconds if compiled programs are cached, see `keep_compiled`. The
-        session does not change. Call it in a thread while the camera goes to its first pose:
-        `threading.Thread(target=session.rehearse).start()`. `add` waits until it has ended.
+        The rehearsal takes half a minute to a minute, or a few seconds if compiled programs are cached (see
+        `keep_compiled`). The session does not change. To rehearse while the camera moves to its first pose, call
+        `threading.Thread(target=session.rehearse).start()`. `add` waits until the rehearsal has ended.
         """
         with self._rehearsing:
             intake = Intake(self.camera, self.box, self.frame, self.convention, self._given_planner)
@@ -199,7 +205,7 @@ class Session:
 
     @property
     def views(self) -> tuple[View, ...]:
-        """The images so far, as views of an episode in scene coordinates."""
+        """The session's images so far, as views of an episode in scene coordinates."""
         return self._loop.views
 
     @property
@@ -232,7 +238,7 @@ class Session:
     @property
     @own_settings()
     def object_pose(self) -> ObjectPose:
-        """Pose of the likeliest part in the world.
+        """World pose of the most probable part.
 
         **Raises:** `ValueError` as `identity` does.
         """
@@ -241,7 +247,7 @@ class Session:
     @property
     @own_settings()
     def alignment(self) -> Alignment:
-        """How far the images disagree, and the error of their poses that explains it, in world units.
+        """Disagreement of the images, and the error of their poses that explains it, in world units.
 
         **Raises:** `ValueError` for fewer than two images.
         """
@@ -249,7 +255,7 @@ class Session:
 
     @property
     def episode(self) -> Episode:
-        """The session so far as an episode, in scene coordinates, with the frame that maps them to the world.
+        """The session so far as an episode in scene coordinates. The episode's `frame` maps the scene to the world.
 
         **Raises:** `ValueError` before the first image.
         """
@@ -259,10 +265,10 @@ class Session:
 
     @own_settings()
     def done(self) -> str | None:
-        """The reason to stop, by the stop rule; None to continue.
+        """Return the stop rule's reason to stop; None to continue.
 
-        The rule is evaluated once for each image. If it needs samples or a proposal, `next` uses the same ones. Nothing
-        is stored.
+        The rule is evaluated once for each image. If the rule needs posterior samples or a proposal, `next` reuses
+        these. Nothing is stored in the folder.
 
         **Raises:** `ValueError` as `next` does, if the rule needs the next proposal.
         """
@@ -277,23 +283,26 @@ class Session:
         depth_scale: float = 1.0,
         mask: AnyArray | None = None,
     ) -> None:
-        """Add an image, and store it first.
+        """Store an image in the folder, and add it to the session.
 
-        A later image that measured nothing is left out with a `UserWarning`.
+        An image without a measurement is left out with a `UserWarning`, unless it is the first image.
 
         - `depth`: depth image, see `PointCloud.from_depth`.
-        - `matrix`: the camera's actual pose, which may differ from the proposed one.
+        - `matrix`: actual pose of the camera, camera to world. It may differ from the proposed pose.
         - `depth_scale`: factor from depth to world units: 0.001 for millimetres in a world in metres.
-        - `mask`: pixels that show the object. Give it if other things in the box may hide the object; by default all
-          points in the box count.
+        - `mask`: mask of the pixels that show the object. Give a mask if other things in the box may hide the object.
+          By default all points in the box belong to the object.
 
-        **Raises:** `ValueError` as `PointCloud.from_depth`, `Pose.from_matrix`, `Planner.init` and `observe` do, if the
-        first image shows nothing of the box, if the image is identical to an earlier one with another pose, or if
-        another process has added images to the folder. The session does not change then.
+        **Raises:** `ValueError` in the following cases. The session does not change then.
+
+        - `PointCloud.from_depth`, `Pose.from_matrix`, `Planner.init` or `Planner.observe` raises.
+        - The first image shows nothing of the box.
+        - The image is identical to an earlier image that has a different pose.
+        - A different process has added images to the folder.
         """
         image, count = Image.of(depth, matrix, depth_scale, mask), len(self.views)
         if self.ignore is not None:
-            # Called now, while the robot is still at this pose, and the result is stored.
+            # `ignore` is called now, while the robot is still at this pose. The image stores the result.
             image = image.with_robot(self.ignore, self.camera, Pose.from_matrix(image.matrix, self.convention))
         with self._rehearsing, self._alone() as folder:
             looks_for_table = count == 0 and self.planner.obstacles is None
@@ -320,15 +329,15 @@ class Session:
     def next(self, seconds: float = math.inf) -> NextView:
         """Propose the pose for the next image.
 
-        The result is stored, and stays the same until an image is added. A pose is proposed only once, since one that
-        the sensor could not take need not be tried again. Warns if the best value is at most three standard errors plus
-        the value that is expected in vain.
+        The result is stored in the folder, and stays the same until an image is added. No pose is proposed twice, even
+        if its image was taken elsewhere. Warns if the value is not greater than three standard errors plus the mean
+        value expected at visited poses, where nothing new is left to see.
 
-        - `seconds`: time limit for `reachable`, for example with a motion planner. After it, the best reachable pose so
+        - `seconds`: time limit for calls of `reachable`, which may be slow. After this time, the best reachable pose so
           far is used.
 
-        **Raises:** `ValueError` before the first image, as `Planner.propose` does, if no pose can be reached, or if
-        another process has added images to the folder.
+        **Raises:** `ValueError` as `Planner.propose` does, before the first image, if no pose can be reached, or if a
+        different process has added images to the folder.
         """
         if self._next is None:
             with self._alone() as folder, self._planning():
@@ -349,10 +358,10 @@ class Session:
 
     @own_settings()
     def expected_depth(self) -> Float[np.ndarray, "h w"] | None:
-        """Expected depth image at the pose of `next`, in world units and at the planner's resolution.
+        """Return the expected depth image at the pose of `next`, in world units and at the planner's resolution.
 
-        A pixel is the mean depth over the posterior samples, NaN where the ray misses most samples. None for a search
-        without samples.
+        A pixel is the mean depth over the posterior samples, or NaN if the ray misses most samples. Return None if the
+        search uses no samples.
 
         **Raises:** `ValueError` as `next` does.
         """
@@ -364,8 +373,10 @@ class Session:
     def refuse(self, reason: str = "refused") -> None:
         """Refuse the pose of `next`, because the camera cannot be held there.
 
-        The pose is not proposed again, and does not count as visited. `next` then returns the best other pose, from the
-        same samples, without delay.
+        The pose is not proposed again, and does not count as visited. `next` then returns the best remaining pose
+        without delay, because it uses the same values again.
+
+        - `reason`: reason for `NextView.refusals` of the following proposals.
 
         **Raises:** `ValueError` if `next` was not called since the last image.
         """
@@ -380,7 +391,7 @@ class Session:
 
     @property
     def next_view(self) -> NextView | None:
-        """The result of `next` since the last image; None if it was not called yet."""
+        """Result of `next` since the last image; None if `next` was not called since then."""
         return self._next
 
     def _add(self, image: Image, accepted: Callable[[], None] = lambda: None) -> None:
@@ -389,7 +400,7 @@ class Session:
             self._loop, self._next = loop, None
 
     def _correct(self) -> None:
-        """Correct the poses by the images so far, and add the images again if that moves a camera."""
+        """Estimate the pose errors from the images so far, and add all images again if the corrections changed."""
         if not self._intake.mount_error.update():
             return
         images, views = self._intake.images, self.views
@@ -412,20 +423,20 @@ class Session:
                     self._correct()
 
     def _next_of(self, proposal: Proposal, refusals: Mapping[str, int] = MappingProxyType({})) -> NextView:
-        """A proposal in world coordinates."""
+        """Convert a proposal to world coordinates."""
         error = None if proposal.standard_error is None else self._loop.in_world(proposal.standard_error)
         error = error if error is not None and math.isfinite(error) else None
         (matrix,), value = self._matrices(proposal.pose[None]), self._loop.in_world(proposal.value)
         return NextView(matrix, value, error, proposal, dict(refusals))
 
     def _matrices(self, poses: Pose) -> Float[np.ndarray, "n 4 4"]:
-        """World matrices to send the camera to, so that it arrives at poses (n,) of the scene."""
+        """Return the world matrices to command so that the camera arrives at scene poses (n,)."""
         sent = self._intake.mount_error.command_poses(self.frame.to_world(poses))
         return np.asarray(sent.to_matrix(self.convention), np.float64)
 
     @property
     def _sees_more_turned(self) -> bool:
-        """Whether turning the camera about its optical axis changes a pose's value."""
+        """Whether a rotation of the camera about its optical axis changes the value of a pose."""
         camera = self.planner.camera
         return self.planner.search.uses_samples and camera.height != camera.width
 
@@ -436,7 +447,7 @@ class Session:
         return 0.0 if proposal.value_at_visited is None else self._loop.in_world(proposal.value_at_visited)
 
     def _show(self, stage: str) -> None:
-        """Show the stage on the bar, which is created at the first stage."""
+        """Show a stage of planning on the progress bar. The first call creates the bar."""
         if self._bar is None:
             self._bar = progress_bar(total=2, wanted=self.progress)
         self._bar.set_description(f"view {len(self.views) + 1}, {stage}")
@@ -444,7 +455,7 @@ class Session:
 
     @contextmanager
     def _planning(self) -> Iterator[None]:
-        """Context of planning: closes the progress bar at its end."""
+        """Context that closes the progress bar at its end."""
         try:
             yield
         finally:
@@ -454,9 +465,9 @@ class Session:
 
     @contextmanager
     def _alone(self) -> Iterator[SessionFolder | None]:
-        """Context with exclusive write access to the folder; yields None without a folder.
+        """Context with exclusive write access to the folder. Yields None if the session has no folder.
 
-        **Raises:** `ValueError` if another process writes there, or has added images.
+        **Raises:** `ValueError` if a different process writes to the folder or has added images.
         """
         if self._folder is None:
             yield None
