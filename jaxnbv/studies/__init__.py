@@ -1,4 +1,7 @@
-"""Studies that compare methods, with scenes and an engine. The library itself imports none of them."""
+"""Studies that compare methods, their scenes, and the engine that runs them.
+
+The rest of the library does not import this package.
+"""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Entries of the studies that ship, see `Entry`."""
+"""Registry entries (`Entry`) of the studies that ship with the package."""
 
 from pathlib import Path
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""Study of heat: how near is the coldest point of the scanned cloud to that of the object?"""
+"""Study of heat, which measures how near the coldest point of the scanned cloud is to the object's coldest points."""
 
 import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -33,15 +33,16 @@ from jaxnbv.tasks import ColdestPoint, Coverage, body_temperature
 from jaxnbv.tasks.diffusion import HeatProblem
 from jaxnbv.viz.render import Still
 
-# Methods that look for the coldest point. The others ignore heat.
+# Methods whose acquisition values the coldest point. All other methods ignore heat.
 HEAT_METHODS = ("heat", "heat-reached", "heat-halving")
 _OTHERS = ("coverage", *BASELINES)
-# Sets of points in which the coldest point of a cloud is searched for.
+# Names of the estimates of the coldest point, and the points of the cloud among which each estimate is the coldest.
 ESTIMATES = {"all": "of all points", "reached": "of the warmed points"}
-# Points within this share of the temperature range from the lowest count as coldest: objects have symmetries, and the
-# inner floor of a mug is equally cold all over.
+# Points count as coldest if their temperature exceeds the lowest by at most this fraction of the range. Several points
+# must count, because objects have symmetries and the inner floor of a mug is equally cold all over.
 _NEARLY = 0.01
-# Inferno without its palest colours, which would not stand out against the grey of unscanned surface.
+# Matplotlib's inferno without its palest colours, which would not stand out against grey, the colour of unscanned
+# surface.
 _HEAT = LinearSegmentedColormap.from_list("heat", mpl.colormaps["inferno"](np.linspace(0.0, 0.9, 256)))
 _MARKS: dict[str, dict[str, Any]] = {
     "heat source": {"marker": "X", "color": "#d55e00", "ms": 6.0, "mec": "white"},
@@ -53,8 +54,8 @@ _MARKS: dict[str, dict[str, Any]] = {
 class Truth(NamedTuple):
     """The temperature of the true object.
 
-    - `mesh`: its surface.
-    - `points`: points on the surface, a fortieth of a scene unit apart; `temperatures`: in degrees.
+    - `mesh`: the surface of the object.
+    - `points`: points on the surface, 1/40 of a scene unit apart; `temperatures`: temperatures of the points in degrees.
     """
 
     mesh: TriangleMesh
@@ -68,13 +69,16 @@ class Truth(NamedTuple):
 
     @property
     def region(self) -> Float[np.ndarray, "m 3"]:
-        """All points whose temperature is within 1 % of the range from the lowest."""
+        """All points whose temperature exceeds the lowest by at most 1 % of the temperature range."""
         low, high = self.temperatures.min(), self.temperatures.max()
         return self.points[self.temperatures <= low + _NEARLY * (high - low)]
 
 
 def _saturated(record: Record, method: str) -> dict[int, float]:
-    """Whether all values of a step were zero (1.0) or not (0.0), by view, for `HEAT_METHODS`."""
+    """Return, for each view after the first, 1.0 if the chosen view has value zero, else 0.0.
+
+    If the chosen view has value zero, then all candidates have. The result is empty for methods not in `HEAT_METHODS`.
+    """
     steps = record["methods"][method]["steps"] if method in HEAT_METHODS else []
     return {view: float(step["value"] == 0.0) for view, step in enumerate(steps, start=2)}
 
@@ -98,11 +102,13 @@ def _measures(estimate: str) -> tuple[Measure, ...]:
 class HeatStudy(Study):
     """Measures how near the coldest point of the cloud is to the object's coldest points.
 
-    Meshes are heated at a random point. Procedural objects come from `heat_scene`. Settings as in `Study`, and
+    Meshes are heated at a random point. Procedural objects and their heat sources come from `heat_scene`.
 
-    - `num_points`: points kept of D for simulating the temperature of D with an imagined scan.
-    - `imagined_rays`: rays along a side of an imagined scan; true scans have 50 x 50.
-    - `true_grid`: grid on which a procedural object is meshed; the default resolves the thinnest rods, of radius 0.04.
+    It has the settings of `Study`, and:
+
+    - `num_points`: number of points to which D is thinned before an imagined scan is added and the temperature simulated.
+    - `imagined_rays`: rays along each side of an imagined scan. True scans have 50 x 50 rays.
+    - `true_grid`: grid on which a procedural object is meshed. The default resolves the thinnest rods (radius 0.04).
     """
 
     title: ClassVar[str] = "The coldest point"
@@ -150,7 +156,7 @@ class HeatStudy(Study):
         return Camera(height=self.imagined_rays, width=self.imagined_rays)
 
     def scene(self, index: int) -> Scene:
-        """An object. The task of the scene is the point where the object is heated."""
+        """Return a scene with an object. The task of the scene is the point where the object is heated."""
         file = self.file(index)
         if file is None:
             heated = heat_scene(index)
@@ -169,14 +175,14 @@ class HeatStudy(Study):
         return super().search(method.removeprefix("heat-"), scene)
 
     def shows_enough(self, scene: Scene, scan: PointCloud) -> bool:
-        """Whether the scan shows the heat source."""
+        """Return whether the scan shows the heat source."""
         points, _ = scan.to_numpy()
         return bool((np.linalg.norm(points - np.asarray(scene.task), axis=1) <= HeatProblem.radius).any())
 
     def truth(self, scene: Scene) -> Truth:
-        """Temperatures on the true surface.
+        """Compute the temperature of the true surface.
 
-        **Raises:** `ValueError` unless the surface is a mesh or a signed distance.
+        **Raises:** `ValueError` if the surface is neither a mesh nor a signed distance.
         """
         surface = scene.surface
         mesh = mesh_from_sdf(surface.sdf, self.true_grid) if isinstance(surface, SDFSurface) else surface
@@ -192,9 +198,10 @@ class HeatStudy(Study):
         return {"name": scene.name, "truth": {"point": truth.coldest.tolist(), "temperature": low, "hottest": high}}
 
     def follow(self, scene: Scene, truth: Truth, planner: Planner, episode: Iterator[Step]) -> Record:
-        """Record after each view the share of warmed points and two estimates of the coldest point.
+        """Record the fraction of warmed points and two estimates of the coldest point after each view.
 
-        One estimate is among all points, the other among the warmed points, or among all if there are none. Each has a
+        A point is warmed if it is connected to the heat source. The first estimate is the coldest of all points of the
+        cloud. The second is the coldest of the warmed points, or of all points if none is warmed. Each estimate has a
         position, a temperature, and a distance to the nearest of the object's coldest points.
         """
         tree, heat, shares = cKDTree(truth.region), heat_problem(scene), []
@@ -211,9 +218,9 @@ class HeatStudy(Study):
         return {"reached": shares, "estimates": estimates}
 
     def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
-        """Tiles of the cloud's visible points, coloured by temperature, over the object in grey.
+        """Return tiles of the cloud's visible points, coloured by temperature, over the object in grey.
 
-        Marks show the object's coldest point and the estimate.
+        Markers show the object's coldest point and the coldest point of the cloud.
         """
         scene, runs = self.scene(record["scene"]), record["methods"]
         truth, heat = self.truth(scene), heat_problem(scene)
@@ -239,12 +246,12 @@ class HeatStudy(Study):
 
 
 def heat_problem(scene: Scene) -> HeatProblem:
-    """The paper's heat problem with the scene's source."""
+    """Return the paper's heat problem with the scene's heat source."""
     return HeatProblem(np.asarray(scene.task))
 
 
 def _mark(axes: Axes, still: Still, point: Float[np.ndarray, "3"], name: str) -> None:
-    """Draw a mark at a point, hollow if the object hides the point."""
+    """Draw the marker `name` at a point. The marker is hollow if the object hides the point."""
     pixels, in_front = still.project(point[None])
     look = _MARKS[name] if in_front[0] else _MARKS[name] | {"mfc": "white", "mec": _MARKS[name]["color"]}
     axes.plot(pixels[0, 0], pixels[0, 1], zorder=6, **look)

@@ -1,4 +1,4 @@
-"""Study of identification: which of the known parts is the object, and in which pose does it lie?"""
+"""Study of identification, which asks which known part the object is and in which pose it lies."""
 
 import dataclasses
 import math
@@ -44,17 +44,17 @@ IDENTIFY, BY_NAME = "identify", "identify-name"
 _SIZE = 2.5
 # Sensor noise: 0.6 % of the size per coordinate of a point, six degrees for a normal.
 _NOISE = SensorNoise(0.006 * _SIZE, 0.1)
-# Cameras about a table stand at least this far above it.
+# Lowest elevation of the cameras around a table.
 _ELEVATION = math.radians(10.0)
-# At least this share of a first view's pixels shows the part.
+# A first view shows the part in at least this fraction of its pixels.
 _ENOUGH = 0.01
 # Rows and columns of rays of an imagined scan.
 _RAYS = (28, 28)
-# Numbers of points on the true surface and on the placed one, between which distances are measured.
+# Distances are measured from _POINTS points on the true surface to _DENSE points on the surface of the placed part.
 _POINTS, _DENSE = 500, 20_000
-# A pose is right if its error is below this share of the size.
+# A pose is right if its error is below this fraction of the part's size.
 _RIGHT = 0.01
-# Names whose weights reach this share of the largest weight count as tied.
+# Names whose weights are at least this fraction of the largest weight count as tied.
 _LEVEL = 0.99
 # Colour scale of distances to the true part, in scene units.
 _ERRORS = LogNorm(0.01, 0.5)
@@ -70,14 +70,15 @@ def _below(share: float) -> Any:
 
 
 class IdentificationStudy(Study):
-    """Measures how well views tell which known part an object is, and its pose.
+    """Measures how well the views of a method tell which known part the object is, and in which pose it lies.
 
-    Settings as in `Study`, and
+    It has the settings of `Study`, and:
 
-    - `setup`: where the part lies and how much of it a view shows.
-    - `meshes`: files of the parts, at true size. Without any, the parts come in sets of eight that look alike.
+    - `setup`: where the part lies, and how much of the part a view shows.
+    - `meshes`: mesh files of the parts at true size. Without mesh files, the study uses sets of eight parts that look
+      alike.
 
-    All methods hold the same bank and weigh the same hypotheses, so they differ only in their views.
+    All methods use the same bank and the same weights of hypotheses. They differ only in the views that they choose.
     """
 
     title: ClassVar[str] = "Which part it is, and how it lies"
@@ -132,11 +133,11 @@ class IdentificationStudy(Study):
         setup: Setup | None = None,
         **options: Any,
     ) -> dict[str, Study]:
-        """A study of one setup, or one study per setup if none is given.
+        """Return one study for `setup`, or one study for each setup if `setup` is None. Keys are the names of setups.
 
-        - `parts`: a folder of meshes at true size; default: parts that look alike.
+        - `parts`: folder of meshes at true size; default: the shipped sets of parts that look alike.
 
-        **Raises:** `ValueError` for a model that knows no parts, or a folder without meshes.
+        **Raises:** `ValueError` if the model is not "known", or if the folder holds no meshes.
         """
         require(model == KNOWN, f"the study is about known parts: give the model {KNOWN}, or none")
         settings: dict[str, Any] = {
@@ -148,7 +149,7 @@ class IdentificationStudy(Study):
 
     @property
     def num_scenes(self) -> int | None:
-        """None: the number of scenes is unlimited, since parts come again in other poses."""
+        """None, because the number of scenes is unlimited: parts come again in new poses."""
         return None
 
     @property
@@ -161,7 +162,7 @@ class IdentificationStudy(Study):
         return self.camera.resized(*_RAYS)
 
     def scene(self, index: int) -> Scene:
-        """A part in a random pose. The task of the scene is its `PlacedPart`.
+        """Return a scene with a part in a random pose. The task of the scene is its `PlacedPart`.
 
         **Raises:** `ValueError` if the index is negative.
         """
@@ -175,9 +176,9 @@ class IdentificationStudy(Study):
         return Scene(index, parts.bank.names[part], placed.mesh, placed)
 
     def sensor(self, scene: Scene) -> Sensor:
-        """A depth camera with noisy points, normals and ranges.
+        """Return a depth camera with noisy points, normals and ranges.
 
-        Obstacles hide the part, and points on obstacles are removed.
+        Obstacles hide the part, and points on obstacles are removed from the scans.
         """
         obstacles = scene.task.obstacles
 
@@ -191,7 +192,7 @@ class IdentificationStudy(Study):
         return int(scan.count) >= _ENOUGH * self.camera.num_rays
 
     def sampler_of(self, scene: Scene) -> SurfaceSampler:
-        """A sampler that holds the bank at the scene's scale. Its parts rest on the table if there is one."""
+        """Return a sampler with the bank at the scene's scale. If there is a table, the parts rest on the table."""
         return self.sampler.with_bank(scene.task.bank, scene.task.poses)
 
     def planner_of(self, acquisition: Acquisition, search: Search, scene: Scene) -> Planner:
@@ -204,7 +205,7 @@ class IdentificationStudy(Study):
         return Identify(pose=method != BY_NAME)
 
     def truth(self, scene: Scene) -> _Truth:
-        """The placed part, points on its surface, and its diameter."""
+        """Return the placed part, points on its surface, and its diameter (scene units)."""
         mesh = scene.task.mesh
         corners = mesh.to_trimesh().convex_hull.vertices
         return scene.task, mesh.sample_points(self.key(scene.index, "measure"), _POINTS), float(pdist(corners).max())
@@ -215,11 +216,11 @@ class IdentificationStudy(Study):
 
     @classmethod
     def group(cls, record: Record) -> str:
-        """The set of parts that look alike."""
+        """Return the name of the scene's set of look-alike parts, or "" for parts from mesh files."""
         return record["set"]
 
     def follow(self, scene: Scene, truth: _Truth, planner: Planner, episode: Iterator[Step]) -> Record:
-        """Record after each view the likeliest name, the true name's probability, and the error of the pose."""
+        """Record the most likely name, the true name's probability, and the error of the pose after each view."""
         views = [self._view_record(truth, step.observations.hypotheses) for step in episode]
         return {name: [view[name] for view in views] for name in views[0]}
 
@@ -228,7 +229,7 @@ class IdentificationStudy(Study):
         (task, points, diameter), bank = truth, hypotheses.bank
         weights = np.append(np.asarray(hypotheses.shape_weights), hypotheses.weights[-1])
         named, (part, placement) = int(np.argmax(weights)), hypotheses.most_likely
-        # Parts that the scans so far do not distinguish are tied, whatever their order in the bank.
+        # Count parts that the scans so far do not distinguish as tied. Otherwise their order in the bank would decide.
         is_tied = weights >= _LEVEL * weights.max()
         right = float(is_tied[task.part] / is_tied.sum())
         rotation, shift = np.asarray(placement.rotation, np.float64), np.asarray(placement.shift, np.float64)
@@ -246,7 +247,7 @@ class IdentificationStudy(Study):
         }
 
     def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
-        """Tiles of the likeliest part as placed after each view, coloured by the distance to the true part."""
+        """Return tiles of the most likely part as placed after each view, coloured by its distance to the true part."""
         task, runs, eye = self.scene(record["scene"]).task, record["methods"], opposite_direction(record)
         true = task.mesh
         tree = cKDTree(true.sample_points(jax.random.key(0), 10 * _DENSE))

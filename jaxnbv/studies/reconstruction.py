@@ -1,4 +1,4 @@
-"""Study of reconstruction: how near is the surface made from a method's views to the true one?"""
+"""Study of reconstruction, which measures how near the surface made from a method's views is to the true surface."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar, cast
@@ -33,7 +33,7 @@ from jaxnbv.viz.style import DEVIATION
 
 POISSON, MEAN = "screened Poisson", "posterior mean"
 RECONSTRUCTIONS = (POISSON, MEAN)
-# Colour scale of distances to the true surface: from the sensor noise to a fifth of the object.
+# Colour scale of distances to the true surface (scene units), from the sensor noise to 1/5 of the object's size.
 _ERRORS = LogNorm(0.01, 0.5)
 # Number of points on the true surface to which pictures measure distances.
 _DENSE = 200_000
@@ -50,8 +50,8 @@ def _distances(name: str, title: str) -> Measure:
 class ReconstructionStudy(Study):
     """Measures the distance between the surface reconstructed from a method's cloud and the true surface.
 
-    Settings as in `Study`. Procedural objects come from the test split of `part_scene`. The posterior mean is meshed on
-    the grid of the samples and carved like them.
+    It has the settings of `Study`. Procedural objects come from the test split of `part_scene`. The posterior mean is
+    meshed on the grid of the samples and carved as the samples are.
     """
 
     title: ClassVar[str] = "Distances to the true surface after the last view"
@@ -85,7 +85,7 @@ class ReconstructionStudy(Study):
     quick: ClassVar[Mapping[str, Any]] = {**Study.quick, "num_candidates": 40}
 
     def scene(self, index: int) -> Scene:
-        """The object of an index: a mesh or a procedural object."""
+        """Return the scene with this index. Its object is a mesh if the study has `meshes`, else procedural."""
         file = self.file(index)
         if file is not None:
             return Scene(index, file.name, file.read())
@@ -96,11 +96,11 @@ class ReconstructionStudy(Study):
         return NewSurface() if method == "new-surface" else Coverage()
 
     def mesher(self, scene: Scene) -> Planner:
-        """The planner whose sampler reconstructs the surface for all methods, including those of the user."""
+        """Return the planner whose sampler reconstructs the surface for all methods, including the user's methods."""
         return self.planner("farthest", scene)
 
     def truth(self, scene: Scene) -> Float[np.ndarray, "n 3"]:
-        """Points on the true surface, uniform by area.
+        """Return points on the true surface, uniformly distributed by area.
 
         **Raises:** `ValueError` if the surface cannot be sampled.
         """
@@ -116,9 +116,10 @@ class ReconstructionStudy(Study):
         planner: Planner,
         episode: Iterator[Step],
     ) -> Record:
-        """Record the share of the surface covered after each view, and errors of two reconstructions.
+        """Record the fraction of the surface covered after each view, and the errors of two reconstructions.
 
-        Both reconstructions are made from the last cloud. The Poisson reconstruction is None without `pymeshlab`.
+        Both reconstructions are made from the observations after the last view. The errors of the Poisson reconstruction
+        are None if `pymeshlab` is not installed.
         """
         views = [view for view, *_ in episode]
         mesher = self.mesher(scene)
@@ -137,9 +138,9 @@ class ReconstructionStudy(Study):
         return {"chamfer": distance.chamfer, **distance._asdict()}
 
     def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
-        """Tiles of each reconstruction after the last view, coloured by the distance to the true surface.
+        """Return tiles of each reconstruction after the last view, coloured by the distance to the true surface.
 
-        **Raises:** `ValueError` if the records hold a reconstruction that needs an extra, and this is not installed.
+        **Raises:** `ValueError` if the record holds errors of the Poisson reconstruction, but `pymeshlab` is not installed.
         """
         scene, runs = self.scene(record["scene"]), record["methods"]
         truth = cast(TriangleMesh, true_mesh(scene.surface))
@@ -163,7 +164,10 @@ class ReconstructionStudy(Study):
 
 
 def reconstruct(sampler: SurfaceSampler, observations: Observations, name: str) -> TriangleMesh | None:
-    """One of `RECONSTRUCTIONS` from observations; None for Poisson reconstruction without `pymeshlab`."""
+    """Reconstruct the surface from observations by the method `name`, one of `RECONSTRUCTIONS`.
+
+    Return None for the Poisson reconstruction if `pymeshlab` is not installed.
+    """
     if name == MEAN:
         return sampler.mean_mesh(observations)
     return screened_poisson(observations.cloud) if has_poisson() else None

@@ -1,4 +1,4 @@
-"""Study of a recorded sequence: how much of a box the frames show that a method chooses one by one."""
+"""Study of a recording. A method chooses frames one by one, and the study measures how much of a box they show."""
 
 import functools
 from collections.abc import Iterator, Mapping, Sequence
@@ -38,23 +38,24 @@ from jaxnbv.utility import Quantity
 from jaxnbv.viz.style import GREY, INK, LINE, NEW
 
 NEW_AREA, COVERAGE, EVEN, ORACLE = "new surface", "coverage", "evenly spaced", "oracle"
-# A voxel that fewer frames show may be noise.
+# Number of frames that must show a voxel. A voxel that fewer frames show may be noise.
 _SEEN_BY = 3
 _VOXELS_ALONG_BOX = 80
-# A first view shows at least this share of the box's voxels.
+# A first view shows at least this fraction of the box's voxels.
 _ENOUGH = 0.05
 # Rows and columns of rays of an imagined scan.
 _RAYS = (24, 32)
-# Pixel stride for the default box, and its margin as a share of the longest side.
+# Pixel stride with which the default box is computed, and the margin of the box as a fraction of its longest side.
 _COARSE, _ROOM = 16, 0.05
 
 
 class Recording(NamedTuple):
-    """The frames of a sequence, and the voxels of the box that at least three of them show.
+    """The frames of a recording, and the voxels of the box that at least three frames show.
 
-    - `poses`: the camera poses; `scans`: what each frame shows of the box; both in scene units.
-    - `is_shown`: whether any pixel of each frame shows each voxel.
-    - `voxels`: the centres of the voxels; `camera_positions`: of the frames; both in the recording's units.
+    - `poses`: camera poses of the frames; `scans`: scans of the frames, cropped to the box; both in scene units.
+    - `is_shown`: True where any pixel of a frame shows a voxel.
+    - `voxels`: centres of the voxels; `camera_positions`: positions of the frames' cameras; both in the recording's
+      units.
     """
 
     poses: Pose
@@ -65,33 +66,33 @@ class Recording(NamedTuple):
 
 
 class _Unknown(Surface):
-    """Stands in for the true surface of a recording, which is unknown."""
+    """Placeholder for the true surface of a recording, which is unknown."""
 
     in_jit: ClassVar[bool] = False
 
     def trace(self, origins, directions) -> Hits:
-        """**Raises:** `ValueError` always."""
+        """Always raise `ValueError`, because the surface is unknown."""
         raise InputError("the true surface of a recording is unknown: take scans from the study's sensor")
 
 
 class FixedOrder(Baseline):
-    """Visits the candidates in a fixed order.
+    """Baseline that visits candidates in a fixed order.
 
-    - `turns`: index of the candidate of each view, the first view included.
+    - `turns`: index of the candidate for each view, including the first view.
     """
 
     turns: Int[Array, " views"] = eqx.field(kw_only=True)
 
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
-        """1 for the candidate whose turn it is, 0 for the others. The key is not used."""
+        """Return 1 for the next candidate in the order, and 0 for all other candidates. The key is not used."""
         chosen = jnp.arange(candidates.position.shape[0]) == self.turns[problem.observations.num_views]
         return chosen.astype(candidates.position.dtype)
 
 
 class MostNewVoxels(Baseline):
-    """Greedy oracle: chooses the frame that shows the most voxels not shown by the frames so far.
+    """Greedy oracle that chooses the frame with the most voxels that no chosen frame shows yet.
 
-    - `is_shown`: whether each candidate shows each voxel.
+    - `is_shown`: True where a candidate shows a voxel.
     """
 
     is_shown: Bool[Array, "candidates voxels"] = eqx.field(kw_only=True)
@@ -100,14 +101,17 @@ class MostNewVoxels(Baseline):
         return Quantity("new voxels", "", "voxels that a frame shows and no earlier frame does.", smooth=False)
 
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
-        """The number of new voxels of each candidate. The key is not used."""
+        """Return the number of new voxels of each candidate. The key is not used."""
         is_shown = jnp.any(self.is_shown & problem.observations.poses.contains(candidates)[:, None], axis=0)
         gain = jnp.sum(self.is_shown & ~is_shown, axis=1)
         return gain.astype(candidates.position.dtype)
 
 
 def _gains(record: Record, method: str) -> dict[int, float | None]:
-    """Voxels that a method has added by each later view, as a share of those that the oracle has added."""
+    """Return, for each view after the first, the voxels that a method has added, relative to the oracle's.
+
+    Both numbers count all voxels added since the first view. The value is None if the oracle has added none.
+    """
     if ORACLE not in record["methods"]:
         return {}
     own, best = (record["methods"][name]["covered"] for name in (method, ORACLE))
@@ -116,16 +120,19 @@ def _gains(record: Record, method: str) -> dict[int, float | None]:
 
 
 class RecordedStudy(Study):
-    """Finds which frames of a recording show the most of a box.
+    """Measures how much of a box the frames of a recording show that a method chooses.
 
-    Each scene starts from another first view, a random one of the frames that show a twentieth of the box. The
-    candidates are the recorded poses, and a chosen frame gives its recorded scan. Settings as in `Study`, and
+    The candidates are the recorded poses, and the scan of a candidate is its recorded scan. The first view is a random
+    frame that shows at least 5 % of the box's voxels. Scenes differ only in their first view.
+
+    It has the settings of `Study`, and:
 
     - `folder`, `up`, `intrinsics` (fx, fy, cx, cy), `depth_scale`: arguments of `RecordedFrames`.
     - `box`: the region of interest, in the recording's units.
-    - `voxel`: side of the voxels that are counted, in the recording's units.
+    - `voxel`: side of the counted voxels, in the recording's units.
 
-    **Raises:** `ValueError` as `RecordedFrames` does, or if the box holds no voxel that three frames show.
+    **Raises:** `ValueError` as `RecordedFrames` does, or if the box holds no voxel that three frames show. Both are
+    raised when the recording is first read.
     """
 
     title: ClassVar[str] = "Voxels of a recorded place that were seen"
@@ -160,14 +167,15 @@ class RecordedStudy(Study):
 
     @classmethod
     def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
-        """The study of one recording.
+        """Return the study of one recording, under the name "".
 
-        - `folder`, `up`, `intrinsics`, `depth_scale`: as in the study.
-        - `box`: its two corners, six numbers; default: `bounds_of` the recording. A voxel's side is an eightieth of the
-          box's longest side.
-        - `num_samples`, `grid_resolution`, `capacity`: as in the study.
+        The side of the voxels is 1/80 of the box's longest side. `options`:
 
-        **Raises:** `ValueError` for a model with known shapes, or for a number of candidates.
+        - `folder`, `up`, `intrinsics`, `depth_scale`: settings of `RecordedStudy`.
+        - `box`: two corners of the box as six numbers; default: `bounds_of` the recording.
+        - `num_samples`, `grid_resolution`, `capacity`: settings of `Study`.
+
+        **Raises:** `ValueError` if the model has known shapes, or if `options` holds `num_candidates`.
         """
         require(
             "num_candidates" not in options,
@@ -197,7 +205,7 @@ class RecordedStudy(Study):
 
     @property
     def recording(self) -> Recording:
-        """The sequence, read once per process."""
+        """The recording, which is read once per process."""
         carving, frame = self.sampler.carving, frame_of_box(self.box)
         kept = self.box if carving is None else carving.with_room(self.box, self.grid, frame)
         sensor = self.up, self.intrinsics, self.depth_scale
@@ -214,7 +222,12 @@ class RecordedStudy(Study):
         return lambda pose, key: self.recording.scans[self.frame_of(pose)]
 
     def first_view(self, scene: Scene) -> int:
-        """Index of a frame that shows enough, a different one in each scene while there are any left."""
+        """Return the index of a random frame that shows at least 5 % of the box's voxels.
+
+        Scenes start from different frames until all such frames have been used.
+
+        **Raises:** `ValueError` if there is no such frame.
+        """
         enough = np.flatnonzero(self.recording.is_shown.mean(axis=1) >= _ENOUGH)
         require(len(enough) > 0, f"no frame of {self.folder} shows a twentieth of {self.box}: give a smaller box")
         order = jax.random.permutation(jax.random.key(self.seed), len(enough))
@@ -229,7 +242,7 @@ class RecordedStudy(Study):
 
     def search(self, method: str, scene: Scene) -> Search:
         if method == EVEN:
-            # Evenly spaced over the recording from the first view on, wrapping around at its end.
+            # Frames are evenly spaced over the recording, start at the first view, and wrap around at the end.
             apart = np.round(np.arange(self.views) * self.num_candidates / self.views).astype(int)
             turns = (self.first_view(scene) + apart) % self.num_candidates
             return FixedOrder(self.candidates, turns=jnp.asarray(turns))
@@ -247,15 +260,16 @@ class RecordedStudy(Study):
         planner: Planner,
         episode: Iterator[Step],
     ) -> Record:
-        """Record the chosen frames, and the share of the voxels shown after each of them."""
+        """Record the chosen frames, and the fraction of the voxels that they show after each view."""
         frames = [self.frame_of(step.view.pose) for step in episode]
         is_shown = np.logical_or.accumulate(truth[frames], axis=0)
         return {"frames": frames, "covered": is_shown.mean(axis=1).tolist()}
 
     def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
-        """Tiles of the box's voxels along its shortest side, in colour once a chosen frame shows them.
+        """Return tiles that show the box's voxels, projected along the shortest side of the box.
 
-        A line is the path of the recorded camera, and numbers are the chosen frames in their order.
+        Voxels that a chosen frame shows are coloured. The line is the path of the recorded camera, and the numbers mark
+        the chosen frames in their order.
         """
         recording, runs = self.recording, record["methods"]
         kept = np.sort(np.argsort(self.box.high - self.box.low)[1:])
@@ -276,14 +290,14 @@ class RecordedStudy(Study):
         return Tiles("Coloured: voxels that the frames show. Numbers: their camera positions, in order.", tile)
 
     def frame_of(self, pose: Pose) -> int:
-        """Index of the frame whose pose is nearest."""
+        """Return the index of the frame whose pose is nearest to `pose`."""
         poses = self.recording.poses
         off = jnp.abs(poses.position - pose.position).sum(-1) + jnp.abs(poses.rotation - pose.rotation).sum((-1, -2))
         return int(jnp.argmin(off))
 
 
 def _points(frames: RecordedFrames, index: int, stride: int) -> Float[np.ndarray, "n 3"]:
-    """Points of a frame in world coordinates, from every `stride`-th pixel along each axis."""
+    """Return the points of a frame in world coordinates, from every `stride`-th pixel along each axis."""
     camera, matrix = frames.camera.strided(stride), frames.matrices[index]
     rows = slice(stride // 2, None, stride)
     depth = frames.depth_scale * frames.depth(index)[rows, rows].reshape(-1)
@@ -292,7 +306,10 @@ def _points(frames: RecordedFrames, index: int, stride: int) -> Float[np.ndarray
 
 
 def bounds_of(frames: RecordedFrames) -> list[float]:
-    """Two corners of a box from the 1st to the 99th percentile of all points per axis, with a margin.
+    """Return two corners of a box around nearly all points of a recording, as six numbers in its units.
+
+    Along each axis, the box spans the 1st to the 99th percentile of the points' coordinates. A margin of 5 % of the
+    longest side is added on all sides.
 
     **Raises:** `ValueError` if no frame has a valid depth.
     """
@@ -304,7 +321,7 @@ def bounds_of(frames: RecordedFrames) -> list[float]:
 
 
 def frame_of_box(box: Box) -> Frame:
-    """The frame that maps the recording's coordinates to the scene's."""
+    """Return the frame that maps the recording's coordinates to scene coordinates."""
     return Frame.fit(np.array([box.low, box.high]), up="z")
 
 
@@ -313,6 +330,7 @@ def _recording(source: tuple[Any, ...], box: Box, voxel: float, kept: Box) -> Re
     """Read a recording.
 
     - `source`: the arguments of `RecordedFrames`.
+    - `box`: the box whose voxels are counted; `voxel`: side of a voxel, both in the recording's units.
     - `kept`: the box to which scans are cropped.
     """
     frames, frame = RecordedFrames(*source), frame_of_box(box)
@@ -321,10 +339,10 @@ def _recording(source: tuple[Any, ...], box: Box, voxel: float, kept: Box) -> Re
     nowhere, none = jnp.zeros((count, 3)), jnp.zeros(count, bool)
     scans, cells_of_frames = [], []
     for index in progress_bar(range(len(frames)), desc="reading frames"):
-        # Not strided as the scans are: fewer pixels would miss voxels that the frame shows.
+        # Use all pixels, although scans use every `stride`-th. Fewer pixels would miss voxels that the frame shows.
         points = _points(frames, index, 1)
         points = points[np.all((points >= box.low) & (points <= box.high), axis=1)]
-        # A frame without points in the box gives an empty scan, which carves nothing either.
+        # A frame without points in the box gives an empty scan. Its rays are not used for carving either.
         scan = PointCloud(nowhere, nowhere, none, none, jnp.zeros(count))
         if len(points) > 0:
             image = frames.depth(index), frames.camera, poses[index], frames.depth_scale, stride

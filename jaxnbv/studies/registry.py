@@ -1,7 +1,7 @@
 """Registry of the studies of `jaxnbv study`.
 
-Studies are entry points of the group `jaxnbv.studies` in any installed package. Each entry point names an `Entry` in a
-module that does not import JAX, so that the command's help shows quickly.
+Any installed package can register a study as an entry point of the group `jaxnbv.studies`. The entry point names an
+`Entry` in a module that does not import JAX, because importing JAX would slow down the command's help.
 """
 
 import functools
@@ -18,12 +18,13 @@ GROUP = "jaxnbv.studies"
 class Entry(NamedTuple):
     """Describes one study to the command line.
 
-    - `study`: its class as "module:class", imported when the study runs.
-    - `question`: the question that it answers, shown in the help.
+    - `study`: class of the study as "module:class". It is imported when the study runs.
+    - `question`: the question that the study answers, shown in the help.
     - `scenes`, `views`: default numbers of scenes and views.
-    - `model`: default model of surfaces; "known" for a study that has a `bank` or is about known parts.
-    - `options`: typer annotations of the study's own options, by the names of its settings. Their default is None. A
-      `typer.Argument` is required. Options that all studies have, such as `capacity`, are left out.
+    - `model`: default surface model. It is "known" for a study that has a `bank` or is about known parts.
+    - `options`: maps names of the study's settings to typer annotations, for options that only this study has. The
+      default of each option is None, and a `typer.Argument` is required. Options of all studies, such as `capacity`,
+      are not listed here.
     """
 
     study: str
@@ -40,7 +41,10 @@ class Entry(NamedTuple):
 
 @functools.cache
 def studies() -> dict[str, Entry]:
-    """The studies of all installed packages, by name. A `UserWarning` names each that cannot be loaded."""
+    """Return the studies of all installed packages by name.
+
+    A study that cannot be loaded is left out, and a `UserWarning` names the study and the error.
+    """
     entries: dict[str, Entry] = {}
     for point in entry_points(group=GROUP):
         try:

@@ -1,4 +1,7 @@
-"""Cameras and candidates of the paper's part and heat experiments, which differ from the default."""
+"""Settings of the paper's part and heat experiments that differ from the default.
+
+Each `Setting` holds the camera, the radius of the sphere of candidates and the number of candidates.
+"""
 
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.scanning.sensors import Setting

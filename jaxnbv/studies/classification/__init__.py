@@ -1,1 +1,1 @@
-"""Studies of the class of an object: the paper's experiments on classification."""
+"""Studies that classify objects, as in the paper's experiments on classification."""

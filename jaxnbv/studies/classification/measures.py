@@ -1,7 +1,7 @@
 """Measures of classification studies: hits, visible cues, and the quality of samples and values.
 
-A view, counted from 1, is a first hit if the right class was predicted up to it, and a stable hit if the right class is
-predicted from it to the end.
+A view is a first hit if some prediction up to this view is the right class. A view is a stable hit if all predictions
+from this view to the last view are the right class. The cue is the part of the object that tells its class.
 """
 
 from collections.abc import Callable
@@ -14,24 +14,35 @@ from jaxnbv.checks import AnyArray
 from jaxnbv.sampler import StepInputs, SurfaceSampler
 from jaxnbv.studies.engine.measures import SECONDS, Measure, Record
 
-# A view shows the cue of the class if at least this number of its rays hits it.
+# A view shows the cue if at least this number of the view's rays hit the cue.
 CUE_PIXELS = 150
-# Methods that share the acquisition cross-entropy, so that their values are comparable.
+# Methods whose acquisition is cross-entropy. Their values are comparable.
 _BY_CROSS_ENTROPY = ("cross-entropy", "halving", "gradient-2dof", "gradient-constrained", "hybrid")
 
 
 def first_hits(correct: Bool[np.ndarray, "runs views"]) -> Bool[np.ndarray, "runs views"]:
-    """Whether any prediction up to each view was correct, which holds from the paper's T_first on."""
+    """Return, for each view, whether any prediction up to this view is correct.
+
+    The first view for which this holds is the paper's T_first.
+    """
     return np.logical_or.accumulate(correct, axis=1)
 
 
 def stable_hits(correct: Bool[np.ndarray, "runs views"]) -> Bool[np.ndarray, "runs views"]:
-    """Whether all predictions from each view on are correct, which holds from the paper's T_stable on."""
+    """Return, for each view, whether all predictions from this view to the last view are correct.
+
+    The first view for which this holds is the paper's T_stable.
+    """
     return np.logical_and.accumulate(correct[:, ::-1], axis=1)[:, ::-1]
 
 
 def _hit(by_view: Callable) -> Callable[[Record, str], Float[np.ndarray, " views"]]:
-    """The share of a method's runs with a hit, by view. Only random search has several runs."""
+    """Return a function that computes the fraction of a method's runs with a hit at each view.
+
+    Only random search has several runs.
+
+    - `by_view`: `first_hits` or `stable_hits`.
+    """
 
     def of(record: Record, method: str) -> Float[np.ndarray, " views"]:
         guesses = np.argmax(record["methods"][method]["log_p"], axis=-1)
@@ -41,7 +52,7 @@ def _hit(by_view: Callable) -> Callable[[Record, str], Float[np.ndarray, " views
 
 
 def _seen(record: Record, method: str) -> Float[np.ndarray, " views"] | list:
-    """The share of runs in which some view up to each one showed the cue of the class."""
+    """Return, for each view, the fraction of runs in which this view or an earlier view shows the cue."""
     pixels = record["methods"][method]["pixels"]
     return first_hits(np.array(pixels) >= CUE_PIXELS).mean(axis=0) if pixels else []
 
@@ -52,11 +63,13 @@ def _value(record: Record, method: str) -> dict[int, float]:
 
 
 def roughness(sampler: SurfaceSampler, inputs: StepInputs) -> float:
-    """Grid cells that a sample's surface crosses on average, relative to the posterior mean's surface.
+    """Return the roughness of the samples in `inputs`.
 
-    The posterior mean is carved like the samples. For a posterior without closed forms it is the mean of the samples.
-    The value is about 1 for samples as smooth as the mean, and rises if the spacing of the data exceeds the kernel's
-    width. Near 5, an acquisition says little about the value of a view.
+    It is the average number of grid cells that a sample's surface crosses, divided by the number of cells that the
+    surface of the posterior mean crosses. The posterior mean is carved as the samples are. If the posterior has no
+    closed forms, the mean of the samples is used. The roughness is about 1 for samples as smooth as the mean, and it
+    rises if the spacing of the data exceeds the kernel's width. If it is near 5, values of an acquisition say little
+    about which view is best.
     """
     posterior, surfaces = inputs.posterior, inputs.surfaces
     assert posterior is not None
@@ -68,7 +81,7 @@ def roughness(sampler: SurfaceSampler, inputs: StepInputs) -> float:
 
 
 def crossed_cells(values: Float[np.ndarray, "g g g"]) -> int:
-    """The number of cells whose eight corners do not share a sign."""
+    """Return the number of grid cells whose eight corners do not all have the same sign."""
     inside = values < 0
     size = inside.shape[0] - 1
     corners = [inside[i : i + size, j : j + size, k : k + size] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
@@ -78,9 +91,9 @@ def crossed_cells(values: Float[np.ndarray, "g g g"]) -> int:
 def rank_correlation(
     values: Float[AnyArray, " c"], true_values: Real[AnyArray, " c"], compared: Bool[np.ndarray, " c"]
 ) -> float | None:
-    """Spearman's rank correlation of expected and true values; None if either is constant.
+    """Return Spearman's rank correlation between expected and true values, or None if either is constant.
 
-    - `compared`: which candidates to include.
+    - `compared`: True for the candidates to include.
     """
     a, b = np.asarray(values)[compared], np.asarray(true_values)[compared]
     return None if np.ptp(a) == 0 or np.ptp(b) == 0 else float(spearmanr(a, b).statistic)

@@ -17,31 +17,36 @@ from jaxnbv.compiled import keep_compiled
 from jaxnbv.errors import optional
 from jaxnbv.storage.folders import differences, num_threads, versions
 
-# Seconds to wait for a scheduler.
+# Seconds to wait until a scheduler answers.
 _TIMEOUT = 5
 
 
 class Cluster(Executor):
-    """An executor on the workers of a Dask scheduler, each of which runs one call at a time.
+    """Executor that runs calls on the workers of a Dask scheduler. Each worker runs one call at a time.
 
     - `address`: address of the scheduler, such as "tcp://HOST:8786".
 
-    Blocks until there is a worker. If a worker dies, Dask starts its call again on another one. If Dask gives up, by
-    default after four workers have died with the call, the future raises `BrokenExecutor`.
+    The constructor blocks until there is a worker. If a worker dies, Dask runs the worker's call again on a different
+    worker. By default, Dask gives up once four workers have died with the same call. The call's future then raises
+    `BrokenExecutor`.
 
-    **Raises:** `ValueError` if Dask is not installed or no scheduler answers. Both this constructor and a future raise
-    it if the scheduler is gone, or if a worker runs several calls at a time, has other software or threads than this
-    process or another device than the first worker, or cannot import the function.
+    **Raises:** `ValueError` if Dask is not installed or no scheduler answers. The constructor and the futures also
+    raise `ValueError` in these cases:
+
+    - the scheduler is gone;
+    - a worker runs several calls at a time, or cannot import the function;
+    - a worker's software or number of threads differs from this process;
+    - a worker's device differs from the device of the first worker.
     """
 
     def __init__(self, address: str):
         distributed = optional("distributed")
         self.address = address
-        # Silences Dask's tracebacks of a lost connection, since the error raised here reports it.
+        # Silence Dask's tracebacks of a lost connection, because this class raises an error that reports the loss.
         logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
         try:
             self._client = distributed.Client(address, timeout=_TIMEOUT, set_as_default=False)
-        # Another kind of server at the address may cause any error.
+        # If a server that is not a Dask scheduler listens at the address, any error may occur.
         except Exception as error:
             raise InputError(
                 f"no Dask scheduler answers at {address} ({error}): start one with `dask scheduler`, and give the "
@@ -52,7 +57,7 @@ class Cluster(Executor):
         self._running: set[Future] = set()
         pools = optional("threadpoolctl").threadpool_info()
         threads = [pool["num_threads"] for pool in pools if pool["user_api"] == "blas"]
-        # Dask gives its workers one thread. They get as many as this process has, at most NPROC.
+        # Dask sets one thread for linear algebra in its workers. Give them as many as this process has, at most NPROC.
         self._blas_threads = min([*threads, num_threads()])
         self._versions = versions()
         del self._versions["device"]
@@ -65,21 +70,26 @@ class Cluster(Executor):
             raise
 
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future:
-        """Run a call on a worker, and return its future. Repeated calls of a function send it once."""
+        """Run a call on a worker, and return its future.
+
+        Consecutive calls of one function send the function once.
+        """
         require(self._client.status == "running", self._lost())
         if function is not self._pickled[0]:
-            # Pickled here, so that a worker can compare versions before it imports the modules of the function.
+            # The function is pickled here so that a worker can compare versions before it imports the function's
+            # modules.
             content = optional("cloudpickle").dumps(function)
             self._pickled = function, self._client.submit(bytes, content, pure=False)
         task = self._client.submit(
-            # A lambda is pickled as code: the scheduler needs no jaxnbv, and a worker without it can report that.
+            # A lambda is pickled as code. So the scheduler does not need jaxnbv, and a worker without jaxnbv can report
+            # that it is missing.
             lambda *values: importlib.import_module("jaxnbv.studies.engine.cluster")._call(*values),
             self._pickled[1],
             self._versions,
             self._blas_threads,
             args,
             kwargs,
-            # First come, first served: Dask ignores the order of calls within a tenth of a second.
+            # Run calls in their order. Without a priority, Dask ignores the order of calls within a tenth of a second.
             priority=-next(self._count),
             pure=False,
         )
@@ -91,9 +101,10 @@ class Cluster(Executor):
         return answer
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Disconnect from the cluster, which keeps running, once all calls are done.
+        """Wait until all calls are done, then disconnect from the cluster. The cluster keeps running.
 
-        - `cancel_futures`: disconnect now, and drop the calls that are not done.
+        - `wait`: False disconnects at once.
+        - `cancel_futures`: True disconnects at once and drops the calls that are not done.
         """
         if wait and not cancel_futures:
             concurrent.futures.wait(tuple(self._running))
@@ -103,7 +114,7 @@ class Cluster(Executor):
         self.shutdown(cancel_futures=kind is not None)
 
     def _settle(self, task: Any, answer: Future) -> None:
-        """Pass the result or error of a Dask task on to its future."""
+        """Set the result or error of a Dask task on the future that `submit` returned for the task."""
         if not answer.set_running_or_notify_cancel():
             return
         if task.status == "cancelled":
@@ -119,7 +130,7 @@ class Cluster(Executor):
             answer.set_exception(InputError(f"{problem}: {remedy}"))
         except BaseException as error:
             answer.set_exception(error)
-        # Until it is released, Dask computes a result again if the worker that holds it dies.
+        # Release the result. Otherwise Dask would compute it again if the worker that holds it dies.
         task.release()
 
     def _lost(self) -> str:
@@ -150,14 +161,17 @@ def _call(
     # A user's module may raise anything on import.
     except Exception as error:
         raise ImportError(f"{type(error).__name__}: {error}") from error
-    # The number of threads changes the last bits of linear algebra.
+    # Results of linear algebra depend on the number of threads in their last bits, so all workers use the same number.
     optional("threadpoolctl").threadpool_limits(blas_threads, user_api="blas")
     return function(*args, **kwargs)
 
 
 @functools.cache
 def _prepare() -> dict[str, Any]:
-    """Keep compiled programs, as the command does, and return the versions of this process. Runs once."""
+    """Enable the cache of compiled programs, as the command does, and return the software versions of this process.
+
+    It runs once per process.
+    """
     with contextlib.suppress(InputError):
         keep_compiled()
     return versions()

@@ -1,4 +1,4 @@
-"""Episodes of a method in a simulated scene: the first view, the record, and replays of the views."""
+"""Functions that choose the first view of an episode, run and record the episode, and replay its views."""
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence
@@ -19,18 +19,18 @@ from jaxnbv.studies.engine.measures import Record
 
 
 def simulated_sensor(surface: Surface, camera: Camera) -> Sensor:
-    """A simulated depth camera with default noise that scans a surface."""
+    """Return a simulated depth camera that scans a surface with the default noise."""
     return lambda pose, key: observe_scene(surface, camera, pose, SensorNoise(), key)
 
 
 def random_first_view(
     enough: Callable[[PointCloud], bool], poses: Pose, sensor: Sensor, key: PRNGKeyArray, episode_key: PRNGKeyArray
 ) -> int | None:
-    """Index of a random pose whose scan satisfies `enough`; None if there is none.
+    """Return the index of a random pose whose scan satisfies `enough`, or None if there is no such pose.
 
-    - `poses`: the candidates (n, ...).
-    - `key`: random key of the order in which poses are tried.
-    - `episode_key`: key of the episode, which decides the noise of its first view.
+    - `poses`: the candidates, with one leading axis.
+    - `key`: random key for the order in which the poses are tried.
+    - `episode_key`: random key of the episode, from which the noise of the scans follows.
     """
     *_, noise_key = view_keys(episode_key, 0)
     order = jax.random.permutation(key, poses.position.shape[0]).tolist()
@@ -48,8 +48,11 @@ def episode_record(
 ) -> Record:
     """Run an episode and return its record.
 
-    It holds the poses of the views, the value and seconds of each step, and the record of `follow`. The episode ends
-    after `views`, or where `follow` stops.
+    The record holds the poses of the views, the value and seconds of each step, and the record that `follow` returns.
+    The episode ends after `views` views, or earlier if `follow` stops drawing steps.
+
+    - `first`: pose of the first view.
+    - `follow`: function that draws the steps from an iterator and returns a record.
     """
     poses: list[dict[str, list]] = []
     searches: list[dict[str, float]] = []
@@ -70,15 +73,16 @@ def episode_record(
 def replay_views(
     planner: Planner, sensor: Sensor, poses: Sequence[Pose], key: PRNGKeyArray, camera: Camera
 ) -> list[tuple[PointCloud, Observations]]:
-    """Compute again, from the poses of an episode, each scan and the observations after it.
+    """Recompute each scan of an episode and the observations after each scan from the poses of the episode.
 
-    - `planner`: any planner of the study. Observations depend only on its capacity and its carving.
+    - `planner`: any planner of the study, because observations depend only on the planner's capacity and carving.
+    - `key`: random key of the episode.
     """
     views = [(pose, sensor(pose, view_keys(key, index)[2])) for index, pose in enumerate(poses)]
     return [(scan, after) for (_, scan), after in zip(views, planner.replay(views, camera), strict=True)]
 
 
 def poses_of(run: Record) -> list[Pose]:
-    """The poses of the views of a record."""
+    """Return the poses of the views in a method's record."""
     arrays = [[np.asarray(view[name], np.float32) for name in ("rotation", "position")] for view in run["views"]]
     return [Pose(rotation, position) for rotation, position in arrays]

@@ -1,4 +1,4 @@
-"""The sampler of a study, with or without known shapes, and selections from its bank."""
+"""Functions that make the sampler of a study, with or without known shapes, and that select shapes from its bank."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -9,7 +9,7 @@ from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.studies.engine.measures import KNOWN
 from jaxnbv.surfaces import KnownShapes, ShapeBank, Upright, bank_poses, shape_bank
 
-# Leaves room for a number in a shape's name.
+# Largest number of characters of a mesh's name in a shape's name, which also holds the index of the mesh.
 _LONGEST = 50
 
 
@@ -21,10 +21,12 @@ def study_sampler(
     quick: bool = False,
     solid: bool = False,
 ) -> SurfaceSampler:
-    """The sampler of a model: a preset, or for "known" the screened preset with known shapes.
+    """Return the sampler for a surface model. The model "known" is the screened preset with known shapes.
 
-    - `bank`: name of a bank that ships; "" for none.
-    - `files`: meshes to use as known shapes instead, upright, with free proportions.
+    - `model`: name of a preset, or "known".
+    - `bank`: name of a shipped bank of known shapes; "" for none.
+    - `files`: meshes to use as known shapes in place of `bank`. The shapes stay upright, and their proportions are free.
+    - `longest_side`, `quick`, `solid`: arguments of `SurfaceSampler.preset`.
 
     **Raises:** `ValueError` for an unknown model, or for "known" with neither meshes nor a bank.
     """
@@ -39,7 +41,10 @@ def study_sampler(
 
 
 def keep_shapes(sampler: SurfaceSampler, wanted: Callable[[str], bool]) -> SurfaceSampler:
-    """The sampler with only the known shapes whose names are wanted; unchanged if it has none."""
+    """Return a copy of the sampler that keeps only the known shapes whose names satisfy `wanted`.
+
+    A sampler without known shapes is returned unchanged.
+    """
     model = sampler.model
     if not isinstance(model, KnownShapes):
         return sampler
@@ -50,7 +55,10 @@ def keep_shapes(sampler: SurfaceSampler, wanted: Callable[[str], bool]) -> Surfa
 
 
 def without_own_shape(sampler: SurfaceSampler, files: Sequence[MeshFile], index: int) -> SurfaceSampler:
-    """The sampler without the known shape made from the mesh of a scene; unchanged if it has none."""
+    """Return a copy of the sampler without the known shape that was made from the mesh `files[index]`.
+
+    A sampler without this shape is returned unchanged.
+    """
     return keep_shapes(sampler, lambda name: name != _name(files, index))
 
 

@@ -1,4 +1,4 @@
-"""Measures of a study, computed from a record by method and by view or another key, and its claims."""
+"""Measures and claims of a study. A measure is computed from a record, for each method and each view or other key."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-# The stored result of one scene with all methods.
+# The stored results of all methods in one scene.
 Record = dict[str, Any]
-# The model with known shapes, and the suffix of a method that runs a second time without them.
+# Name of the model with known shapes, and suffix of a method that runs a second time without known shapes.
 KNOWN, WITHOUT_BANK = "known", "-screened"
 
 
@@ -16,12 +16,12 @@ class Measure(NamedTuple):
     """One quantity of a study, shown as a table and as a panel of the chart.
 
     - `name`: name in files; `title`: name in tables and charts.
-    - `of`: function from a record and a method to values: a sequence by view, from the first, or a mapping. None or NaN
-      if a value is undefined.
-    - `by`: what the keys of a mapping are.
-    - `unit`: unit of the values; "%" for shares in [0, 1].
+    - `of`: function that computes the values of a method from a record. It returns either a sequence with one value per
+      view, starting at the first view, or a mapping from keys to values. An undefined value is None or NaN.
+    - `by`: name of the keys, such as "view".
+    - `unit`: unit of the values; "%" for fractions in [0, 1], which are shown in percent.
     - `digits`: decimal places in tables.
-    - `less`: whether lower values are better.
+    - `less`: True if lower values are better.
     """
 
     name: str
@@ -34,11 +34,11 @@ class Measure(NamedTuple):
 
 
 class Claim(NamedTuple):
-    """A claim of the paper: the study's reference does better than other methods, or no worse.
+    """A claim of the paper that the study's reference method is better, or not worse, than others.
 
     - `text`: the claim in words.
-    - `measure`, `at`: name of the measure that decides, and its view or other key.
-    - `others`: the other methods.
+    - `measure`: name of the measure that decides the claim; `at`: the view or other key at which it is compared.
+    - `others`: the methods with which the reference is compared.
     - `must_be_better`: True if the reference must be better, False if it must not be worse.
     """
 
@@ -50,7 +50,7 @@ class Claim(NamedTuple):
 
 
 def _seconds(record: Record, method: str) -> dict[str, float]:
-    """Median over a scene's steps, without the first, which may include compilation."""
+    """Return the median time of a scene's steps. The first step is left out, because it may include compilation."""
     seconds = [step["seconds"] for step in record["methods"][method].get("steps", [])][1:]
     return {"median": float(np.median(seconds))} if seconds else {}
 

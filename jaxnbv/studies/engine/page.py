@@ -1,4 +1,4 @@
-"""Page of all studies in a folder, with claims, tables, chart, pictures, settings and times of each."""
+"""HTML page of all studies in a folder, with the claims, tables, chart, pictures, settings and times of each study."""
 
 import json
 import os
@@ -23,9 +23,10 @@ _REMEDY = "give a folder that `jaxnbv study` has written"
 class Chapter(NamedTuple):
     """The part of the page about one study.
 
-    - `scenes`: number of scenes; `facts`: sentences on times and versions; `explanation`: what its measures mean.
-    - `tables`: titles and HTML of the tables, by group of scenes.
-    - `images`: names and PNG files of its chart, drawn anew, and of the pictures in its folder.
+    - `scenes`: number of scenes; `facts`: sentences on times and versions.
+    - `explanation`: text that explains the measures and the cells of the tables.
+    - `tables`: titles and HTML of the tables, for each group of scenes.
+    - `images`: names and PNG content of the chart and of the pictures in the study's folder. The chart is drawn again.
     - `settings`: settings of the study as JSON.
     """
 
@@ -40,9 +41,9 @@ class Chapter(NamedTuple):
 
 
 def write_page(folder: str | Path, out: str | Path) -> Path:
-    """Write one HTML page of all studies in a folder, which opens offline, and return its path.
+    """Write all studies in a folder to one HTML page, which needs no other files, and return its path.
 
-    **Raises:** `ValueError` for a name that does not end in .html, and as `chapters` does.
+    **Raises:** `ValueError` if the name of the page does not end in .html, and as `chapters` does.
     """
     out = Path(out)
     require(out.suffix == ".html", f"the page {out} must end in .html")
@@ -53,9 +54,9 @@ def write_page(folder: str | Path, out: str | Path) -> Path:
 
 
 def chapters(folder: str | Path) -> list[Chapter]:
-    """A chapter for each study in a folder and its subfolders, in the order of the registry.
+    """Return one chapter for each study in a folder and its subfolders, in the order of the registry.
 
-    **Raises:** `ValueError` if there is no study, a study is unknown to this version, or a record is damaged.
+    **Raises:** `ValueError` if there is no study, if this version does not know a study, or if a record is damaged.
     """
     folder = Path(folder)
     require(os.path.isdir(folder), f"there is no folder {folder}: {_REMEDY}")
@@ -76,7 +77,7 @@ def chapters(folder: str | Path) -> list[Chapter]:
 
 
 def _kinds() -> dict[str, type[Study]]:
-    """Classes of studies by name, those of the registry first."""
+    """Return the classes of studies by name. The classes of the registry come before other subclasses of `Study`."""
     named = {kind.__qualname__: kind for kind in (entry.load() for entry in studies().values())}
     todo = [Study]
     while todo:

@@ -12,23 +12,25 @@ import loky
 from loky.process_executor import TerminatedWorkerError
 
 _TRIES = 2
-# Numbers of threads, read by XLA, linear algebra libraries and pools of processes.
+# Environment variables from which XLA, linear algebra libraries and process pools read their number of threads.
 _THREADS = ("NPROC", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "LOKY_MAX_CPU_COUNT")
 
 
 class Processes(Executor):
-    """An executor of processes on this machine, which share its cores evenly and end with this process.
+    """Executor that runs calls in processes on this machine.
+
+    The processes share the machine's cores evenly. They end when this process ends.
 
     - `workers`: number of processes.
 
-    If the process of a call dies, for example from lack of memory, the call starts again in a new process. If that dies
-    too, its future raises `BrokenExecutor`. An error that leaves a `with` block kills running calls.
+    If a process dies during a call, for example from lack of memory, the call runs again in a new process. If the new
+    process dies too, the call's future raises `BrokenExecutor`. An error that leaves a `with` block kills running calls.
     """
 
     def __init__(self, workers: int):
         self._environment = dict.fromkeys(_THREADS, str(max(loky.cpu_count() // workers, 1)))
         self._threads = ThreadPoolExecutor(workers)
-        # One pool per process, so that the pool tells which call died with its process.
+        # Each process has its own pool, because an error of a larger pool would not tell which call's process died.
         self._pools = [self._pool() for _ in range(workers)]
         self._free: queue.SimpleQueue[int] = queue.SimpleQueue()
         for number in range(workers):
@@ -38,14 +40,15 @@ class Processes(Executor):
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future:
         """Run a call in one of the processes, and return its future.
 
-        Cloudpickle pickles the function and its arguments.
+        The function and its arguments are pickled with cloudpickle.
         """
         return self._threads.submit(self._call, function, args, kwargs)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End the processes once all calls are done.
+        """Shut the executor down, and end its processes once all calls are done.
 
-        - `cancel_futures`: kill running calls, and cancel the others.
+        - `wait`: False returns without waiting for the calls, and the processes keep running.
+        - `cancel_futures`: True kills running calls and cancels the calls that have not started.
         """
         if cancel_futures:
             self._kill()
@@ -71,7 +74,7 @@ class Processes(Executor):
 
     def _replace(self, number: int) -> None:
         with self._lock:
-            # `shutdown` has killed the process.
+            # The process died because `shutdown` killed it.
             if self._is_closed:
                 raise BrokenExecutor("the processes were shut down")
             self._pools[number].shutdown(kill_workers=True)
@@ -88,7 +91,7 @@ class Processes(Executor):
 
 
 def _end_with(parent: int) -> None:
-    """End this process when its parent is gone, since a killed parent cannot end its processes."""
+    """Start a thread that ends this process when its parent is gone. A killed parent cannot end its processes itself."""
 
     def watch() -> None:
         while os.getppid() == parent:

@@ -1,4 +1,4 @@
-"""Results of a study on disk: one JSON record per scene, so that an interrupted study can continue."""
+"""Results of a study on disk. One JSON file per scene lets an interrupted study continue."""
 
 import hashlib
 import json
@@ -26,13 +26,14 @@ _NONE: Mapping[str, np.ndarray] = MappingProxyType({})
 
 
 class RecordFolder(ResultFolder):
-    """A folder of records that belong to one configuration, which is stored in study.json.
+    """A folder of records of one configuration, which the file study.json stores.
 
-    - `executor`: an executor of `concurrent.futures` that runs the missing scenes, such as `Processes(8)` or a
-      `Cluster`; default: this process runs them. Only this process writes records.
+    - `executor`: an executor with the interface of `concurrent.futures` that runs the scenes without a record, such as
+      `Processes(8)` or a `Cluster`; default: this process runs the scenes. In both cases, this process writes the
+      records.
     - `arrays`: the large arrays of the configuration, see `describe`.
 
-    **Raises:** `ValueError` if the folder cannot be made or holds records of another configuration.
+    **Raises:** `ValueError` if the folder cannot be made, or if it holds records of a different configuration.
     """
 
     kind, pattern, format = "study", "scene_*.json", _FORMAT
@@ -48,12 +49,12 @@ class RecordFolder(ResultFolder):
         super().__init__(path, config, arrays)
 
     def collect(self, scenes: Sequence[int], run: Trial, progress: bool = True) -> list[Record]:
-        """Return the records of these scenes, in order. Run the scenes that have no record, and write theirs.
+        """Run the scenes that have no record yet, and return all records in order of their indices.
 
-        Each record is written once its scene is done. A scene whose `run` fails has no record: `failures` gives its
-        error, and the next call tries again.
+        Each record is written as soon as its scene is done. If `run` fails for a scene, the scene has no record.
+        `failures` then returns the error, and the next call of `collect` runs the scene again.
 
-        **Raises:** `ValueError` for a record that is damaged, and if another process writes in the folder.
+        **Raises:** `ValueError` if a record is damaged, or if another process is writing in the folder.
         """
         with self.writing():
             records = {index: _read(self._file(index), index) for index in scenes if self._file(index).exists()}
@@ -73,10 +74,12 @@ class RecordFolder(ResultFolder):
         return [records[index] for index in sorted(records)]
 
     def join(self, folders: Iterable[str | Path]) -> None:
-        """Copy the records of other folders into this one.
+        """Copy the records of other folders into this folder.
 
-        **Raises:** `ValueError` if a folder holds no records, records of another configuration, or a damaged record, or
-        if a scene is in two folders with results that differ in more than their times.
+        **Raises:** `ValueError` in these cases:
+
+        - a folder holds no study, a study with a different configuration, or a damaged record;
+        - two folders hold the same scene, and the results differ in more than their times.
         """
         with self.writing():
             for folder in map(Path, folders):
@@ -100,7 +103,7 @@ class RecordFolder(ResultFolder):
                 raise InputError(f"{file} and {own} differ in {'; '.join(changes[:3])}: delete the one that is wrong")
 
     def failures(self, scenes: Sequence[int]) -> dict[int, str]:
-        """The errors of failed scenes, one line each. The files scene_*.failed hold their tracebacks."""
+        """Return the error of each failed scene as one line. The files scene_*.failed hold the tracebacks."""
         files = {index: self._file(index).with_suffix(_FAILED) for index in scenes}
         return {index: file.read_text().partition("\n")[0] for index, file in files.items() if os.path.isfile(file)}
 
@@ -111,8 +114,8 @@ class RecordFolder(ResultFolder):
         write_text(self._file(index).with_suffix(_FAILED), f"{failure.error}\n\n{failure.traceback}")
 
     def _write(self, index: int, record: Record) -> Record:
-        """Write a record, and return it as reading it would."""
-        # JSON turns number keys into text, which changes the sorting of keys in the checksum.
+        """Write a record, and return the record as `_read` would return it."""
+        # JSON turns number keys into text, which changes the order of sorted keys and so the checksum.
         record = json.loads(json.dumps(record))
         self.bind()
         sealed = {"format": _FORMAT, "index": index, "sha256": _checksum(index, record), "record": record}
@@ -122,9 +125,9 @@ class RecordFolder(ResultFolder):
 
 
 def read_records(folder: str | Path) -> list[Record]:
-    """Read all records of a folder, in the order of their scenes.
+    """Read all records of a folder, in the order of their files' names.
 
-    **Raises:** `ValueError` for a damaged record, or a file scene_*.json whose name has no scene number.
+    **Raises:** `ValueError` if a record is damaged, or if a file scene_*.json has no scene number in its name.
     """
     return [_read(file, index) for index, file in _files(Path(folder))]
 
@@ -139,7 +142,7 @@ def _files(folder: Path) -> list[tuple[int, Path]]:
 
 
 def _without_seconds(content: Any) -> Any:
-    """A copy without the entries "seconds", at any depth."""
+    """Return a copy of nested lists and dicts without the entries named "seconds"."""
     if isinstance(content, list):
         return [_without_seconds(item) for item in content]
     if isinstance(content, dict):
@@ -152,7 +155,7 @@ def _checksum(index: int, record: dict[str, Any]) -> str:
 
 
 def _read(file: Path, index: int) -> dict[str, Any]:
-    """Read and check a record."""
+    """Read the record of scene `index`, and check its format, index and checksum."""
     remedy = "delete it, and it is made again"
     content = read_json(file, "is damaged", remedy)
     check_format(content.get("format"), _FORMAT, file)

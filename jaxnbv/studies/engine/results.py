@@ -1,4 +1,4 @@
-"""Statistics over the records of a study, tables of them, and verdicts on the paper's claims."""
+"""Statistics over the records of a study, their tables, and verdicts on the paper's claims."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -18,11 +18,12 @@ _WHERE = ("ahead of", "level with", "behind")
 
 
 def results(records: Sequence[Record], study: type[Study]) -> pd.DataFrame:
-    """Statistics of all measures: a row per group of scenes, measure, key (`at`) and method.
+    """Compute the statistics of all measures, one row per group of scenes, measure, key (`at`) and method.
 
-    A row holds the mean over the scenes, its standard error and its interval (`low`, `high`). It also holds the `lead`
-    of the study's reference: the mean difference of its value and the method's on the same scenes, with its interval.
-    Only scenes count in which all methods have a value. A method without any value has no row.
+    Each row holds the method's mean over the scenes, the standard error of the mean, and the bootstrap interval of the
+    mean (`low`, `high`). The `lead` is the mean over the scenes of the reference's value minus the method's value, and
+    `lead_low` and `lead_high` are its interval. A method without values has no row. The statistics use only scenes in
+    which all other methods have a value.
 
     **Raises:** `ValueError` if there are no records.
     """
@@ -45,7 +46,7 @@ def results(records: Sequence[Record], study: type[Study]) -> pd.DataFrame:
 
 
 def _compared(part: pd.DataFrame, reference: str) -> pd.DataFrame:
-    """The rows of one measure at one key, one per method."""
+    """Return the rows of one measure at one key, one row per method."""
     values = part.pivot(index="scene", columns="method", values="value")[part["method"].unique()]
     values = values.dropna(axis="columns", how="all").dropna()
     values = values if len(values) else values[[]]
@@ -60,9 +61,9 @@ def _compared(part: pd.DataFrame, reference: str) -> pd.DataFrame:
 
 
 def interval(values: Float[np.ndarray, "scenes columns"]) -> Float[np.ndarray, "2 columns"]:
-    """The ends of Efron's percentile bootstrap interval of each column's mean.
+    """Return the lower and upper ends of Efron's percentile bootstrap interval for the mean of each column.
 
-    Whole scenes are drawn with replacement, the same for all columns. The interval of a single scene has width zero.
+    Scenes are drawn with replacement, and all columns use the same draws. For one scene, the interval has width zero.
     """
     if len(values) < 2:
         return np.stack([values.sum(axis=0)] * 2)
@@ -72,12 +73,15 @@ def interval(values: Float[np.ndarray, "scenes columns"]) -> Float[np.ndarray, "
 
 
 def groups_of(table: pd.DataFrame) -> dict[str, int]:
-    """The number of scenes in each group. The first group, "all", holds all scenes."""
+    """Return the number of scenes in each group. The first group, "all", holds all scenes."""
     return table.groupby("group", sort=False)["scenes"].max().to_dict()
 
 
 def tables(table: pd.DataFrame, study: type[Study], group: str = _ALL) -> list[tuple[str, pd.DataFrame]]:
-    """Titles and text cells of two tables per measure: means of the methods, leads of the reference."""
+    """Return the titles and text cells of two tables per measure.
+
+    The first table shows the means of the methods, and the second the leads of the reference.
+    """
     texts = []
     for measure in study.measures:
         part = table[(table["group"] == group) & (table["quantity"] == measure.name)]
@@ -97,7 +101,10 @@ def tables(table: pd.DataFrame, study: type[Study], group: str = _ALL) -> list[t
 
 
 def _means(rows: pd.DataFrame, measure: Measure, best: pd.Series) -> list[str]:
-    """Shares with their interval, other means with their standard error. A star marks the best."""
+    """Format means as text. A star marks the best mean.
+
+    Means in percent are shown with their interval, and all other means with their standard error.
+    """
     texts = []
     for row, star in zip(rows.itertuples(), best, strict=True):
         if measure.unit == "%":
@@ -110,7 +117,7 @@ def _means(rows: pd.DataFrame, measure: Measure, best: pd.Series) -> list[str]:
 
 
 def _leads(rows: pd.DataFrame, measure: Measure) -> list[str]:
-    """Leads with their interval. A star marks a lead whose interval excludes zero."""
+    """Format leads and their intervals as text. A star marks a lead whose interval excludes zero."""
     form, scale = ("+.0f", 100) if measure.unit == "%" else (f"+.{measure.digits}f", 1)
     return [
         f"{scale * lead:{form}} [{scale * low:{form}}, {scale * high:{form}}]" + "*" * (low > 0 or high < 0)
@@ -119,7 +126,7 @@ def _leads(rows: pd.DataFrame, measure: Measure) -> list[str]:
 
 
 def summary(table: pd.DataFrame, study: type[Study]) -> str:
-    """The tables of a study over all scenes, as text."""
+    """Return the tables of a study over all scenes as text."""
     title = f"{study.title}: {count_of(groups_of(table)[_ALL], 'scene')}"
     sections = [f"{title}\n{'=' * len(title)}\n\n{study.explanation}\n{explained(study)}\n"]
     sections += [f"{title}\n{cells.to_string()}\n" for title, cells in tables(table, study)]
@@ -127,7 +134,7 @@ def summary(table: pd.DataFrame, study: type[Study]) -> str:
 
 
 def explained(study: type[Study]) -> str:
-    """An explanation of the cells of tables."""
+    """Return the text that explains the cells of the tables."""
     return (
         f"Mean over scenes +- its standard error, or in percent; in [ ] the {LEVEL:.0%} bootstrap interval over\n"
         f"scenes; * the best. Differences: {study.reference} minus another method over the same scenes, * where the\n"
@@ -136,7 +143,12 @@ def explained(study: type[Study]) -> str:
 
 
 class Verdict(NamedTuple):
-    """A claim, the number of its methods against which it holds, and a sentence that lists all of them."""
+    """Result of the check of one claim.
+
+    - `claim`: text of the claim.
+    - `num_held`: number of compared methods for which the claim holds; `num_methods`: number of compared methods.
+    - `sentence`: sentence that lists all compared methods.
+    """
 
     claim: str
     num_held: int
@@ -145,10 +157,10 @@ class Verdict(NamedTuple):
 
 
 def verdicts(table: pd.DataFrame, study: type[Study]) -> list[Verdict]:
-    """Compare the reference with the methods of each claim, over all scenes.
+    """Check each claim over all scenes by comparing the reference with the claim's methods.
 
-    A claim also covers its methods' runs without known shapes. The reference is level with a method if the interval of
-    its lead includes zero. Claims whose methods were not run are left out.
+    The comparison includes the runs of these methods without known shapes. The sentence calls the reference level with a
+    method if the interval of the lead includes zero. A claim is left out if none of its methods was run.
     """
     judged = []
     for claim in study.claims:
@@ -169,5 +181,5 @@ def verdicts(table: pd.DataFrame, study: type[Study]) -> list[Verdict]:
 
 
 def count_of(count: int, thing: str) -> str:
-    """ "1 scene", "2 scenes"."""
+    """Return the count with its noun, such as "1 scene" or "2 scenes"."""
     return f"{count} {thing}{'s' if count != 1 else ''}"

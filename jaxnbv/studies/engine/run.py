@@ -1,4 +1,4 @@
-"""Runs of a scene with all methods, and replays of the views of a method."""
+"""Functions that run all methods of a study on a scene, load stored studies, and replay the views of a method."""
 
 import functools
 import time
@@ -16,23 +16,27 @@ from jaxnbv.studies.engine.measures import KNOWN, WITHOUT_BANK, Record
 from jaxnbv.studies.engine.records import RecordFolder, read_records
 from jaxnbv.studies.engine.study import Scene, Study
 
-# A method of the user: makes the planner of a scene.
+# Type of a user's method: a function that makes the planner for a scene.
 Factory: TypeAlias = Callable[[Study, Scene], Planner]
 
 
 def run_scene(
     study: Study, index: int, methods: Sequence[str] | None = None, own: Mapping[str, Factory] | None = None
 ) -> Record:
-    """Run all methods on one scene and return its record, from which tables and figures are made.
+    """Run all methods on one scene and return the record, from which tables and figures are made.
 
-    All methods share the first view, which is a random one of the candidates that show enough. They also share the
-    sensor noise and the prior samples at each view.
+    All methods share the first view, which is drawn from the candidates that show enough of the object. The methods
+    also share the sensor noise and the prior samples at each view.
 
-    - `methods`: names of the study's methods to run, default: all.
-    - `own`: further methods: functions that make their planners, by name.
+    - `index`: index of the scene.
+    - `methods`: names of the study's methods to run; default: `Study.methods`.
+    - `own`: the user's methods by name. Each is a function that makes the planner for a scene.
 
-    **Raises:** `ValueError` for an unknown method, as `Study.scene` does, if no candidate shows enough, or if a method
-    of `own` fails or makes no planner with room for the study's views.
+    **Raises:** `ValueError` as `Study.scene` does, and in these cases:
+
+    - a method is unknown;
+    - no candidate shows enough of the object;
+    - a method of `own` fails, or does not return a planner for at least as many views as the study has.
     """
     names = study.methods if methods is None else methods_of(type(study), methods, KNOWN)
     start = time.perf_counter()
@@ -51,7 +55,7 @@ def run_scene(
 
 
 def load_study(folder: str | Path) -> tuple[Study, list[Record]]:
-    """Load a study with its settings, and its records, from a folder.
+    """Load a study and its records from a folder.
 
     **Raises:** `ValueError` if the folder holds no study, or if the study or a record is damaged.
     """
@@ -61,10 +65,11 @@ def load_study(folder: str | Path) -> tuple[Study, list[Record]]:
 
 
 def methods_of(study: type[Study], names: Sequence[str] | None, model: str) -> tuple[str, ...]:
-    """The names of the methods to run, in the study's order.
+    """Return the names of the methods to run, in the study's order.
 
-    - `names`: the methods to run; default: the study's, and with the model `known` also those of
-      `Study.without_bank`, as "METHOD-screened".
+    - `names`: the methods to run. The default is `Study.methods`. With the model `known`, the default also includes the
+      methods of `Study.without_bank`, under the name "METHOD-screened".
+    - `model`: name of the surface model.
 
     **Raises:** `ValueError` for an unknown method.
     """
@@ -94,7 +99,7 @@ def _own_planner(study: Study, scene: Scene, name: str, make: Factory) -> Planne
 
 
 def replay(study: Study, scene: Scene, run: Record) -> list[tuple[PointCloud, Observations]]:
-    """Compute again, from the poses of a method's record, each scan and the observations after it."""
+    """Recompute each scan and the observations after each scan from the poses in a method's record."""
     planner, sensor, key = (
         study.planner(study.methods[0], scene),
         study.sensor(scene),

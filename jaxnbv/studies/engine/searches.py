@@ -1,4 +1,4 @@
-"""Searches of studies by the names of methods."""
+"""Searches of the methods that have the same name in all studies."""
 
 from collections.abc import Callable
 
@@ -18,7 +18,7 @@ from jaxnbv.search import (
     UncertaintyView,
 )
 
-# The baselines of all studies that ignore the acquisition.
+# The baselines that all studies share. They ignore the acquisition.
 BASELINES = ("farthest", "uncertainty", "random")
 _OVER_CANDIDATES: dict[str, Callable[..., Search]] = {
     "farthest": FarthestView,
@@ -26,7 +26,8 @@ _OVER_CANDIDATES: dict[str, Callable[..., Search]] = {
     "random": RandomView,
     "halving": HalvingSearch,
 }
-# Free poses drift to views that miss the object, as the paper found; constrained ones keep it in view.
+# Gradient search over free poses drifts to views that miss the object, as the paper found. Constrained poses keep the
+# object in view.
 _SPACES: dict[str, Callable[[float], PoseSpace]] = {
     "gradient-2dof": SpherePoses,
     "gradient-6dof": FreePoses,
@@ -43,10 +44,11 @@ def search_of(
     iterations: int,
     learning_rate: float = 0.03,
 ) -> Search:
-    """The search that a method is named after, or `DiscreteSearch` over all candidates for any other name.
+    """Return the search that a method's name denotes, or `DiscreteSearch` over all candidates for any other name.
 
-    A search by gradient, around `radius` (scene units), scores half of `num_candidates` and climbs from the best
-    `num_starts`.
+    A gradient search scores half of `num_candidates` poses and then climbs from the best `num_starts` of them.
+
+    - `radius`: distance of the cameras from the scene's origin, in scene units.
     """
     if method in _SPACES:
         settings = num_starts, iterations, learning_rate, max(num_candidates // 2, num_starts)

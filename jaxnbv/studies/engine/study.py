@@ -1,4 +1,4 @@
-"""Base class of studies: scenes, methods, measures and settings."""
+"""Base class of studies, which defines their scenes, methods, measures and settings."""
 
 import dataclasses
 from abc import abstractmethod
@@ -33,8 +33,8 @@ _PURPOSES = ("first", "episode", "scene", "measure")
 class Scene(eqx.Module):
     """One object of a study.
 
-    - `name`: shown in tables and pictures.
-    - `task`: other facts about the object, such as its heat source or its parts; the type depends on the study.
+    - `index`: index of the scene; `name`: name in tables and pictures; `surface`: true surface of the object.
+    - `task`: other facts about the object, such as its heat source or its parts. The type depends on the study.
     """
 
     index: int
@@ -44,30 +44,33 @@ class Scene(eqx.Module):
 
 
 class Study(eqx.Module):
-    """Base class: compares methods of choosing views over many scenes.
+    """Base class of studies, which compare methods of choosing views over many scenes.
 
     A new study defines the abstract members. Settings:
 
-    - `views`: number of views, the first included.
-    - `num_candidates`: candidates on the sphere of `radius` (scene units). Gradient searches start with half as many.
-    - `sampler`, `capacity`: as in `Planner`; `num_samples` and `grid_resolution` replace those of the sampler.
-    - `camera`: the sensor; a planner may imagine fewer rays, see `imagined_camera`.
-    - `num_starts`, `iterations`, `learning_rate`: settings of searches by gradient.
-    - `meshes`: mesh files, one per scene; without any, scenes are procedural.
+    - `views`: number of views, including the first.
+    - `num_candidates`: number of candidates on the sphere of `radius` (scene units). Gradient searches score half of
+      this number before they climb.
+    - `sampler`, `capacity`: as in `Planner`.
+    - `num_samples`, `grid_resolution`: number of samples and resolution of the grid, which replace the sampler's.
+    - `camera`: camera of the sensor. Imagined scans may have fewer rays, see `imagined_camera`.
+    - `num_starts`, `iterations`, `learning_rate`: settings of gradient searches.
+    - `meshes`: mesh files, one per scene. Without mesh files, the scenes are procedural.
 
     Class attributes:
 
     - `title`, `explanation`: texts above the tables.
-    - `methods`: names of the methods, in order; `reference`: the method that the others are compared with.
-    - `extra_methods`: methods that run only if a command names them; `pictured`: methods in pictures, default: all.
-    - `measures`: quantities in tables and the chart; `claims`: the paper's claims about the study.
-    - `quick`: settings of a quick run; `quick_scenes`: its number of scenes.
-    - `paper`: settings of the paper and its code. `views` may be one of them.
+    - `methods`: names of the methods, in order; `reference`: the method with which the others are compared.
+    - `extra_methods`: methods that run only if a command names them.
+    - `pictured`: methods in pictures; if empty, all methods.
+    - `measures`: quantities in the tables and the chart; `claims`: the paper's claims about the study.
+    - `quick`: settings of a quick run; `quick_scenes`: number of scenes of a quick run.
+    - `paper`: settings of the paper and its code, which may include `views`.
     - `seed`: seed of first views, noise and samples.
     - `bank`: name of the bank of known shapes, see `shape_bank`; "" for none.
-    - `without_bank`: methods that run a second time without known shapes, as "METHOD-screened".
+    - `without_bank`: methods that run a second time without known shapes, under the name "METHOD-screened".
 
-    **Raises:** `ValueError` for fewer than two views, or fewer candidates than views.
+    **Raises:** `ValueError` if there are fewer than two views, or fewer candidates than views.
     """
 
     title: eqx.AbstractClassVar[str]
@@ -121,10 +124,12 @@ class Study(eqx.Module):
 
     @classmethod
     def configured(cls, model: str, views: int, quick: bool, **options: Any) -> "dict[str, Study]":
-        """The studies of one command, by the names of their folders; "" for a single study.
+        """Return the studies of one command by the names of their folders. The name of a single study is "".
 
-        - `options`: settings, which replace those of `quick`. `meshes` is a folder, see `files_in`. With the model
-          `known`, the bank for each mesh holds all the other meshes.
+        - `model`: name of the surface model. With the model `known` and `meshes`, the bank of each scene holds all
+          meshes except the scene's own.
+        - `quick`: True to use the settings `Study.quick`.
+        - `options`: other settings, which override `Study.quick`. `meshes` is a folder, see `files_in`.
 
         **Raises:** `ValueError` as `files_in` and `study_sampler` do.
         """
@@ -134,9 +139,9 @@ class Study(eqx.Module):
 
     @classmethod
     def files_in(cls, folder: str | Path) -> tuple[MeshFile, ...]:
-        """The meshes in a folder that are usable as scenes.
+        """Return the meshes in a folder that are usable as scenes.
 
-        **Raises:** `ValueError` if there is no mesh.
+        **Raises:** `ValueError` if there is no usable mesh.
         """
         return mesh_files(folder)
 
@@ -147,15 +152,15 @@ class Study(eqx.Module):
 
     @abstractmethod
     def scene(self, index: int) -> Scene:
-        """The scene of an index.
+        """Return the scene with this index.
 
-        **Raises:** `ValueError` if there is no such scene, or it cannot be read.
+        **Raises:** `ValueError` if there is no scene with this index, or if its file cannot be read.
         """
 
     def file(self, index: int) -> MeshFile | None:
-        """The mesh file of a scene; None if scenes are procedural.
+        """Return the mesh file of the scene with this index, or None if the scenes are procedural.
 
-        **Raises:** `ValueError` if there is no such scene.
+        **Raises:** `ValueError` if there is no scene with this index.
         """
         count = len(self.meshes)
         require(
@@ -166,15 +171,18 @@ class Study(eqx.Module):
 
     @abstractmethod
     def acquisition(self, method: str, scene: Scene) -> Acquisition:
-        """The acquisition of a method, with one structure in all scenes, so that they share compilations."""
+        """Return the acquisition of a method.
+
+        Its pytree structure should be the same in all scenes, because they then share one compilation.
+        """
 
     def search(self, method: str, scene: Scene) -> Search:
-        """The search of a method, see `search_of`."""
+        """Return the search of a method, see `search_of`."""
         climbs = self.num_starts, self.iterations, self.learning_rate
         return search_of(method, self.candidates, self.num_candidates, self.radius, *climbs)
 
     def planner(self, method: str, scene: Scene) -> Planner:
-        """The planner of a method, which may end in "-screened"."""
+        """Return the planner of a method. If the name ends in "-screened", the planner has no known shapes."""
         name = method.removesuffix(WITHOUT_BANK)
         planner = self.planner_of(self.acquisition(name, scene), self.search(name, scene), scene)
         if name == method:
@@ -182,32 +190,39 @@ class Study(eqx.Module):
         return dataclasses.replace(planner, sampler=planner.sampler.without_bank)
 
     def truth(self, scene: Scene) -> Any:
-        """The ground truth of a scene, computed once; by default its task."""
+        """Return the ground truth of a scene, by default its task. It is computed once per scene, for all methods."""
         return scene.task
 
     @abstractmethod
     def follow(self, scene: Scene, truth: Any, planner: Planner, episode: Iterator[Step]) -> Record:
-        """The record (JSON) of a planner's episode. It may stop drawing steps early."""
+        """Run an episode and return its record, which must be JSON-serialisable.
+
+        - `truth`: the result of `truth` for the scene.
+        - `episode`: iterator that runs one step at a time. The method may stop before the iterator ends.
+        """
 
     def scene_record(self, scene: Scene, truth: Any, first: int) -> Record:
-        """The record (JSON) of the scene itself."""
+        """Return the facts about the scene that its record stores, which must be JSON-serialisable."""
         return {"name": scene.name}
 
     def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles | None:
-        """The picture of a scene's record, in tiles of `pixels` x `pixels`; None if the study draws none."""
+        """Return the picture of a scene in tiles of `pixels` x `pixels`, or None if the study draws no pictures."""
         return None
 
     def sensor(self, scene: Scene) -> Sensor:
-        """The simulated camera that scans a scene."""
+        """Return the simulated sensor that scans the scene."""
         return simulated_sensor(scene.surface, self.camera)
 
     def shows_enough(self, scene: Scene, scan: PointCloud) -> bool:
-        """Whether a scan shows enough of the object to be the first."""
+        """Return whether a scan shows enough of the object to be the first scan of an episode."""
         return bool(scan.mask.any())
 
     @classmethod
     def group(cls, record: Record) -> str:
-        """Name of the subset of scenes that a record belongs to, tabulated separately; "" for none."""
+        """Return the name of the group of scenes to which a record belongs, or "" for no group.
+
+        Each group has its own tables.
+        """
         return ""
 
     @property
@@ -222,35 +237,46 @@ class Study(eqx.Module):
 
     @property
     def imagined_camera(self) -> Camera:
-        """The camera with which planners imagine scans."""
+        """The camera of imagined scans."""
         return self.camera
 
     def sampler_of(self, scene: Scene) -> SurfaceSampler:
-        """The sampler for a scene. A bank made from `meshes` leaves out the mesh of the scene."""
+        """Return the sampler for a scene. If its bank was made from `meshes`, the scene's own mesh is left out."""
         return without_own_shape(self.sampler, self.meshes, scene.index) if self.meshes else self.sampler
 
     def planner_of(self, acquisition: Acquisition, search: Search, scene: Scene) -> Planner:
-        """A planner with the study's settings and the sampler of the scene."""
+        """Return a planner with the study's settings and the sampler of the scene."""
         base = self.sampler_of(scene)
         sampler = dataclasses.replace(base, grid=self.grid, num_samples=self.num_samples)
         planned = acquisition, search, self.imagined_camera, sampler
         return Planner(*planned, capacity=self.capacity, max_views=self.views)
 
     def key(self, index: int, purpose: str) -> PRNGKeyArray:
-        """The random key of a scene for a purpose. It depends only on these and the study's seed."""
+        """Return the random key for a purpose in the scene with this index.
+
+        The key depends only on `index`, `purpose` and the study's seed.
+
+        - `purpose`: "first" (first view), "episode", "scene" or "measure".
+        """
         scene_key = jax.random.fold_in(jax.random.key(self.seed), index)
         return jax.random.fold_in(scene_key, _PURPOSES.index(purpose))
 
     def episode_keys(self, method: str, scene: Scene) -> list[PRNGKeyArray]:
-        """Keys of a method's episodes: one that all methods share, or several for `merge_runs`."""
+        """Return one random key per episode of a method.
+
+        By default there is one episode, and all methods share its key. `merge_runs` merges several episodes.
+        """
         return [self.key(scene.index, "episode")]
 
     def merge_runs(self, runs: Sequence[Record]) -> Record:
-        """One record of a method, merged from those of its episodes."""
+        """Merge the records of a method's episodes into one record."""
         return runs[0]
 
     def first_view(self, scene: Scene) -> int:
-        """Index of a random candidate from which the object shows enough."""
+        """Return the index of a random candidate whose scan shows enough of the object, see `shows_enough`.
+
+        **Raises:** `ValueError` if no candidate shows enough.
+        """
 
         def enough(scan: PointCloud) -> bool:
             return self.shows_enough(scene, scan)

@@ -1,4 +1,4 @@
-"""Tiles in which a study draws a scene, and tools to fill them."""
+"""Tiles, the small images of which a study composes the picture of a scene, and functions that draw them."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -17,18 +17,20 @@ from jaxnbv.viz.render import Still
 from jaxnbv.viz.style import GREY
 
 _RIGHT = "#00734f"
-# Longest edge of a still's triangles, since it is coloured at vertices, and half of its extent (scene units).
+# Longest edge of a still's triangles, which is short because colours are set at vertices, and radius of the still's
+# content, both in scene units.
 _EDGE, _REACH = 0.05, 1.6
 
 
 class Tiles(NamedTuple):
-    """The picture of a scene.
+    """The picture of a scene, with one row of tiles per method.
 
     - `caption`: text below the picture.
-    - `tile`: draws the tile of a method and a column on its axes.
-    - `truth`: draws the tile of the true object, left of the first row; None for no such tile.
+    - `tile`: function that draws the tile of a method (name) and a column (index) on the given axes.
+    - `truth`: function that draws the tile of the true object, left of the first row; None for no such tile.
     - `columns`: titles of the columns; empty for one column per view.
-    - `marks`: settings of `Line2D` by name, for the legend; `scale`: a colour bar and its label.
+    - `marks`: entries of the legend, as settings of `Line2D` by name.
+    - `scale`: colour scale of the colour bar, and its label; None for no colour bar.
     """
 
     caption: str
@@ -40,13 +42,16 @@ class Tiles(NamedTuple):
 
 
 def caption_tile(axes: Axes, text: str, right: bool = False) -> None:
-    """Write a line below a tile; in bold green with a tick if `right`."""
+    """Write a line of text below a tile. If `right`, the text is bold and green and starts with a tick."""
     colour, weight = (_RIGHT, "bold") if right else (GREY, "normal")
     axes.set_xlabel(f"{'✓ ' if right else ''}{text}", fontsize=9, color=colour, fontweight=weight)
 
 
 def opposite_direction(record: Record) -> Float[np.ndarray, "3"]:
-    """A direction opposite the shared first view and above, to show what this view does not."""
+    """Return a direction from which pictures show the side that the shared first view hides.
+
+    The direction is opposite the first view and slopes upwards.
+    """
     run = next(iter(record["methods"].values()))
     position = np.asarray(run["views"][0]["position"])
     away = -position[[0, 2]]
@@ -62,7 +67,11 @@ def still_of(
     value: Callable[[np.ndarray], Float[np.ndarray, " n"]] | None = None,
     norm: LogNorm | None = None,
 ) -> Still:
-    """Render a mesh, in one colour or coloured by a positive value at its points."""
+    """Render a mesh from the direction `eye` in an image of `size` x `size` pixels.
+
+    - `value`: function of points whose positive values colour the surface; default: one colour.
+    - `norm`: colour scale of the values.
+    """
     vertices, faces = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, _EDGE, max_iter=12)
     fine = trimesh.Trimesh(vertices, faces)
     values = np.ones(len(fine.vertices)) if value is None else np.maximum(value(fine.vertices), 1e-6)
@@ -76,7 +85,7 @@ def draw_on(
     points: Float[np.ndarray, "n 3"],
     colours: Float[np.ndarray, "n channels"],
 ) -> None:
-    """Draw a still, and over it the points that its surface does not hide, the nearest last."""
+    """Draw a still, and then the points that its surface does not hide, ordered so that near points cover far points."""
     axes.imshow(still.image, interpolation="antialiased", zorder=1)
     pixels, in_front = still.project(points)
     depth = (points - np.asarray(still.pose.position)) @ np.asarray(still.pose.forward)

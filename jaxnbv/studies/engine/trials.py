@@ -1,4 +1,7 @@
-"""Runs the trials of a study one after the other in this process, or with an executor."""
+"""Functions that run the trials of a study, one after the other in this process or with an executor.
+
+A trial runs all methods on one scene.
+"""
 
 import functools
 import traceback
@@ -10,25 +13,26 @@ from jaxnbv.studies.engine.measures import Record
 
 
 class Failure(NamedTuple):
-    """The error of a failed trial in one line, and its traceback."""
+    """A failed trial: its error in one line, and its traceback."""
 
     error: str
     traceback: str
 
 
-# Runs all methods on the scene of an index.
+# Type of a function that runs all methods on the scene with an index.
 Trial: TypeAlias = Callable[[int], Record]
 Outcome: TypeAlias = Record | Failure
 Outcomes: TypeAlias = Generator[tuple[int, Outcome], None, None]
 
 
 def outcomes(trial: Trial, indices: Sequence[int], executor: Executor | None = None) -> Outcomes:
-    """Run trials, and yield the index and outcome of each as it ends.
+    """Run trials, and yield the index and outcome of each trial when it ends.
 
+    - `indices`: indices of the scenes.
     - `executor`: an executor of `concurrent.futures`; default: this process runs the trials one after the other.
 
-    A `BrokenExecutor` means that the executor gave a trial up because its process died, which counts as a `Failure`.
-    Other errors of the executor are raised. Closing the generator cancels the trials that have not started.
+    If a trial's process dies, the executor raises `BrokenExecutor`, and the outcome of the trial is a `Failure`. Other
+    errors of the executor are raised. Closing the generator cancels the trials that have not started.
     """
     attempt = functools.partial(_attempt, trial)
     if executor is None:

@@ -1,4 +1,4 @@
-"""Base class of the studies of semantic parts: how many views until all parts of an object are found?"""
+"""Base class of the studies of semantic parts, which count the views until all parts of an object are found."""
 
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
@@ -31,29 +31,32 @@ from jaxnbv.studies.sensors import PART_SETTING
 from jaxnbv.tasks import Coverage, Segmenter, SoftPartCount, part_counts
 from jaxnbv.viz.style import GREY, SERIES
 
-# N_target of the paper's Table 1, and the authors' N_target of the utility, both for the 2,048 points of the network.
+# Values of N_target in the paper's Table 1, the authors' N_target for the utility, and the number of points that the
+# network gets. All values of N_target refer to this number of points.
 TARGETS = (20, 40, 60, 80, 100)
 TARGET, NETWORK_POINTS = 60, 2048
 _BY_PARTS = ("discrete", "gradient-2dof", "gradient-6dof")
 _OTHERS = (*BASELINES, "coverage")
-# Width w: twice the standard deviation of the sensor noise.
+# The width w of `NearestPart`, which is twice the standard deviation of the sensor noise.
 _WIDTH = 0.02
-# Distance of an absent part, at which its probability and all derivatives are zero.
+# Distance that stands for an absent part. At this distance, the part's probability and all derivatives are zero.
 _NOWHERE = 100.0
-# Number of points of the true surface in pictures.
+# Number of points that pictures show on the true surface.
 _DENSE = 8000
 
 
 class NearestPart(Segmenter):
-    """An oracle segmenter that knows the true parts. It measures planning without a network's errors.
+    """Oracle segmenter that knows the true parts. Studies use it to evaluate planning without a network's errors.
+
+    The probability that point i belongs to part c is
 
         p_ic proportional to exp(-d_ic^2 / 2 w^2),   w = 0.02 scene units,
 
-    with the distance d_ic of point i from the true part c. Objects with room for equally many parts share one
-    compilation.
+    where d_ic is the distance of point i from the true part c. Oracles with the same number of parts, padding included,
+    share one compilation.
 
-    - `distances`: distance from each part at the nodes of `grid`, interpolated linearly.
-    - `num_points`: number of points to segment, chosen by farthest point sampling.
+    - `distances`: distance of each node of `grid` from each part. Values between nodes are interpolated linearly.
+    - `num_points`: number of points to segment. They are chosen by farthest point sampling.
     """
 
     distances: Float[Array, "parts g g g"]
@@ -62,28 +65,28 @@ class NearestPart(Segmenter):
 
     @classmethod
     def of(cls, parts: MeshParts, room: int, grid: Grid, num_points: int) -> "NearestPart":
-        """The oracle of a mesh, with room for `room` parts."""
+        """Make the oracle of a mesh, padded with absent parts to `room` parts."""
         distances = parts.distances(grid)
         absent = ((0, room - len(distances)), (0, 0), (0, 0), (0, 0))
         return cls(jnp.pad(distances, absent, constant_values=_NOWHERE), grid, num_points)
 
     def __call__(self, cloud: PointCloud) -> Float[Array, "num_points parts"]:
-        """Probabilities p; zero in rows without a point."""
+        """Return the probabilities p. They are zero in rows without a point."""
         fed = farthest_point_subsample(cloud, self.num_points)
         p = jax.nn.softmax(-0.5 * (self.distances_at(fed.points) / _WIDTH) ** 2, axis=-1)
         return jnp.where(fed.mask[:, None], p, 0.0)
 
     def predict(self, cloud: PointCloud) -> tuple[PointCloud, Int[Array, " num_points"]]:
-        """The segmented points, and the nearest part of each; -1 in rows without a point."""
+        """Return the segmented points and the index of the part nearest to each; -1 in rows without a point."""
         fed = farthest_point_subsample(cloud, self.num_points)
         return fed, jnp.where(fed.mask, self.nearest(fed.points), -1)
 
     def nearest(self, points: Float[Array, "n 3"]) -> Int[Array, " n"]:
-        """The part nearest to each point."""
+        """Return the index of the part nearest to each point."""
         return jnp.argmin(self.distances_at(points), axis=-1).astype(jnp.int32)
 
     def distances_at(self, points: Float[Array, "n 3"]) -> Float[Array, "n parts"]:
-        """Distances of points from all parts. Points beyond the grid get the values at its border."""
+        """Return the distance of each point from each part. Points outside the grid get the value at its border."""
         at = (points.T + self.grid.half_extent) / self.grid.spacing
         interpolate = jax.vmap(lambda values: map_coordinates(values, list(at), order=1, mode="nearest"), out_axes=-1)
         return interpolate(self.distances)
@@ -94,20 +97,23 @@ PartSegmenter: TypeAlias = CloudSegmenter | NearestPart
 
 
 def discovery_time(counts: Int[np.ndarray, "views parts"], target: int) -> int | None:
-    """T_discovery: the first view, from 1, after which all parts have `target` points; None if never."""
+    """Return T_discovery, the first view after which every part has `target` points, or None if there is none.
+
+    Views are counted from 1.
+    """
     is_complete: Bool[np.ndarray, " views"] = np.all(np.asarray(counts) >= target, axis=1)
     return int(np.argmax(is_complete)) + 1 if is_complete.any() else None
 
 
 def _times(record: Record, method: str) -> dict[int, float]:
-    """T_discovery by target; one more than the number of views if some part was not found."""
+    """Return T_discovery for each target, or the number of views plus one if some part was not found."""
     counts = np.asarray(record["methods"][method]["counts"])
     times = {target: discovery_time(counts, target) for target in TARGETS}
     return {target: float(record["study_views"] + 1 if time is None else time) for target, time in times.items()}
 
 
 def _found(record: Record, method: str) -> dict[int, float]:
-    """Whether all parts are found after the last view, by target."""
+    """Return, for each target, 1.0 if all parts were found by the last view, else 0.0."""
     return {target: float(time <= record["study_views"]) for target, time in _times(record, method).items()}
 
 
@@ -117,12 +123,13 @@ def _found_by_view(record: Record, method: str) -> list[float]:
 
 
 class PartDiscoveryStudy(Study):
-    """Measures the number of views until a segmenter gives enough points to every part of the object.
+    """Measures the number of views until a segmenter assigns enough points to every part of the object.
 
-    Settings as in `Study`, and
+    It has the settings of `Study`, and:
 
-    - `imagined_rays`: rays along a side of an imagined scan; true scans have 64 x 64.
-    - `num_points`: points of D and an imagined scan that the segmenter gets. N_target is scaled in proportion.
+    - `imagined_rays`: rays along each side of an imagined scan. True scans have 64 x 64 rays.
+    - `num_points`: number of points of D and an imagined scan that the segmenter gets. The utility's N_target is scaled
+      in proportion to this number.
     """
 
     title: ClassVar[str] = "Views until all parts are found"
@@ -155,11 +162,14 @@ class PartDiscoveryStudy(Study):
 
     @abstractmethod
     def segmenter_of(self, scene: Scene, num_points: int | None = None) -> PartSegmenter:
-        """The segmenter for a scene that gets `num_points` points; default: as many as for a cloud alone."""
+        """Return the segmenter for a scene.
+
+        - `num_points`: number of points that the segmenter gets; default: the number that it gets of an observed cloud.
+        """
 
     @abstractmethod
     def true_parts(self, scene: Scene, points: Float[Array, "n 3"]) -> Int[Array, " n"]:
-        """The true part of each point of the surface, as its index among the parts of the segmenter."""
+        """Return the true part of each point of the surface, as an index of the segmenter's parts."""
 
     @property
     def imagined_camera(self) -> Camera:
@@ -173,9 +183,9 @@ class PartDiscoveryStudy(Study):
         return ExpectedUtilityImprovement(soft_count, self.num_points)
 
     def follow(self, scene: Scene, truth: list[int], planner: Planner, episode: Iterator[Step]) -> Record:
-        """Record the points that the segmenter gives to each part after each view.
+        """Record the number of points that the segmenter assigns to each part after each view.
 
-        Stops once every part has the largest of `TARGETS`.
+        The episode ends once every part has as many points as the largest of `TARGETS`.
         """
         segmenter = self.segmenter_of(scene)
         counts: list[list[int]] = []
@@ -186,9 +196,10 @@ class PartDiscoveryStudy(Study):
         return {"counts": counts}
 
     def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
-        """Tiles of the cloud over the true shape, coloured by predicted part.
+        """Return tiles of the cloud over the true shape. The points are coloured by their predicted part.
 
-        Below is the number of parts with N_target = 60 points. A method ends once every part has 100.
+        The text below a tile gives the number of parts that have at least 60 points (N_target). The tiles of a method
+        end once every part has 100 points, because its episode ends there.
         """
         scene, runs = self.scene(record["scene"]), record["methods"]
         parts, segmenter = np.asarray(self.truth(scene)), self.segmenter_of(scene)

@@ -1,6 +1,7 @@
-"""Studies of the views until all semantic parts of an object are found: the paper's Table 1.
+"""Studies that count the views until all semantic parts of an object are found, as in the paper's Table 1.
 
-Objects are procedural and segmented by a network, or mesh files whose nodes are parts, segmented by an oracle.
+`PartStudy` uses procedural objects, which a network segments. `MeshPartStudy` uses mesh files whose nodes are parts,
+which an oracle segments.
 """
 
 from pathlib import Path
@@ -25,7 +26,7 @@ from jaxnbv.studies.scenes import Split, part_scene
 from jaxnbv.surfaces.known_shapes import kind_of
 from jaxnbv.tasks import part_counts
 
-# The grid of distances from the parts. The object's longest side is 2.5.
+# The grid on which distances from the parts are stored. The object's longest side is 2.5.
 _GRID = Grid(64, 1.4)
 
 
@@ -37,14 +38,15 @@ class PartMesh(eqx.Module):
 
 
 class MeshPartStudy(PartDiscoveryStudy):
-    """Studies the parts of real objects with the oracle `NearestPart`, without a network's errors.
+    """Part discovery on mesh files with the oracle `NearestPart`, which excludes a network's errors.
 
-    Settings as in `PartDiscoveryStudy`, and
+    It has the settings of `PartDiscoveryStudy`, and:
 
-    - `meshes`: files whose nodes are parts; `room`: largest number of parts of any mesh.
+    - `meshes`: mesh files whose nodes are parts.
+    - `room`: largest number of parts of any mesh.
 
-    The utility counts all parts. The measures count only the parts that can be found, of which all candidates together
-    show at least the largest N_target of points.
+    The utility counts all parts. The measures count only parts that can be found. A part can be found if the oracle
+    assigns at least 100 points (the largest N_target) to it when it segments the scans from all candidates together.
     """
 
     explanation: ClassVar[str] = (
@@ -62,9 +64,11 @@ class MeshPartStudy(PartDiscoveryStudy):
 
     @classmethod
     def files_in(cls, folder: str | Path) -> tuple[MeshFile, ...]:
-        """The meshes with two nodes or more, by folder and name. Folders take turns.
+        """Return the meshes that have at least two nodes.
 
-        **Raises:** `ValueError` if there is no such mesh, or one cannot be read.
+        The order takes one mesh from each subfolder in turn. The names of the meshes include the name of the subfolder.
+
+        **Raises:** `ValueError` if there is no such mesh, or if a mesh cannot be read.
         """
         by_class: dict[str, list[MeshFile]] = {}
         for file in mesh_files(folder):
@@ -75,7 +79,7 @@ class MeshPartStudy(PartDiscoveryStudy):
         return tuple(interleave(by_class.values()))
 
     def scene(self, index: int) -> Scene:
-        """A mesh. The task of the scene is its `PartMesh`."""
+        """Return a scene with a mesh. The task of the scene is its `PartMesh`."""
         file = self.file(index)
         assert file is not None
         parts = load_parts(file.path)
@@ -83,7 +87,7 @@ class MeshPartStudy(PartDiscoveryStudy):
         return Scene(index, file.name, parts.mesh, PartMesh(parts, oracle))
 
     def segmenter_of(self, scene: Scene, num_points: int | None = None) -> NearestPart:
-        """The oracle."""
+        """Return the oracle of the scene."""
         oracle = scene.task.oracle
         return NearestPart(oracle.distances, oracle.grid, num_points or oracle.num_points)
 
@@ -91,9 +95,9 @@ class MeshPartStudy(PartDiscoveryStudy):
         return scene.task.oracle.nearest(points)
 
     def truth(self, scene: Scene) -> list[int]:
-        """Indices of the parts that can be found.
+        """Return the indices of the parts that can be found.
 
-        **Raises:** `ValueError` if there are none.
+        **Raises:** `ValueError` if no part can be found.
         """
         scans = scan(scene.surface, self.imagined_camera, self.candidates.poses())
         joined = PointCloud(scans.points.reshape(-1, 3), scans.normals.reshape(-1, 3), scans.mask.reshape(-1))
@@ -109,12 +113,12 @@ class MeshPartStudy(PartDiscoveryStudy):
 
 
 class PartStudy(PartDiscoveryStudy):
-    """Studies the parts of procedural objects with the shipped network.
+    """Part discovery on procedural objects with the shipped network.
 
-    Settings as in `PartDiscoveryStudy`, and
+    It has the settings of `PartDiscoveryStudy`, and:
 
-    - `segmenter`: segmenter of clouds in scene coordinates. Each scene replaces its category by that of the object.
-    - `split`: split of the scenes. Tune settings on the validation split.
+    - `segmenter`: segmenter of clouds in scene coordinates. The object's category replaces the segmenter's category.
+    - `split`: split from which the scenes come. Tune settings on the validation split.
     """
 
     bank: ClassVar[str] = "parts"
@@ -126,30 +130,30 @@ class PartStudy(PartDiscoveryStudy):
     def configured(
         cls, model: str, views: int, quick: bool, meshes: str | Path | None = None, **options: Any
     ) -> dict[str, Study]:
-        """The study, or a `MeshPartStudy` if there is a folder of meshes."""
+        """Return the study under the name "". With a folder of `meshes`, it is a `MeshPartStudy`."""
         if meshes is not None:
             return MeshPartStudy.configured(model, views, quick, meshes=meshes, **options)
         return super().configured(model, views, quick, segmenter=part_segmenter(category=0), **options)
 
     def scene(self, index: int) -> Scene:
-        """A procedural object. The task of the scene is its `PartScene`."""
+        """Return a scene with a procedural object. The task of the scene is its `PartScene`."""
         part = part_scene(self.split, index)
         return Scene(index, CATEGORIES[int(part.category)].name, SDFSurface(part.solid), part)
 
     def segmenter_of(self, scene: Scene, num_points: int | None = None) -> CloudSegmenter:
-        """The network, for the object's category."""
+        """Return the segmenter for the object's category."""
         base = self.segmenter
         return CloudSegmenter(base.network, scene.task.category, num_points or base.num_points, base.scale)
 
     def sampler_of(self, scene: Scene) -> SurfaceSampler:
-        """The sampler, with only the known shapes of the object's category."""
+        """Return the sampler with only the known shapes of the object's category."""
         return keep_shapes(self.sampler, lambda name: kind_of(name) == scene.name)
 
     def true_parts(self, scene: Scene, points: Float[Array, "n 3"]) -> Int[Array, " n"]:
         return scene.task.solid.part_labels(points)
 
     def truth(self, scene: Scene) -> list[int]:
-        """Labels of the object's parts."""
+        """Return the labels of the object's parts."""
         return [int(label) for label in np.flatnonzero(np.asarray(scene.task.parts))]
 
     def scene_record(self, scene: Scene, truth: list[int], first: int) -> Record:
