@@ -1,1 +1,1 @@
-"""The planner, and the simulated episodes and live sessions that use it."""
+"""The planner, and the simulated episodes and live sessions that use the planner."""

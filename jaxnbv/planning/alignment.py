@@ -7,9 +7,10 @@ X_i are estimated by minimising the disagreement of overlapping views,
     the sum over points p of view i and the nearest point q of view j  of  rho(n_q . (T_i X_i p - T_j X_j q)),
 
 with rho(r) = c^2 log(1 + r^2 / c^2). The points p and q are in the coordinates of cameras i and j, and the normal n_q
-is in world coordinates. A prior keeps the components small that no view determines. The nearest points are searched again
-in each round, within a distance that decreases (point-to-plane iterative closest points, Chen and Medioni 1992). If the
-views do not determine all of X, the smallest eigenvalue of J^T J is small, where J is the derivative of the residuals.
+is in world coordinates. A prior keeps the components small that no view determines. The nearest points are searched
+again in each round, within a distance that decreases (point-to-plane iterative closest points, Chen and Medioni 1992).
+If the views do not determine all of X, the smallest eigenvalue of J^T J is small, where J is the derivative of the
+residuals.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Calls within a compiled program that give the same bits as outside `jit`."""
+"""Computation within a compiled program with results that are bit for bit the same as outside `jit`."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,11 +14,12 @@ from jaxnbv.sharding import on_cpu
 
 
 def in_parts(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Compute `function(*arguments)` under `jit` with the same bits as outside `jit`, on a CPU.
+    """Compute `function(*arguments)` under `jit`. On a CPU, the result has the same bits as outside `jit`.
 
-    Outside `jit`, each operation and each jitted function that the function calls is a separate program. In one program
-    XLA would fuse them, and a fused product and sum are rounded once. Here each is a call that XLA does not inline,
-    between barriers that hide constants. On a GPU, which does not reproduce bits, this only calls the function.
+    Outside `jit`, each operation and each jitted function that `function` calls is a separate program. In a single
+    program, XLA would fuse operations. Fusion changes the bits, because a fused product and sum are rounded only once.
+    Therefore each operation becomes a call that XLA does not inline, and optimisation barriers around the call hide
+    constants from XLA. On a GPU, results are not reproducible to the bit, so the function is called directly.
     """
     if not on_cpu():
         return function(*arguments)
@@ -38,10 +39,10 @@ def in_parts(function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def _part(equation: JaxprEqn) -> Callable[..., list[Any]]:
-    """One equation as a function of its inputs."""
+    """Return one equation of a jaxpr as a function of the equation's inputs."""
 
     def part(*inputs: Any) -> list[Any]:
-        # Before JAX 0.12, this returns functions too.
+        # Before JAX 0.12, get_bind_params returns functions too.
         bound = equation.primitive.get_bind_params(equation.params)
         functions, settings = bound if isinstance(bound, tuple) else ((), bound)
         with equation.ctx.manager:
@@ -52,7 +53,7 @@ def _part(equation: JaxprEqn) -> Callable[..., list[Any]]:
 
 
 def _in_order(array: Any) -> Any:
-    """The array with its last axis varying fastest, as in the arguments and results of a program."""
+    """Constrain an array to row-major layout, which the arguments and results of a program have."""
     if array.ndim < 2 or jnp.issubdtype(array.dtype, jax.dtypes.prng_key):
         return array
     return with_layout_constraint(array, Layout(tuple(range(array.ndim))))

@@ -1,4 +1,4 @@
-"""Proposals that an arm can reach: poses are checked by the user's function, the best ones first."""
+"""Proposals that an arm can reach. The user's function checks poses in the order of their value, best first."""
 
 import dataclasses
 import math
@@ -19,14 +19,18 @@ from jaxnbv.geometry.rotations import rotation_about
 from jaxnbv.search import Proposal
 
 Reachable: TypeAlias = Callable[[Float[np.ndarray, "n 4 4"]], Any]
-"""Function of matrices (n, 4, 4), camera to world, that returns for each whether the arm can go there.
+"""Function of camera-to-world matrices (n, 4, 4) that returns, for each matrix, whether the arm can reach the pose.
 
-An answer is a bool; or None if it can and otherwise the reason; or a score from 0 (not at all) to 1, which multiplies
-the value of the pose."""
+The function may return one of three kinds of answers:
+
+- a bool,
+- None if the pose can be reached, otherwise the reason as a text such as "joint limit",
+- a score from 0 (not reachable) to 1, which multiplies the value of the pose.
+"""
 
 # Number of poses in one call of the function.
 _BATCH = 8
-# Turns of the camera about its optical axis, in degrees, that are tried if the upright camera cannot reach a pose.
+# Rotations about the optical axis, in degrees, that are tried if the arm cannot reach the pose itself.
 _ROLLS = (45.0, -45.0, 90.0, -90.0, 135.0, -135.0, 180.0)
 _NO_REASON = "not reachable"
 
@@ -35,7 +39,7 @@ class Choice(NamedTuple):
     """The best pose that can be reached.
 
     - `proposal`: the search's proposal with this pose and its value.
-    - `refusals`: number of poses that cannot be reached, by reason.
+    - `refusals`: for each reason, the number of poses that cannot be reached.
     """
 
     proposal: Proposal
@@ -43,14 +47,14 @@ class Choice(NamedTuple):
 
 
 class Refused(NamedTuple):
-    """A pose that was refused, in scene coordinates, and the reason."""
+    """A pose that the user refused, in scene coordinates, and the reason."""
 
     pose: Pose
     reason: str
 
 
 class _Option(NamedTuple):
-    """A pose that can be reached, its value, and the value times its score."""
+    """A pose that can be reached, the pose's value, and the value times the score of the user's function."""
 
     pose: Pose
     value: float
@@ -59,10 +63,12 @@ class _Option(NamedTuple):
 
 @dataclasses.dataclass
 class _Checks:
-    """Iterator over poses, from the highest value, with the answers of the user's function.
+    """Iterator over the reachable options of poses, in the order in which the poses are checked.
 
-    - `poses`, `values`: poses and values in the order in which they are checked.
-    - `refusals`: counts of the reasons so far.
+    - `poses`, `values`: poses and values in this order.
+    - `answers`: function that returns the scores or reasons of a batch of poses.
+    - `refused`, `values_at`: as in `best_reachable`.
+    - `refusals`: for each reason, the number of poses so far that cannot be reached.
     """
 
     poses: Pose
@@ -73,7 +79,11 @@ class _Checks:
     refusals: Counter[str] = dataclasses.field(default_factory=Counter)
 
     def __iter__(self) -> Iterator[list[_Option]]:
-        """Yield the options for each pose in order: the pose itself, or turned about its optical axis."""
+        """Yield the options of each pose.
+
+        The options are the pose itself if the arm can reach it, otherwise the reachable rotations of the pose about the
+        optical axis.
+        """
         for start in range(0, len(self.values), _BATCH):
             rows = range(start, min(start + _BATCH, len(self.values)))
             for row, answer in zip(rows, self.answers(self.poses[jnp.asarray(rows)]), strict=True):
@@ -95,7 +105,8 @@ class _Checks:
         return [self._option(turned[index], float(values[index]), score) for index, score in scores.items()]
 
     def _option(self, pose: Pose, value: float, score: float) -> _Option:
-        # The search may break ties by other criteria, so no pose counts more than the proposed one.
+        # Among tied poses, the search need not propose the one of the highest value. So no value counts more than that
+        # of the proposed pose.
         least = min(value, float(self.values[0]))
         return _Option(pose, value, least * score if least > 0 else least)
 
@@ -108,19 +119,19 @@ def best_reachable(
     values_at: Callable[[Pose], Float[Array, " n"]] | None = None,
     seconds: float = math.inf,
 ) -> Choice:
-    """Find the reachable pose with the highest value times score, among all poses of the search.
+    """Find the reachable pose with the highest value times score, among all poses that the search evaluated.
 
-    Poses are checked in batches, those of the highest value first, until no other can be better. A pose that cannot be
-    reached is tried with the camera turned about its optical axis.
+    Poses are checked in batches, highest value first, until no unchecked pose can be better. If a pose cannot be
+    reached, the same pose with the camera rotated about its optical axis is tried.
 
-    - `reachable`: function of the user; None if all poses can be reached.
-    - `to_matrices`: converts poses of the scene to matrices for it.
-    - `refused`: poses that are excluded in any roll.
-    - `values_at`: function that returns the values of turned poses; None if turning does not change the value, as for
-      square images.
-    - `seconds`: time limit. After it, the best pose so far is used.
+    - `reachable`: the user's function; None if all poses can be reached.
+    - `to_matrices`: function that converts scene poses to the matrices for `reachable`.
+    - `refused`: poses that are excluded, also with the camera rotated about its optical axis.
+    - `values_at`: function that returns the values of rotated poses; None if such a rotation does not change the value,
+      as for square images.
+    - `seconds`: time limit. After this time, the best pose so far is used.
 
-    **Raises:** `ValueError` if no pose can be reached, or if the function returns something else.
+    **Raises:** `ValueError` if no pose can be reached, or if `reachable` returns an invalid answer.
     """
 
     def answers(batch: Pose) -> list[float | str]:
@@ -145,7 +156,10 @@ def best_reachable(
 
 
 def _looks(proposal: Proposal) -> tuple[Pose, Float[np.ndarray, " looks"]]:
-    """All poses that a search evaluated, with values: the proposed pose, then the others from the highest value."""
+    """Return all poses that a search evaluated, and their values.
+
+    The proposed pose comes first. The others follow in descending order of value.
+    """
     parts = [(proposal.candidates, proposal.values)]
     if proposal.trajectories is not None:
         parts.append(proposal.trajectories.flat)
@@ -158,7 +172,10 @@ def _looks(proposal: Proposal) -> tuple[Pose, Float[np.ndarray, " looks"]]:
 
 
 def _with_pose(proposal: Proposal, pose: Pose, value: float) -> Proposal:
-    """The proposal with another pose and its value, and with its standard error if that is known."""
+    """Return a copy of a proposal with a different pose and value.
+
+    The standard error is that of the candidate with this value, or None if there is no such candidate.
+    """
     error, errors, same = proposal.standard_error, proposal.standard_errors, proposal.values == value
     if value != float(proposal.value):
         error = errors[jnp.argmax(same)] if errors is not None and bool(same.any()) else None
@@ -167,7 +184,7 @@ def _with_pose(proposal: Proposal, pose: Pose, value: float) -> Proposal:
 
 
 def _rolled(pose: Pose) -> Pose:
-    """The pose turned about its optical axis by each angle of `_ROLLS`, as a batch."""
+    """Rotate a pose about its optical axis by each angle of `_ROLLS`, and return the poses as a batch."""
     axis = jnp.array([0.0, 0.0, 1.0], pose.rotation.dtype)
     turns = jax.vmap(lambda angle: rotation_about(axis, angle))(jnp.radians(jnp.array(_ROLLS, axis.dtype)))
     rotations = jnp.matmul(pose.rotation, turns, precision="highest")
@@ -175,12 +192,12 @@ def _rolled(pose: Pose) -> Pose:
 
 
 def _refusal(pose: Pose, refused: Sequence[Refused]) -> str | None:
-    """The reason why a pose was refused, in any roll; None if it was not."""
+    """Return the reason if a pose was refused, in any rotation about the optical axis; otherwise None."""
     return next((earlier.reason for earlier in refused if is_same_view(pose, earlier.pose)), None)
 
 
 def _answers(reachable: Reachable, matrices: Float[np.ndarray, "n 4 4"]) -> list[float | str]:
-    """The score of each matrix, or the reason why it cannot be reached.
+    """Return, for each matrix, the score or the reason why the pose cannot be reached.
 
     **Raises:** `ValueError` unless the function returns a list of bools, reasons or scores.
     """
@@ -194,9 +211,9 @@ def _answers(reachable: Reachable, matrices: Float[np.ndarray, "n 4 4"]) -> list
 
 
 def _answer(answer: Any) -> float | str:
-    """The score or reason that an answer stands for.
+    """Convert an answer of the user's function to a score or a reason.
 
-    **Raises:** `ValueError` unless it is a bool, None, a reason or a score.
+    **Raises:** `ValueError` unless the answer is a bool, None, a string or a number from 0 to 1.
     """
     if answer is None or isinstance(answer, str):
         return 1.0 if answer is None else answer

@@ -1,4 +1,4 @@
-"""Rehearsal of a session: compiles its programs before the first image."""
+"""Rehearsal of a session, which compiles the session's programs before the first image."""
 
 import time
 from typing import NamedTuple
@@ -17,15 +17,15 @@ from jaxnbv.planning.loop import Loop
 from jaxnbv.programs import LOADED
 
 _COMPILED = "/jax/core/compile/backend_compile_duration"
-# Radius of the ball, as a share of the box's shortest side.
+# Radius of the ball, as a fraction of the box's shortest side.
 _RADIUS = 0.2
 
 
 class Rehearsal(NamedTuple):
     """Result of a rehearsal.
 
-    - `programs`: number of programs that it compiled, or read from the cache.
-    - `seconds`: duration.
+    - `programs`: number of programs that were compiled or read from the cache.
+    - `seconds`: duration of the rehearsal.
     """
 
     programs: int
@@ -36,9 +36,9 @@ class Rehearsal(NamedTuple):
 
 
 def rehearse(intake: Intake, loop: Loop) -> Rehearsal:
-    """Add two views of a ball on a table to a session's intake and loop, and propose after each.
+    """Add two simulated images of a ball on a table, and propose a pose after each image.
 
-    - `intake`, `loop`: intake and loop without views. Do not use them afterwards.
+    - `intake`, `loop`: intake and loop without views. The rehearsal changes both, so do not use them afterwards.
     """
     start, programs = time.monotonic(), 0
 
@@ -61,15 +61,15 @@ def rehearse(intake: Intake, loop: Loop) -> Rehearsal:
 
 
 def slanted(poses: Pose, count: int) -> Pose:
-    """The `count` poses whose view direction is closest to 30 degrees downward. They see the table."""
+    """Return the `count` poses whose view direction is closest to 30 degrees downward, since these show the table."""
     down = -np.asarray(poses.forward)[:, 1]
     return poses[jnp.asarray(np.argsort(np.abs(down - 0.5), kind="stable")[:count])]
 
 
 def ball_on_a_table(camera: Camera, pose: Pose, box: Box) -> Float[np.ndarray, "height width"]:
-    """Depth image of a ball in the middle of a box and a table under it; zero where a ray misses both.
+    """Return a depth image of a ball in the middle of a box, with a table at the bottom of the box.
 
-    Computed by ray equations, in scene units with y up.
+    The depths are exact, in scene units with y up. A pixel is zero if its ray misses both, or is out of range.
     """
     origin = np.asarray(pose.position, np.float64)
     ahead = np.asarray(camera.pixel_directions(), np.float64)

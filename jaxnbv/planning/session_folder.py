@@ -1,4 +1,4 @@
-"""The folder of a session: images, proposals and refused poses, each stored before it is used."""
+"""The folder of a session, in which images, proposals and refused poses are stored before they are used."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,10 +19,10 @@ _KIND = "session"
 class SessionFolder:
     """The stored images, proposals and refused poses of a session, in order.
 
-    - `path`: the folder.
+    - `path`: path of the folder.
     - `config`: arguments of the session.
 
-    **Raises:** `ValueError` for a folder of another session.
+    **Raises:** `ValueError` for a folder of a session with different arguments.
     """
 
     def __init__(self, path: str | Path, config: dict[str, Any]):
@@ -30,7 +30,9 @@ class SessionFolder:
 
     @staticmethod
     def config_of(path: str | Path, **replacements: Any) -> dict[str, Any]:
-        """Arguments of the session in a folder. `replacements` are used for values that cannot be restored.
+        """Return the arguments of the session in a folder.
+
+        - `replacements`: arguments to use in place of stored ones, for example if these cannot be restored.
 
         **Raises:** `ValueError` if the folder holds no session.
         """
@@ -38,11 +40,11 @@ class SessionFolder:
 
     @contextmanager
     def writing(self, num_images: int) -> Iterator[None]:
-        """Context with exclusive write access.
+        """Context with exclusive write access to the folder.
 
         - `num_images`: number of images in the session.
 
-        **Raises:** `ValueError` if another process writes there, or has added images.
+        **Raises:** `ValueError` if a different process writes to the folder or has added images.
         """
         with self._folder.writing():
             require(
@@ -58,35 +60,38 @@ class SessionFolder:
         return self._folder.count("image")
 
     def image(self, index: int) -> Image:
-        """The image with an index from 0."""
+        """Read the image with this index, counted from 0."""
         entry = self._folder.read("image", index)
         image = Image.of(entry["depth"], entry["matrix"], float(entry["depth_scale"]), entry.get("mask"))
         return image._replace(robot=entry.get("robot"))
 
     def store_image(self, index: int, image: Image) -> None:
-        """Store an image, and remove an outdated proposal after it, which used images that were deleted since."""
+        """Store an image.
+
+        A stored proposal after this image is removed. It is outdated, because it was made before images were deleted.
+        """
         self._folder.file("proposal", index + 1).unlink(missing_ok=True)
         pixels = {"mask": image.mask, "robot": image.robot}
         pixels = {name: rows for name, rows in pixels.items() if rows is not None}
         self._folder.write("image", index, depth=image.depth, matrix=image.matrix, depth_scale=image.scale, **pixels)
 
     def proposal(self, num_images: int) -> Proposal | None:
-        """The proposal after `num_images` images; None if there is none."""
+        """Read the proposal that was made after `num_images` images; None if none is stored."""
         if not self._folder.file("proposal", num_images).exists():
             return None
         return self._folder.read("proposal", num_images)["proposal"]
 
     def store_proposal(self, num_images: int, proposal: Proposal) -> None:
-        """Store the proposal after `num_images` images."""
+        """Store the proposal that was made after `num_images` images."""
         self._folder.write("proposal", num_images, proposal=proposal)
 
     def refused(self) -> list[Refused]:
-        """The refused poses."""
+        """Read all refused poses."""
         entries = [self._folder.read("refused", index) for index in range(self._folder.count("refused"))]
         return [Refused(entry["pose"], str(entry["reason"])) for entry in entries]
 
     def store_refused(self, num_images: int, refused: Refused) -> None:
-        """Store a refused pose, and remove the proposal after `num_images` images."""
+        """Store a refused pose, and remove the proposal that was made after `num_images` images."""
         index = self._folder.count("refused")
         self._folder.write("refused", index, pose=refused.pose, reason=np.asarray(refused.reason))
         self._folder.file("proposal", num_images).unlink(missing_ok=True)

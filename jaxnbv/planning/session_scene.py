@@ -1,4 +1,4 @@
-"""A session's box, and its planner in scene coordinates."""
+"""The box of a session, and the session's planner in scene coordinates."""
 
 import dataclasses
 
@@ -16,19 +16,19 @@ from jaxnbv.scanning import Obstacles
 from jaxnbv.search import DiscreteSearch
 from jaxnbv.tasks import NewSurface
 
-# Default number of samples. Twice as many did not improve the views of recordings.
+# Default number of posterior samples. Twice as many did not give better views on recordings.
 _SAMPLES = 8
 
 
 def usual_planner() -> Planner:
-    """The default planner of a session."""
+    """Return the default planner of a session."""
     return Planner(
         NewSurface(), DiscreteSearch(), Camera(height=24, width=32), SurfaceSampler(num_samples=_SAMPLES), capacity=2000
     )
 
 
 def box_of(corners) -> Box:
-    """The box of two corners, or a `Box` unchanged.
+    """Convert two corners to a `Box`, or return a `Box` unchanged.
 
     **Raises:** `ValueError` for anything else.
     """
@@ -47,10 +47,11 @@ def in_scene(
     matrices: Float[np.ndarray, "n 4 4"] | None,
     obstacles: Obstacles | None,
 ) -> Planner:
-    """The planner for a sensor and a box, in scene coordinates.
+    """Return a copy of a planner for a sensor and a box, in scene coordinates.
 
     - `camera`, `box`: as for `Session`, in world units.
-    - `matrices`, `obstacles`: as for `Session`, in world units; None for the planner's own.
+    - `matrices`: poses as for `Session`, in world units; None for the candidates of the planner's search.
+    - `obstacles`: as for `Session`, in world units; None for the planner's own obstacles.
     """
     search = planner.search.upper_half()
     if matrices is not None:

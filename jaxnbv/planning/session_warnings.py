@@ -1,4 +1,4 @@
-"""Warnings of a session, for example of a box that cuts the object, a table, or views of no value."""
+"""Warnings of a session, for example about a box that cuts the object, a table, or views without value."""
 
 import math
 import warnings
@@ -12,18 +12,18 @@ from jaxnbv.planning.alignment import Alignment
 from jaxnbv.planning.table import plane_of
 from jaxnbv.scanning import Obstacles
 
-# Smallest share of points beyond a face for a warning. Fewer may be stray.
+# Smallest fraction of points beyond a face that leads to a warning. Fewer points may be stray.
 _STRAY = 0.01
-# `stacklevel` of the call of a session's method. `add` has one more level, the wrapper that checks its arguments.
+# `stacklevel` for the user's call of a session's method. For `add` it is one more, because a wrapper checks arguments.
 _CALLER, _CALLER_OF_ADD = 3, 4
 
 
 def warn_of_cut(box: Box, points: Float[np.ndarray, "n 3"], voxel: float, faces: frozenset[str]) -> frozenset[str]:
-    """Warn of faces where the object seems to extend beyond the box; return all faces warned of so far.
+    """Warn about faces beyond which the object seems to extend. Return the faces of all warnings so far.
 
-    - `box`, `points`: box and points in world units. Points beyond a face are kept within about a voxel of it.
+    - `box`, `points`: box and points in world units. The points must include those within about a voxel beyond a face.
     - `voxel`: side of a cell of the planner's grid, in world units.
-    - `faces`: faces with an earlier warning, which is not repeated.
+    - `faces`: faces of earlier warnings, which are not repeated.
     """
     shares = {face: share for face, share in box.shares_beyond(points, 0.5 * voxel).items() if share >= _STRAY}
     for face in sorted(shares.keys() - faces):
@@ -36,7 +36,7 @@ def warn_of_cut(box: Box, points: Float[np.ndarray, "n 3"], voxel: float, faces:
 
 
 def warn_of_table(table: Obstacles, frame: Frame) -> None:
-    """Warn of a plane that the session takes for a table. `table` is one half space, in scene coordinates."""
+    """Warn that the session takes a plane for a table. `table` is one half space, in scene coordinates."""
     point, normal = plane_of(table, frame)
     warnings.warn(
         f"the object stands on a plane through {np.round(point, 4).tolist()} with the normal "
@@ -46,7 +46,7 @@ def warn_of_table(table: Obstacles, frame: Frame) -> None:
 
 
 def warn_of_blank() -> None:
-    """Warn of an image that measured nothing."""
+    """Warn that an image has no measurement."""
     warnings.warn(
         "the image measured nothing (all pixels are invalid, or of one value beyond the object) and is left out: take "
         "it again, from farther away or with another exposure",
@@ -55,7 +55,11 @@ def warn_of_blank() -> None:
 
 
 def warn_of_no_table(up: str, others: tuple[str, ...]) -> None:
-    """Warn that no table is under the object. `others` are axes that would give one if they were upward."""
+    """Warn that no table was detected under the object.
+
+    - `up`: the session's upward axis.
+    - `others`: axes with which a table would be detected if they were upward.
+    """
     if others:
         axes = " or ".join(f'up="{axis}"' for axis in others)
         problem = f'no table is found with up="{up}", but a plane would be one with {axes}: give that if it is upward'
@@ -69,7 +73,7 @@ def warn_of_no_table(up: str, others: tuple[str, ...]) -> None:
 
 
 def warn_of_mount(alignment: Alignment) -> None:
-    """Warn of views that disagree, in world units."""
+    """Warn that views disagree. The alignment is in world units."""
     turns, shifts = alignment.errors
     worst = int(np.nanargmax(alignment.disagreement))
     off = f"off by {shifts.max():.2g} and {np.degrees(turns.max()):.2g} degrees"
@@ -89,7 +93,10 @@ def warn_of_mount(alignment: Alignment) -> None:
 
 
 def warn_of_inside(box: Box, cameras: Float[np.ndarray, "n 3"], candidates: Float[np.ndarray, "m 3"]) -> None:
-    """Warn at the first camera inside the box if no candidate is inside. All arguments are in world units."""
+    """Warn if the last camera is the first one inside the box and all candidates are outside.
+
+    - `cameras`, `candidates`: positions of the views so far and of the candidates. They and `box` are in world units.
+    """
     low, high = box.low, box.high
     is_inside, any_inside = (np.all((x > low) & (x < high), axis=1) for x in (cameras, candidates))
     if is_inside[-1] and is_inside.sum() == 1 and not any_inside.any():
@@ -102,9 +109,10 @@ def warn_of_inside(box: Box, cameras: Float[np.ndarray, "n 3"], candidates: Floa
 
 
 def warn_of_little(value: float, error: float | None, value_at_visited: float) -> None:
-    """Warn of a best view that may be worth nothing: candidates look elsewhere, or all has been seen.
+    """Warn that even the best view may have no value, since everything was seen or no candidate faces the object.
 
-    - `value`, `error`, `value_at_visited`: value, standard error, and value expected at visited poses, in world units.
+    - `value`, `error`: value of the best view and its standard error, in world units.
+    - `value_at_visited`: mean value that is expected at visited poses, in world units.
     """
     has_error = error is not None and math.isfinite(error)
     if value <= (3.0 * error if has_error and error is not None else 0.0) + value_at_visited:

@@ -1,4 +1,4 @@
-"""Simulated episodes: the planning loop with a sensor that scans a known surface."""
+"""Simulated episodes, in which the sensor scans a known surface."""
 
 import dataclasses
 import itertools
@@ -38,19 +38,27 @@ def simulate(
 ) -> Episode:
     """Simulate an episode: scan a known surface from `first`, then from the planner's proposals.
 
-    View i depends only on the key and i, not on the number of views. An interrupted run with a folder continues after
-    its last view. On a CPU with the same versions, the result is the same bit for bit. (A GPU may add in another order
-    from run to run.) The stop rule is checked after the last stored view, so you can continue with another rule.
+    View i does not depend on `views`, the total number of views. An interrupted run with a folder continues after its
+    last view. On a CPU with the same versions, its result is bit for bit that of an uninterrupted run. On a GPU the
+    bits may differ, because the order of sums varies between runs. The stop rule is checked after the last stored view,
+    so you can continue a run with a different stop rule.
 
-    - `scene`: surface, solid or trimesh mesh.
+    - `scene`: the true surface: a surface, a solid or a trimesh mesh.
+    - `first`: pose of the first view, in scene coordinates.
     - `views`: total number of views, unless the stop rule ends the episode earlier.
+    - `key`: random key. The random numbers of view i depend only on `key` and i.
+    - `noise`: noise of the sensor.
     - `folder`: folder that stores every finished view.
-    - `progress`: whether a bar shows the stages.
+    - `progress`: whether to show the stages on a progress bar.
     - `until`: stop rule, for example `Sure(0.95) | Budget(seconds=60)`.
-    - `each`: called with the step of every view when it is done, stored views included.
+    - `each`: function that is called with the step of every view, including stored views.
 
-    **Raises:** `ValueError` if `views` < 1 or greater than the planner's `max_views`, if the first view sees nothing,
-    or if the folder belongs to another configuration or already holds more views.
+    **Raises:** `ValueError` in four cases:
+
+    - `views` is less than 1 or greater than the planner's `max_views`.
+    - The first view sees nothing.
+    - The folder belongs to a run with different arguments.
+    - The folder already holds more views.
     """
     require(views >= 1, f"asked for {views} views; ask for at least one")
     require(
@@ -85,7 +93,7 @@ def simulate(
                     store.write("view", index, pose=step.view.pose, scan=step.view.scan, proposal=step.view.proposal)
                 if each is not None:
                     each(step)
-                # A posterior may be large: free it before the next step computes another.
+                # A posterior may be large, so it is freed before the next step computes a new one.
                 del step
             bar.update(bar.total - bar.n)
         reason = loop.stop_reason if len(loop.views) < views else None
@@ -103,7 +111,7 @@ def observe_scene(
     key: PRNGKeyArray,
     obstacles: Obstacles | None = None,
 ) -> PointCloud:
-    """A noisy scan of the true surface, behind obstacles; compiled if the surface supports it."""
+    """Return a noisy scan of the true surface, which obstacles may hide. Scans run under `jit` if `scene.in_jit`."""
     barrier = None if obstacles is None else _barrier(obstacles, camera, pose)
     observe = _noisy_scan_in_jit if scene.in_jit else _noisy_scan
     return observe(scene, camera, pose, barrier, noise, key)

@@ -1,15 +1,15 @@
 """Stop rules: conditions that end an episode, checked after each view and for each proposed view.
 
-    rule         its limit is                                             checks the proposed view too
+    rule         limit of the rule                                        checks the proposed view too
     Sure         a probability                                            no
-    PartsFound   points of each part                                      no
+    PartsFound   a number of points for each part                         no
     Identified   a probability                                            no
     Placed       a length                                                 no
-    Covered      a share of the area that can be seen                     no
-    ValueBelow   a value of the search, lengths in world units            yes
-    Budget       seconds; or a cost, of poses in the world                for a cost
+    Covered      a fraction of the visible area                           no
+    ValueBelow   a value of the search, with lengths in world units       yes
+    Budget       a time in seconds, or a cost of the path in the world    if a cost is given
 
-Combine rules with `|`: the first that holds ends the episode. In a simulation, world units are scene units.
+Rules are combined with `|`. The episode ends as soon as one rule holds. In a simulation, world units are scene units.
 """
 
 import dataclasses
@@ -40,12 +40,12 @@ from jaxnbv.tasks.segmentation import PartAnswer, SoftPartCount
 class StopContext:
     """The state of an episode between two views, for stop rules.
 
-    - `planner`, `observations`: planner and observations of the next step, in scene coordinates.
+    - `planner`, `observations`: planner and observations for the next view, in scene coordinates.
     - `poses`: poses of the views so far, in scene coordinates.
-    - `seconds`: time since the first view of this process.
-    - `key`: random key of the next step's samples.
-    - `surfaces`: function that draws these samples, once for both the rule and the search.
-    - `frame`: frame of the user's world, which gives the units of values and costs.
+    - `seconds`: time since the first view that this process added.
+    - `key`: random key of the posterior samples for the next view.
+    - `surfaces`: function that returns these samples. They are drawn once, and the search uses the same samples.
+    - `frame`: frame of the user's world. Values and costs are in units of this world.
     """
 
     planner: Planner
@@ -57,12 +57,12 @@ class StopContext:
     frame: Frame
 
     def cost(self, poses: tuple[Pose, ...], of: CostFunction) -> float:
-        """Cost of the path through poses of the scene, by a function `of` of poses in the user's world."""
+        """Return the cost of the path through scene poses. The cost function `of` gets poses in the user's world."""
         return total_cost(poses, WorldCost(of, self.frame))
 
 
 class StopRule(eqx.Module):
-    """Base class of rules that end an episode: after a view, or before the proposed view is taken."""
+    """Base class of rules that end an episode, either after a view or before a proposed view is taken."""
 
     @property
     def needs_proposal(self) -> bool:
@@ -74,14 +74,14 @@ class StopRule(eqx.Module):
         return
 
     def after(self, context: StopContext) -> str | None:
-        """The reason to stop after the views so far, in words; None to continue."""
+        """Return the reason to stop after the views so far, as a text; None to continue."""
         return None
 
     def before(self, context: StopContext, pose: Pose, value: float) -> str | None:
-        """The reason to stop before the proposed view, in words; None to continue.
+        """Return the reason to stop before the proposed view, as a text; None to continue.
 
         - `pose`: proposed pose, in scene coordinates.
-        - `value`: its value, in world units.
+        - `value`: value of the proposed pose, in world units.
         """
         return None
 
@@ -91,7 +91,7 @@ class StopRule(eqx.Module):
 
 
 class AnyOf(StopRule):
-    """Stop once any of these rules holds. The reason is that of the first one."""
+    """Stop once any of these rules holds. The reason comes from the first rule that holds, in order."""
 
     rules: tuple[StopRule, ...]
 
@@ -112,9 +112,9 @@ class AnyOf(StopRule):
 
 
 def checked_reason(rule: StopRule, reason: str | None) -> str | None:
-    """The reason that a rule returned, unchanged.
+    """Check a reason that a rule returned, and return the reason unchanged.
 
-    **Raises:** `ValueError` unless it is a non-empty string or None.
+    **Raises:** `ValueError` unless the reason is a non-empty string or None.
     """
     is_proper = reason is None or (isinstance(reason, str) and bool(reason))
     name = type(rule).__name__
@@ -126,9 +126,9 @@ def checked_reason(rule: StopRule, reason: str | None) -> str | None:
 
 
 class Sure(StopRule):
-    """Stop once the most probable class has this probability, given D and also given random halves of D.
+    """Stop once the most probable class has at least this probability, given D and given each of several halves of D.
 
-    The halves count too because a single answer may be sure by chance.
+    The random halves are checked because a classifier may be sure of a single cloud by chance.
 
     - `probability`: within (0, 1).
     - `num_resamplings`: number of random halves.
@@ -153,7 +153,7 @@ class Sure(StopRule):
         return self.reason(context.planner.acquisition, context.observations.cloud, context.key)
 
     def reason(self, acquisition: Acquisition, cloud: PointCloud, key: PRNGKeyArray) -> str | None:
-        """The reason to stop given D, in words; None to continue. `key` decides the random halves."""
+        """Return the reason to stop given D, as a text; None to continue. `key` decides the random halves."""
         acquisition = _of_classes(acquisition)
         answer = acquisition.answer(cloud)
         best = int(np.argmax(answer.values))
@@ -180,18 +180,19 @@ def _of_classes(acquisition: Acquisition) -> ClassAcquisition:
 
 @jax.jit
 def half_of(cloud: PointCloud, key: PRNGKeyArray) -> PointCloud:
-    """A random subset of a cloud that keeps each point with probability one half."""
+    """Return a random subset of a cloud, to which each point belongs with probability one half."""
     return cloud.only(jax.random.bernoulli(key, 0.5, cloud.mask.shape))
 
 
 class PartsFound(StopRule):
-    """Stop once all parts are found.
+    """Stop once the segmenter predicts enough points for every part.
 
-    - `points`: number of points that must be predicted to belong to each part.
-    - `parts`: names of the parts to find, by default all parts of the segmenter. The object may lack one of these.
+    - `points`: smallest number of predicted points for each part.
+    - `parts`: names of the parts to find, by default all parts of the segmenter. Give names if the object may lack some
+      of the segmenter's parts.
 
-    **Raises:** `ValueError` for a number of points below one, an acquisition without a segmenter, or a part that the
-    segmenter does not know.
+    **Raises:** `ValueError` for a number of points below one, an acquisition without a segmenter, or a name that is not
+    a part of the segmenter.
     """
 
     points: int = eqx.field(static=True, default=60)
@@ -230,12 +231,13 @@ class PartsFound(StopRule):
 
 
 class Covered(StopRule):
-    """Stop once this share of the visible surface is expected to have been seen, see `expected_coverage`.
+    """Stop once the views so far are expected to cover this fraction of the visible area, see `expected_coverage`.
 
-    - `share`: share of the area, within (0, 1].
-    - `size`: size of `NewSurface`, in world units; by default that of the acquisition, or of `NewSurface()`.
+    - `share`: fraction of the area, within (0, 1].
+    - `size`: size of `NewSurface`, in world units. The default is the acquisition's size if the acquisition is a
+      `NewSurface`, otherwise the size of `NewSurface()`.
 
-    **Raises:** `ValueError` for another share, or a size that is not positive.
+    **Raises:** `ValueError` for a `share` outside (0, 1], or a size that is not positive.
     """
 
     share: float = eqx.field(static=True, default=0.98)
@@ -256,12 +258,12 @@ class Covered(StopRule):
 
 
 def expected_coverage(context: StopContext, new: NewSurface) -> float:
-    """Expected share of the visible surface that the views so far have seen.
+    """Return the expected fraction of the visible area that the views so far have seen.
 
-    It is `seen_share` of the posterior samples from all candidates. Sampled surface that a view should have measured
-    and did not is left out.
+    The visible area is the area of the posterior samples that is visible from any candidate, see `seen_share`. Sampled
+    surface that an earlier view should have measured but did not is left out.
 
-    - `new`: decides which surface is new.
+    - `new`: acquisition that decides which surface is new.
     """
     planner, observations, surfaces = context.planner, context.observations, context.surfaces()
     if observations.looks is not None and not planner.acquisition.measurable_only:
@@ -273,11 +275,11 @@ def expected_coverage(context: StopContext, new: NewSurface) -> float:
 
 
 class Identified(StopRule):
-    """Stop once one of the known parts, or "none of these", has this probability.
+    """Stop once one of the known parts, or "none of these", has at least this probability.
 
     - `probability`: within (0, 1).
 
-    **Raises:** `ValueError` for another probability, or a planner without known parts.
+    **Raises:** `ValueError` for a probability outside (0, 1), or a planner without known parts.
     """
 
     probability: float = eqx.field(static=True, default=0.95)
@@ -292,11 +294,11 @@ class Identified(StopRule):
 
 
 class Placed(StopRule):
-    """Stop once the surface of the likeliest part is known to this length, see `surface_error`.
+    """Stop once the expected error of the most probable part's surface is at most this length, see `surface_error`.
 
     The error is a root mean square over the surface and over the hypotheses.
 
-    - `length`: in world units in a session, scene units in a simulation.
+    - `length`: length in world units in a session, and in scene units in a simulation.
 
     **Raises:** `ValueError` for a length that is not positive, or a planner without known parts.
     """
@@ -317,8 +319,8 @@ class Placed(StopRule):
 class ValueBelow(StopRule):
     """Stop once the proposed view's value is below this limit.
 
-    - `value`: in the units of the search's values, with lengths in world units in a session and in scene units in a
-      simulation.
+    - `value`: limit in the unit of the search's values. Lengths are in world units in a session, and in scene units in
+      a simulation.
     """
 
     value: float = eqx.field(static=True)
@@ -334,13 +336,13 @@ class ValueBelow(StopRule):
 
 
 class Budget(StopRule):
-    """Stop when time is up, or when the next view would exceed the cost.
+    """Stop when the time is over, or when the next view would exceed the cost.
 
-    - `seconds`: time since the first view of this process. The current view is finished.
-    - `cost`: cost of the whole path through all views, by the function `of`.
-    - `of`: cost function of poses, in world coordinates in a session.
+    - `seconds`: time limit, counted from the first view that this process adds. The time is checked between views.
+    - `cost`: limit of the cost of the whole path through all views.
+    - `of`: function that returns the cost of a move. In a session it gets poses in world coordinates.
 
-    **Raises:** `ValueError` for neither limit, or one that is not positive.
+    **Raises:** `ValueError` if both limits are None, or if a limit is not positive.
     """
 
     seconds: float | None = eqx.field(static=True, default=None)
