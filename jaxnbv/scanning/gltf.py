@@ -1,4 +1,4 @@
-"""Reader of glTF files by trimesh. Rejects features that trimesh ignores, and content that differs from the header."""
+"""Reader of glTF files, which uses trimesh but rejects features that trimesh ignores or reads wrongly."""
 
 import importlib.util
 import json
@@ -17,28 +17,30 @@ from jaxnbv.checks import require
 
 # Divisor of normalised integers, by the component type of their accessor.
 _LARGEST = {5120: 127.0, 5121: 255.0, 5122: 32767.0, 5123: 65535.0}
-# Modes of primitives: the ones that trimesh reads, triangles and strips among them, and fans.
+# Modes of glTF primitives: modes that trimesh reads, modes with triangles (lists and strips), and the mode of fans.
 _KEPT, _TRIANGLES, _FANS = (0, 1, 4, 5), (4, 5), 6
-# Required extensions that are allowed, since trimesh reads them or they do not change the shape.
+# These required extensions are allowed, since trimesh reads them or they do not change the shape.
 _HARMLESS = re.compile("material|texture|light|mesh_quantization|xmp|KHR_draco_mesh_compression")
 _ROUNDING = 1e-3
 _REMEDY = "export the file again without these, for example from Blender"
 
 
 def read_gltf(content: bytes, kind: str, resolver: Resolver) -> trimesh.Scene:
-    """The scene in a glTF file.
+    """Read the scene in a glTF file.
 
+    - `content`: the bytes of the file.
     - `kind`: "gltf" or "glb".
-    - `resolver`: trimesh's resolver of the files that this one refers to.
+    - `resolver`: trimesh's resolver of the files that this file refers to.
 
-    **Raises:** `ValueError` for features that trimesh does not read, and for counts or bounds other than declared.
+    **Raises:** `ValueError` if the file has features that trimesh does not read, or if the counts or bounds of the
+    meshes differ from those in the file's header.
     """
     text = content[20 : 20 + struct.unpack("<I", content[12:16])[0]] if kind == "glb" else content
     header = json.loads(text)
     unread = sorted(set(_unread(header)))
     require(not unread, f"has {', '.join(unread)}, which trimesh does not read: {_REMEDY}")
     scene = trimesh.load_scene(BytesIO(content), kind, resolver, process=False)
-    # trimesh keeps the order of primitives.
+    # trimesh returns geometries in the order of the file's primitives.
     kept = [(index, part) for index, part in _primitives(header) if part.get("mode", 4) in _KEPT]
     require(len(kept) == len(scene.geometry), f"has {len(kept)} primitives, but trimesh reads {len(scene.geometry)}")
     boxes: dict[int, list[Float[np.ndarray, "8 3"]]] = {}
@@ -76,7 +78,7 @@ def read_gltf(content: bytes, kind: str, resolver: Resolver) -> trimesh.Scene:
 
 
 def _unread(header: dict[str, Any]) -> Iterator[str]:
-    """Names of features in a file that change its shape but that trimesh ignores."""
+    """Yield the names of features in a file that change the shape but that trimesh ignores."""
     yield from (name for name in header.get("extensionsRequired", []) if not _HARMLESS.search(name))
     for node in header.get("nodes", []):
         if "mesh" in node and "skin" in node:
@@ -105,7 +107,7 @@ def _primitives(header: dict[str, Any]) -> list[tuple[int, dict[str, Any]]]:
 
 
 def _placed(header: dict[str, Any]) -> Iterator[tuple[int, Float[np.ndarray, "4 4"]]]:
-    """Index and matrix (mesh to scene) of each mesh that a node of the scene places."""
+    """Yield the mesh index and the mesh-to-scene matrix of each node of the scene that has a mesh."""
     scenes = header.get("scenes", [])
     roots = scenes[header.get("scene", 0)].get("nodes", []) if scenes else []
     waiting = [(root, np.eye(4)) for root in roots]

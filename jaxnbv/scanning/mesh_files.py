@@ -1,4 +1,4 @@
-"""Meshes and their parts from files of any format that trimesh reads."""
+"""Readers of meshes, and of the parts of a mesh, from files in any format that trimesh reads."""
 
 import os
 from io import BytesIO
@@ -24,22 +24,25 @@ from jaxnbv.scanning.sphere_tracing import SDFSurface
 
 @checked
 def load_mesh(path: str | Path | trimesh.Trimesh | trimesh.Scene, up: str = "y") -> TriangleMesh:
-    """The mesh in a file of any format that trimesh reads, or of a trimesh mesh or scene.
+    """Load a mesh from a file in any format that trimesh reads, or convert a trimesh mesh or scene.
 
-    The geometries of a scene are joined where it places them.
+    If the file or scene has several geometries, they are placed as it says and joined into one mesh.
 
     - `up`: the file's axis that is upward, see `Frame`.
 
     **Raises:** `ValueError` if the file is missing, cannot be read, or has features that the reader would ignore (such
-    as a skeleton or sparse accessors in glTF), and as `TriangleMesh.from_arrays` does.
+    as a skeleton or sparse accessors in glTF), or for the same reasons as `TriangleMesh.from_arrays`.
     """
     return joined_nodes(path, [mesh for _, mesh in read_nodes(path)], up)
 
 
 def as_surface(scene: Surface | SignedDistance | trimesh.Trimesh | trimesh.Scene) -> Surface:
-    """The surface of a scene: itself, the boundary of a solid, or a trimesh object by `load_mesh` (y up).
+    """Convert a scene of any accepted type to a surface.
 
-    **Raises:** `ValueError` as `load_mesh` does.
+    A `Surface` is returned unchanged. A solid gives the `SDFSurface` of its boundary. A trimesh object is converted by
+    `load_mesh` with the y axis up.
+
+    **Raises:** `ValueError` for the same reasons as `load_mesh`.
     """
     if isinstance(scene, trimesh.Trimesh | trimesh.Scene):
         return load_mesh(scene)
@@ -47,11 +50,11 @@ def as_surface(scene: Surface | SignedDistance | trimesh.Trimesh | trimesh.Scene
 
 
 class MeshParts(eqx.Module):
-    """A mesh whose file has a node for each part.
+    """A mesh and its parts, from a file that has a node for each part.
 
     - `mesh`: the whole mesh.
-    - `parts`: the triangles of each part, in the scene coordinates of the whole.
-    - `names`: name of each part's node.
+    - `parts`: each part as a mesh, in the scene coordinates of the whole mesh.
+    - `names`: name of each part's node in the file.
     """
 
     mesh: TriangleMesh
@@ -59,7 +62,7 @@ class MeshParts(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
 
     def distances(self, grid: Grid) -> Float[Array, "parts g g g"]:
-        """Unsigned distance from each of the grid's nodes to the surface of each part, in scene units."""
+        """Return the unsigned distance from each node of a grid to the surface of each part, in scene units."""
         nodes = np.stack(np.meshgrid(*[grid.axis] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
         distances = [distance_to_triangles(nodes, part.vertices, part.faces) for part in self.parts]
         shape = len(self.parts), *(grid.resolution,) * 3
@@ -67,13 +70,13 @@ class MeshParts(eqx.Module):
 
 
 def load_parts(path: str | Path | trimesh.Scene, up: str = "y") -> MeshParts:
-    """The mesh in a file or trimesh scene and its parts.
+    """Load a mesh and its parts from a file or a trimesh scene.
 
-    There is one part for each node with a face of positive area, sorted by name.
+    Each node that has a face of positive area is a part. Parts are sorted by the names of their nodes.
 
     - `up`: the file's axis that is upward, see `Frame`.
 
-    **Raises:** `ValueError` as `load_mesh` does, or if there is only one part.
+    **Raises:** `ValueError` for the same reasons as `load_mesh`, or if there is only one part.
     """
     nodes = read_nodes(path)
     mesh = joined_nodes(path, [node for _, node in nodes], up)
@@ -85,9 +88,11 @@ def load_parts(path: str | Path | trimesh.Scene, up: str = "y") -> MeshParts:
 
 
 def joined_nodes(path: str | Path | trimesh.Geometry, meshes: list[trimesh.Trimesh], up: str) -> TriangleMesh:
-    """The single mesh of all nodes of a file.
+    """Join the meshes of all nodes of a file into one.
 
-    **Raises:** `ValueError` as `TriangleMesh.from_arrays` does, with the path in the message.
+    - `path`: the file or trimesh object that the meshes come from, for error messages.
+
+    **Raises:** `ValueError` for the same reasons as `TriangleMesh.from_arrays`, with the path in the message.
     """
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
     vertices = np.concatenate([mesh.vertices for mesh in meshes])
@@ -99,9 +104,9 @@ def joined_nodes(path: str | Path | trimesh.Geometry, meshes: list[trimesh.Trime
 
 
 def read_nodes(path: str | Path | trimesh.Geometry) -> list[tuple[str, trimesh.Trimesh]]:
-    """Name and placed mesh of each node with faces in a file or scene, in the file's coordinates.
+    """Return the name and the mesh of each node that has faces, in the coordinates of the file or scene.
 
-    **Raises:** `ValueError` if the file is missing, cannot be read, has no faces, or has features that its reader would
+    **Raises:** `ValueError` if the file is missing, cannot be read, has no faces, or has features that the reader would
     ignore.
     """
     meshes = _read_file(Path(path)) if isinstance(path, str | Path) else _placed(path)
@@ -136,7 +141,10 @@ def _read(path: Path) -> list[tuple[str, trimesh.Trimesh]]:
 
 
 def _placed(geometry: trimesh.Geometry) -> list[tuple[str, trimesh.Trimesh]]:
-    """Name of the node and placed mesh, for each mesh of a scene or for a single mesh."""
+    """Return the node's name and the transformed mesh for each mesh of a scene, or for a single mesh.
+
+    A mesh without a node is named by its index.
+    """
     parts = geometry.dump() if isinstance(geometry, trimesh.Scene) else [geometry]
     meshes = [part for part in parts if isinstance(part, trimesh.Trimesh)]
     return [(str(mesh.metadata.get("node", index)), mesh) for index, mesh in enumerate(meshes)]

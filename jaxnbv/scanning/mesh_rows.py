@@ -13,7 +13,7 @@ from jaxnbv.checks import InputError, require
 
 Triangles: TypeAlias = tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]
 
-# Longer marks come first, since the mark of UTF-32 begins with that of UTF-16.
+# Longer byte order marks come first, since the mark of UTF-32 begins with the mark of UTF-16.
 _MARKS = (
     (codecs.BOM_UTF32_LE, "utf-32"),
     (codecs.BOM_UTF32_BE, "utf-32"),
@@ -24,7 +24,7 @@ _MARKS = (
 
 
 def without_mark(content: bytes) -> bytes:
-    """The bytes of a file; text with a byte order mark becomes UTF-8 without the mark."""
+    """Convert text with a byte order mark to UTF-8 without the mark. All other bytes are returned unchanged."""
     for mark, encoding in _MARKS:
         if content.startswith(mark):
             return content.decode(encoding, "replace").encode()
@@ -32,7 +32,7 @@ def without_mark(content: bytes) -> bytes:
 
 
 def read_obj(content: bytes) -> dict[str, Triangles]:
-    """The triangles of each material of an OBJ file. Polygons are cut into fans.
+    """Read the triangles of each material of an OBJ file. Polygons are cut into fans.
 
     **Raises:** `ValueError` for a vertex or a face that is not a row of numbers.
     """
@@ -51,7 +51,8 @@ def read_obj(content: bytes) -> dict[str, Triangles]:
                 corners = [int(value.partition("/")[0]) for value in values]
             except ValueError as error:
                 raise InputError(f"has a face {line.strip()!r}, whose corners are not vertex numbers") from error
-            # Negative numbers count back from the last vertex so far.
+            # Negative numbers count back from the latest vertex. Zero is invalid and becomes -1, which is rejected
+            # later.
             rows = [corner - 1 if corner > 0 else len(vertices) + corner if corner else -1 for corner in corners]
             polygons.setdefault(material, []).append(rows)
     places = as_array(vertices)
@@ -62,9 +63,10 @@ def read_obj(content: bytes) -> dict[str, Triangles]:
 
 
 def read_off(content: bytes) -> Triangles:
-    """The triangles of an OFF file, with or without colours and normals.
+    """Read the triangles of a text OFF file, whose vertices may have colours, normals and texture coordinates.
 
-    **Raises:** `ValueError` for another kind of OFF, missing rows, or entries that are not numbers.
+    **Raises:** `ValueError` for an OFF file that is binary or does not have three coordinates per vertex, for missing
+    rows, or for entries that are not numbers.
     """
     text = re.sub("#.*", "", content.decode("utf-8", "replace"))
     head = re.match(r"\s*(ST)?C?N?OFF\b\s*|\s*(ST)?C?N?OFF(?=\d)", text)
@@ -88,7 +90,10 @@ def read_off(content: bytes) -> Triangles:
 
 
 def triangles_of(polygons: Sequence[Sequence[int]] | Sequence[np.ndarray] | np.ndarray) -> Int[np.ndarray, "f 3"]:
-    """Triangles of polygons, as fans about the first corner. Fewer than three corners give no triangle."""
+    """Cut polygons into fans of triangles about their first corners.
+
+    A polygon with fewer than three corners gives no triangle.
+    """
     if isinstance(polygons, np.ndarray):
         alike = [polygons]
     else:
@@ -101,7 +106,7 @@ def triangles_of(polygons: Sequence[Sequence[int]] | Sequence[np.ndarray] | np.n
 
 
 def _used(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Triangles:
-    """The same triangles with only the vertices that they use."""
+    """Drop the vertices that no triangle uses. Triangles with an index out of range are returned unchanged."""
     if not len(faces) or faces.min() < 0 or faces.max() >= len(vertices):
         return vertices, faces
     rows, faces = np.unique(faces, return_inverse=True)
@@ -109,9 +114,9 @@ def _used(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> 
 
 
 def as_array(rows: list[list[str]]) -> Float[np.ndarray, "n k"]:
-    """Rows of words as an array of numbers.
+    """Convert rows of words to an array of numbers.
 
-    **Raises:** `ValueError` for rows that differ in length or are not numbers.
+    **Raises:** `ValueError` if rows differ in length or a word is not a number.
     """
     try:
         return np.array(rows, np.float64) if rows else np.zeros((0, 3))
@@ -122,5 +127,9 @@ def as_array(rows: list[list[str]]) -> Float[np.ndarray, "n k"]:
 
 
 def cut_short(count: int, declared: int, what: str) -> str:
-    """The message for a file that ends early."""
+    """Return the error message for a file that ends before all declared rows.
+
+    - `count`, `declared`: number of rows in the file, and in its header.
+    - `what`: name of the rows, such as "vertices".
+    """
     return f"has {count} of the {declared} {what} that its header declares: fetch it again"

@@ -13,14 +13,14 @@ from jaxnbv.scanning.mesh_rows import Triangles, as_array, cut_short, triangles_
 _TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
 _TYPES |= {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"}
 _TYPES |= {"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"}
-# Text is converted to 64-bit numbers first.
+# Byte order of each encoding. Text is first converted to little-endian 64-bit numbers.
 _ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
-# Name of a property, its type, and for a list the type of its length.
+# Name and type of a property. For a list, the third entry is the type of the list's length, otherwise None.
 _Property: TypeAlias = tuple[str, np.dtype, np.dtype | None]
 
 
 def read_ply(content: bytes) -> Triangles:
-    """The triangles of a PLY file: its faces, cut into fans, and its strips of triangles.
+    """Read the triangles of a PLY file, from its faces, which are cut into fans, and its triangle strips.
 
     **Raises:** `ValueError` for an invalid header, missing rows, or entries that are not numbers.
     """
@@ -42,7 +42,7 @@ def read_ply(content: bytes) -> Triangles:
 
 
 def _header(text: str) -> tuple[str, dict[str, tuple[int, list[_Property]]]]:
-    """The encoding, and the count and properties of each element."""
+    """Return the encoding of a PLY file, and the number of rows and the properties of each element by name."""
     encoding, elements = "", dict[str, tuple[int, list[_Property]]]()
 
     def kind_of(word: str) -> np.dtype:
@@ -66,7 +66,14 @@ def _header(text: str) -> tuple[str, dict[str, tuple[int, list[_Property]]]]:
 def _element(
     body: bytes, start: int, element: str, count: int, properties: list[_Property]
 ) -> tuple[dict[str, Any], int]:
-    """The columns of an element by name, and the byte at which it ends. Lists have one array per row."""
+    """Return the columns of an element by property name, and the byte at which the element ends.
+
+    - `start`: the byte of the file's body at which the element starts.
+    - `element`: name of the element.
+    - `count`: number of rows.
+
+    A column of lists is an array if all lists have the same length, else a list with one array per row.
+    """
     if count == 0:
         return {name: [] for name, *_ in properties}, start
     what = f"{element!r} elements"
@@ -89,9 +96,9 @@ def _element(
 
 
 def _row(body: bytes, start: int, properties: list[_Property], message: str) -> tuple[list[np.ndarray], int]:
-    """The values of a row, and the byte at which it ends.
+    """Return the values of a row, and the byte at which the row ends.
 
-    **Raises:** `ValueError` with this message if the file ends before.
+    **Raises:** `ValueError` with this message if the file ends before the row does.
     """
     row: list[np.ndarray] = []
     for _, kind, length in properties:
@@ -106,7 +113,11 @@ def _row(body: bytes, start: int, properties: list[_Property], message: str) -> 
 
 
 def _of_strips(strips: Iterable[np.ndarray]) -> Int[np.ndarray, "f 3"]:
-    """Triangles of strips that end with -1. Every second triangle of a strip is wound the other way."""
+    """Convert triangle strips to triangles.
+
+    A row may hold several strips, separated by -1. Every second triangle of a strip is reversed, so that all triangles
+    have the same winding.
+    """
     faces = [np.zeros((0, 3), np.int64)]
     for strip in strips:
         whole = np.asarray(strip, np.int64)

@@ -79,7 +79,7 @@ class Surface(eqx.Module):
 
     @property
     def world_frame(self) -> Frame | None:
-        """The frame that maps the surface's world to the scene; None if the surface is given in scene coordinates."""
+        """The frame that maps the surface's world to the scene. None if they are the same."""
         return None
 
 
@@ -307,10 +307,10 @@ def _implicit_depth_jvp(primals, tangents):
 
 
 def pixel_area(scan: PointCloud, camera: Camera, pose: Pose, steepest: float) -> Float[Array, " rays"]:
-    """Return the surface area that each pixel shows, in squared scene units; zero for pixels without a point.
+    """Surface area that each pixel shows, in squared scene units.
 
-    The area is r^2 omega / cos = z^3 / (r fx fy cos), with focal lengths fx and fy, depth z, distance r, the pixel's
-    solid angle omega and the cosine of incidence cos.
+    It is zero for pixels without a point. Otherwise the area is r^2 omega / cos = z^3 / (r fx fy cos), with focal
+    lengths fx and fy, depth z, distance r, the pixel's solid angle omega and the cosine of incidence cos.
 
     - `scan`: the scan that this camera took from this pose.
     - `steepest`: least cosine of incidence. A smaller cosine is replaced by this value.

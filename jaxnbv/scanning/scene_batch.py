@@ -1,4 +1,4 @@
-"""Stacking of scenes with the same structure, so that one compiled program scans any of them."""
+"""Stacking of scenes that have the same structure, so that one compiled program scans all of them."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -17,7 +17,9 @@ from jaxnbv.scanning.sphere_tracing import SDFSurface
 
 
 def scene_batch(scenes: Any, count: int) -> Surface:
-    """The scenes as one surface whose arrays have a leading axis.
+    """Stack scenes into one surface whose arrays have a leading axis of length `count`.
+
+    - `scenes`: a list of scenes, or one scene whose arrays already have this leading axis.
 
     **Raises:** `ValueError` for a scene that JAX cannot trace, a number of scenes other than `count`, or scenes with
     different structures.
@@ -56,7 +58,7 @@ def _traceable(scene: Any, name: str) -> Surface:
 
 
 def _structure(surface: Surface) -> Any:
-    """The structure, array shapes and static values that surfaces must share to be stacked."""
+    """Return the structure, array shapes and static values, which surfaces must have in common to be stacked."""
     arrays, rest = eqx.partition(surface, eqx.is_array)
     return jax.tree.structure(arrays), list(map(np.shape, jax.tree.leaves(arrays))), jax.tree.leaves(rest)
 

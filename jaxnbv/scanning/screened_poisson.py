@@ -1,4 +1,4 @@
-"""Screened Poisson surface reconstruction of a cloud, for comparison."""
+"""Screened Poisson surface reconstruction of a cloud, for comparison with the posterior mean."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from jaxnbv.scanning.mesh import TriangleMesh
 
 
 def has_poisson() -> bool:
-    """Whether `screened_poisson` can run: `pymeshlab` can be imported."""
+    """Return whether `screened_poisson` can run, that is, whether `pymeshlab` can be imported."""
     try:
         import pymeshlab  # noqa: F401
     except ImportError:
@@ -20,15 +20,16 @@ def has_poisson() -> bool:
 
 @checked
 def screened_poisson(cloud: PointCloud, depth: int = 8) -> TriangleMesh:
-    """MeshLab's screened Poisson reconstruction (Kazhdan and Hoppe 2013) of an oriented cloud.
+    """Reconstruct the surface of an oriented cloud by screened Poisson reconstruction (Kazhdan and Hoppe 2013).
 
-    The mesh is in scene coordinates (its frame is the identity), with faces wound outward, and the same in every run.
-    It bridges gaps in the scan, and is open where it leaves a cube 1.1 times the cloud's size.
+    The computation is MeshLab's. The mesh is in scene coordinates (its frame is the identity), and its faces are wound
+    outward. Every run gives the same mesh. The mesh bridges gaps in the scan. It is open where the surface leaves a
+    cube of 1.1 times the cloud's size.
 
-    - `depth`: depth of the octree. Details go down to 1 / 2^depth of the cloud's size if there are points for them.
+    - `depth`: depth of the octree. The smallest details have 1 / 2^depth of the cloud's size, if points are that dense.
 
-    **Raises:** `ValueError` if `pymeshlab`, an optional dependency (GPL), is not installed, the depth is not within
-    [1, 12], the cloud has fewer than four points, entries that are not finite, or no surface comes out.
+    **Raises:** `ValueError` if `pymeshlab`, an optional dependency (GPL), is not installed, if the depth is not within
+    [1, 12], if the cloud has fewer than four points or an entry that is not finite, or if there is no surface.
     """
     require(1 <= depth <= 12, f"the octree's depth is {depth}; it must be at least 1 and at most 12, such as 8")
     try:
@@ -48,7 +49,7 @@ def screened_poisson(cloud: PointCloud, depth: int = 8) -> TriangleMesh:
     require(finite, "the cloud has points or normals that are not finite: build it with PointCloud.from_arrays")
     meshes = pymeshlab.MeshSet(verbose=False)
     meshes.add_mesh(pymeshlab.Mesh(vertex_matrix=points, v_normals_matrix=normals))
-    # Several threads would change the last bits from run to run.
+    # With several threads, the last bits would differ from run to run.
     meshes.generate_surface_reconstruction_screened_poisson(depth=depth, threads=1)
     reconstruction = meshes.current_mesh()
     vertices, faces = reconstruction.vertex_matrix(), reconstruction.face_matrix()

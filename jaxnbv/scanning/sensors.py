@@ -1,16 +1,17 @@
-"""The authors' usual camera and its distance, and a distance at which an object fits into the image."""
+"""The authors' usual camera and camera distance, and the distance from which an image shows a whole object."""
 
 import math
 from typing import NamedTuple
 
 from jaxnbv.geometry.camera import Camera
 
-# Room beside the object, since space near the image's border is not seen empty.
+# Width of the image relative to the object. The object must not touch the border, because space near the border of an
+# image never counts as seen empty.
 _ROOM = 1.05
 
 
 class Setting(NamedTuple):
-    """A camera, its distance from the object's centre in scene units, and its number of candidates."""
+    """A camera, its distance `radius` from the scene's origin in scene units, and the number of candidate poses."""
 
     camera: Camera
     radius: float
@@ -22,12 +23,12 @@ SENSOR_RADIUS = USUAL_SETTING.radius
 
 
 def fit_distance(setting: Setting, bounding_radius: float) -> Setting:
-    """The setting at a distance from which its square image shows the whole object from all sides.
+    """Return the setting with a distance from which the camera's image shows the whole object from all sides.
 
-    There is 5 % to spare:
+    The camera must have a square image. The object's bounding ball is enlarged by 5 %:
 
         sin(fov / 2) = 1.05 bounding_radius / radius
 
-    - `bounding_radius`: radius of the ball about the origin that holds the object, in scene units.
+    - `bounding_radius`: radius of a ball about the scene's origin that holds the object, in scene units.
     """
     return setting._replace(radius=_ROOM * bounding_radius / math.sin(0.5 * setting.camera.fov))

@@ -1,4 +1,4 @@
-"""First triangles that rays hit, on the host: by Embree, or by libigl on platforms without an Embree wheel."""
+"""Host code that finds the first triangle on each ray by Embree, or by libigl on platforms without an Embree wheel."""
 
 import importlib
 import weakref
@@ -10,9 +10,9 @@ from jaxtyping import Float, Int
 
 from jaxnbv.errors import optional
 
-# libigl treats a ray as parallel to a triangle if twice the area times the cosine is below 1e-6. It also loses rays
-# that run exactly through an edge. So lengths are scaled up, and rays are shifted by 1e-9 in a direction that edges are
-# unlikely to have.
+# libigl treats a ray as parallel to a triangle if twice the triangle's area times the cosine of incidence is below
+# 1e-6, so lengths are scaled up. libigl also misses the triangles of an edge that a ray meets exactly, so rays are
+# shifted by 1e-9 in a direction that edges are unlikely to have.
 _SCALE = 2.0**20
 _SHIFT = 1e-10 * np.array([3.1, 7.7, 5.5])
 
@@ -20,12 +20,12 @@ FirstFaces: TypeAlias = Callable[
     [Float[np.ndarray, "rays 3"], Float[np.ndarray, "rays 3"]],
     tuple[Int[np.ndarray, " rays"], Float[np.ndarray, " rays"]],
 ]
-"""A function of origins and unit directions that returns the row of the face that each ray hits first (-1 for none) and
-the distance to it."""
+"""A function that takes origins and unit directions of rays. It returns the row of the face that each ray hits first
+(-1 if the ray misses) and the distance to this face."""
 
 
 def first_faces(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> FirstFaces:
-    """The ray tracer of these triangles (scene coordinates), with its tree built.
+    """Build the tree of these triangles (scene coordinates), and return the function that traces rays through it.
 
     **Raises:** `ValueError` if neither Embree nor libigl is installed.
     """
@@ -33,7 +33,7 @@ def first_faces(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"
 
 
 def tracer() -> str:
-    """The name of the package that traces rays here: `embreex` or `libigl`."""
+    """Return the name of the package that traces rays on this machine: `embreex` or `libigl`."""
     try:
         importlib.import_module("embreex.rtcore_scene")
     except ImportError:
@@ -64,6 +64,6 @@ def _by_libigl(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
         indices, distances, _ = trees[0].intersect_ray_first(corners, rows, _SCALE * (origins + _SHIFT), directions)
         return indices, distances / _SCALE
 
-    # A tree that outlives Python would be reported as a leak on standard error.
+    # The tree is freed with the function or at exit. If it outlived Python, a leak would be reported on standard error.
     weakref.finalize(first, trees.clear)
     return first
