@@ -28,7 +28,8 @@ _ESTIMATED_BY = 64
 def _on_torus(has_shape: Callable[[Any], bool], wanted: str) -> Callable[..., Any]:
     """Decorator: check that a method's arguments are arrays of this shape with coordinates in [-pi, pi].
 
-    Beyond this torus functions only repeat. The scene is the middle eighth of the torus, and no surface lies elsewhere.
+    Functions are periodic, so points outside [-pi, pi]^3 would repeat points inside. The scene is [-pi/2, pi/2]^3, an
+    eighth of this cube, and surfaces lie only in the scene.
     """
 
     def checking(method: Callable[..., Any]) -> Callable[..., Any]:
@@ -59,9 +60,9 @@ on_grid_of_torus = _on_torus(lambda axis: axis.ndim == 1, "the nodes along one a
 
 
 def sampling_method(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Decorator for a method of a key and a number of samples: check both.
+    """Decorator: check the key and the number of samples that a sampling method is called with.
 
-    **Raises:** the method raises `ValueError` for something else than a key, or a number of samples below 1.
+    **Raises:** the method raises `ValueError` if the key is not a JAX random key, or for a number of samples below 1.
     """
 
     @functools.wraps(method)
@@ -80,22 +81,25 @@ class Fields(eqx.Module):
 
     @abstractmethod
     def __call__(self, x: Float[AnyArray, "n 3"]) -> Float[Array, "s n"]:
-        """Values of all samples at the points x (scene coordinates)."""
+        """Return the values of all samples at the points x (scene coordinates)."""
 
     @on_torus
     def gradient(self, x: Float[AnyArray, "n 3"]) -> Float[Array, "s n 3"]:
-        """Gradients of all samples at the points x. By default they are forward derivatives of the values."""
+        """Return the gradients of all samples at the points x (scene coordinates).
+
+        The default differentiates the values in forward mode.
+        """
         x = jnp.asarray(x)
 
         def along(direction):
-            # Each value depends only on its own point, so one sweep can move all points.
+            # The value at a point depends on this point alone, so one sweep differentiates at all points.
             return jax.jvp(self, (x,), (jnp.broadcast_to(direction, x.shape),))[1]
 
         return jnp.moveaxis(jax.vmap(along)(jnp.eye(3, dtype=x.dtype)), 0, -1)
 
     @on_grid_of_torus
     def on_grid(self, axis: Float[AnyArray, " g"]) -> Float[Array, "s g g g"]:
-        """Values of all samples on the tensor grid axis x axis x axis (scene coordinates)."""
+        """Return the values of all samples on the tensor grid axis x axis x axis (scene coordinates)."""
         return on_tensor_grid(self, axis)
 
 
@@ -103,8 +107,8 @@ class SurfacePosterior(eqx.Module):
     """The posterior p(f | D). The surface is where f equals `level`, and f is greater outside.
 
     A subclass defines `level` and `sample`. If it has closed forms, it overrides `mean`, `variance` and
-    `probability_inside`. The methods that it leaves are estimates from S = 64 samples with a fixed key, the same
-    functions for all points.
+    `probability_inside`. The default methods estimate from S = 64 samples with a fixed key, and evaluate the same
+    samples at all points.
     """
 
     level: eqx.AbstractVar[Float[Array, ""]]
@@ -119,29 +123,35 @@ class SurfacePosterior(eqx.Module):
         return type(self).mean is not SurfacePosterior.mean
 
     def kinds(self) -> dict[str, float]:
-        """Probability of each kind of known shape, most likely first; empty without known shapes."""
+        """Return the probability of each kind of known shape, most likely first.
+
+        Models without known shapes return an empty dictionary.
+        """
         return {}
 
     def names_of_samples(self, key: PRNGKeyArray, num_samples: int) -> list[str]:
-        """Name of the known shape behind each sample of `sample`; empty names without known shapes."""
+        """Return the name of the known shape of each sample that `sample` draws with this key.
+
+        Models without known shapes return empty names.
+        """
         return [""] * num_samples
 
     def mean(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
-        """E f(x). By default the mean of S samples, with standard error sqrt(Var f / S)."""
+        """Return E f(x). The default is the mean of S samples, with standard error sqrt(Var f / S)."""
         return jnp.mean(self._kept()(x), axis=0)
 
     def variance(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
-        """Var f(x). By default the variance of S samples, with denominator S - 1."""
+        """Return Var f(x). The default is the variance of S samples, with denominator S - 1."""
         return jnp.var(self._kept()(x), axis=0, ddof=1)
 
     def probability_inside(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
-        """P(f(x) < level). By default the share of samples below the level."""
+        """Return P(f(x) < level). The default is the fraction of samples below the level."""
         return jnp.mean(self._kept()(x) < self.level, axis=0)
 
     @on_grid_of_torus
     @program
     def mean_on_grid(self, axis: Float[AnyArray, " g"]) -> Float[Array, "g g g"]:
-        """E f on the tensor grid axis x axis x axis (scene coordinates)."""
+        """Return E f on the tensor grid axis x axis x axis (scene coordinates)."""
         if self.has_closed_forms:
             return on_tensor_grid(self.mean, axis)
         return jnp.mean(self._kept().on_grid(axis), axis=0)
@@ -155,25 +165,31 @@ class SurfaceModel(eqx.Module):
 
     @abstractmethod
     def condition(self, observations: Observations | PointCloud) -> SurfacePosterior:
-        """The posterior p(f | observations).
+        """Return the posterior p(f | observations).
 
-        Models use the filled rows of the cloud, and some also use the space that was seen to be empty. An
-        implementation converts a cloud alone by `as_observations`.
+        All models use the filled rows of the cloud. Some models also use the space that was seen to be empty.
+        Implementations convert a `PointCloud` with `as_observations`.
         """
 
     def add_state(self, observations: Observations) -> Observations:
-        """Add the state that the model carries from view to view. Called after each view."""
+        """Return the observations with the state that the model carries from view to view.
+
+        The loop calls this method after each view. By default a model carries no state.
+        """
         return observations
 
     def in_scene(self, frame: Frame) -> "SurfaceModel":
-        """The model in scene units, if it has true sizes in the world units of a frame; otherwise unchanged."""
+        """Return a copy with the model's true sizes converted from a frame's world units to scene units.
+
+        A model without true sizes is returned unchanged.
+        """
         return self
 
     @property
     def carries_hypotheses(self) -> bool:
-        """Whether `add_state` keeps hypotheses about the identity of a known part, see `PartHypotheses`."""
+        """Whether `add_state` adds hypotheses about the identity of a known part, see `PartHypotheses`."""
         return False
 
     def check(self, cloud: PointCloud) -> None:
-        """Warn if the model can make little use of a cloud. The cloud's values must be concrete."""
+        """Warn if a cloud does not suit the model. The cloud's values must be concrete (not traced)."""
         return

@@ -2,12 +2,12 @@
 
     prior      f = m_k(T^-1 x) + g,   k ~ pi over shapes 1..K and 0 for none of these,   g a Gaussian process
     mean       m_k = h tanh(d_k / h), d_k the signed distance, h half the residual's jump across the surface
-    weights    w_k proportional to exp(-beta E_k) over the modes of the fit,  w_0 to exp(-beta E_0)
+    weights    w_k proportional to exp(-beta E_k) over distinct fits (`Hypotheses.is_mode`),  w_0 to exp(-beta E_0)
     sample     shapes by systematic resampling of w; then f about the mean m_k, or for k = 0 a sample of the model
                without known shapes
 
-The weights are tempered, because thousands of normals are not independent, and their likelihood would always choose one
-shape. See `surfaces/registration.py` for E.
+The factor beta tempers the weights. A likelihood that treats thousands of normals as independent would always select a
+single shape. See `surfaces/registration.py` for E.
 """
 
 import dataclasses
@@ -39,14 +39,16 @@ from jaxnbv.surfaces.values import OnSurface
 
 
 def short_ranged(longest_side: float = 2.5, truncation: int = 32) -> ScreenedSPSR:
-    """The default residual model, for an object whose box has this longest side, in scene units.
+    """Return the default residual model for an object of this size.
 
+    - `longest_side`: longest side of the object's bounding box, in scene units.
     - `truncation`: largest frequency along each axis.
     """
     scale = longest_side / 2.5
-    # Long lengthscales, or values beside the surface, would pull the surface back to the residual's own guess. The
-    # noise is the error of the shape's normals: beside a slightly misplaced edge, they are those of the other face.
-    # The level is the shape's own, and the values are no more precise than the placement.
+    # Long lengthscales, or values at points off the surface, would change the shape far from the scan. `noise` covers
+    # errors of the shape's normals: near an edge of a slightly misplaced shape, they are the normals of the wrong face.
+    # `level_deviation` is small because the shape's own surface has level zero. The noise of `OnSurface` is the error
+    # of the placement.
     base = GeometricSPSR(0.01 * scale, truncation=min(round(32 / scale), truncation), noise=0.2)
     return ScreenedSPSR(base, (OnSurface(noise=0.3),), level_deviation=0.02, offset=0.1 * scale)
 
@@ -55,13 +57,14 @@ class KnownShapes(SurfaceModel):
     """A mixture prior over known shapes that fit the scan, and a model for "none of these".
 
     - `bank`: the shapes.
-    - `residual`: the short-ranged model of the difference between the object and the shape, near the scan.
+    - `residual`: the model of the difference between object and shape. Its short lengthscale limits it to the
+      neighbourhood of the scan.
     - `poses`: the possible placements of shapes in the scene.
     - `box`: a tight box around the object.
     - `model_of_none`: the model for an object that is none of the shapes. With an empty bank this is the whole model.
-    - `num_starts`: number of placements tried, over all shapes.
-    - `noise_scale`: rho, which scales the residual's standard deviation. At 1 the prior's deviation in unseen places
-      breaks thin parts and leaves pieces floating around them.
+    - `num_starts`: total number of placements tried over all shapes.
+    - `noise_scale`: rho, the factor on the residual's standard deviation. With 1, the large prior deviation in unseen
+      space breaks thin parts in samples and adds floating fragments near the parts.
     - `inverse_temperature`: beta.
     - `misfit_of_none`: E_0, the misfit at which a shape is as likely as "none of these".
 
@@ -96,7 +99,10 @@ class KnownShapes(SurfaceModel):
         return dataclasses.replace(self, bank=self.bank.in_scene(frame))
 
     def add_state(self, observations: Observations) -> Observations:
-        """Add the `PartHypotheses` of parts at true size; no change for a bank of categories."""
+        """Return the observations with the `PartHypotheses` of a bank at true size.
+
+        For a bank without true sizes, the observations are returned unchanged.
+        """
         if not self.carries_hypotheses:
             return observations
         previous = observations.hypotheses
@@ -106,14 +112,16 @@ class KnownShapes(SurfaceModel):
         )
 
     def fit(self, observations: Observations) -> tuple[Hypotheses, Float[Array, " h_and_none"]]:
-        """The shapes registered to the observations, and the weight of each, last of "none of these"."""
+        """Register the shapes, and return the hypotheses and their weights, the last for "none of these"."""
         fits = register(self.bank, Prior(self.poses, self.box), FitTargets.of(observations), self.num_starts)
         return fits, _weights(fits, self.inverse_temperature, self.misfit_of_none)
 
     def condition(self, observations: Observations | PointCloud) -> SurfacePosterior:
-        """The posterior p(f | observations), with the shapes registered to the cloud and to empty space.
+        """Return the posterior p(f | observations).
 
-        **Raises:** `ValueError` as the `condition` of `residual` and `model_of_none` does.
+        The shapes are registered to the cloud and to the space that was seen to be empty.
+
+        **Raises:** `ValueError` if the `condition` of `residual` or of `model_of_none` does.
         """
         observations = as_observations(observations)
         of_none = self.model_of_none.condition(observations)
@@ -155,8 +163,8 @@ class KnownShapesPosterior(SurfacePosterior):
 
     - `level`: zero.
     - `fits`: the registered shapes.
-    - `weights`: weight of each of them, and last of "none of these".
-    - `residual`: p(g | D), which gives the samples about the shapes.
+    - `weights`: weights of the shapes in `fits`, followed by the weight of "none of these".
+    - `residual`: p(g | D), from which samples about the shapes are drawn.
     - `of_none`: p(f | D, none of the shapes).
     """
 
@@ -170,7 +178,7 @@ class KnownShapesPosterior(SurfacePosterior):
     @property
     def hypotheses(self) -> list[Hypothesis]:
         """The hypotheses, including "none of these", most likely first."""
-        # One transfer to the host, not one per row.
+        # Transfer all rows to the host at once.
         fits, weights = jax.tree.map(np.asarray, self.fits), np.asarray(self.weights)
         names = self.model.bank.names
         of_shapes = [
@@ -186,7 +194,10 @@ class KnownShapesPosterior(SurfacePosterior):
         return sorted([*of_shapes, none], key=lambda one: -one.weight)
 
     def kinds(self) -> dict[str, float]:
-        """Probability of each kind of shape, most likely first: "chair 3" and "chair 12" are of one kind."""
+        """Return the probability of each kind of shape, most likely first.
+
+        "chair 3" and "chair 12" are of the kind "chair". "None of these" is a kind too.
+        """
         weights: dict[str, float] = {}
         for one in self.hypotheses:
             kind = kind_of(one.name)
@@ -194,14 +205,14 @@ class KnownShapesPosterior(SurfacePosterior):
         return dict(sorted(weights.items(), key=lambda item: -item[1]))
 
     def names_of_samples(self, key: PRNGKeyArray, num_samples: int) -> list[str]:
-        """Name of the shape behind each sample of `sample` with the same key."""
+        """Return the name of the shape of each sample that `sample` draws with this key."""
         of_bank = self.model.bank.names
         names = [*(of_bank[index] for index in np.asarray(self.fits.shape)), NONE]
         return [names[index] for index in np.asarray(_drawn(self, key, num_samples))]
 
     @sampling_method
     def sample(self, key: PRNGKeyArray, num_samples: int) -> "MixtureFields":
-        """Draw `num_samples` samples of f. Their shapes are drawn jointly, by systematic resampling."""
+        """Draw `num_samples` samples of f. Systematic resampling draws the shapes of all samples jointly."""
         return _sample(self, key, num_samples)
 
 
@@ -227,15 +238,15 @@ def _sample(posterior: KnownShapesPosterior, key: PRNGKeyArray, num_samples: int
 
 @program
 def _drawn(posterior: KnownShapesPosterior, key: PRNGKeyArray, num_samples: int) -> Int[Array, " s"]:
-    """Index of each sample's hypothesis; the last index is "none of these"."""
+    """Draw the index of each sample's hypothesis. The last index is "none of these"."""
     shape_key, order_key = jax.random.split(jax.random.split(key, 3)[0])
     index = systematic_resampling(shape_key, posterior.weights, num_samples)
-    # Shuffled, so that the first few samples are as representative as all.
+    # The indices are sorted. Shuffle them to make the first few samples as representative as all.
     return jax.random.permutation(order_key, index)
 
 
 def kind_of(name: str) -> str:
-    """Kind of a shape: its name without the number."""
+    """Return the kind of a shape, which is its name without the trailing number."""
     head, _, last = name.rpartition(" ")
     return head if head and last.isdigit() else name
 
@@ -243,14 +254,16 @@ def kind_of(name: str) -> str:
 def systematic_resampling(
     key: PRNGKeyArray, weights: Float[Array, " n"], num_samples: int
 ) -> Int[Array, " num_samples"]:
-    """Draw indices with counts that differ by less than one from their expectations (Kitagawa 1996)."""
+    """Draw indices so that each index's count is within one of its expectation (Kitagawa 1996)."""
     places = (jnp.arange(num_samples) + jax.random.uniform(key)) / num_samples
     total = jnp.cumsum(weights)
     return jnp.clip(jnp.searchsorted(total / total[-1], places, side="right"), 0, len(weights) - 1)
 
 
 class PlacedShapes(Fields):
-    """h tanh(d / h) for placed solids: bounded, and as steep at the surface as the signed distance d.
+    """The fields h tanh(d / h), where d is the signed distance of a placed solid.
+
+    They are bounded by h, and at the surface their gradient equals that of d.
 
     - `solids`, `placements`: batches along a leading axis.
     - `width`: h, in scene units.
@@ -269,11 +282,11 @@ class PlacedShapes(Fields):
 
 
 class MixtureFields(Fields):
-    """Samples that come from one of two batches.
+    """A batch of samples in which each sample comes from one of two batches.
 
     - `of_shapes`, `of_none`: the two batches, of the same size.
-    - `level`: the level of `of_none`, which is subtracted from its values.
-    - `is_none`: whether each sample comes from `of_none`.
+    - `level`: the level of `of_none`, which is subtracted from the values of `of_none`.
+    - `is_none`: for each sample, whether it comes from `of_none`.
     """
 
     of_shapes: Fields
@@ -293,7 +306,7 @@ class MixtureFields(Fields):
     def _merged(self, evaluate: Any, relative: bool = True) -> Array:
         shape = jax.eval_shape(lambda: evaluate(self.of_shapes))
         zero = jnp.zeros(shape.shape, shape.dtype)
-        # A batch that gives no sample is not evaluated.
+        # Do not evaluate a batch from which no sample comes.
         from_shapes = jax.lax.cond(jnp.all(self.is_none), lambda: zero, lambda: evaluate(self.of_shapes))
         from_none = jax.lax.cond(jnp.any(self.is_none), lambda: evaluate(self.of_none), lambda: zero)
         is_none = self.is_none.reshape(-1, *(1,) * (zero.ndim - 1))

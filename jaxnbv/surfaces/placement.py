@@ -32,22 +32,22 @@ class Placement(eqx.Module):
 
     @property
     def factor(self) -> Float[Array, "*batch"]:
-        """Scene units per unit of the shape's distance: the geometric mean of s, exact if all are equal."""
+        """Scene units per unit of the shape's distance: the geometric mean of s, exact for equal s."""
         return jnp.exp(jnp.mean(jnp.log(self.scale), axis=-1))
 
     def to_shape(self, x: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
         """Map points of the scene to the shape's own frame."""
         away = x - self.shift
-        # R^T x as a sum, which XLA fuses with the next operations. It would not fuse a matrix product.
+        # R^T x is written as a sum, because XLA fuses a sum with the next operations, but not a matrix product.
         turned = sum(away[..., i, None] * self.rotation[i] for i in range(3))
         return turned / self.scale
 
     def distance(self, solid: SignedDistance, x: Float[Array, "n 3"]) -> Float[Array, " n"]:
-        """The signed distance of the placed solid at points of the scene."""
+        """Return the signed distance of the placed solid at points of the scene."""
         return self.factor * solid(self.to_shape(x))
 
     def moved(self, step: Float[Array, "9"]) -> "Placement":
-        """A copy turned about t, shifted and scaled.
+        """Return a copy that is rotated about t, shifted and scaled.
 
         - `step`: rotation vector (3), shift (3), and logarithms of the scale factors (3).
         """
@@ -78,26 +78,26 @@ class ShapePoses(eqx.Module):
 
     @abstractmethod
     def rotations(self, count: int) -> Float[AnyArray, "m 3 3"]:
-        """At most `count` rotations, spread evenly over the possible ones, from which a search starts."""
+        """Return at most `count` start rotations, spread evenly over the possible rotations."""
 
     @abstractmethod
     def turns(self) -> Float[np.ndarray, "3 k"]:
-        """Axes about which a placement can be turned, as columns."""
+        """Return the axes about which a placement can rotate, as columns."""
 
     @property
     def moves(self) -> Float[np.ndarray, "9 k"]:
-        """Independent steps of `Placement.moved` that keep the scale, as columns."""
+        """Basis of the possible steps of `Placement.moved` that keep the scale, as columns."""
         return scipy.linalg.block_diag(self.turns(), np.eye(3), np.zeros((3, 0)))
 
     @property
     def steps(self) -> Float[np.ndarray, "9 k"]:
-        """Independent steps of `Placement.moved`, as columns."""
+        """Basis of the possible steps of `Placement.moved`, as columns."""
         least, most = self.scale
         scales = np.zeros((3, 0)) if least == most else np.eye(3) if self.by_axis else np.full((3, 1), 3**-0.5)
         return scipy.linalg.block_diag(self.turns(), np.eye(3), scales)
 
     def rotations_of(self, num_shapes: int, count: int) -> Float[AnyArray, "k m 3 3"]:
-        """At most `count` rotations for each of the first shapes of a bank.
+        """Return at most `count` start rotations for each of the first `num_shapes` shapes of a bank.
 
         The first axis has length one if all shapes have the same rotations.
         """
@@ -108,7 +108,7 @@ class FreeRotation(ShapePoses):
     """Any rotation, for an object that may lie on any side."""
 
     def rotations(self, count: int) -> Float[np.ndarray, "m 3 3"]:
-        """A super-Fibonacci spiral of unit quaternions (Alexa 2022)."""
+        """Return `count` rotations on a super-Fibonacci spiral of unit quaternions (Alexa 2022)."""
         index = np.arange(count) + 0.5
         inner, outer = np.sqrt(index / count), np.sqrt(1.0 - index / count)
         a, b = 2.0 * np.pi * index * _SILVER, 2.0 * np.pi * index * _GOLDEN
@@ -120,12 +120,12 @@ class FreeRotation(ShapePoses):
 
 
 class Upright(ShapePoses):
-    """Any turn about the vertical.
+    """Any rotation about the vertical.
 
-    - `axis`: the vertical in the frames of the shapes and in the scene.
-    - `within`: largest angle to either side at which the search starts, in radians. Refined turns may exceed it.
+    - `axis`: the vertical direction, which is the same in the frames of the shapes and in the scene.
+    - `within`: the search starts at angles between -`within` and `within`, in radians. Refined angles may lie outside.
 
-    **Raises:** `ValueError` also for a zero axis, or an angle outside (0, pi].
+    **Raises:** `ValueError` as `ShapePoses` does, and for a zero axis or an angle `within` outside (0, pi].
     """
 
     axis: tuple[float, float, float] = eqx.field(static=True, default=(0.0, 1.0, 0.0))
@@ -137,7 +137,7 @@ class Upright(ShapePoses):
         require(0 < self.within <= math.pi, f"turns are searched within {self.within} rad; give an angle in (0, pi]")
 
     def rotations(self, count: int) -> Float[np.ndarray, "m 3 3"]:
-        """Evenly spaced turns, no closer than two degrees."""
+        """Return rotations by evenly spaced angles that are at least two degrees apart."""
         count = max(1, min(count, round(self.within / math.radians(1.0))))
         angles = self.within * ((2.0 * np.arange(count) + 1.0) / count - 1.0)
         return Rotation.from_rotvec(angles[:, None] * self._unit).as_matrix()
@@ -151,7 +151,7 @@ class Upright(ShapePoses):
 
 
 class AsGiven(ShapePoses):
-    """Only shift and scale, with the orientation that shapes have in the bank."""
+    """Placements that shift and scale shapes, but keep the orientation that shapes have in the bank."""
 
     def rotations(self, count: int) -> Float[np.ndarray, "m 3 3"]:
         return np.eye(3)[None]

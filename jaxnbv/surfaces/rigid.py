@@ -1,12 +1,12 @@
 """Registration of a partial scan with a triangle mesh of the same size: iterative closest points from many starts.
 
-A motion x -> R x + t takes the points p and normals n of the scan to the mesh. With c the nearest point of the mesh and
-m its normal, a Gauss-Newton step reduces
+A motion x -> R x + t maps the points p and normals n of the scan to the mesh. Let c be the point of the mesh nearest to
+R p + t, and m the normal at c. A Gauss-Newton step reduces
 
     sum_p w (m . (R p + t - c))^2,    w = max(m . R n, 0) / (1 + |R p + t - c|^2 / s^2)
 
-(Chen and Medioni 1992, with Cauchy weights). The scale s falls from step to step. The mean of w is the fit of the
-motion, at best 1. Lengths are in units of the diagonal of the mesh's bounding box.
+(Chen and Medioni 1992, with Cauchy weights). The scale s decreases from step to step. The mean of w, at most 1, is
+called the fit of the motion. Lengths are in units of the diagonal of the mesh's bounding box.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,32 +23,37 @@ from jaxnbv.errors import optional
 from jaxnbv.scanning.sdf.sampled import winding_number
 from jaxnbv.surfaces.placement import FreeRotation
 
-# Number of rotations to start from, shifts for each, and points of the mesh used until motions are nearly right.
+# Number of initial rotations, of initial shifts per rotation, and of points sampled on the mesh, which replace the mesh
+# in the first two stages.
 _ROTATIONS, _PLACES, _SAMPLES = 400, 3, 4000
-# Points of the scan in each stage, scales of its steps, and number of motions kept for the next.
+# Number of scan points in each stage; scales s of the steps in the first three stages; number of motions kept after the
+# first and the second stage, and number of steps in the last stage.
 _FIRST, _SECOND, _THIRD, _LAST = 64, 400, 1000, 20_000
 _SCALES = np.geomspace(0.1, 0.03, 8), np.geomspace(0.05, 0.01, 12), np.geomspace(0.02, 0.003, 12)
 _KEPT_FIRST, _KEPT_SECOND, _ROUNDS = 40, 6, 12
-# Scale in medians of the distances, smallest scale, damping relative to the trace of the normal equations, and the
-# largest step.
+# Default scale s as a multiple of the median distance, smallest scale, damping relative to the trace of the normal
+# equations, and largest step.
 _MEDIANS, _LEAST, _DAMPING, _LARGEST_STEP = 2.0, 1e-9, 1e-5, 0.5
-# Motions that differ by less than this angle (as a cosine) and this shift count as one.
+# Motions that differ by less than this angle (stored as its cosine) and this shift count as equal.
 _SAME_TURN, _SAME_SHIFT = np.cos(np.radians(10.0)), 0.05
-# Turns about the axis that the scan determines least: an almost round part has a local optimum at many of them.
+# Number of rotations tried about the axis that the scan constrains least. An almost round part has many local optima
+# there.
 _TURNS = 72
-# A motion is a rival of the best if it has this share of its fit, and its mesh lies this far away on average.
+# A motion is a rival of the best motion if its fit is at least this fraction of the best fit, and if the two motions
+# place the mesh at least this mean distance apart.
 _RIVAL, _ELSEWHERE = 0.97, 0.01
 
 Nearest = Callable[[Float[np.ndarray, "n 3"]], tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]]
-"""A function from points to the nearest points of a mesh, and the normals there."""
+"""A function that maps points to the nearest points on a mesh, and to the normals of the mesh there."""
 
 
 class Registration(NamedTuple):
-    """Result of `register_scan`, lengths in units of the mesh.
+    """Result of `register_scan`. Lengths are in the unit of the mesh.
 
     - `matrix`: the motion from the scan to the mesh.
     - `median`: median distance of the scan from the mesh.
-    - `rival`: mean distance of the mesh from its place under another motion of nearly the same fit; 0 without one.
+    - `rival`: mean distance between the mesh as placed by `matrix` and as placed by a clearly different motion that
+      fits nearly as well (the largest over such motions); 0 if there is no such motion.
     """
 
     matrix: Float[np.ndarray, "4 4"]
@@ -65,10 +70,10 @@ class _Motions(NamedTuple):
 
 
 class _Equations(NamedTuple):
-    """Normal equations of a step for each motion.
+    """Normal equations of one Gauss-Newton step for each motion.
 
     - `gaps`: distances of the points from the surface.
-    - `agreement`: agreement of the normals, from 0 to 1.
+    - `agreement`: cosines between the normals of the scan and of the mesh, clipped to [0, 1].
     """
 
     matrix: Float[np.ndarray, "s 6 6"]
@@ -81,7 +86,7 @@ class _Equations(NamedTuple):
 
 
 class _Stage(NamedTuple):
-    """Points and normals of a scan, and the surface that they are registered to."""
+    """The scan points and normals that one stage uses, and the surface to which the stage registers the scan."""
 
     points: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
@@ -89,7 +94,7 @@ class _Stage(NamedTuple):
     is_solid: bool
 
     def equations(self, motions: _Motions, scale: float | None = None) -> _Equations:
-        """Normal equations at a scale, by default twice the median distance of each motion."""
+        """Return the normal equations at a scale. The default scale is twice each motion's median distance."""
         arms = np.einsum("nj,sij->sni", self.points, motions.turns)
         places = arms + motions.shifts[:, None]
         feet, outer = (rows.reshape(places.shape) for rows in self.nearest(places.reshape(-1, 3)))
@@ -104,7 +109,7 @@ class _Stage(NamedTuple):
         return _Equations(matrix, vector, gaps, agreement)
 
     def aligned(self, motions: _Motions, scales: Sequence[float | None] | np.ndarray) -> _Motions:
-        """The motions after a damped step at each scale."""
+        """Return the motions after one damped Gauss-Newton step at each of the scales."""
         for scale in scales:
             matrix, vector, *_ = self.equations(motions, scale)
             damping = _DAMPING * np.trace(matrix, axis1=1, axis2=2) + 1e-12
@@ -115,7 +120,7 @@ class _Stage(NamedTuple):
         return motions
 
     def best(self, motions: _Motions, scale: float, count: int) -> _Motions:
-        """The `count` motions of best fit that differ from all better ones."""
+        """Return the `count` motions with the best fits, without motions that nearly equal a better motion."""
         rows: list[int] = []
         for row in np.argsort(-self.equations(motions, scale).fit(scale), kind="stable").tolist():
             cosine = 0.5 * (np.einsum("kij,ij->k", motions.turns[rows], motions.turns[row]) - 1.0)
@@ -127,7 +132,7 @@ class _Stage(NamedTuple):
         return motions.at(rows)
 
     def swept(self, motion: _Motions) -> _Motions:
-        """One motion followed by turns about the axis that changes the fit least, in general a screw axis."""
+        """Return a motion followed by rotations about the (screw) axis along which the fit changes least."""
         weakest = np.linalg.eigh(self.equations(motion).matrix[0])[1][:, 0]
         twist = np.zeros((4, 4))
         twist[:3, :3], twist[:3, 3] = np.cross(np.eye(3), weakest[:3]), weakest[3:]
@@ -137,10 +142,10 @@ class _Stage(NamedTuple):
 
 
 def orient_outward(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, bool]:
-    """Clean a mesh and wind its faces outward, and return whether it has an inside.
+    """Return a cleaned copy of a mesh with faces wound outward, and whether the mesh is a solid.
 
-    Duplicate vertices and faces of zero area are removed. Winding numbers on both sides of the surface distinguish a
-    solid, which may have holes, from a sheet. A sheet keeps its winding.
+    Duplicate vertices and faces of zero area are removed, and the faces are wound consistently. Winding numbers on both
+    sides of the surface distinguish a solid, which may have holes, from a sheet. A sheet is not turned outward.
     """
     mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     mesh.merge_vertices()
@@ -168,7 +173,7 @@ def register_scan(
     """Find the motion that registers points with outward normals to a mesh.
 
     - `mesh`, `is_solid`: the results of `orient_outward`. The normals of a sheet may point to either side.
-    - `start`: motion from the scan to the mesh to start from; without it, the search is over all motions.
+    - `start`: initial motion from the scan to the mesh. Without it, the search covers all rotations.
     """
     unit, center, middle = mesh.scale, points.mean(axis=0), mesh.bounds.mean(axis=0)
     order = np.random.default_rng(0).permutation(len(points))[:_LAST]
@@ -230,9 +235,10 @@ def _nearest_point(vertices: Float[np.ndarray, "v 3"], mesh: trimesh.Trimesh) ->
 def _starts(
     points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], samples: Float[np.ndarray, "m 3"]
 ) -> _Motions:
-    """Rotations, each with some shifts that put the scan inside the mesh's box.
+    """Return the initial motions: rotations, each with several shifts that put the scan inside the mesh's box.
 
-    The first shift lays the scan on the front of the mesh along the mean normal.
+    The first shift centres the scan, and moves it along its mean normal to the front of the mesh. The other shifts are
+    random.
     """
     turns = FreeRotation().rotations(_ROTATIONS)
     views = np.einsum("nj,sij->sni", points[:_THIRD], turns)
@@ -247,6 +253,6 @@ def _starts(
 
 
 def _apart(first: _Motions, second: _Motions, samples: Float[np.ndarray, "m 3"], nearest: Nearest) -> float:
-    """Mean distance between the mesh placed relative to the scan by one motion, and by another."""
+    """Return the mean distance between the mesh as placed relative to the scan by `first` and by `second`."""
     moved = (samples - second.shifts[0]) @ second.turns[0] @ first.turns[0].T + first.shifts[0]
     return float(np.mean(np.linalg.norm(moved - nearest(moved)[0], axis=1)))
