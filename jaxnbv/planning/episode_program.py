@@ -1,4 +1,4 @@
-"""Simulated episodes as one compiled program: the same computation as `simulate`, in JAX only."""
+"""The compiled program of simulated episodes, which does the computation of `simulate` in JAX only."""
 
 from typing import Any, NamedTuple
 
@@ -23,9 +23,9 @@ from jaxnbv.surfaces.part_hypotheses import hypotheses_of
 
 
 class ViewRecord(NamedTuple):
-    """The record of a view.
+    """Result of one view.
 
-    - `value`: value that the search expected; NaN for the first view.
+    - `value`: value of the view in the search; NaN for the first view.
     - `answer`: values of the acquisition's answer, or `PartHypotheses.part_weights` if `answers_by_parts`.
     """
 
@@ -35,7 +35,7 @@ class ViewRecord(NamedTuple):
 
 
 def answers_by_parts(planner: Planner) -> bool:
-    """Whether `View.answer` names a known part, because the acquisition has no answer of its own."""
+    """Return whether `View.answer` names a known part, because the acquisition has no answer of its own."""
     return type(planner.acquisition).answer is Acquisition.answer and planner.sampler.model.carries_hypotheses
 
 
@@ -47,12 +47,13 @@ def run(
     rows: tuple[Surface, Pose, Key[Array, " episodes"]],
     at_once: int,
 ) -> tuple[ViewRecord, PointCloud, Bool[Array, " episodes"]]:
-    """Run episodes, and return their records, last clouds and whether the first views saw anything.
+    """Run episodes, and return three results for each episode.
 
-    The records have axes (episodes, max_views).
+    The results are the record of each view with axes (episodes, max_views), the cloud after the last view, and whether
+    the first view hit the object.
 
-    - `views`: number of views of each episode.
-    - `rows`: scene, first pose and key of each episode along a leading axis, which is split among the devices.
+    - `views`: number of views of each episode. Later rows of the records are zero.
+    - `rows`: scene, first pose and random key of each episode. The leading axis is split among the devices.
     - `at_once`: number of episodes that a device computes together.
     """
 
@@ -70,7 +71,7 @@ def _episode(
     records = jax.tree.map(lambda leaf: jnp.zeros((room, *leaf.shape), leaf.dtype).at[0].set(leaf), record)
     arrays, rest = eqx.partition(observations, eqx.is_array)
 
-    # A loop with a traced number of rounds, so that one program works for any number of views.
+    # The number of iterations is traced, so the same program serves any number of views.
     def add(index: Any, state: Any) -> Any:
         arrays, pending, records = state
         before = eqx.combine(arrays, rest), pending

@@ -26,12 +26,13 @@ from jaxnbv.tasks.identification import weights_by_name
 
 
 class Episodes(eqx.Module):
-    """Results of `episodes`, along a leading axis of episodes, in scene coordinates.
+    """Results of `episodes` in scene coordinates. All arrays have a leading axis of episodes.
 
     - `poses`: poses of the views, (episodes, views).
-    - `values`: value that the search expected of each view; NaN for the first one.
-    - `clouds`: D after the last view.
-    - `answers`: values of `View.answer` after each view; None if there are none, or if they need code outside JAX.
+    - `values`: value of each view in the search; NaN for the first view, which was not proposed.
+    - `clouds`: the cloud D after the last view.
+    - `answers`: values of `View.answer` after each view. None if there is no answer, or if the answer needs code
+      outside JAX.
     """
 
     poses: Pose
@@ -50,22 +51,29 @@ def episodes(
     noise: Noise = SensorNoise(),
     batch_size: int | None = None,
 ) -> Episodes:
-    """Simulate a batch of episodes in one compiled program: as `simulate` for each scene and key.
+    """Simulate a batch of episodes in one compiled program.
 
-    On a CPU poses, values, clouds and answers are the same bit for bit. The episodes are split among the devices of
-    `jax.set_mesh`, by default all local devices.
+    The results are those of `simulate` for each scene and key. On a CPU with the default `batch_size`, poses, values,
+    clouds and answers are bit for bit those of `simulate`. The episodes are split among the devices of `jax.set_mesh`,
+    by default among all local devices.
 
-    - `scenes`: a list with a solid or surface for each key, all of one structure, or one with a leading axis on its
-      arrays, as `jax.vmap` returns. `[scene] * len(keys)` repeats a scene.
+    - `scenes`: a list with one solid or surface for each key, all of the same structure. `[scene] * len(keys)` repeats
+      a scene. You can also pass a single solid or surface whose arrays have a leading axis, as `jax.vmap` returns.
     - `first`: pose of the first view, or a batch with one pose for each key.
-    - `views`: number of views of each episode. One compiled program works for any number.
+    - `views`: number of views of each episode. The same compiled program serves any number.
     - `keys`: a random key for each episode, `jax.random.split(key, episodes)`.
-    - `batch_size`: number of episodes that a device computes together, by default one on a CPU and its whole share on a
-      GPU. Memory grows with it. With more than one, values equal those of `simulate` up to rounding.
+    - `noise`: noise of the sensor.
+    - `batch_size`: number of episodes that a device computes together. The default is one on a CPU, and all episodes of
+      the device on a GPU. More episodes need more memory. If it is greater than one, the values equal those of
+      `simulate` only up to rounding.
 
-    **Raises:** `ValueError` for triangle meshes, scenes of different structures, different numbers of scenes and keys,
-    `views` < 1 or greater than the planner's `max_views`, and for episodes in which the first view sees nothing or the
-    value of a view is not finite.
+    **Raises:** `ValueError` in the following cases:
+
+    - The scenes are triangle meshes or have different structures.
+    - There are different numbers of scenes and keys.
+    - `views` is less than 1 or greater than the planner's `max_views`.
+    - The first view of an episode sees nothing.
+    - The value of a view is not finite.
     """
     require(views >= 1, f"asked for {views} views; ask for at least one")
     require(
@@ -81,7 +89,7 @@ def episodes(
     require(not is_traced(scenes, first, keys), "episodes is a compiled program itself: call it outside jit and vmap")
     count = len(keys)
     rows = scene_batch(scenes, count), _batch_of_poses(first, count), keys
-    # NaN is the value of the first view.
+    # The value of the first view is NaN, which is not an error.
     with _devices(count), jax.debug_nans(False):
         at_once = min(batch_size or (1 if on_cpu() else count), share_of(count))
         records, clouds, sees = run(planner, noise, jnp.asarray(views), rows, at_once)
@@ -95,7 +103,7 @@ def episodes(
 
 
 def _batch_of_poses(first: Pose, count: int) -> Pose:
-    """The first pose of each episode, as a batch (count,).
+    """Return the first pose of each episode, as a batch (count,).
 
     **Raises:** `ValueError` unless `first` is one pose or `count` poses, or if a pose is far from the scene.
     """
@@ -110,7 +118,7 @@ def _batch_of_poses(first: Pose, count: int) -> Pose:
 
 
 def _devices(count: int) -> AbstractContextManager:
-    """Context that uses up to `count` devices of this process, unless the user chose devices."""
+    """Return a context that uses up to `count` local devices, unless the user has chosen devices."""
     chosen = not get_abstract_mesh().empty or jax.config.jax_default_device is not None  # type: ignore[attr-defined]
     devices = jax.local_devices()[:count]
     return nullcontext() if chosen or len(devices) == 1 else jax.set_mesh(Mesh(np.array(devices), "devices"))
@@ -119,7 +127,10 @@ def _devices(count: int) -> AbstractContextManager:
 def _check(
     planner: Planner, values: Float[np.ndarray, "b v"], clouds: PointCloud, sees: Bool[np.ndarray, " b"]
 ) -> None:
-    """**Raises:** `ValueError` if a first view sees nothing, an answer is invalid, or a value is not finite."""
+    """Check the results of all episodes.
+
+    **Raises:** `ValueError` if a first view sees nothing, an answer is invalid, or a value is not finite.
+    """
     require(
         bool(sees.all()),
         f"the first view of episode {sees.argmin()} sees nothing: point the camera at the object",

@@ -59,7 +59,7 @@ class Image(NamedTuple):
         return cls(pixels.copy(), as_numbers(matrix, "the matrix of a pose", np.float64), scale, pixel_mask)
 
     def cleaned(self, camera: Camera, pose: Pose, box: Box) -> "Image":
-        """Return a copy with depth zero at pixels whose value stands for "not measured", see `without_sentinels`."""
+        """Return a copy with depth zero where a value means "not measured", see `without_sentinels`."""
         return self._replace(depth=without_sentinels(self.depth, camera, pose, self.scale, box))
 
     def points(self, camera: Camera, pose: Pose) -> Float[np.ndarray, "height width 3"]:

@@ -24,7 +24,7 @@ from jaxnbv.scanning import Obstacles
 
 
 class Intake:
-    """The images of a session so far, and the table, clutter and pose errors that were detected in these images.
+    """The images of a session so far, and the table, clutter and pose errors detected in the images.
 
     - `camera`, `box`, `convention`: as in the session, in world units.
     - `frame`: frame of the session's world.
@@ -43,7 +43,7 @@ class Intake:
         self.clutter = self._no_clutter()
 
     def without_images(self) -> "Intake":
-        """Return a copy without images, to which the images can be added again with the current pose corrections."""
+        """Return a copy without images, which keeps the pose corrections. The images can be added again."""
         intake = copy.copy(self)
         intake.images, intake.clutter = (), self._no_clutter()
         return intake

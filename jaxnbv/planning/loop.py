@@ -195,7 +195,9 @@ class Loop:
 
     @own_settings()
     def take(self, sensor: Sensor, first: Pose) -> Step | None:
-        """Take the next view with a sensor at the proposed pose, and add the view. Return None if the episode ended.
+        """Take the next view with a sensor at the proposed pose, and add the view.
+
+        Return None if the episode has ended.
 
         - `first`: pose of the first view.
 
@@ -215,7 +217,7 @@ class Loop:
     def steps(
         self, sensor: Sensor, first: Pose, stored: Iterable[tuple[Pose, PointCloud, Proposal | None]] = ()
     ) -> Iterator[Step]:
-        """Take views until the stop rule ends the episode or `max_views` is reached, and yield the step of each view.
+        """Take views until the stop rule holds or `max_views` is reached, and yield the step of each view.
 
         - `first`: pose of the first view.
         - `stored`: stored views of the same episode, in order. They are added first, and the sensor is not used.
@@ -310,7 +312,7 @@ class Loop:
 
 
 def view_keys(key: PRNGKeyArray, index: int | Int[Array, ""]) -> tuple[PRNGKeyArray, PRNGKeyArray, PRNGKeyArray]:
-    """Return the random keys of view `index` (counted from 0): for posterior samples, search and sensor noise."""
+    """Return three random keys for view `index` (from 0): for posterior samples, search and sensor noise."""
     return _view_keys(key, index if isinstance(index, Array) else np.int32(index))
 
 

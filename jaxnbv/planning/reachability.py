@@ -119,10 +119,11 @@ def best_reachable(
     values_at: Callable[[Pose], Float[Array, " n"]] | None = None,
     seconds: float = math.inf,
 ) -> Choice:
-    """Find the reachable pose with the highest value times score, among all poses that the search evaluated.
+    """Find the reachable pose with the highest value times score.
 
-    Poses are checked in batches, highest value first, until no unchecked pose can be better. If a pose cannot be
-    reached, the same pose with the camera rotated about its optical axis is tried.
+    All poses that the search evaluated are considered. They are checked in batches, highest value first, until no
+    unchecked pose can be better. If a pose cannot be reached, the same pose with the camera rotated about its optical
+    axis is tried.
 
     - `reachable`: the user's function; None if all poses can be reached.
     - `to_matrices`: function that converts scene poses to the matrices for `reachable`.

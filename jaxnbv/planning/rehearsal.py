@@ -61,7 +61,7 @@ def rehearse(intake: Intake, loop: Loop) -> Rehearsal:
 
 
 def slanted(poses: Pose, count: int) -> Pose:
-    """Return the `count` poses whose view direction is closest to 30 degrees downward, since these show the table."""
+    """Return the `count` poses that look most nearly 30 degrees downward, since these show the table."""
     down = -np.asarray(poses.forward)[:, 1]
     return poses[jnp.asarray(np.argsort(np.abs(down - 0.5), kind="stable")[:count])]
 

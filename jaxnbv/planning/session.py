@@ -255,7 +255,9 @@ class Session:
 
     @property
     def episode(self) -> Episode:
-        """The session so far as an episode in scene coordinates. The episode's `frame` maps the scene to the world.
+        """The session so far as an episode in scene coordinates.
+
+        The episode's `frame` maps the scene to the world.
 
         **Raises:** `ValueError` before the first image.
         """
@@ -358,10 +360,10 @@ class Session:
 
     @own_settings()
     def expected_depth(self) -> Float[np.ndarray, "h w"] | None:
-        """Return the expected depth image at the pose of `next`, in world units and at the planner's resolution.
+        """Return the expected depth image at the pose of `next`, in world units.
 
-        A pixel is the mean depth over the posterior samples, or NaN if the ray misses most samples. Return None if the
-        search uses no samples.
+        The image has the resolution of the planner's camera. A pixel is the mean depth over the posterior samples, or
+        NaN if the ray misses most samples. Return None if the search uses no samples.
 
         **Raises:** `ValueError` as `next` does.
         """

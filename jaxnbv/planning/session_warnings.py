@@ -109,7 +109,9 @@ def warn_of_inside(box: Box, cameras: Float[np.ndarray, "n 3"], candidates: Floa
 
 
 def warn_of_little(value: float, error: float | None, value_at_visited: float) -> None:
-    """Warn that even the best view may have no value, since everything was seen or no candidate faces the object.
+    """Warn that even the best view may have no value.
+
+    Either everything has been seen, or no candidate looks at the unseen surface.
 
     - `value`, `error`: value of the best view and its standard error, in world units.
     - `value_at_visited`: mean value that is expected at visited poses, in world units.

@@ -1,4 +1,4 @@
-"""Several objects on a table: one session for each object, all with the same images."""
+"""Sessions for several objects on a table. There is one session for each object, and all use the same images."""
 
 import warnings
 from pathlib import Path
@@ -29,23 +29,23 @@ from jaxnbv.scanning.sdf import HalfSpace
 from jaxnbv.surfaces.part_hypotheses import hypotheses_of
 from jaxnbv.surfaces.part_pose import distances_to
 
-# Default gap between objects, as a share of the longest side of the box.
+# Default gap between objects, as a fraction of the longest side of the box.
 _GAP = 0.02
-# Fewest rays of an object, and number of points of a cluster that are compared with known parts.
+# Smallest number of rays that show an object, and number of a cluster's points that are compared with known parts.
 _FEWEST, _COMPARED = 20, 256
 
 
 class Sessions:
-    """Sessions for several objects, each of which is a known part. All get the same images.
+    """Sessions for several objects, each of which is a known part. Every session gets the same images.
 
-    An object is a cluster of the points above the table, or a label in a segmentation of the image.
+    An object is a cluster of points above the table, or a label in a segmentation of the image.
 
     - `camera`, `up`, `key`, `until`, `obstacles`, `progress`: as for `Session`.
     - `planner`: planner with known parts and a search over candidates.
-    - `box`: two corners of a box about all objects, without the table.
-    - `gap`: smallest distance between objects that are separated without a segmentation, in world units. By default
-      2 % of the longest side of the box.
-    - `folder`: folder that holds a folder for each session. Sessions continue from it.
+    - `box`: two corners of a box around all objects. The box should not contain the table.
+    - `gap`: smallest distance between two objects, in world units, at which they can be separated without a
+      segmentation. The default is 2 % of the longest side of the box.
+    - `folder`: folder with a subfolder for each session. If a subfolder exists, its session continues.
 
     **Raises:** `ValueError` as `Session` does, or for a planner without known parts.
     """
@@ -80,7 +80,7 @@ class Sessions:
         candidates = self._frame.to_world(whole.planner.search.poses_around())
         self._poses = np.asarray(candidates.to_matrix(), np.float64)
         self._folder = None if folder is None else Path(folder)
-        # Indices of candidates: the one that `next` proposed since the last image, and all that it has proposed.
+        # Index of the candidate that `next` proposed since the last image, and indices of all proposed candidates.
         self._next: int | None = None
         self._proposed: list[int] = []
         self.objects: dict[int, Session] = {}
@@ -99,12 +99,12 @@ class Sessions:
         depth_scale: float = 1.0,
         labels: AnyArray | None = None,
     ) -> None:
-        """Add an image. New objects in it get the next numbers.
+        """Add an image to all sessions. A new object gets the next free number and a session.
 
         - `depth`, `matrix`, `depth_scale`: as for `Session.add`.
-        - `labels`: number of the object at each pixel, the same in all images, and zero for none. By default, objects
-          are clusters of the points above the table. A cluster belongs to an earlier object if it is within `gap` of
-          its points or of the surface of its likely parts.
+        - `labels`: number of the object at each pixel, or zero for no object. An object must have the same number in
+          all images. By default, objects are clusters of points above the table. A cluster belongs to an earlier object
+          if the cluster is within `gap` of this object's points, or of the surface of this object's probable parts.
 
         **Raises:** `ValueError` as `Session.add` does, or if no image so far shows an object.
         """
@@ -127,7 +127,7 @@ class Sessions:
                 proper, f"the labels are {short_text(labels)}: give whole numbers, one for each of the image's pixels"
             )
         numbers = np.where(inside, numbers, 0)
-        # The rays that a session uses.
+        # Rows and columns that a session uses.
         rows = slice(stride // 2, None, stride)
         shown_numbers, counts = np.unique(numbers[rows, rows].reshape(-1)[np.asarray(cloud.mask)], return_counts=True)
         for number in shown_numbers[counts >= _FEWEST].tolist():
@@ -148,10 +148,11 @@ class Sessions:
         self._warned_of_mount = self._warned_of_mount or self._mount_error.warn_if_off()
 
     def next(self) -> Float[np.ndarray, "4 4"]:
-        """Propose the pose for the next image: a matrix, camera to world.
+        """Return the camera-to-world matrix of the pose for the next image.
 
-        It is the candidate of the highest value, in world units, summed over the objects that are not done. It stays
-        the same until an image is added. A pose is proposed only once.
+        The pose is the candidate with the highest sum of values in world units. The sum is over the objects for which
+        the stop rule does not hold yet, or over all objects if there is no such object. The result stays the same until
+        an image is added. No pose is proposed twice.
 
         **Raises:** `ValueError` before the first image, if all candidates were proposed, or as `Planner.propose` does.
         """
@@ -166,14 +167,14 @@ class Sessions:
         return self._poses[self._next]
 
     def done(self) -> str | None:
-        """The reasons to stop once the stop rule holds for all objects; None to continue."""
+        """Return the reasons to stop if the stop rule holds for all objects; None to continue."""
         reasons = {number: session.done() for number, session in self.objects.items()}
         if not reasons or None in reasons.values():
             return None
         return "; ".join(f"{number}: {reason}" for number, reason in reasons.items())
 
     def _session(self, number: int, box: Box) -> Session:
-        """A session for an object, loaded from its folder if there is one."""
+        """Load the session of an object from its folder, or create the session if there is no folder."""
         folder = None if self._folder is None else self._folder / str(number)
         if folder is not None and folder.exists():
             return Session.load(folder, self._planner, self.until, self._progress)
@@ -192,7 +193,10 @@ class Sessions:
         )
 
     def _table_of(self, cloud: PointCloud) -> Obstacles:
-        """The table under the objects, in world units, by the cloud of a whole image. Warns if there is none."""
+        """Detect the table under the objects in the cloud of a whole image, and return it in world units.
+
+        If there is no table, warn and return `Obstacles()`.
+        """
         table = table_under(self._frame.to_scene(cloud), self._frame.to_scene(self.box))
         if table is None:
             warnings.warn(
@@ -205,7 +209,7 @@ class Sessions:
         return Obstacles((HalfSpace(*plane_of(table, self._frame)),), margin, clearance)
 
     def _points(self, image: Image, pose: Pose) -> tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-        """The point of each pixel, in world units, and the mask of points in the box and off the obstacles."""
+        """Return the world point of each pixel, and a mask of the points in the box that are not on obstacles."""
         points = image.points(self.camera, pose)
         depth = (points - np.asarray(pose.position, np.float64)) @ np.asarray(pose.forward, np.float64)
         assert self._obstacles is not None
@@ -214,7 +218,7 @@ class Sessions:
         return points, inside
 
     def _numbers(self, points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
-        """Number of the object that each point belongs to, by clusters; zero for stray points."""
+        """Return, for each point, the number of the object of the point's cluster; zero for stray points."""
         owner = np.zeros(len(points), int)
         nearest = np.full(len(points), self._gap)
         for number, session in self.objects.items():
@@ -234,17 +238,21 @@ class Sessions:
         return owner
 
     def _on_a_part(self, points: Float[np.ndarray, "n 3"]) -> int | None:
-        """Number of the object whose likely parts have these points on their surface, within the gap; or None."""
+        """Return the number of the object to whose surface a cluster belongs; None if there is no such object.
+
+        The distance of the points from the surface is the expectation over the object's hypotheses. It must be below
+        the gap.
+        """
         few = points[np.linspace(0, len(points) - 1, _COMPARED).astype(int)]
         distances = {number: _expected_distance(session, few) for number, session in self.objects.items()}
         best = min(distances, key=lambda number: distances[number], default=None)
         return best if best is not None and distances[best] < self._gap else None
 
     def _box_about(self, points: Float[np.ndarray, "n 3"]) -> Box:
-        """A cube that holds an object, given some of its points.
+        """Return a cube that contains an object, given some of the object's points.
 
-        It extends beyond the points by their own extent, up to the length of the longest part. The sides are equal, so
-        that all objects share the same compiled programs.
+        The cube extends beyond the points by their own extent, but at most to the length of the longest part. The sides
+        are equal because all objects can then share the same compiled programs.
         """
         low, high = points.min(axis=0), points.max(axis=0)
         reach = float((high - low).max()) + self._gap
@@ -255,10 +263,10 @@ class Sessions:
 
 
 def clusters(points: Float[np.ndarray, "n 3"], gap: float) -> Int[np.ndarray, " n"]:
-    """Index of the cluster of each point. Points within about `gap` of each other are in one cluster.
+    """Return the index of each point's cluster.
 
-    Distances are between cells with a side of a quarter of the gap, so that a dense image costs no more than a coarse
-    one.
+    Points within about `gap` of each other are in the same cluster. Distances are computed between cells whose side is
+    a quarter of the gap. Therefore the cost hardly grows with the density of the points.
     """
     if len(points) == 0:
         return np.zeros(0, int)
@@ -269,14 +277,17 @@ def clusters(points: Float[np.ndarray, "n 3"], gap: float) -> Int[np.ndarray, " 
 
 
 def _values(session: Session) -> Float[np.ndarray, " candidates"]:
-    """Values of the candidates for one object, in world units; -inf for excluded ones."""
+    """Return the values of the candidates for one object, in world units; -inf for excluded candidates."""
     planner, key = session.planner, jax.random.fold_in(session.key, len(session.views))
     values = planner.propose(session.observations, key).values
     return np.asarray(session.frame.length_to_world(values, planner.quantity.length_power), np.float64)
 
 
 def _expected_distance(session: Session, points: Float[np.ndarray, "n 3"]) -> float:
-    """Median over points of the expected distance from an object's surface, in world units."""
+    """Return the median over points of the expected distance from an object's surface, in world units.
+
+    The expectation is over the object's hypotheses.
+    """
     hypotheses, frame = hypotheses_of(session.observations), session.frame
     own = jnp.asarray(frame.to_scene(points), hypotheses.weights.dtype)
     weights = np.asarray(hypotheses.weights, np.float64)[:-1]

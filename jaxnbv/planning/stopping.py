@@ -57,7 +57,10 @@ class StopContext:
     frame: Frame
 
     def cost(self, poses: tuple[Pose, ...], of: CostFunction) -> float:
-        """Return the cost of the path through scene poses. The cost function `of` gets poses in the user's world."""
+        """Return the cost of the path through scene poses.
+
+        - `of`: cost function of poses in the user's world.
+        """
         return total_cost(poses, WorldCost(of, self.frame))
 
 
@@ -126,9 +129,10 @@ def checked_reason(rule: StopRule, reason: str | None) -> str | None:
 
 
 class Sure(StopRule):
-    """Stop once the most probable class has at least this probability, given D and given each of several halves of D.
+    """Stop once the most probable class has at least this probability.
 
-    The random halves are checked because a classifier may be sure of a single cloud by chance.
+    The probability must hold given D, and also given each of several random halves of D. The halves are checked because
+    a classifier may be sure of a single cloud by chance.
 
     - `probability`: within (0, 1).
     - `num_resamplings`: number of random halves.
@@ -231,7 +235,7 @@ class PartsFound(StopRule):
 
 
 class Covered(StopRule):
-    """Stop once the views so far are expected to cover this fraction of the visible area, see `expected_coverage`.
+    """Stop once views are expected to cover this fraction of the visible area, see `expected_coverage`.
 
     - `share`: fraction of the area, within (0, 1].
     - `size`: size of `NewSurface`, in world units. The default is the acquisition's size if the acquisition is a
@@ -294,9 +298,9 @@ class Identified(StopRule):
 
 
 class Placed(StopRule):
-    """Stop once the expected error of the most probable part's surface is at most this length, see `surface_error`.
+    """Stop once the expected error of the most probable part's surface is at most this length.
 
-    The error is a root mean square over the surface and over the hypotheses.
+    The error is `surface_error`, a root mean square over the surface and over the hypotheses.
 
     - `length`: length in world units in a session, and in scene units in a simulation.
 

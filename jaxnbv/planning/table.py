@@ -11,23 +11,24 @@ from jaxnbv.geometry.volume import Box
 from jaxnbv.scanning import Obstacles
 from jaxnbv.scanning.sdf import HalfSpace
 
-# A table is level to 30 degrees. The noisy normals of its points agree with its normal to 40 degrees.
+# A table is level to within 30 degrees. The noisy normals of its points differ from its normal by at most 40 degrees.
 _LEVEL, _AGREES = np.cos(np.radians(30.0)), np.cos(np.radians(40.0))
-# How far a table may lie below the box, and how far beside the box points are used, as shares of its longest side.
+# Largest distances of a table below the box, and of points beside the box, as fractions of the box's longest side.
 _BELOW, _BESIDE = 0.25, 0.2
-# Largest share of the points in the box below a table, and fewest points outside the box on it.
+# Largest fraction of the box's points below a table, and smallest number of points outside the box on a table.
 _STRAY, _FEWEST = 0.02, 50
 # Largest distance of a point from its plane, in scene units.
 _TOLERANCE = 0.03
-# Number of planes that are tried, and of points that each is tried on.
+# Number of random planes, and number of points on which each plane is evaluated.
 _DRAWS, _COUNTED = 1000, 3000
 
 
 class _Points(NamedTuple):
     """Points of an image relative to the middle of a box, with normals and weights.
 
-    - `inside`: mask of the points in the box; `around`: mask of those in, under, over or close beside it.
-    - `weights`: weights that fall with the horizontal distance.
+    - `inside`: mask of the points in the box.
+    - `around`: mask of the points in, under, above or close beside the box.
+    - `weights`: weights that decrease with the horizontal distance from the middle of the box.
     """
 
     points: Float[np.ndarray, "n 3"]
@@ -41,19 +42,24 @@ class _Points(NamedTuple):
 
 
 def table_under(cloud: PointCloud, box: Box) -> Obstacles | None:
-    """The half space below the plane that an object in a box stands on; None if the image shows none.
+    """Return the half space below the plane that an object stands on; None if no such plane is detected.
 
-    In scene coordinates, with y up. The margin is three standard deviations of the plane's points, or the default if
-    that is larger. RANSAC (Fischler and Bolles 1981) draws planes, and the one with most points outside the box wins,
-    where near points have more weight. A plane can be a table if it
+    The margin is three standard deviations of the plane's points, or the default margin if this is larger. RANSAC
+    (Fischler and Bolles 1981) draws planes through points that are sampled by weight, and near points have higher
+    weights. Among all planes that can be a table, the plane with the most points outside the box is used. A plane can
+    be a table if it satisfies four conditions:
 
-    - is level to 30 degrees, so that it is no wall,
-    - lies, at the middle of the box, between its top and a quarter of its longest side below its bottom,
-    - has at most 2 % of the points in the box below it, so that it is not the top of an object,
-    - has, under the box and close beside it, at least as many points on it as below it, so that it is not an edge of
-      something in the air.
+    - It is level to within 30 degrees, so it is not a wall.
+    - Its height at the middle of the box is below the top of the box. It is at most a quarter of the box's longest side
+      below the bottom.
+    - At most 2 % of the points in the box are below the plane, so it is not the top of an object.
+    - Of the points in, under, above and close beside the box, at least as many are on the plane as below it. So it is
+      not the edge of something in the air.
 
-    `cloud` is the whole image, including points outside the box.
+    Arguments are in scene coordinates with y up.
+
+    - `cloud`: points of the whole image, also outside the box.
+    - `box`: box around the object.
     """
     low, high = box.low, box.high
     side, middle = float((high - low).max()), 0.5 * (low + high)
@@ -71,7 +77,7 @@ def table_under(cloud: PointCloud, box: Box) -> Obstacles | None:
 
 
 def plane_of(table: Obstacles, frame: Frame) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """A point and the normal, in world coordinates, of the plane from `table_under`."""
+    """Return a point and the normal of the plane from `table_under`, in world coordinates."""
     (plane,) = table.solids
     assert isinstance(plane, HalfSpace)
     point, normal = np.asarray(plane.point, np.float64), np.asarray(plane.normal, np.float64)
@@ -79,14 +85,14 @@ def plane_of(table: Obstacles, frame: Frame) -> tuple[Float[np.ndarray, "3"], Fl
 
 
 def other_ups(cloud: PointCloud, box: Box, up: str) -> tuple[str, ...]:
-    """The other axes that would give a table if they were upward. Cloud and box are in world units."""
+    """Return the axes other than `up` with which a table is detected, for a cloud and box in world units."""
     frames = [Frame.fit(np.array([box.low, box.high]), up=axis) for axis in AXES if axis != up]
     tables = [table_under(frame.to_scene(cloud), frame.to_scene(box)) for frame in frames]
     return tuple(frame.up for frame, table in zip(frames, tables, strict=True) if table is not None)
 
 
 def _points_about(cloud: PointCloud, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], side: float) -> _Points:
-    """The points of an image relative to the middle of a box with corners `low` and `high`."""
+    """Return the points of an image relative to the middle of a box with corners `low` and `high`."""
     points, normals = (rows.astype(np.float64) for rows in cloud.to_numpy())
     inside = np.all((points > low) & (points < high), axis=1)
     room = np.array([_BESIDE * side, np.inf, _BESIDE * side])
@@ -97,12 +103,14 @@ def _points_about(cloud: PointCloud, low: Float[np.ndarray, "3"], high: Float[np
 
 
 def _plane_of_most(image: _Points, lowest: float, highest: float) -> tuple[Float[np.ndarray, "3"], float] | None:
-    """Normal n and offset d of the plane n . x = d with most points on it, among possible tables; None if none is.
+    """Return the normal n and offset d of the table plane n . x = d; None if no plane can be a table.
+
+    Among the planes that can be a table, it is the one with the most points outside the box.
 
     - `lowest`, `highest`: limits of the plane's height at the middle of the box.
     """
     draw = np.random.default_rng(0)
-    # A tilted table within these limits may differ in height by this much at a point's horizontal distance.
+    # Largest difference between the height of a tilted table at a point and at the middle of the box.
     reach = np.hypot(image.points[:, 0], image.points[:, 2]) * np.sqrt(1.0 / _LEVEL**2 - 1.0)
     up = image.points[:, 1]
     rows = np.flatnonzero(~image.inside & (image.normals[:, 1] > 0.5) & (up > lowest - reach) & (up < highest + reach))
@@ -136,19 +144,19 @@ def _plane_of_most(image: _Points, lowest: float, highest: float) -> tuple[Float
 def _on_and_below(
     image: _Points, normals: Float[np.ndarray, "k 3"], offsets: Float[np.ndarray, " k"]
 ) -> tuple[Bool[np.ndarray, "n k"], Bool[np.ndarray, "n k"]]:
-    """Masks of the points on and below each plane."""
+    """Return masks of the points on each plane and of the points below each plane."""
     height = image.points @ normals.T - offsets
     return (np.abs(height) <= _TOLERANCE) & (image.normals @ normals.T >= _AGREES), height < -_TOLERANCE
 
 
 def _is_table(image: _Points, on: Bool[np.ndarray, "n k"], below: Bool[np.ndarray, "n k"]) -> Bool[np.ndarray, " k"]:
-    """Whether an object can stand on each plane, by the points in the box and close beside it."""
+    """Return, for each plane, whether an object can stand on it. The last two conditions of `table_under` decide."""
     free = below[image.inside].sum(axis=0) <= _STRAY * image.inside.sum()
     return free & (on[image.around].sum(axis=0) >= below[image.around].sum(axis=0))
 
 
 def _fitted(points: _Points) -> tuple[Float[np.ndarray, "3"], float]:
-    """Normal and offset of the plane y = h + a x + b z, fitted to points by weighted least squares."""
+    """Fit the plane y = h + a x + b z by weighted least squares, and return the plane's normal and offset."""
     root = np.sqrt(points.weights)
     columns = np.stack([np.ones(len(root)), points.points[:, 0], points.points[:, 2]], axis=1)
     height, across, along = np.linalg.lstsq(root[:, None] * columns, root * points.points[:, 1])[0]

@@ -1,4 +1,4 @@
-"""The cost of going from one view to the next, and how it counts against the value of a view."""
+"""Costs of moving the camera from one view to the next, and their effect on the value of a view."""
 
 import dataclasses
 import itertools
@@ -19,9 +19,11 @@ from jaxnbv.observations import Observations
 from jaxnbv.utility import Quantity
 
 CostFunction: TypeAlias = Callable[[Pose, Pose], Float[Array, ""]]
-"""Function of two poses that returns the cost of going from the first to the second, in any unit, zero or more.
+"""Function that returns the cost of moving the camera from the first pose to the second.
 
-It must use JAX operations. Poses are in world coordinates in a session, and in scene coordinates in a simulation."""
+The cost is finite and at least zero, in any unit. The function must use JAX operations. It gets poses in world
+coordinates in a session, and in scene coordinates in a simulation.
+"""
 
 
 _COST, _ONE_NUMBER = "the cost of going from one pose to another", "make it one number a pose, finite and zero or more"
@@ -30,9 +32,10 @@ _COST, _ONE_NUMBER = "the cost of going from one pose to another", "make it one 
 class ArcLength(eqx.Module):
     """Length of the path between two camera positions around a centre.
 
-    It is hypot(mean distance x angle, difference of distances): at equal distances, an arc of the great circle.
+    The length is hypot(mean distance x angle, difference of distances), with distances and the angle at the centre. For
+    two positions at equal distance it is the length of the arc on a great circle.
 
-    - `center`: the centre, by default the middle of the scene, or of the box in a session.
+    - `center`: the centre. The default is the middle of the scene, or the middle of the box in a session.
     """
 
     center: tuple[float, float, float] | None = None
@@ -40,7 +43,7 @@ class ArcLength(eqx.Module):
     @checked
     @jax.jit
     def __call__(self, start: Pose, end: Pose) -> Float[Array, ""]:
-        """The length, in the units of the poses."""
+        """Return the length, in the unit of the poses."""
         center = jnp.zeros(3) if self.center is None else jnp.asarray(self.center)
         first, second = (pose.position - center for pose in (start, end))
         radii = safe_norm(*first), safe_norm(*second)
@@ -52,9 +55,9 @@ arc_length = ArcLength()
 
 
 class WorldCost(eqx.Module):
-    """Cost function of poses in the scene, by a cost function of poses in the world.
+    """Cost function of scene poses that evaluates a cost function of world poses.
 
-    - `of`: cost of poses in world coordinates. An `ArcLength` without a centre uses the middle of the scene.
+    - `of`: cost function of poses in world coordinates. An `ArcLength` without a centre uses the middle of the scene.
     - `frame`: frame of the user's world.
     """
 
@@ -62,7 +65,7 @@ class WorldCost(eqx.Module):
     frame: Frame
 
     def __call__(self, start: Pose, end: Pose) -> Float[Array, ""]:
-        """The cost, in world units."""
+        """Return the cost, in the unit of `of`."""
         of = self.of
         if isinstance(of, ArcLength) and of.center is None:
             of = ArcLength(self.frame.center)
@@ -70,11 +73,11 @@ class WorldCost(eqx.Module):
 
 
 class ValuePerCost(eqx.Module):
-    """Value of a view divided by the cost of going there: value / (fixed + cost).
+    """Value of a view divided by the cost of the view: value / (fixed + cost of the move).
 
-    - `of`: cost of going from one pose to another: `arc_length`, or your own function. In a session it gets poses in
-      world coordinates.
-    - `fixed`: fixed cost of every view in the units of `of`, for example the time of taking an image.
+    - `of`: cost function of the move between two poses: `arc_length` or your own function. In a session it gets poses
+      in world coordinates.
+    - `fixed`: fixed cost of every view, in the unit of `of`. It may be the time that the sensor needs for an image.
 
     **Raises:** `ValueError` if `fixed` is not positive.
     """
@@ -89,21 +92,21 @@ class ValuePerCost(eqx.Module):
     def __call__(
         self, values: Float[Array, "*samples poses"], observations: Observations, poses: Pose
     ) -> Float[Array, "*samples poses"]:
-        """Values of poses, divided by the cost of going there from the last view, if there is one."""
+        """Return the values of poses divided by their costs, including the move from the last view if there is one."""
         cost = jax.vmap(lambda pose: checked_result(self.of(observations.poses.last, pose), _COST, 0, _ONE_NUMBER))(
             poses
         )
-        # An invalid cost becomes NaN, so that the planner raises and names it, see `total_cost`.
+        # An invalid cost becomes NaN. The planner then raises an error that names the cost, see `total_cost`.
         cost = jnp.where((cost >= 0) & (cost < jnp.inf), cost, jnp.nan)
         return values / (self.fixed + jnp.where(observations.num_views > 0, cost, 0.0))
 
     def in_world(self, frame: Frame) -> "ValuePerCost":
-        """A copy for poses in the scene, given that `of` is the cost of poses in the world."""
+        """Return a copy for scene poses, whose cost function `of` still gets world poses."""
         of = self.of.of if isinstance(self.of, WorldCost) else self.of
         return dataclasses.replace(self, of=WorldCost(of, frame))
 
     def quantity(self, value: Quantity) -> Quantity:
-        """Quantity of a value of this quantity divided by its cost."""
+        """Return the quantity of a value divided by a cost, given the quantity `value` of the value."""
         meaning = f"{value.meaning.rstrip('.')}, over the cost of going there."
         unit = f"{value.unit or ('' if value.length_power else value.name)} per unit of cost".lstrip()
         return dataclasses.replace(value, name=f"{value.name} per cost", unit=unit, meaning=meaning)
@@ -111,9 +114,9 @@ class ValuePerCost(eqx.Module):
 
 @checked
 def total_cost(poses: Sequence[Pose], cost: CostFunction = arc_length) -> float:
-    """Cost of the path through the poses in order; zero for one pose or none.
+    """Return the cost of the path through the poses in order; zero for fewer than two poses.
 
-    **Raises:** `ValueError` for a cost that is not one finite number, zero or more.
+    **Raises:** `ValueError` for a cost that is not a single finite number, zero or more.
     """
     total = 0.0
     for start, end in itertools.pairwise(poses):
