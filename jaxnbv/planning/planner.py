@@ -103,8 +103,7 @@ class Planner(eqx.Module):
         )
 
     @classmethod
-    def for_parts(cls, bank: ShapeBank, poses: ShapePoses = FreeRotation(), acquisition: Any = Identify()) -> "Planner":
-        # noqa: B008
+    def for_parts(cls, bank: ShapeBank, poses: ShapePoses = FreeRotation(), acquisition: Any = Identify()) -> "Planner":  # noqa: B008
         """Return a planner that identifies which part of a bank the object is, and estimates the part's pose.
 
         - `bank`: parts at true size, from `ShapeBank.from_meshes(folder, scale="m")`. Lengths are in world units in a

@@ -28,8 +28,7 @@ def in_parts(function: Callable[..., Any], *arguments: Any) -> Any:
     values |= zip(closed.jaxpr.invars, jax.tree.leaves(eqx.filter(arguments, eqx.is_array)), strict=True)
 
     def value(atom: Any) -> Any:
-        return jnp.asarray(atom.val, atom.aval.dtype) if isinstance(atom, Literal) else values[atom]  # type:
-        ignore[attr - defined]
+        return jnp.asarray(atom.val, atom.aval.dtype) if isinstance(atom, Literal) else values[atom]  # type: ignore[attr-defined]
 
     for equation in closed.jaxpr.eqns:
         inputs = jax.lax.optimization_barrier([value(atom) for atom in equation.invars])
