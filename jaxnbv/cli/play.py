@@ -196,7 +196,14 @@ def play(options: EpisodeOptions, subject: Subject, setting: Setting, sizes: Siz
         words = race_words(rival_episode, episode)
         typer.echo(textwrap.fill(words, 100, initial_indent="race     ", subsequent_indent="         "))
     if options.report:
-        page = viz.write_report(episode, folder, title=subject.name, rival=rival_episode, sketches=sketches)
+        page = viz.write_report(
+            episode,
+            folder,
+            title=subject.name,
+            rival=rival_episode,
+            sketches=sketches,
+            question=subject.question,
+        )
         typer.echo(f"report   {page}")
     typer.echo(f"episode  {folder}   ({time.perf_counter() - began:.0f} s)")
 

@@ -26,6 +26,7 @@ class Subject(NamedTuple):
     - `bank`: known shapes as in `--known`, or a bank of parts at their size in the scene.
     - `grid`: grid of the imagined surfaces, or None for the usual one.
     - `note`: text to print before the first view.
+    - `question`: question at the head of the report, or None for the task's.
     """
 
     name: str
@@ -35,6 +36,7 @@ class Subject(NamedTuple):
     bank: "str | ShapeBank" = "none"
     grid: "Grid | None" = None
     note: str = ""
+    question: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

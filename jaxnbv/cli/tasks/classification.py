@@ -57,7 +57,8 @@ class ClassTask(Task):
         side = Framing.CLOSE_UP.longest_side
         acquisition = cls.compared(pretrained_classifier("truck", side, num_points=_NUM_POINTS))
         note = f"the truck carries a {HOUSEHOLD[int(truck.label)]}, which the first view does not show"
-        return Subject("truck", SDFSurface(truck), acquisition, first, "truck", Grid(64, 0.7 * side), note)
+        grid, question = Grid(64, 0.7 * side), "What does the truck carry?"
+        return Subject("truck", SDFSurface(truck), acquisition, first, "truck", grid, note, question)
 
 
 class CrossEntropyTask(ClassTask):
