@@ -35,7 +35,7 @@ def cubic(corners: list, a: list, b: list) -> list[Float[Array, " n"]]:
 
 
 def first_bracket(c: list) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
-    """Return an s such that [0, s] holds only the first root of each cubic, and whether [0, 1] holds a root.
+    """Return an s for which [0, s] holds only the first root of each cubic, and whether [0, 1] has a root.
 
     If a cubic is positive at 0 but not at its local minimum, there is exactly one root before the minimum, and s is the
     minimum. Otherwise s is 1: a cubic that is positive at 0 then has one root in [0, 1] if it is not positive at 1, and

@@ -27,7 +27,7 @@ _STRAY = 0.01
 
 
 class Carving(eqx.Module):
-    """Removal of sampled surface where the sensor saw empty space, and outside the volume that holds the object.
+    """Removal of sampled surface in space that was seen to be empty, and outside the object's volume.
 
     - `volume`: the region that can hold the object, see `jaxnbv.geometry.volume`. The default is the box that
       `Frame.fit` scales scenes to.
@@ -106,9 +106,9 @@ class Carving(eqx.Module):
         return on_tensor_grid(self.volume, jnp.asarray(grid.axis, jnp.result_type(float))) < 0
 
     def check_inside(self, cloud: PointCloud, grid: Grid) -> None:
-        """Check that the volume, widened by two margins, holds the cloud. Otherwise carving would cut the object.
+        """Check that the volume, widened by two margins, holds the cloud.
 
-        Because of noise, up to 1 % of the points may lie outside.
+        Carving would cut the object otherwise. Because of noise, up to 1 % of the points may lie outside.
 
         **Raises:** `ValueError` if more points lie outside.
         """
@@ -125,7 +125,9 @@ class Carving(eqx.Module):
 
 @jax.jit
 def carve(values: Float[Array, "*s g g g"], empty: Bool[Array, "g g g"]) -> Float[Array, "*s g g g"]:
-    """Return values of f minus its level in which the empty nodes are positive, that is, outside the surface.
+    """Return the node values with positive values, which mean outside, at the empty nodes.
+
+    - `values`: f minus its level at the nodes.
 
     The new value of an empty node is twice the largest magnitude among the node and its neighbours. So the surface
     crosses an edge between an inside node and an empty node within a third of the edge from the inside node.

@@ -160,7 +160,7 @@ class GridSurface(Surface):
 def scan_samples(
     surfaces: GridSurface, camera: Camera, poses: Pose, barrier: Float[Array, "poses rays"] | None = None
 ) -> PointCloud:
-    """Scan each surface of a batch from each pose of a batch. The result has leading axes (surfaces, poses)."""
+    """Scan each surface of a batch from each pose of a batch. Leading axes are (surfaces, poses)."""
     return shared_map(scan, surfaces, camera, poses, barrier, at_once=samples_at_once(camera, poses))
 
 
@@ -176,9 +176,9 @@ def samples_at_once(camera: Camera, poses: Pose) -> int:
 @jax.debug_nans(False)
 @program
 def mean_depth(scans: PointCloud, pose: Pose) -> Float[Array, " rays"]:
-    """Return each ray's mean depth over the samples that it hits (scene units); NaN if it misses most samples.
+    """Return each ray's mean depth over the samples that it hits; NaN if it misses most samples.
 
-    The depth is measured along the camera's axis.
+    The depth is measured along the camera's axis, in scene units.
 
     - `scans`: scans of all samples from the pose, along a leading axis.
     """

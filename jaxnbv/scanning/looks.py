@@ -129,7 +129,7 @@ class Looks(eqx.Module):
         return surfaces.without_cells(shared_map(_unmeasured_by_any, surfaces, self, poses))
 
     def unmeasured_cells(self, surface: Surface, index: Int[Array, ""] | int, pose: Pose) -> Int[Array, "rays 3"]:
-        """Return the cell of each ray's hit on a sampled surface that the view should have measured but did not.
+        """Return the cell of each ray's hit on a surface that the view should have measured but did not.
 
         The view should have measured the hit if the surface faces the camera and the ray saw as far as the hit, or if
         the ray passed the hit and went on to something deeper. The view did not measure the hit if no stored hit lies

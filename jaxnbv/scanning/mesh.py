@@ -80,7 +80,7 @@ class TriangleMesh(Surface):
     def from_arrays(
         cls, vertices: Float[AnyArray, "v 3"] | list, faces: Int[AnyArray, "f 3"] | list, up: str = "y"
     ) -> "TriangleMesh":
-        """Build a mesh from vertices (world coordinates) and faces, scaled to a longest side of 2.5 scene units.
+        """Build a mesh from vertices (world coordinates) and faces. Its longest side becomes 2.5 scene units.
 
         Vertices that no face uses are dropped. Faces of zero area are dropped with a `UserWarning`.
 
@@ -170,7 +170,7 @@ class TriangleMesh(Surface):
 def level_triangles(
     values: Float[np.ndarray, "g g g"], grid: Grid
 ) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"], Float[np.ndarray, "v 3"]] | None:
-    """Return vertices, faces and vertex normals of the zero set of `values`; None if `values` does not change sign.
+    """Return vertices, faces and vertex normals of the zero set of `values`; None if it is empty.
 
     The triangles come from marching cubes. Values are positive outside. Faces are wound outward, and normals have unit
     length and point outward.
@@ -204,7 +204,7 @@ def supported_pieces(
 
 @checked
 def mesh_from_sdf(sdf: SignedDistance, grid: Grid) -> TriangleMesh:
-    """Convert the surface of a solid to a mesh in scene coordinates (identity frame), by marching cubes on a grid.
+    """Convert a solid to a mesh in scene coordinates (identity frame), by marching cubes on a grid.
 
     **Raises:** `ValueError` if no surface lies within the grid.
     """

@@ -24,7 +24,7 @@ _MARKS = (
 
 
 def without_mark(content: bytes) -> bytes:
-    """Convert text with a byte order mark to UTF-8 without the mark. All other bytes are returned unchanged."""
+    """Convert text with a byte order mark to UTF-8 without the mark. Return all other bytes unchanged."""
     for mark, encoding in _MARKS:
         if content.startswith(mark):
             return content.decode(encoding, "replace").encode()
@@ -63,7 +63,7 @@ def read_obj(content: bytes) -> dict[str, Triangles]:
 
 
 def read_off(content: bytes) -> Triangles:
-    """Read the triangles of a text OFF file, whose vertices may have colours, normals and texture coordinates.
+    """Read the triangles of a text OFF file. Colours, normals and texture coordinates are ignored.
 
     **Raises:** `ValueError` for an OFF file that is binary or does not have three coordinates per vertex, for missing
     rows, or for entries that are not numbers.

@@ -20,9 +20,9 @@ def has_poisson() -> bool:
 
 @checked
 def screened_poisson(cloud: PointCloud, depth: int = 8) -> TriangleMesh:
-    """Reconstruct the surface of an oriented cloud by screened Poisson reconstruction (Kazhdan and Hoppe 2013).
+    """Reconstruct a surface from an oriented cloud by the screened Poisson method.
 
-    The computation is MeshLab's. The mesh is in scene coordinates (its frame is the identity), and its faces are wound
+    MeshLab computes the surface by the method of Kazhdan and Hoppe (2013). The mesh is in scene coordinates (its frame is the identity), and its faces are wound
     outward. Every run gives the same mesh. The mesh bridges gaps in the scan. It is open where the surface leaves a
     cube of 1.1 times the cloud's size.
 

@@ -11,7 +11,7 @@ _ROOM = 1.05
 
 
 class Setting(NamedTuple):
-    """A camera, its distance `radius` from the scene's origin in scene units, and the number of candidate poses."""
+    """A camera, its distance from the scene's origin in scene units, and the number of candidate poses."""
 
     camera: Camera
     radius: float
@@ -23,7 +23,7 @@ SENSOR_RADIUS = USUAL_SETTING.radius
 
 
 def fit_distance(setting: Setting, bounding_radius: float) -> Setting:
-    """Return the setting with a distance from which the camera's image shows the whole object from all sides.
+    """Return the setting with a distance from which an image shows the whole object, from any side.
 
     The camera must have a square image. The object's bounding ball is enlarged by 5 %:
 

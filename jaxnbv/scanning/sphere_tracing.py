@@ -96,7 +96,7 @@ class _Along(eqx.Module):
         return self.sdf(self.points(depth))
 
     def newton(self, depth: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Return depths after one Newton step towards the root. They are exact to rounding except for grazing rays."""
+        """Return depths after one Newton step towards the root, exact to rounding except for grazing rays."""
         value, slope = jax.jvp(self, (depth,), (jnp.ones_like(depth),))
         return depth - value / (jnp.where(slope < 0, -1.0, 1.0) * jnp.maximum(jnp.abs(slope), _GRAZING))
 

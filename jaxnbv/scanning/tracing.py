@@ -70,7 +70,7 @@ class Field(eqx.Module):
 
 
 def free_distance(values: Float[Array, "g g g"]) -> Int8[Array, "m m m"]:
-    """Return the signed distance, in cells, from each of the m^3 = (g - 1)^3 cells to a change of sign of f.
+    """Return the signed distance, in cells, from each of the m^3 = (g - 1)^3 cells to a change of sign.
 
     The distance is 0 for a cell whose own corners differ in sign. Otherwise it has the sign of f in the cell, and its
     magnitude is a lower bound on the Chebyshev distance to the nearest cell with a change of sign. The magnitude is 1,
@@ -183,7 +183,7 @@ def smooth_gradient(field: Field, x: Triple) -> Triple:
 
 
 def enter(u: Triple, du: Triple, field: Field) -> tuple[March, Float[Array, " n"]]:
-    """Return a march whose rays are where they enter the box, and the t of this point on the original rays.
+    """Return a march that starts where the rays enter the box, and the t of this point on the rays.
 
     The `t` of the march counts from this point.
     """
@@ -199,7 +199,7 @@ def enter(u: Triple, du: Triple, field: Field) -> tuple[March, Float[Array, " n"
 
 
 def march(rays: March, field: Field) -> March:
-    """March all rays until each ray has reached the cell of its first zero or has left the box (see `March.end`)."""
+    """March all rays to the cell of their first zero, or out of the box (see `March.end`)."""
     count = rays.t.size
     remainder = count // _SHRINK if count > _SMALLEST else 0
     rays = jax.lax.while_loop(

@@ -25,7 +25,7 @@ FirstFaces: TypeAlias = Callable[
 
 
 def first_faces(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> FirstFaces:
-    """Build the tree of these triangles (scene coordinates), and return the function that traces rays through it.
+    """Return a function that traces rays through these triangles (scene coordinates).
 
     **Raises:** `ValueError` if neither Embree nor libigl is installed.
     """

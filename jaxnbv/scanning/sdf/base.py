@@ -1,9 +1,10 @@
-"""The base class of signed distance functions, rigid motions, scaling and set operations (constructive solid geometry).
+"""The base class of solids, rigid motions, scaling, and set operations (constructive solid geometry).
 
-A signed distance function is negative inside the solid. All functions here have slopes of at most one, so their
-magnitude never exceeds the distance to the surface, and a ray may stride by it (Hart 1996). Each class states whether
-it is *exact* or a *bound* if its parts are exact. Parameters are arrays: build a batch of scenes with `jax.vmap` and
-scan them in one jitted function.
+A solid is defined by a signed distance function, which is negative inside. All functions here have slopes of at most
+one, so their magnitude never exceeds the distance to the surface, and a ray may advance by this magnitude (Hart 1996).
+A class is *exact* if the magnitude equals the distance to the surface, and a *bound* if the magnitude may be smaller.
+The docstring of each class says which holds, provided that the solids it combines are exact. Parameters are arrays, so
+`jax.vmap` can build a batch of solids that one compiled program scans.
 """
 
 import functools
@@ -21,7 +22,7 @@ from jaxnbv.checks import AnyArray, InputError, as_floats, check_type, is_traced
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.rotations import rotation_about, safe_norm
 
-# A converter accepts numbers and lists, which mypy cannot see.
+# The converter of these fields also accepts numbers and lists, which mypy does not know.
 if TYPE_CHECKING:
     Scalar: TypeAlias = Any
     Vector: TypeAlias = Any
@@ -35,37 +36,38 @@ def _as_float(value):
 
 
 def parameter(**kwargs):
-    """A field for a parameter of a signed distance."""
+    """Return a dataclass field for a parameter of a solid. Numbers and lists are converted to arrays."""
     return eqx.field(converter=_as_float, **kwargs)
 
 
 def nonnegative(**kwargs):
-    """A field for a parameter that must not be negative."""
+    """Return a dataclass field for a parameter of a solid that must not be negative."""
     return parameter(metadata={"length": True}, **kwargs)
 
 
 def split(x):
-    """The three coordinates of points (..., 3)."""
+    """Return the three coordinates of points (..., 3) as three arrays."""
     return x[..., 0], x[..., 1], x[..., 2]
 
 
-# Not jnp.minimum and jnp.maximum, whose derivatives split ties evenly and cost many times as much.
+# `least` and `greatest` replace jnp.minimum and jnp.maximum, whose derivatives split ties evenly and cost many times as
+# much.
 def least(a, b):
-    """The smaller of two values, the first of equals."""
+    """Return the smaller of two values. If they are equal, the derivative is that of `a`."""
     return jnp.where(a <= b, a, b)
 
 
 def greatest(a, b):
-    """The larger of two values, the first of equals."""
+    """Return the larger of two values. If they are equal, the derivative is that of `a`."""
     return jnp.where(a >= b, a, b)
 
 
 @jax.custom_jvp
 def least_of_last(values):
-    """The minimum along the last axis, with the derivative of its first occurrence.
+    """Return the minimum along the last axis. The derivative is that of the first least entry.
 
-    The derivative of `jnp.min` compares the values with their minimum. If both are compiled separately they can differ
-    in the last bit, and the derivative is then 0 / 0.
+    The derivative of `jnp.min` compares the values with their minimum. If the values and the minimum are compiled
+    separately, they can differ in the last bit, and the derivative of `jnp.min` is then 0 / 0.
     """
     return jnp.min(values, axis=-1)
 
@@ -78,7 +80,10 @@ def _least_of_last_jvp(values, tangents):
 
 
 def corner_distance(*q):
-    """Signed distance to the solid where all q <= 0, from the signed distances q to orthogonal planes."""
+    """Return the signed distance to the solid where all q <= 0; each q is the signed distance to a plane.
+
+    The planes must be orthogonal to each other.
+    """
     outside = safe_norm(*(greatest(c, 0.0) for c in q))
     return outside + least(functools.reduce(greatest, q), 0.0)
 
@@ -86,8 +91,8 @@ def corner_distance(*q):
 class SignedDistance(eqx.Module):
     """A solid, defined by its signed distance function in scene units: negative inside.
 
-    A subclass defines `__call__`, which treats each point independently, has slopes of at most one, and changes sign at
-    the surface. Solids combine as sets: `a | b`, `a & b`, `a - b`.
+    A subclass defines `__call__`, which evaluates each point independently, has slopes of at most one, and changes sign
+    at the surface. Solids can be combined as sets: `a | b`, `a & b` and `a - b`.
 
     **Raises:** `ValueError` if a parameter is not finite, has the wrong shape, or is a negative length.
     """
@@ -99,7 +104,7 @@ class SignedDistance(eqx.Module):
 
     @abstractmethod
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
-        """The signed distance at the points x."""
+        """Return the signed distance at the points x."""
 
     @property
     def class_label(self) -> Int[AnyArray, ""] | None:
@@ -117,7 +122,7 @@ class SignedDistance(eqx.Module):
                 check_type(value, SignedDistance, name)
             if not eqx.is_array(value):
                 continue
-            # A letter in the annotation allows any length.
+            # A letter in the shape annotation allows any length of the axis.
             shape = tuple(int(n) if n.isdigit() else n for n in cast(Any, field.type).dim_str.split())
             require(
                 len(value.shape) == len(shape)
@@ -126,32 +131,32 @@ class SignedDistance(eqx.Module):
             )
             if not is_traced(value):
                 numbers = np.asarray(value)
-                # Not `require`, since formatting an array takes far longer than checking it.
+                # `require` would format the array even if it is valid, which takes far longer than checking it.
                 if not np.isfinite(numbers).all():
                     raise InputError(f"{name} is {value}: give finite numbers")
                 if "length" in field.metadata and (numbers < 0).any():
                     raise InputError(f"{name} is {value}: a length must not be negative")
 
     def translate(self, offset) -> "Translated":
-        """The solid moved by `offset` (3,)."""
+        """Return the solid moved by `offset` (3,)."""
         return Translated(self, offset)
 
     def rotate(self, axis, angle) -> "Rotated":
-        """The solid turned about the axis (3,) through the origin by `angle` radians, right-handed.
+        """Return the solid rotated about `axis` (3,) through the origin by `angle` radians, right-handed.
 
-        **Raises:** `ValueError` if the axis is zero.
+        **Raises:** `ValueError` if the axis is zero, or an argument has the wrong shape.
         """
         axis, angle = _as_float(axis), _as_float(angle)
         shapes = axis.shape, angle.shape
         require(shapes == ((3,), ()), f"axis and angle have shapes {shapes[0]} and {shapes[1]}: give (3,) and ()")
         if not is_traced(axis):
-            # In JAX's float type, which flushes numbers below the least normal one to zero.
+            # JAX's float type flushes numbers below its least normal number to zero, so the limit is this number.
             longer = bool(np.sum(np.square(np.asarray(axis))) >= jnp.finfo(axis.dtype).tiny)
             require(longer, f"the axis of rotation is {axis}: give a direction that is not zero")
         return Rotated(self, rotation_about(axis, angle))
 
     def scale(self, factor) -> "Scaled":
-        """The solid scaled about the origin by a positive factor."""
+        """Return the solid scaled about the origin by a positive factor."""
         return Scaled(self, factor)
 
     def __or__(self, other: "SignedDistance") -> "Union":
@@ -165,7 +170,7 @@ class SignedDistance(eqx.Module):
 
 
 class Union(SignedDistance):
-    """The union, min(a, b). Exact outside, a bound inside."""
+    """The union of two solids, min(a, b). The distance is exact outside and a bound inside."""
 
     first: SignedDistance
     second: SignedDistance
@@ -175,9 +180,10 @@ class Union(SignedDistance):
 
 
 class SmoothUnion(SignedDistance):
-    """The union with a fillet where the two surfaces come within `width` of each other. A bound.
+    """The union of two solids with a fillet where their distances a and b differ by less than `width`.
 
-    min(a, b) - h^2 / (4 width), h = max(width - |a - b|, 0). Its slopes are averages of those of a and b.
+    The distance is min(a, b) - h^2 / (4 width), with h = max(width - |a - b|, 0). It is a bound. Its gradient is a
+    weighted mean of the gradients of a and b.
     """
 
     first: SignedDistance
@@ -191,7 +197,7 @@ class SmoothUnion(SignedDistance):
 
 
 class Intersection(SignedDistance):
-    """The intersection, max(a, b). A bound outside, exact inside."""
+    """The intersection of two solids, max(a, b). The distance is a bound outside and exact inside."""
 
     first: SignedDistance
     second: SignedDistance
@@ -201,7 +207,7 @@ class Intersection(SignedDistance):
 
 
 class Difference(SignedDistance):
-    """The first solid without the second, max(a, -b). A bound outside, exact inside."""
+    """The first solid without the second, max(a, -b). The distance is a bound outside and exact inside."""
 
     first: SignedDistance
     second: SignedDistance
@@ -211,7 +217,7 @@ class Difference(SignedDistance):
 
 
 class Translated(SignedDistance):
-    """A solid moved by `offset`. As exact as the solid."""
+    """A solid moved by `offset`. The distance is exact if that of the solid is."""
 
     solid: SignedDistance
     offset: Vector = parameter()
@@ -221,9 +227,9 @@ class Translated(SignedDistance):
 
 
 class Rotated(SignedDistance):
-    """A solid turned by a rotation matrix about the origin. As exact as the solid.
+    """A solid rotated about the origin by a matrix. The distance is exact if that of the solid is.
 
-    **Raises:** `ValueError` also if the matrix is not a rotation.
+    **Raises:** `ValueError` if the matrix is not a rotation, or for the same reasons as `SignedDistance`.
     """
 
     solid: SignedDistance
@@ -239,7 +245,10 @@ class Rotated(SignedDistance):
 
 
 class Scaled(SignedDistance):
-    """A solid scaled about the origin by `factor` > 0. As exact as the solid."""
+    """A solid scaled about the origin by `factor` > 0. The distance is exact if that of the solid is.
+
+    **Raises:** `ValueError` if the factor is not positive.
+    """
 
     solid: SignedDistance
     factor: Scalar = nonnegative()

@@ -13,13 +13,14 @@ PATTERNS = ("cross", "ring", "star", "triangle", "square")
 
 
 class ImprintedPyramid(SignedDistance):
-    """A pyramid on a square base with a pattern pressed into the base. A bound.
+    """A pyramid on a square base with a pattern pressed into the base. The distance is a bound.
 
-    In the pyramid's own frame the base is [-1, 1]^2 at z = 0 and the apex is at (0, 0, height). A point u of this frame
+    In the pyramid's own frame the base is [-1, 1]^2 at z = 0 and the apex is at (0, 0, height). A point u in this frame
     lies at `scale * rotation @ u + offset` in the scene.
 
     - `pattern`: index of the pattern in `PATTERNS`.
-    - `size`, `place`, `turn`, `depth`: the pattern's radius, centre, angle (radians) and depth, in the pyramid's frame.
+    - `size`, `place`, `turn`, `depth`: radius, centre, rotation angle (radians) and depth of the pattern, in the
+      pyramid's frame.
     """
 
     pattern: Int[Array, ""]
@@ -39,7 +40,10 @@ class ImprintedPyramid(SignedDistance):
         return self.scale * jnp.maximum(jnp.maximum(sides, -w), -self._imprint(u, v, w))
 
     def imprint(self, x: Float[AnyArray, "*n 3"]) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
-        """Signed distance to the prism pressed into the base, and height above the base, in scene units."""
+        """Return the signed distance to the prism pressed into the base, and the height above the base.
+
+        Both are in scene units.
+        """
         u, v, w = self._own(x)
         return self.scale * self._imprint(u, v, w), self.scale * w
 
@@ -50,7 +54,10 @@ class ImprintedPyramid(SignedDistance):
         return own[..., 0], own[..., 1], own[..., 2]
 
     def _imprint(self, u, v, w):
-        """Signed distance to the prism pressed into the base, which has no lower end."""
+        """Return the signed distance to the prism that is pressed into the base, in the pyramid's frame.
+
+        The prism ends at `depth` above the base and extends without end below the base.
+        """
         c, s = jnp.cos(self.turn) / self.size, jnp.sin(self.turn) / self.size
         u, v = u - self.place[0], v - self.place[1]
         flat = self.size * pattern_distance(self.pattern, c * u + s * v, c * v - s * u)
@@ -58,9 +65,12 @@ class ImprintedPyramid(SignedDistance):
 
 
 def pattern_distance(pattern: Int[Array, ""], x: Float[Array, "*n"], y: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Signed distance, negative inside, to a pattern within the unit circle. A bound away from its edge.
+    """Return the signed distance (negative inside) to a pattern within the unit circle.
 
-    - `pattern`: index in `PATTERNS`. All five are evaluated, so that scenes of all classes share one program.
+    The distance is a bound: its magnitude may be smaller than the distance to the pattern's edge.
+
+    - `pattern`: index in `PATTERNS`. All five patterns are evaluated, so that scenes of all classes share one compiled
+      program.
     """
     shapes: tuple[Callable[..., Float[Array, "*n"]], ...] = (_cross, _ring, _star, _triangle, _square)
     return jnp.select([pattern == index for index in range(len(PATTERNS))], [shape(x, y) for shape in shapes])
@@ -76,10 +86,14 @@ def _ring(x, y, middle=0.74, half_width=0.24):
 
 
 def _star(x, y, inner=0.48):
-    """A star with five tips at radius 1. By symmetry, one wedge between a tip and a notch gives all ten."""
+    """Return the signed distance to a star with five tips at radius 1.
+
+    The star consists of ten congruent wedges between a tip and a notch. The point is mirrored into one of the wedges.
+    """
     x = jnp.abs(x)
     half_turn = math.pi / 5
-    # Mirrors at 3 and then 1 half turns from the tip on the y axis fold all directions into the first half turn.
+    # Two mirrors, at angles of 3 and 1 times pi / 5 from the tip on the y axis, map all directions to the wedge beside
+    # this tip.
     for angle in (3 * half_turn, half_turn):
         c, s = math.cos(angle), math.sin(angle)
         beyond = jnp.maximum(x * c - y * s, 0.0)

@@ -1,4 +1,4 @@
-"""Unions of labelled primitives. All have one type, so that one compiled program scans any of them."""
+"""Unions of labelled primitives. All unions have the same type, so that one compiled program scans any of them."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -7,26 +7,29 @@ from jaxnbv.checks import AnyArray
 from jaxnbv.geometry.rotations import safe_norm
 from jaxnbv.scanning.sdf.base import SignedDistance, corner_distance, least_of_last, nonnegative, parameter
 
-# Label of a slot without a primitive.
+# Label of an unused slot. All unions have the same number of slots, and each primitive takes one slot.
 UNUSED = -1
 
 
 class LabelledSolid(SignedDistance):
-    """The union of labelled primitives. A bound.
+    """The union of labelled rounded boxes and solids of revolution. The distance is a bound.
 
-    A point x has the coordinates u = rotation^T (x - centre) in a primitive's own frame. With h = half_size and
-    t = rounding, its distance is that of the box [-h, h] rounded by t,
+    A point x has the coordinates u = rotation^T (x - centre) in the frame of a primitive. With h = half_size and
+    t = rounding, the distance to the box [-h, h] rounded by t is
 
         d(u) = |max(q, 0)| + min(max(q1, q2, q3), 0) - t,    q = |u| - (h - t).
 
-    A revolved primitive has the same distance in two dimensions, of (r - radius - slant * u2, u2) with r the distance
-    from the axis u2. It is divided by the largest singular value (|slant| + sqrt(slant^2 + 4)) / 2 of this shear.
+    A solid of revolution uses the two-dimensional form of d at the point (r - radius - slant * u2, u2), where r is the
+    distance from the axis u2. The result is divided by (|slant| + sqrt(slant^2 + 4)) / 2, the largest singular value of
+    this shear.
 
     - `labels`: label of each primitive; -1 for a slot that is not used.
-    - `revolved`: whether each primitive is revolved.
-    - `centre`, `rotation`, `half_size`, `rounding`: as above, in scene units. For a revolved primitive, the half width
-      is the first half size, and the half height is the second and also the third.
-    - `radius`, `slant`: for a revolved primitive, the radius of the ring (0 for a solid) and its growth with height.
+    - `revolved`: whether each primitive is a solid of revolution.
+    - `centre`, `rotation`, `half_size`, `rounding`: the quantities of the formula, in scene units. For a solid of
+      revolution, the first half size is the half width of the profile. The second and third must both be its half
+      height.
+    - `radius`, `slant`: for a solid of revolution, the radius of the ring (0 for a full solid) and the growth of the
+      radius with height.
     """
 
     labels: Int[Array, " slots"]
@@ -42,7 +45,7 @@ class LabelledSolid(SignedDistance):
         return least_of_last(self.distances(x))
 
     def distances(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n primitives"]:
-        """Signed distance to each primitive; infinite for slots that are not used."""
+        """Return the signed distance from the points x to each primitive; infinite for unused slots."""
         a, b, c = (x[..., i, None] - self.centre[:, i] for i in range(3))
         # R^T x as sums, which XLA fuses with other operations; a matrix product would not fuse.
         u, v, w = (
@@ -58,5 +61,8 @@ class LabelledSolid(SignedDistance):
         return jnp.where(self.labels > UNUSED, distance / steepest, jnp.inf)
 
     def part_labels(self, x: Float[AnyArray, "*n 3"]) -> Int[Array, "*n"]:
-        """The label of the primitive with the nearest surface; exact for points on the solid's surface."""
+        """Return the label of the primitive whose surface is nearest to each point x.
+
+        Distances to primitives are bounds, so the label is reliable only for points on the surface of the union.
+        """
         return self.labels[jnp.argmin(jnp.abs(self.distances(x)), axis=-1)]

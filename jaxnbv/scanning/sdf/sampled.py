@@ -1,4 +1,4 @@
-"""Meshes as solids that JAX can trace, by signed distances sampled on grids."""
+"""Conversion of meshes to solids that JAX can trace, by sampling their signed distances on grids."""
 
 from typing import Any
 
@@ -12,18 +12,18 @@ from jaxnbv.errors import optional
 from jaxnbv.geometry.rotations import safe_norm
 from jaxnbv.scanning.sdf.base import Scalar, SignedDistance, Vector, nonnegative, parameter, split
 
-# Width of the space around the mesh, as a share of its longest side.
+# Width of the empty space between the mesh and the sides of the grid, as a fraction of the mesh's longest side.
 _PADDING = 0.1
 
 
 class Sampled(SignedDistance):
-    """A solid with signed distances at the nodes of a grid, trilinear between them.
+    """A solid whose signed distance is interpolated linearly between the nodes of a grid.
 
-    Accurate to about a cell within the grid, a bound beyond it.
+    The distance is accurate to about a cell inside the grid, and a bound outside the grid.
 
     - `values`: signed distance at each node.
-    - `low`, `spacing`: the first node, and the distance between neighbouring nodes.
-    - `padding`: width of the space between the solid and the sides of the grid.
+    - `low`, `spacing`: position of the first node, and the distance between neighbouring nodes.
+    - `padding`: width of the empty space between the solid and the sides of the grid.
     """
 
     values: Float[Array, "a b c"] = parameter()
@@ -48,15 +48,16 @@ def solid_of_mesh(
     sheet: float = 0.0,
     cubic: bool = False,
 ) -> Sampled:
-    """A mesh as a solid in the coordinates of its vertices, for example for an obstacle.
+    """Convert a mesh to a solid in the coordinates of its vertices, for example to use it as an obstacle.
 
     Inside and outside follow from winding numbers, so the mesh may have holes.
 
-    - `resolution`: number of nodes along the longest side.
-    - `sheet`: thickness of faces with the outside on both sides. With 0 they vanish.
-    - `cubic`: use this many nodes along all sides, so that the solids of several meshes can be stacked.
+    - `resolution`: number of nodes along the longest side of the grid.
+    - `sheet`: thickness that is given to faces with the outside on both sides. With 0, such faces vanish.
+    - `cubic`: use `resolution` nodes along all sides, so that the solids of different meshes can be stacked.
 
-    **Raises:** `ValueError` for triangles as `TriangleMesh.from_arrays` does, or a resolution below four.
+    **Raises:** `ValueError` if the triangles are invalid (see `TriangleMesh.from_arrays`), all vertices coincide, or
+    the resolution is below four.
     """
     vertices, faces = checked_triangles(vertices, faces)
     require(resolution >= 4, f"the resolution is {resolution}; it must be at least 4")
@@ -97,14 +98,15 @@ def _signed_distance(
 def _is_inside(
     points: Float[np.ndarray, "n 3"], vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Bool[np.ndarray, " n"]:
-    # The number is negative for a solid whose faces are wound inside out.
+    # The winding number is negative in a solid whose faces are wound inside out.
     return np.abs(winding_number(points, vertices, faces)) > 0.5
 
 
 def checked_triangles(vertices: Any, faces: Any) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
-    """Vertices and faces as arrays, checked to be a mesh of triangles.
+    """Convert vertices and faces to arrays, and check that they are a mesh of triangles.
 
-    **Raises:** `ValueError` if they are not.
+    **Raises:** `ValueError` if a shape is not (n, 3), there are no faces, an index is not an integer or out of range,
+    or a vertex is not finite.
     """
     vertices = as_numbers(vertices, "the mesh's vertices", np.float64)
     faces = as_numbers(faces, "the mesh's faces", None)
@@ -133,15 +135,16 @@ def checked_triangles(vertices: Any, faces: Any) -> tuple[Float[np.ndarray, "v 3
 def distance_to_triangles(
     points: Float[np.ndarray, "n 3"], vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Float[np.ndarray, " n"]:
-    """Unsigned distance from each point to the nearest triangle."""
+    """Return the unsigned distance from each point to the nearest triangle."""
     return np.sqrt(optional("igl").point_mesh_squared_distance(points, vertices, faces)[0])
 
 
 def winding_number(
     points: Float[np.ndarray, "n 3"], vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Float[np.ndarray, " n"]:
-    """Winding number of the triangles around each point (Barill et al. 2018).
+    """Return the winding number of the triangles around each point (Barill et al. 2018).
 
-    It is 1 inside a closed mesh, -1 if the mesh is wound inside out, and between that and 0 near a hole.
+    The winding number is 0 outside a closed mesh. It is 1 inside the mesh, or -1 if the mesh is wound inside out. Near
+    a hole it lies between these values.
     """
     return np.asarray(optional("igl").fast_winding_number(vertices, faces, points))

@@ -18,7 +18,7 @@ from jaxnbv.scanning.sdf.base import (
 
 
 class Sphere(SignedDistance):
-    """The ball of `radius` about the origin. Exact."""
+    """The ball of `radius` about the origin. The distance is exact."""
 
     radius: Scalar = nonnegative()
 
@@ -27,11 +27,12 @@ class Sphere(SignedDistance):
 
 
 class Cuboid(SignedDistance):
-    """The box [-half_size, half_size] with rounded edges. Exact.
+    """The box [-half_size, half_size] with rounded edges. The distance is exact.
 
-    - `rounding`: radius of the edges; it does not change the outer size.
+    - `half_size`: half of the length of each side, (3,).
+    - `rounding`: radius of the edges. It does not change the outer size.
 
-    **Raises:** `ValueError` also if the rounding is greater than half of a side.
+    **Raises:** `ValueError` if the rounding exceeds half of a side, or for the same reasons as `SignedDistance`.
     """
 
     half_size: Vector = nonnegative()
@@ -49,7 +50,10 @@ class Cuboid(SignedDistance):
 
 
 class Cylinder(SignedDistance):
-    """The solid cylinder about the y axis with flat caps at y = -half_height and half_height. Exact."""
+    """The solid cylinder about the y axis. The distance is exact.
+
+    - `half_height`: the flat caps are at y = -half_height and y = half_height.
+    """
 
     radius: Scalar = nonnegative()
     half_height: Scalar = nonnegative()
@@ -60,9 +64,10 @@ class Cylinder(SignedDistance):
 
 
 class Cone(SignedDistance):
-    """The solid cone about the y axis with flat caps at y = -half_height and half_height. Exact.
+    """The solid truncated cone about the y axis. The distance is exact.
 
-    - `bottom_radius`, `top_radius`: radii of the lower and the upper cap.
+    - `bottom_radius`, `top_radius`: radii of the lower and the upper cap; zero gives a tip.
+    - `half_height`: the flat caps are at y = -half_height and y = half_height.
     """
 
     bottom_radius: Scalar = nonnegative()
@@ -87,7 +92,10 @@ class Cone(SignedDistance):
 
 
 class Torus(SignedDistance):
-    """The torus about the y axis: a tube of `minor_radius` around the circle of `major_radius`. Exact."""
+    """The torus about the y axis: a tube of `minor_radius` around a circle of `major_radius`.
+
+    The distance is exact.
+    """
 
     major_radius: Scalar = nonnegative()
     minor_radius: Scalar = nonnegative()
@@ -98,7 +106,7 @@ class Torus(SignedDistance):
 
 
 class Capsule(SignedDistance):
-    """All points within `radius` of the segment from `start` to `end`. Exact."""
+    """All points within `radius` of the segment from `start` to `end`. The distance is exact."""
 
     start: Vector = parameter()
     end: Vector = parameter()
@@ -114,11 +122,11 @@ class Capsule(SignedDistance):
 
 
 class HalfSpace(SignedDistance):
-    """The half space behind the plane through `point`, such as a table or wall. Exact.
+    """The half space behind a plane through `point`, such as a table or a wall. The distance is exact.
 
-    - `normal`: direction out of the solid, of any length.
+    - `normal`: normal of the plane, of any length, which points out of the solid.
 
-    **Raises:** `ValueError` also if the normal is zero.
+    **Raises:** `ValueError` if the normal is zero, or for the same reasons as `SignedDistance`.
     """
 
     point: Vector = parameter()
