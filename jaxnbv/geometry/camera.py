@@ -23,16 +23,19 @@ _Places = TypeVar("_Places", Float[Array, "*n 2"], Float[np.ndarray, "*n 2"])
 _SKEW = 1e-6
 
 
-# Depth cameras have no rays more than 70 degrees off the axis. A principal point this close to an image's centre, as a
-# share of half the image, may be meant as the centre.
+# Depth cameras have no rays more than 70 degrees off the axis (`_WIDEST` is the tangent). `_OFF_CENTER` is the largest
+# distance of a principal point from an image's centre, as a fraction of half the image, at which it may be the centre.
 _WIDEST, _OFF_CENTER = math.tan(math.radians(70.0)), 0.2
-# If both shares of the principal point are at least this, the matrix is for a larger image.
+# If the principal point lies at this fraction or more of both the width and the height, the matrix is certainly for a
+# larger image.
 _SURELY = 0.96
 
 
 def _limit(depth: Any) -> Any:
-    """A limit of the range as an array, so that a program compiled for one scale of a scene runs for any. A missing
-    limit stays 0.0 or None, so that programs can branch on it."""
+    """Convert a limit of the range to an array, so that a program compiled for one scale of a scene runs for any scale.
+
+    A missing limit stays 0.0 or None, so that programs can branch on it.
+    """
     is_number = isinstance(depth, int | float) and not isinstance(depth, bool) and depth != 0
     return np.float64(depth) if is_number else depth
 
@@ -41,16 +44,18 @@ class Camera(eqx.Module):
     """A pinhole depth camera. The centres of pixels are at 0.5, 1.5, ... from the image's top left corner.
 
     - `fov`: vertical field of view in radians, within (0, pi), as if the principal point were at the image's centre.
-    - `height`, `width`: number of pixels; one ray through the centre of each.
-    - `aspect`: focal length across over focal length down, in pixels; 1 for square pixels.
-    - `center`: the principal point, as shares of the width and the height.
-    - `nearest`, `farthest`: depths along the viewing direction between which the sensor measures, in scene units; None
-      is no limit. A hit before `nearest` is invalid; a ray without a hit up to `farthest` is missed and empty up to it.
-    - `max_incidence`: largest angle in radians, within (0, pi/2], between a ray and the normal at which a hit returns.
-    - `distortion`: coefficients of the lens, see `from_intrinsics`. All rays are those of the pinhole;
-      `PointCloud.from_depth` first undoes the distortion of an image.
+    - `height`, `width`: number of rows and columns of pixels. One ray goes through the centre of each pixel.
+    - `aspect`: horizontal focal length divided by vertical focal length, both in pixels; 1 for square pixels.
+    - `center`: the principal point, as fractions of the width and the height.
+    - `nearest`, `farthest`: the sensor measures depths between these limits, along the viewing direction and in scene
+      units. `nearest=0` and `farthest=None` mean no limit. A hit nearer than `nearest` is invalid. A ray without a hit
+      up to `farthest` is missed, so it is empty up to `farthest`.
+    - `max_incidence`: largest angle between a ray and the surface normal at which the sensor measures a hit, in radians
+      within (0, pi/2].
+    - `distortion`: coefficients of the lens, see `from_intrinsics`. The rays are those of the pinhole without
+      distortion. `PointCloud.from_depth` undoes the distortion of an image first.
 
-    The defaults are the paper's: 30 degrees, 50 x 50, no limits.
+    The defaults are the paper's: 30 degrees, 50 x 50 pixels, no limits.
 
     **Raises:** `ValueError` for a value outside these limits.
     """
@@ -96,17 +101,18 @@ class Camera(eqx.Module):
         max_incidence: float = 0.5 * math.pi,
         distortion: Float[AnyArray, " k"] | list | tuple = (),
     ) -> "Camera":
-        """The camera with intrinsic matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels.
+        """Build a camera from an intrinsic matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels.
 
-        As in OpenCV and the data of camera makers, the centre of the first pixel is at (0, 0). The principal point may
-        lie outside the image, which may be a window of a larger one. Warns if the matrix is probably for another image
-        size.
+        The centre of the first pixel is at (0, 0), as in OpenCV and the calibrations of camera makers. The principal
+        point may lie outside the image, since the image may be a window of a larger image. Warns if the matrix is
+        probably for an image of a different size than `height` x `width`.
 
         - `nearest`, `farthest`, `max_incidence`: see `Camera`.
         - `distortion`: OpenCV's coefficients k1, k2, p1, p2[, k3[, k4, k5, k6]].
 
-        **Raises:** `ValueError` for another matrix, such as one with skew or certainly for another image size; for
-        another number of coefficients, or coefficients that fold the image.
+        **Raises:** `ValueError` for a matrix of a different form, such as a matrix with skew, for a matrix that is
+        certainly for a different image size, for a wrong number of coefficients, or for coefficients that map two
+        points to the same pixel.
         """
         intrinsics = as_numbers(matrix, "the intrinsic matrix", np.float64)
         require(intrinsics.shape == (3, 3), f"the intrinsic matrix has shape {intrinsics.shape}: give one of (3, 3)")
@@ -136,13 +142,13 @@ class Camera(eqx.Module):
 
     @checked
     def resized(self, height: int, width: int) -> "Camera":
-        """The camera with the same field of view and another number of pixels, such as fewer rays for samples."""
+        """Return a camera with the same field of view and a different number of pixels."""
         aspect = self.aspect * (width / self.width) / (height / self.height)
         return dataclasses.replace(self, height=height, width=width, aspect=aspect)
 
     @checked
     def strided(self, stride: int) -> "Camera":
-        """The camera of every `stride`-th row and column, starting at `stride // 2`.
+        """Return the camera of every `stride`-th row and column of the image, starting at `stride // 2`.
 
         **Raises:** `ValueError` for a stride below one, or one that leaves no pixel.
         """
@@ -164,13 +170,13 @@ class Camera(eqx.Module):
 
     @property
     def focal_lengths(self) -> tuple[float, float]:
-        """Focal lengths across and down, in pixels."""
+        """Horizontal and vertical focal length, in pixels."""
         down = 0.5 * self.height / math.tan(0.5 * self.fov)
         return self.aspect * down, down
 
     @property
     def edges(self) -> tuple[float, float, float, float]:
-        """Left, top, right and bottom edge of the image in the plane z = 1 of the camera's frame."""
+        """Left, top, right and bottom coordinate of the image in the plane z = 1 of the camera's frame."""
         (fx, fy), (cx, cy) = self.focal_lengths, self.center
         return -cx * self.width / fx, -cy * self.height / fy, (1 - cx) * self.width / fx, (1 - cy) * self.height / fy
 
@@ -181,7 +187,7 @@ class Camera(eqx.Module):
         return has_range or self.max_incidence < 0.5 * math.pi
 
     def pixel_directions(self) -> Float[Array, "rays 3"]:
-        """Directions through the pixel centres in the camera's frame, scaled so that z = 1; row by row."""
+        """Return the directions through the pixel centres in the camera's frame, with z = 1, row by row."""
         (fx, fy), (cx, cy) = self.focal_lengths, self.center
         column, row = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
         x = (column - cx * self.width) / fx
@@ -190,13 +196,16 @@ class Camera(eqx.Module):
         return jnp.asarray(directions, dtype=jnp.result_type(float))
 
     def to_pixels(self, image: _Places) -> _Places:
-        """Columns and rows (first pixel's centre at 0.5) of image points (x / z, y / z) in the camera's frame."""
+        """Convert points (x / z, y / z) in the camera's frame to columns and rows.
+
+        The centre of the first pixel has column and row 0.5.
+        """
         (fx, fy), (cx, cy) = self.focal_lengths, self.center
         return image * np.array([fx, fy], image.dtype) + np.array([cx * self.width, cy * self.height], image.dtype)
 
     @program
     def rays(self, pose: Pose) -> tuple[Float[Array, "*batch rays 3"], Float[Array, "*batch rays 3"]]:
-        """Origins and unit directions of all rays in scene coordinates, for one pose or a batch."""
+        """Return the origins and unit directions of all rays in scene coordinates, for one pose or a batch."""
         directions = self.pixel_directions()
         directions = directions / jnp.linalg.norm(directions, axis=-1, keepdims=True)
         directions = jnp.einsum("...ij,rj->...ri", pose.rotation, directions, precision="highest")
@@ -204,10 +213,10 @@ class Camera(eqx.Module):
 
 
 def _check_image_size(matrix: np.ndarray, height: int, width: int, center: tuple[float, float]) -> None:
-    """Warn of a principal point that is the centre of an image of another size.
+    """Warn if the principal point is probably the centre of an image of a different size.
 
-    **Raises:** `ValueError` if it is then at the corner of this image or beyond, or if the image ends more than 70
-    degrees off the axis.
+    **Raises:** `ValueError` if such a principal point is at the corner of this image or beyond it, or if it lies
+    outside this image and the image would extend more than 70 degrees off the axis.
     """
     (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
     across, down = (

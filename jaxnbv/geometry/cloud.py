@@ -28,24 +28,24 @@ from jaxnbv.geometry.farthest_points import farthest_point_indices
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
 
-# The most rows that an index of 32 bits can count, far more than a planner can hold in memory.
+# Largest number of rows that an index of 32 bits can count. A planner cannot hold nearly that many in memory.
 _MOST_ROWS = 2**31 - 1
 _LONGEST_NORMAL = 10.0
 
 
 class PointCloud(eqx.Module):
-    """Oriented points (x, n), the paper's D. Rows whose mask is False are empty; their values are zero.
+    """Oriented points (x, n), the paper's D, in an array with a fixed number of rows.
 
-    The number of rows is the cloud's capacity. It is a shape and so fixed under `jit`. Leading axes make a batch of
-    clouds.
+    The number of rows is the cloud's capacity. It is fixed under `jit`, since it is a shape. Rows whose mask is False
+    are empty, and their points and normals are zero. Leading axes make a batch of clouds.
 
     - `points`: positions, in scene units unless stated otherwise.
     - `normals`: unit outward normals.
-    - `mask`: whether each row is filled.
-    - `missed`: for a sensor's scan, with one row per pixel: whether the ray met nothing, so that all of it is empty. A
-      row that is neither filled nor missed is invalid. None for a cloud that is not a sensor's image.
-    - `sight`: how far each ray of a scan saw, in units of the points: the distance to its hit, even if the hit is not a
-      point of the cloud, and infinite where nothing came back. None if unknown.
+    - `mask`: whether each row holds a point.
+    - `missed`: for a sensor's scan, which has one row per pixel, whether each ray met nothing and so crossed only empty
+      space. A row that is neither filled nor missed is invalid. None for a cloud that is not a sensor's image.
+    - `sight`: for a sensor's scan, the distance from the camera to the hit of each ray, in units of the points, even if
+      the hit is not a point of the cloud. Infinite if the ray returned nothing. None if unknown.
     """
 
     points: Float[Array, "*batch n 3"] = eqx.field(converter=native)
@@ -74,12 +74,14 @@ class PointCloud(eqx.Module):
         normals: Float[AnyArray, "n 3"] | list,
         capacity: int | None = None,
     ) -> "PointCloud":
-        """A cloud of points with outward normals, padded to `capacity` rows (default: the number of points).
+        """Build a cloud from points and outward normals, padded to `capacity` rows.
 
-        Normals are scaled to unit length, with a `UserWarning` if that changes one by more than 1 %.
+        Normals are scaled to unit length. A `UserWarning` is given if the length of a normal changes by more than 1 %.
 
-        **Raises:** `ValueError` for shapes other than (n, 3), no points at all, an entry that is not finite, a normal
-        of length zero, or more points than the capacity.
+        - `capacity`: number of rows, by default the number of points.
+
+        **Raises:** `ValueError` for shapes other than (n, 3), no points, an entry that is not finite, a normal of
+        length zero, or more points than the capacity.
         """
         points, normals = (as_numbers(rows, name) for rows, name in ((points, "points"), (normals, "normals")))
         require(
@@ -132,30 +134,35 @@ class PointCloud(eqx.Module):
         stride: int = 1,
         box: Box | None = None,
     ) -> "PointCloud":
-        """The cloud of a depth image in the coordinates of the pose, one row per pixel, row by row.
+        """Convert a depth image to a cloud in the coordinates of the pose, with one row per pixel, row by row.
 
-        A pixel of +infinity is missed: its ray met nothing in the whole scene. A pixel that is zero, negative or NaN is
-        invalid and says nothing. A depth below the camera's range is invalid, and one beyond the range is missed. The
-        largest value of an integer type is invalid. So is a value beyond the range, or well beyond the box, that fills
-        far more pixels than any other near it: it stands for "not measured" (with a `UserWarning`).
+        Each pixel is a point, missed, or invalid:
 
-        Distortion is undone first (`Camera.from_intrinsics`). Points and normals are those of planes fitted to the
-        pixels around each pixel on the same surface, in a window that grows with the noise (`geometry/plane_fit.py`).
-        Normals point towards the camera. A pixel is invalid if its neighbours do not define a plane, or if six of the
-        eight beside it disagree with it, since sensors mix the depths of two surfaces at edges. In an image with gaps
-        between its pixels, such as a lidar's, each block of the gap's size gives one sample, and planes are evaluated
-        on the rays of the rows.
+        - A pixel of +infinity is missed: its ray met nothing in the whole scene. A pixel with a depth beyond the
+          camera's range is missed too.
+        - A pixel that is zero, negative or NaN, or has a depth below the camera's range, is invalid. It gives no
+          information.
+        - A value that stands for "not measured" is invalid. This is the largest value of an integer type, or a value
+          beyond the camera's range or well beyond the box that fills far more pixels than any value near it. The second
+          kind gives a `UserWarning`.
+
+        Distortion is undone first (`Camera.from_intrinsics`). Then a plane is fitted to the pixels around each pixel
+        that lie on the same surface. The window of these pixels grows with the noise (`geometry/plane_fit.py`). The
+        plane gives the point and its normal, which points towards the camera. A pixel is invalid if its neighbours do
+        not define a plane. It is also invalid if six of its eight neighbours disagree with it, since sensors mix the
+        depths of two surfaces at edges. If an image has gaps between its valid pixels, such as a lidar's, each block of
+        the gap's size gives one sample, and each row of the cloud lies on the ray of its pixel.
 
         - `depth`: depths along the camera's forward axis. Integers count as rounded.
-        - `depth_scale`: units of the pose per unit of depth: 0.001 for an image in millimetres and a pose in metres.
-          The camera's range and the box are in units of the pose too.
-        - `stride`: keep every `stride`-th row and column; the cloud is then an image of `camera.strided(stride)`.
-          Planes are fitted to all pixels.
-        - `box`: keep only points inside. A ray that hits behind the box has crossed it and is missed. A ray that hits
-          before it is invalid.
+        - `depth_scale`: units of the pose per unit of depth, such as 0.001 for an image in millimetres and a pose in
+          metres. The camera's range and the box are in units of the pose.
+        - `stride`: keep every `stride`-th row and column. The cloud is then an image of `camera.strided(stride)`.
+          Planes are still fitted to all pixels.
+        - `box`: keep only points inside the box. A ray that hits behind the box has crossed the box, so it is missed. A
+          ray that hits in front of the box is invalid.
 
-        **Raises:** `ValueError` if the image's shape is not the camera's, all depths are out of the camera's range, the
-        box is behind the camera, or the depths are of another order of magnitude than the box's distance.
+        **Raises:** `ValueError` if the image's shape differs from the camera's, all depths are outside the camera's
+        range, the box is behind the camera, or depths and the distance of the box differ by orders of magnitude.
         """
         return cls(*points_of_depth(depth, camera, pose, depth_scale, stride, box))
 
@@ -171,7 +178,7 @@ class PointCloud(eqx.Module):
 
     @own_settings()
     def to_numpy(self) -> tuple[Float[np.ndarray, "count 3"], Float[np.ndarray, "count 3"]]:
-        """Points and normals of the filled rows of a single cloud.
+        """Return the points and normals of the filled rows of a single cloud.
 
         **Raises:** `ValueError` for a batch of clouds.
         """
@@ -181,30 +188,30 @@ class PointCloud(eqx.Module):
 
     @own_settings()
     def only(self, mask: Bool[Array, "*batch n"]) -> "PointCloud":
-        """The cloud with only the rows where `mask` is True. `missed` and `sight` stay as they are."""
+        """Return the cloud with only those points where `mask` is True. `missed` and `sight` do not change."""
         mask = self.mask & mask
         points, normals = (jnp.where(mask[..., None], rows, 0.0) for rows in (self.points, self.normals))
         return PointCloud(points, normals, mask, self.missed, self.sight)
 
     @own_settings()
     def __getitem__(self, index) -> "PointCloud":
-        """The cloud, or clouds, at an index of the leading axes.
+        """Return the cloud, or the batch of clouds, at an index of the leading axes.
 
-        **Raises:** `ValueError` for a single cloud, or if there is no such index.
+        **Raises:** `ValueError` for a single cloud, or if the index is out of range.
         """
         check_index(index, self.mask.shape[:-1], "the cloud")
         return jax.tree.map(lambda leaf: leaf[index], self)
 
     def __iter__(self) -> Iterator["PointCloud"]:
-        """The clouds along the first axis of a batch."""
+        """Iterate over the clouds along the first axis of a batch."""
         check_batch(self.mask.shape[:-1], "the cloud")
         return (self[index] for index in range(self.mask.shape[0]))
 
 
 def some_rows(cloud: PointCloud, count: int) -> Int[Array, " count"]:
-    """Indices of `count` evenly spaced filled rows of a single cloud.
+    """Return the indices of `count` filled rows of a single cloud, evenly spaced among all filled rows.
 
-    Rows repeat if fewer are filled. All indices are 0 if the cloud is empty.
+    Indices repeat if fewer than `count` rows are filled. All indices are 0 if the cloud is empty.
     """
     order = jnp.argsort(~cloud.mask, stable=True)
     return order[(jnp.arange(count) * cloud.count) // count]
@@ -213,20 +220,24 @@ def some_rows(cloud: PointCloud, count: int) -> Int[Array, " count"]:
 def check_single(cloud: PointCloud, name: str = "the cloud") -> None:
     """Check that a cloud is not a batch.
 
-    **Raises:** `ValueError` if it is.
+    **Raises:** `ValueError` for a batch of clouds.
     """
     batch = cloud.mask.shape[:-1]
     require(not batch, f"{name} is a batch {batch} of clouds: give one, or use jax.vmap")
 
 
 def check_oriented(cloud: PointCloud, name: str, limit: float, unit: bool = True) -> None:
-    """Check that a cloud, which must not be traced, has oriented points within the scene.
+    """Check that a cloud has points within the scene, and that their normals have valid lengths.
 
+    JAX must not be tracing the cloud.
+
+    - `name`: name of the cloud in error messages.
     - `limit`: largest magnitude of a coordinate, in scene units.
-    - `unit`: whether normals must have unit length (to 1 %). Otherwise a length of up to 10 is allowed, since a model
-      may be conditioned on prior samples, whose normals do not have unit length.
+    - `unit`: whether normals must have unit length (to 1 %). If not, lengths up to 10 are allowed, since a model may be
+      conditioned on prior samples, whose normals do not have unit length.
 
-    **Raises:** `ValueError` if it is empty, or if a row is not finite, has a wrong normal, or is beyond the limit.
+    **Raises:** `ValueError` if the cloud is empty, an entry is not finite, a normal has an invalid length, or a point
+    is beyond the limit.
     """
     points, normals = cloud.to_numpy()
     require(
@@ -253,9 +264,12 @@ def check_oriented(cloud: PointCloud, name: str, limit: float, unit: bool = True
 
 @checked
 def concatenate(first: PointCloud, second: PointCloud) -> PointCloud:
-    """The paper's union D u D', whose capacity is the sum of both.
+    """Join two clouds into one, the paper's union of D and D'.
 
-    Rows keep their order. The result is not a sensor's image: `missed` and `sight` are None.
+    The capacity of the result is the sum of both capacities, and rows keep their order. `missed` and `sight` are None,
+    since the result is not a sensor's image.
+
+    **Raises:** `ValueError` for a batch of clouds.
     """
     for cloud in (first, second):
         check_single(cloud)
@@ -269,10 +283,10 @@ def _without_rays(cloud: PointCloud) -> PointCloud:
 @checked
 @functools.partial(jax.jit, static_argnames="count")
 def farthest_point_subsample(cloud: PointCloud, count: int) -> PointCloud:
-    """`count` points by farthest point sampling, in order of choice (Eldar et al. 1997).
+    """Choose `count` points by farthest point sampling (Eldar et al. 1997).
 
-    Starts at the first filled row. If the cloud has fewer points than `count`, all of them come first and the other
-    rows are masked.
+    Sampling starts at the first filled row, and the points are returned in the order in which they are chosen. If
+    the cloud has fewer points than `count`, all its points come first and the remaining rows are empty.
 
     **Raises:** `ValueError` if `count` < 1.
     """
@@ -286,7 +300,9 @@ def farthest_point_subsample(cloud: PointCloud, count: int) -> PointCloud:
 @own_settings()
 @functools.partial(jax.jit, static_argnames="capacity")
 def limit_capacity(cloud: PointCloud, capacity: int) -> PointCloud:
-    """The cloud in `capacity` rows, filled ones first: all points if they fit, else farthest points.
+    """Return the cloud with `capacity` rows, filled rows first.
+
+    If the cloud has more points than `capacity`, they are thinned by farthest point sampling.
 
     **Raises:** `ValueError` if `capacity` < 1.
     """

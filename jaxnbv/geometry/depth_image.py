@@ -1,4 +1,4 @@
-"""Conversion of a depth image to oriented points, missed rays and the range that each ray saw."""
+"""Conversion of a depth image to oriented points, missed rays, and the distance that each ray saw."""
 
 import math
 import warnings
@@ -19,28 +19,29 @@ from jaxnbv.geometry.volume import Box, ray_interval
 from jaxnbv.programs import program
 
 Rows = tuple[Float[Array, "n 3"], Float[Array, "n 3"], Bool[Array, " n"], Bool[Array, " n"], Float[Array, " n"]]
-# Depths that differ from the box's by more than this factor are in other units.
+# Depths that differ from the depths of the box by more than this factor are probably in different units.
 _OTHER_UNITS = 20.0
-# A value beyond this factor of the box's far depth may be a sentinel. The support of the object is nearer than that.
+# A value beyond the box's far depth times this factor may be a sentinel ("not measured"). The surface that the object
+# stands on is nearer than that.
 _BEHIND = 1.1
-# Share of depths within that factor that shows the units to be right.
+# If at least this fraction of the depths is within the factor `_OTHER_UNITS`, the units are right.
 _SOME = 1e-3
 
 
 class NothingInside(UserWarning):
-    """Warns that no point of a depth image lies in the box."""
+    """The warning that no point of a depth image lies in the box."""
 
 
 def points_of_depth(
     depth: Real[AnyArray, "height width"], camera: Camera, pose: Pose, scale: float, stride: int, box: Box | None
 ) -> Rows:
-    """The fields of `PointCloud.from_depth`: points, normals, mask, missed and sight.
+    """Compute the fields of the cloud of `PointCloud.from_depth`: points, normals, mask, missed and sight.
 
-    **Raises:** `ValueError` for an image of another shape than the camera's, a scale that is not positive, a batch of
-    poses, or a stride that does not fit.
+    **Raises:** `ValueError` for an image whose shape differs from the camera's, a scale that is not positive, a batch
+    of poses, or a stride that does not fit.
     """
     shape = (camera.height, camera.width)
-    # Before a conversion that may round large numbers to infinity.
+    # Infinite depths are detected before a conversion that may round large numbers to infinity.
     numbers = depth if is_traced(depth) else as_numbers(depth, "the depth image", None)
     missed = numbers == np.inf
     rounding = scale / math.sqrt(12.0) if np.issubdtype(numbers.dtype, np.integer) else 0.0
@@ -52,7 +53,7 @@ def points_of_depth(
     )
     require(scale > 0, f"the depth's scale is {scale}; it must be positive")
     require(pose.position.ndim == 1, f"the pose is a batch {pose.position.shape[:-1]}: give one, such as poses[0]")
-    # Reject a wrong stride before any work is done.
+    # Reject an invalid stride before any other computation.
     camera.strided(stride)
     if not is_traced(depth, pose):
         ahead = None if box is None else _depths_of(box, pose)
@@ -64,7 +65,7 @@ def points_of_depth(
         matrix = jnp.asarray(camera.intrinsics, depth.dtype)
         depth, missed = undistort_image(depth, jnp.asarray(missed), place, matrix, camera.distortion)
     gap = 1 if is_traced(depth) else gap_of(np.isfinite(depth) & (np.asarray(depth) > 0))
-    # The rounding is an array, so that a program compiled for one unit runs for any.
+    # The rounding is an array, so that a program compiled for one unit of depth runs for any unit.
     image = depth, jnp.asarray(missed), camera, pose, stride, jnp.asarray(rounding, depth.dtype), box, gap
     points, normals, mask, missed, inside, sight = _oriented(*image)
     if box is not None and not is_traced(points):
@@ -92,8 +93,11 @@ def _oriented(
     Bool[Array, " n"],
     Float[Array, " n"],
 ]:
-    """Points, normals, whether each is valid, whether each ray met nothing in the box, whether each point lies in the
-    box, and how far each ray saw."""
+    """Return the points, their normals, and four arrays with one entry per ray.
+
+    These arrays are: whether the point is valid, whether the ray is missed (it met nothing, or it crossed the box),
+    whether the point lies in the box, and how far the ray saw.
+    """
     rows, strided = slice(stride // 2, None, stride), camera.strided(stride)
     samples = _rows_of(depth, jnp.isfinite(depth) & (depth > 0), stride, gap)[0]
     sight = jnp.where(samples > 0, samples, jnp.inf).reshape(-1) * jnp.linalg.norm(strided.pixel_directions(), axis=-1)
@@ -120,9 +124,10 @@ def _oriented(
 def _rows_of(
     depth: Float[Array, "h w"], valid: Bool[Array, "h w"], stride: int, gap: int
 ) -> tuple[Float[Array, "k l"], Bool[Array, "k l"], Float[Array, "k l"]]:
-    """Depth of every `stride`-th row and column, whether it is valid, and the least depth that the ray may have met.
+    """Return, for every `stride`-th row and column, the depth, whether it is valid, and a lower bound on the depth.
 
-    The depth is the sample of the pixel's block. With gaps, the least depth includes the blocks beside it.
+    The depth is the sample of the pixel's block (see `gaps`). The bound is the least sample of this block and, if the
+    image has gaps, of the eight blocks around it.
     """
     samples, is_sample, _ = block_samples(depth, valid, gap)
     nearest = jnp.where(is_sample, samples, jnp.inf)
@@ -134,7 +139,7 @@ def _rows_of(
 
 
 def _depth_behind(box: Box, camera: Camera, pose: Pose) -> Float[Array, " n"]:
-    """The depth at which each ray leaves a box; minus infinity for a ray that misses the box."""
+    """Return the depth at which each ray leaves a box; minus infinity for a ray that misses the box."""
     directions = jnp.matmul(camera.pixel_directions(), pose.rotation.T, precision="highest")
     enter, leave = ray_interval(list(pose.position), list(directions.T), box.low, box.high)
     return jnp.where(leave > jnp.maximum(enter, 0.0), leave, -jnp.inf)
@@ -143,7 +148,9 @@ def _depth_behind(box: Box, camera: Camera, pose: Pose) -> Float[Array, " n"]:
 def without_sentinels(
     depth: Real[np.ndarray, "height width"], camera: Camera, pose: Pose, scale: float, box: Box
 ) -> Real[np.ndarray, "height width"]:
-    """The image with zeros in place of sentinels, the same that `points_of_depth` finds with this box.
+    """Return the image with zeros in place of the sentinels that `points_of_depth` finds with this box.
+
+    A sentinel is a value that stands for "not measured" (see `sentinels`).
 
     **Raises:** `ValueError` if the box lies behind the camera.
     """
@@ -158,9 +165,9 @@ def _is_sentinel(
 
 
 def _depths_of(box: Box, pose: Pose) -> tuple[float, float]:
-    """The least and greatest depth of a box, both positive.
+    """Return the least and greatest depth of a box. Both are made positive.
 
-    **Raises:** `ValueError` if it lies behind the camera.
+    **Raises:** `ValueError` if the box lies behind the camera.
     """
     corners = np.stack(np.meshgrid(*zip(box.low, box.high, strict=True)), axis=-1).reshape(-1, 3)
     ahead = (corners - np.asarray(pose.position)) @ np.asarray(pose.forward)
@@ -174,10 +181,13 @@ def _depths_of(box: Box, pose: Pose) -> tuple[float, float]:
 
 
 def _check_meaning(depth: Float[np.ndarray, " valid"], camera: Camera, ahead: tuple[float, float] | None) -> None:
-    """Check the units of the measured depths: at least one in a thousand of those in the camera's range must be of the
-    order of the box's. The others may be a far background, or glare.
+    """Check that the units of the measured depths can be right.
 
-    - `ahead`: least and greatest depth of the box.
+    The depths must not all be nearer or all be farther than the camera's range. At least 0.1 % of the depths in the
+    range must be of the order of magnitude of the box's depths. The other depths may come from a far background or from
+    glare.
+
+    - `ahead`: least and greatest depth of the box; None if there is no box.
 
     **Raises:** `ValueError` if the units must be wrong.
     """
@@ -202,7 +212,7 @@ def _check_meaning(depth: Float[np.ndarray, " valid"], camera: Camera, ahead: tu
 
 
 def _warn_of_nothing_inside(points: Float[np.ndarray, "valid 3"], inside: Bool[np.ndarray, " n"], box: Box) -> None:
-    """Warn if no point lies in the box. The image may show nothing of the object, but more often its pose is wrong."""
+    """Warn if no point lies in the box. The image may not show the object, but more often its pose is wrong."""
     if len(points) and not inside.any():
         low, high = points.min(axis=0), points.max(axis=0)
         warnings.warn(
