@@ -4,9 +4,9 @@
     cov(f(x), v_d(y))   = sum_n s(n) n_d / |n|^2 sin(n.(x - y))
     cov(f(x), f(y))     = sum_n s(n) / |n|^2 cos(n.(x - y)),   n != 0
 
-If the prior is a sum of spectra, one for each lengthscale, each covariance is the sum of theirs.
+The prior may be a sum of spectra, one for each lengthscale. Each covariance is then a sum over these spectra.
 
-For one spectrum the first covariance is a product over the axes. The other two are a short sum of such products, by the
+For one spectrum, the first covariance is a product over the axes. The other two are short sums of such products, by the
 trapezoidal rule for 1 / r = int exp(-r e^u) e^u du (Beylkin and Monzon 2010). This avoids an array over the (2 L + 1)^3
 frequencies.
 """
@@ -28,13 +28,13 @@ Spectra = Float[Array, "*scales l_plus_1"]
 
 @functools.partial(jax.jit, static_argnames=("nu", "truncation"))
 def circle_spectrum(nu: float, lengthscale: Scalar, variance: Scalar, truncation: int) -> Float[Array, "l_plus_1"]:
-    """The Matern spectrum s1(0), ..., s1(L) on the circle.
+    """Compute the Matern spectrum s1(0), ..., s1(L) on the circle.
 
     s1(n) = variance w(n) / sum_{m in Z} w(m),   w(n) = (2 nu / ell^2 + 4 pi^2 n^2)^-(nu + 1/2)
 
-    So sum_{n in Z} s1(n) cos(n t) is the Matern kernel on the circle, with value `variance` at t = 0 (Borovitskiy et
-    al. 2020). The sum over m has a closed form and includes all integers. So truncation removes the variance of higher
-    frequencies from the kernel, and does not spread it over the kept ones.
+    The function sum_{n in Z} s1(n) cos(n t) is the Matern kernel on the circle, with value `variance` at t = 0
+    (Borovitskiy et al. 2020). The sum over m has a closed form and includes all integers. Truncation therefore removes
+    the variance of frequencies above L from the kernel, and does not move it to lower frequencies.
 
     - `nu`: smoothness, one of 1/2, 3/2, 5/2.
     - `lengthscale`: ell, in units of the circumference.
@@ -47,9 +47,9 @@ def circle_spectrum(nu: float, lengthscale: Scalar, variance: Scalar, truncation
 
 
 def _lattice_sum(nu: float, a: Float[Array, ""]) -> Float[Array, ""]:
-    """sum_{m in Z} (1 + (2 pi m / a)^2)^-p for p = nu + 1/2.
+    """Return sum_{m in Z} (1 + (2 pi m / a)^2)^-p for p = nu + 1/2.
 
-    It is a coth(a/2) / 2 for p = 1. Larger p follow by derivatives with respect to a.
+    For p = 1 the sum is a coth(a/2) / 2. The sums for larger p follow by differentiation with respect to a.
     """
     decay = jnp.exp(-a)
     coth = (1.0 + decay) / (1.0 - decay)
@@ -62,7 +62,7 @@ def _lattice_sum(nu: float, a: Float[Array, ""]) -> Float[Array, ""]:
 
 
 def normal_covariance(x: Float[Array, "n 3"], y: Float[Array, "m 3"], spectrum: Spectra) -> Float[Array, "n m"]:
-    """cov(v_d(x), v_d(y)), the same for each component d. Different components are independent."""
+    """Return cov(v_d(x), v_d(y)), which is equal for all components d. The components are independent."""
     return _over_scales(lambda of_scale: _normal_covariance(x, y, of_scale), spectrum)
 
 
@@ -78,7 +78,7 @@ def _normal_covariance(x, y, spectrum: Spectrum):
 def function_normal_covariance(
     x: Float[Array, "n 3"], y: Float[Array, "m 3"], spectrum: Spectra
 ) -> Float[Array, "3 n m"]:
-    """cov(f(x), v_d(y)) for d = 1, 2, 3."""
+    """Return cov(f(x), v_d(y)) for d = 1, 2, 3."""
 
     def products(damped):
         odd_spectrum = damped * jnp.arange(damped.size, dtype=damped.dtype)
@@ -90,7 +90,7 @@ def function_normal_covariance(
 
 
 def function_covariance(x: Float[Array, "n 3"], y: Float[Array, "m 3"], spectrum: Spectra) -> Float[Array, "n m"]:
-    """cov(f(x), f(y))."""
+    """Return cov(f(x), f(y))."""
 
     def of_one(spectrum):
         return _over_squared_frequency(lambda damped: _normal_covariance(x, y, damped) - spectrum[0] ** 3, spectrum)
@@ -99,13 +99,13 @@ def function_covariance(x: Float[Array, "n 3"], y: Float[Array, "m 3"], spectrum
 
 
 def function_variance(spectrum: Spectra) -> Float[Array, ""]:
-    """Var f(x) = sum_n s(n) / |n|^2, the same everywhere."""
+    """Return Var f(x) = sum_n s(n) / |n|^2, which is equal for all x."""
     origin = jnp.zeros((1, 3), dtype=spectrum.dtype)
     return function_covariance(origin, origin, spectrum)[0, 0]
 
 
 def mode_variance(spectrum: Spectra) -> Float[Array, "a a a"]:
-    """Prior variances of the coefficients of each component of v, see `surfaces/trigonometric.py`."""
+    """Return the prior variances of the coefficients of a component of v, see `surfaces/trigonometric.py`."""
 
     def of_one(spectrum):
         variance = basis_variance(spectrum)
@@ -115,14 +115,17 @@ def mode_variance(spectrum: Spectra) -> Float[Array, "a a a"]:
 
 
 def _even(x: Float[Array, " n"], y: Float[Array, " m"], spectrum: Spectrum) -> Float[Array, "n m"]:
-    """sum_{n in Z} s1(n) cos(n (x - y))."""
+    """Return sum_{n in Z} s1(n) cos(n (x - y))."""
     truncation = spectrum.shape[0] - 1
     weighted = circle_basis(x, truncation) * basis_variance(spectrum)
     return jnp.matmul(weighted, circle_basis(y, truncation).T, precision="highest")
 
 
 def _odd(x: Float[Array, " n"], y: Float[Array, " m"], spectrum: Spectrum) -> Float[Array, "n m"]:
-    """sum_{n in Z} s1(|n|) sign(n) sin(n (x - y)), by sin(n (x - y)) = sin(n x) cos(n y) - cos(n x) sin(n y)."""
+    """Return sum_{n in Z} s1(|n|) sign(n) sin(n (x - y)).
+
+    It uses sin(n (x - y)) = sin(n x) cos(n y) - cos(n x) sin(n y).
+    """
     truncation = spectrum.shape[0] - 1
     sign = jnp.sign(jnp.arange(-truncation, truncation + 1))
     # Reversing the basis swaps the sine and the cosine of each frequency.
@@ -141,21 +144,24 @@ def _over_squared_frequency(products, spectrum: Spectrum):
         rate, weight = node
         return total + weight * products(spectrum * jnp.exp(-rate * frequency**2)), None
 
-    # A loop, because XLA would hold all unrolled terms in memory at once.
+    # Use a loop, because XLA would hold all unrolled terms in memory at once.
     nodes = tuple(jnp.asarray(a, dtype=spectrum.dtype) for a in _inverse_quadrature(spectrum))
     shape = jax.eval_shape(products, spectrum)
     return jax.lax.scan(add, jnp.zeros(shape.shape, shape.dtype), nodes)[0]
 
 
 def _inverse_quadrature(spectrum: Spectrum) -> tuple[np.ndarray, np.ndarray]:
-    """Rates t_q and weights w_q with 1 / r = sum_q w_q exp(-t_q r) for 1 <= r <= 3 L^2, in the dtype's precision."""
+    """Return rates t_q and weights w_q with 1 / r = sum_q w_q exp(-t_q r) for 1 <= r <= 3 L^2.
+
+    The equation holds to the precision of the spectrum's dtype.
+    """
     tolerance = 10 * float(jnp.finfo(spectrum.dtype).eps)
     largest = 3.0 * (spectrum.shape[0] - 1) ** 2
     step = math.pi**2 / math.log(10.0 / tolerance)
     low, high = math.log(tolerance / largest), math.log(math.log(1.0 / tolerance))
     rate = np.exp(np.arange(low, high + step, step))
     weight = step * rate
-    # The slowest rates merge into one exponential with their weighted mean, which is accurate to third order.
+    # Merge the slowest rates into one exponential at their weighted mean rate, which is accurate to third order.
     slow = rate < tolerance ** (1 / 3) / largest
     together = weight[slow].sum()
     mean = (weight * rate)[slow].sum() / together

@@ -11,31 +11,34 @@ Rows = Float[Array, "n *columns"]
 class CholeskyFactor(eqx.Module):
     """The lower triangular C with A = C C^T.
 
-    - `upper`: C^T. Its row-major memory is the column-major C that LAPACK takes. A row-major C would be transposed
-      first, which takes ten times as long as a solve.
+    - `upper`: C^T. C^T in row-major order is C in column-major order, which LAPACK requires. A row-major C would have
+      to be transposed first, which takes ten times as long as a solve.
     """
 
     upper: Float[Array, "n n"]
 
     @classmethod
     def of(cls, matrix: Float[Array, "n n"]) -> "CholeskyFactor":
-        """Factorise a symmetric A, reading one triangle. Not finite if A is not positive definite."""
+        """Factorise a symmetric matrix A, of which only one triangle is read.
+
+        The factor is not finite if A is not positive definite.
+        """
         return cls(jnp.linalg.cholesky(matrix.T, symmetrize_input=False).T)
 
     def leading(self, size: int) -> "CholeskyFactor":
-        """The factor of the first `size` rows and columns of A."""
+        """Return the factor of the first `size` rows and columns of A."""
         return CholeskyFactor(self.upper[:size, :size])
 
     def whiten(self, rows: Rows) -> Rows:
-        """Apply C^-1 to columns."""
+        """Apply C^-1 to each column of `rows`."""
         return solve_triangular(self.upper.T, rows, lower=True)
 
     def unwhiten(self, rows: Rows) -> Rows:
-        """Apply C^-T to columns."""
+        """Apply C^-T to each column of `rows`."""
         return solve_triangular(self.upper.T, rows, lower=True, trans="T")
 
     def solve(self, rows: Rows) -> Rows:
-        """Apply A^-1 to columns."""
+        """Apply A^-1 to each column of `rows`."""
         return self.unwhiten(self.whiten(rows))
 
     @property

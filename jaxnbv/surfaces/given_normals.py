@@ -1,4 +1,4 @@
-"""The posterior p(f | D) under `GeometricSPSR`: closed forms, and the draws and solves of its samples.
+"""The posterior p(f | D) under `GeometricSPSR`: closed forms, and pathwise samples.
 
     solver   A^-1 for A = k(X, X) + noise^2 I, see `surfaces/solver.py`
     mean     Poisson(k(., X) A^-1 n)
@@ -31,7 +31,7 @@ from jaxnbv.surfaces.trigonometric import NonuniformTransform, solve_poisson
 
 
 class NormalDraws(NamedTuple):
-    """Draws from the prior: coefficients of v, and v(X) + eps."""
+    """Draws from the prior: coefficients of v, and the noisy values v(X) + eps at the data."""
 
     coefficients: Float[Array, "s 3 a a a"]
     at_data: Float[Array, "s n 3"]
@@ -40,7 +40,7 @@ class NormalDraws(NamedTuple):
 class GeometricSPSRPosterior(TrigonometricPosterior):
     """The posterior p(f | D) under `GeometricSPSR`, in closed form and as pathwise samples.
 
-    - `level`: mean over the data of E f(x_j). The surface is where f equals it.
+    - `level`: mean of E f(x_j) over the data. The surface is where f equals the level.
     - `mean_coefficients`: coefficients of E f, see `surfaces/trigonometric.py`.
     - `weights`: A^-1 n.
     - `solver`: A^-1, with the cloud, spectrum and noise that define A. For more than 16,384 points it uses conjugate
@@ -70,40 +70,43 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
     @on_torus
     @program
     def variance(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
-        """Var f(x) at points in scene coordinates: the prior variance minus the part that the data explain."""
+        """Return Var f(x) at points in scene coordinates.
+
+        This is the prior variance minus the variance that the data explain.
+        """
         x = jnp.asarray(x, dtype=self.weights.dtype)
         return jnp.maximum(function_variance(self.spectrum) - self.solver.explained_variance(x), 0.0)
 
     @on_torus
     @program
     def covariance(self, x: Float[AnyArray, "n 3"], y: Float[AnyArray, "m 3"]) -> Float[Array, "n m"]:
-        """Cov(f(x), f(y)) between points in scene coordinates, in one batch."""
+        """Return Cov(f(x), f(y)) between points in scene coordinates, computed in one batch."""
         x, y = (jnp.asarray(points, dtype=self.weights.dtype) for points in (x, y))
         explained = jnp.einsum("djn,djm->nm", *map(self.solver.whitened_cross, (x, y)), precision="highest")
         return function_covariance(x, y, self.spectrum) - explained
 
     def log_marginal_likelihood(self) -> Float[Array, ""]:
-        """log p(n_1, ..., n_N | x_1, ..., x_N), summed over the three components."""
+        """Return log p(n_1, ..., n_N | x_1, ..., x_N), summed over the three components."""
         count = self.cloud.count
         fit = jnp.sum(self.cloud.normals * self.weights)
         return -0.5 * (fit + 3.0 * self.solver.factor.log_determinant + 3.0 * count * jnp.log(2.0 * jnp.pi))
 
     def data_points(self) -> DataPoints:
-        """The points of the cloud, for gradients and for values."""
+        """Return the points of the cloud, both for gradients and for values."""
         points = fill_rows(self.cloud.points, self.cloud.mask)
         return DataPoints(points, points)
 
     def level_about(self, means: MeansAtData) -> Float[Array, " s"]:
-        """Mean over the data of the change that m_s makes to E f(x_j).
+        """Return the change of the level that each mean function m_s causes.
 
-        It is m_s(x_j) minus the effect of subtracting grad m_s from the normals. The level is linear in the normals, so
-        its slope is computed once for all means.
+        The change is the mean of m_s(x_j) over the data, minus the level given grad m_s as normals. The level is linear
+        in the normals, so its slope is computed once for all mean functions.
         """
         explained = jnp.einsum("snd,nd->s", means.gradients, _level_slope(self), precision="highest")
         return jnp.mean(means.values, axis=1, where=self.cloud.mask) - explained
 
     def prior_draws(self, key: PRNGKeyArray, num_samples: int) -> NormalDraws:
-        """Draw v and eps."""
+        """Draw v and eps from the prior."""
         scale, dtype = jnp.sqrt(mode_variance(self.spectrum)), self.weights.dtype
         modes, shape = scale.shape[0], self.cloud.points.shape
         transform = NonuniformTransform(self.cloud.points, self.truncation)
@@ -118,21 +121,21 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
         return shared_map(prior, (field_keys, noise_keys), scale, self.solver.noise, transform)
 
     def conditioned(self, draws: NormalDraws, means: MeansAtData) -> Float[Array, "s a a a"]:
-        """Coefficients of Poisson(v + k(., X) A^-1 (n - grad m - v(X) - eps))."""
+        """Return the coefficients of Poisson(v + k(., X) A^-1 (n - grad m - v(X) - eps))."""
         return self._reconstructed(draws.coefficients, self.solver.solve(self._residual(draws, means)))
 
     def _residual(self, draws: NormalDraws, means: MeansAtData) -> Float[Array, "s n 3"]:
-        """n - grad m - v(X) - eps, zero in unfilled rows."""
+        """Return n - grad m - v(X) - eps, with zeros in unfilled rows."""
         return jnp.where(self.cloud.mask[:, None], self.cloud.normals - means.gradients - draws.at_data, 0.0)
 
     def whitened_residual(self, draws: NormalDraws, means: MeansAtData) -> Float[Array, "s n 3"]:
-        """C^-1 (n - grad m - v(X) - eps), zero in unfilled rows."""
+        """Return C^-1 (n - grad m - v(X) - eps), with zeros in unfilled rows."""
         return self.solver.whiten(self._residual(draws, means))
 
     def updated(
         self, coefficients: Float[Array, "s 3 a a a"], whitened: Float[Array, "s n 3"]
     ) -> Float[Array, "s a a a"]:
-        """Coefficients of Poisson(v + k(., X) C^-T z) for each v and each whitened residual z."""
+        """Return the coefficients of Poisson(v + k(., X) C^-T z) for each sample's v and whitened residual z."""
         return self._reconstructed(coefficients, self.solver.unwhiten(whitened))
 
     def _reconstructed(
@@ -149,8 +152,8 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
 
 @program
 def given_normals(cloud: PointCloud, spectrum: Spectra, noise: Scalar) -> GeometricSPSRPosterior:
-    """The posterior p(f | D), with a solver that suits the cloud's capacity."""
-    # The contents of unfilled rows, which may be NaN, must not reach the products.
+    """Return the posterior p(f | D), with a solver that suits the cloud's capacity."""
+    # Unfilled rows may hold NaN, and become zero so that NaN does not spread through products.
     points, normals = (jnp.where(cloud.mask[:, None], rows, 0.0) for rows in (cloud.points, cloud.normals))
     cloud = PointCloud(points, normals, cloud.mask)
     solver = solver_of(cloud, spectrum, noise)
@@ -164,28 +167,34 @@ def given_normals(cloud: PointCloud, spectrum: Spectra, noise: Scalar) -> Geomet
 def reconstruct(
     transform: NonuniformTransform, weights: Float[Array, "n 3"], spectrum: Spectra
 ) -> Float[Array, "a a a"]:
-    """Coefficients of the f whose Laplacian is the divergence of the field k(., X) w, with w the weights."""
+    """Return the coefficients of f = Poisson(k(., X) w), where w are the weights.
+
+    - `transform`: transform at the points X.
+    """
     return solve_poisson(mode_variance(spectrum) * transform.adjoint(weights))
 
 
 def mean_at_data(
     transform: NonuniformTransform, coefficients: Float[Array, "a a a"], cloud: PointCloud
 ) -> Float[Array, ""]:
-    """Mean of f over the filled rows of a cloud, whose points are those of the transform."""
+    """Return the mean of f over the filled rows of a cloud.
+
+    - `transform`: transform at the points of the cloud.
+    """
     at_data = transform.evaluate(coefficients[None])[:, 0]
     return jnp.sum(jnp.where(cloud.mask, at_data, 0.0)) / jnp.sum(cloud.mask)
 
 
 @program
 def _level_slope(posterior: GeometricSPSRPosterior) -> Float[Array, "n 3"]:
-    """Derivative of the level with respect to n: A^-1 times the derivative with respect to A^-1 n."""
+    """Return the derivative of the level with respect to n: A^-1 times the derivative with respect to A^-1 n."""
     cloud, spectrum = posterior.cloud, posterior.spectrum
     transform = NonuniformTransform(cloud.points, posterior.truncation)
 
     def damped(fields):
         return solve_poisson(mode_variance(spectrum) * fields)
 
-    # `adjoint` and `evaluate` are each other's transposes, ten times as fast as the transposes that JAX derives.
+    # `adjoint` and `evaluate` are transposes of each other, and ten times as fast as the transposes that JAX derives.
     at_data = transform.adjoint(cloud.mask[:, None] / jnp.sum(cloud.mask))[0]
     fields = jax.ShapeDtypeStruct((3, *at_data.shape), at_data.dtype)
     slope = transform.evaluate(jax.linear_transpose(damped, fields)(at_data)[0])

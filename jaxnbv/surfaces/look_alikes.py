@@ -1,4 +1,4 @@
-"""Detection of parts in a bank with the same surface at the same size, which no scan can tell apart."""
+"""Detection of parts of a bank that no scan can distinguish, because they have the same surface and size."""
 
 import itertools
 import warnings
@@ -11,17 +11,16 @@ from scipy.spatial.transform import Rotation
 
 from jaxnbv.surfaces.mesh_shapes import MeshShape
 
-# Number of points at which signed distances are compared, before those far from the surface are dropped. Points within
-# this many cells of the grid are near.
+# Number of random points. Signed distances are compared at points within this many grid cells of the surface.
 _PROBES, _NEAR = 8192, 3.0
-# Rotations of a cube onto itself, because parts are often drawn along other axes.
+# The rotations of a cube onto itself are tested, because files often store equal parts along different axes.
 _TURNS = Rotation.create_group("O").as_matrix()
 
 
 def warn_of_look_alikes(
     shapes: Sequence[MeshShape], names: Sequence[str], sizes: Float[np.ndarray, " k"], stacklevel: int
 ) -> None:
-    """Warn of each pair of parts that are equal within a cell of their grids, up to turns by right angles.
+    """Warn of each pair of parts that are equal to within a grid cell, up to rotations by right angles.
 
     - `sizes`: world units per unit of each shape.
     """
@@ -50,9 +49,10 @@ class _Grid:
 
 
 def _difference(one: _Grid, other: _Grid, ratio: float) -> float:
-    """Largest difference between the distances to two centred shapes near the surface of `one`.
+    """Return the largest difference between the signed distances to two centred shapes, near the surface of `one`.
 
-    It is for the turn of `other` by right angles with the smallest difference, and infinite if the side lengths differ.
+    `other` is rotated by right angles such that the result is smallest. The result is infinite if the side lengths
+    differ in every rotation.
 
     - `ratio`: factor that scales `other` to the units of `one`.
     """

@@ -30,7 +30,7 @@ _T = TypeVar("_T")
 
 
 def as_tuple(values: Sequence[_T], name: str) -> tuple[_T, ...]:
-    """The values as a tuple.
+    """Return the values as a tuple.
 
     **Raises:** `ValueError` for values that are not iterable.
     """
@@ -41,11 +41,11 @@ def as_tuple(values: Sequence[_T], name: str) -> tuple[_T, ...]:
 
 
 def mesh_paths(meshes: str | Path | Sequence[str | Path | trimesh.Trimesh]) -> list[Path | trimesh.Trimesh]:
-    """The listed files and meshes, or all mesh files in a folder and its subfolders.
+    """Return the listed files and meshes, or all mesh files in a folder and its subfolders.
 
-    Mesh files are those with the extension of a format that trimesh reads.
+    A file counts as a mesh file if its extension belongs to a format that trimesh reads.
 
-    **Raises:** `ValueError` for a folder that does not exist or holds no mesh, or for an empty list.
+    **Raises:** `ValueError` for a folder that does not exist or contains no mesh, or for an empty list.
     """
     if isinstance(meshes, str | Path):
         folder = Path(meshes)
@@ -64,9 +64,9 @@ def mesh_paths(meshes: str | Path | Sequence[str | Path | trimesh.Trimesh]) -> l
 class MeshShape(NamedTuple):
     """A mesh as a shape of a bank, scaled so that its longest side is 2.5.
 
-    - `solid`: its signed distance.
-    - `extremes`: its farthest points in evenly spread directions.
-    - `from_mesh`: the similarity from the coordinates of the mesh to those of the shape.
+    - `solid`: signed distance of the shape.
+    - `extremes`: farthest vertices of the shape in evenly spread directions.
+    - `from_mesh`: the similarity transform from the coordinates of the mesh to the coordinates of the shape.
     """
 
     solid: Sampled
@@ -77,9 +77,9 @@ class MeshShape(NamedTuple):
 def shapes_of_meshes(
     paths: Sequence[Path | trimesh.Trimesh], resolution: int, sheet: float, num_extremes: int, up: str, progress: bool
 ) -> tuple[list[MeshShape], list[int]]:
-    """Shapes of the usable meshes, and their indices.
+    """Return the shapes of all usable meshes, and the indices of these meshes.
 
-    A `UserWarning` names each mesh that cannot be used, and the reason.
+    A `UserWarning` names each unusable mesh and the reason.
 
     **Raises:** `ValueError` if no mesh can be used.
     """

@@ -1,20 +1,22 @@
-"""Evidence of the rays of all views for placed parts, and the weights that follow from it.
+"""Evidence of the rays of all views for placed parts, and the weights that follow from this evidence.
 
-A ray that passes through empty space and meets the object at x tests a placed part with signed distance d twice: x
-should lie on its surface, and the ray should not pass through it:
+A ray passes through empty space and meets the object at x. For a placed part with signed distance d, it gives two
+tests: x should lie on the part's surface, and the ray should not pass through the part before x:
 
     L = sum over rays of  l(d(x)) + l(min over the ray of min(d, 0)),   l(r) = log(1 + r^2 / 2 tau^2)
 
-A ray that did not meet the object has only the second term. No term exceeds C = l(4 tau), so outliers count no more
-than that. tau is twice the noise of the sights, estimated from their third differences between pixels, but at least
-0.03 scene units, the accuracy of a part's surface on its grid. A sensor may miss a surface, so a ray without a return
-counts only if it goes through the part in space that was seen to be empty. Misfits add up, so weights sharpen with
-evidence. Rays that meet the object less than 0.12 apart have dependent errors, so they count as fewer:
+A ray that did not meet the object has only the second term. Each term is clipped at C = l(4 tau), which limits the
+effect of outliers. tau is twice the noise of the measured ray lengths, but at least 0.03 scene units, the accuracy of a
+part's surface on its grid. The noise is estimated from third differences of the lengths between pixels. A sensor may
+miss a surface. So a ray without a return counts only if it passes through the part in space that was seen to be empty.
+Misfits are summed over rays, so the weights become more decisive with more views. Rays that meet the object less than
+0.12 apart have dependent errors, so each counts as less than one ray:
 
     w_h proportional to exp(-L_h),   w_0 (none of these) to exp(-L_0),   L_0 = sum over rays of e_0 + o
 
-The sum for L_0 is over the rays that met the object. o is the excess over e_0 of l(d(x)) for the hypothesis that
-explains x best: a point that no hypothesis explains belongs to something else. At most a fifth of the points do.
+The sum for L_0 is over the rays that met the object. e_0 is a constant. o is the amount by which l(d(x)) exceeds e_0
+for the hypothesis that explains x best. It covers points that belong to a different object, which no hypothesis
+explains. The sum of o is limited, on the assumption that at most a fifth of the points are of this kind.
 """
 
 import math
@@ -37,8 +39,8 @@ from jaxnbv.surfaces.shape_bank import ShapeBank
 # Smallest tau in scene units, tau in standard deviations of the noise, and the residual with misfit C, in tau.
 LEAST_TAU, _TAU_OF_NOISE, _FAR = 0.03, 2.0, 4.0
 MOST = math.log1p(_FAR**2 / 2.0)
-# Standard deviation of a normal distribution divided by the lower quartile of its absolute value. On a thin object more
-# than half of the differences cross its edges, and a median would count them as noise.
+# Standard deviation of a normal distribution divided by the lower quartile of its absolute value. A median would not do
+# for a thin object: more than half of the differences cross the object's edges, and would count as noise.
 _BY_QUARTILE = 1.0 / 0.31864
 # Smallest stride along a ray in scene units, and number of strides.
 _STRIDE, _NUM_STRIDES = 0.04, 40
@@ -46,9 +48,10 @@ _STRIDE, _NUM_STRIDES = 0.04, 40
 _NUM_RAYS = 4096
 # Rays closer together than this on the object have dependent errors; scene units.
 _APART = 0.12
-# e_0. The right part leaves up to 0.15 per ray, and for most objects that are none of the parts 0.3 or more is left.
+# e_0. The mean misfit per ray is up to 0.15 for the correct part, and at least 0.3 for the best part if the object is
+# none of the parts (in most cases).
 _NONE_MISFIT = 0.25
-# Largest share of points that belong to something else.
+# Largest fraction of points that belong to a different object.
 _STRAY = 0.2
 
 
@@ -57,8 +60,8 @@ class Rays(NamedTuple):
 
     - `sight`: length of each ray in scene units; infinite without a return, zero for padding.
     - `is_object`: whether the ray ended on the object.
-    - `weight`: number of independent rays that each stands for. It is below one if rays are denser than `_APART`, and
-      higher if the ray represents others.
+    - `weight`: number of independent rays that the ray counts as. The weight is lower if rays are closer together than
+      `_APART`, and higher if the ray also represents rays that were left out.
     - `empty_nodes`: mask of the nodes of `grid` that were seen to be empty.
     - `tau`: the tau of l, in scene units.
     """
@@ -75,7 +78,7 @@ class Rays(NamedTuple):
     @classmethod
     @program
     def of(cls, observations: Observations, box: Box) -> "Rays | None":
-        """The rays that enter a box; None if the observations keep no looks."""
+        """Return the rays that enter a box, or None if the observations have no `looks`."""
         looks, poses = observations.looks, observations.poses
         if looks is None or observations.empty_nodes is None:
             return None
@@ -96,7 +99,7 @@ class Rays(NamedTuple):
             chosen.append(order.at[rows].get(mode="fill", fill_value=count))
             share = jnp.maximum(2.0 * jnp.sum(kind) / _NUM_RAYS, 1.0)
             weights.append(jnp.broadcast_to(share * jnp.minimum(weight_of(away, looks.camera), 1.0), rows.shape))
-        # Both kinds alternate, so that the first few rays contain both.
+        # Rays that met the object alternate with the other rays, so that the first few rays contain both kinds.
         picked, weight = (jnp.stack(parts, axis=1).reshape(-1) for parts in (chosen, weights))
         at = jnp.minimum(picked, count - 1)
         return cls(
@@ -111,7 +114,7 @@ class Rays(NamedTuple):
         )
 
     def first(self, count: int) -> "Rays":
-        """The first `count` rays, with their weights increased to stand for all."""
+        """Return the first `count` rays, with weights increased to represent all rays."""
         weight, holds = self.weight[:count], self.sight > 0
         for kind in (self.is_object & holds, ~self.is_object & holds):
             share = jnp.sum(kind) / jnp.maximum(jnp.sum(kind[:count]), 1)
@@ -123,9 +126,10 @@ class Rays(NamedTuple):
 def _noise_of(
     sight: Float[Array, "views rays"], is_object: Bool[Array, " all_rays"], camera: Camera
 ) -> Float[Array, ""]:
-    """Standard deviation of the noise of the sights on the object; zero without data.
+    """Return the standard deviation of the noise in the ray lengths on the object; zero without data.
 
-    It is estimated from third differences along rows and columns, which are near zero on a surface of low curvature.
+    The estimate uses third differences along rows and columns of the images. Without noise these differences are near
+    zero on a surface of low curvature.
     """
     images = jnp.where(is_object, sight.reshape(-1), jnp.nan).reshape(-1, camera.height, camera.width)
     changes = [jnp.diff(images, 3, axis=axis).reshape(-1) for axis in (1, 2)]
@@ -136,7 +140,7 @@ def _noise_of(
 
 @program
 def evidence(bank: ShapeBank, hypotheses: Hypotheses, rays: Rays) -> tuple[Float[Array, " h"], Float[Array, ""]]:
-    """L of each hypothesis, and L_0 of "none of these"."""
+    """Return L of each hypothesis, and L_0 of "none of these"."""
     points = rays.origins + jnp.where(rays.is_object, rays.sight, 0.0)[:, None] * rays.directions
 
     def of_part(one):
@@ -157,25 +161,28 @@ def evidence(bank: ShapeBank, hypotheses: Hypotheses, rays: Rays) -> tuple[Float
 
 
 def weight_of(away: Float[Array, ""], camera: Camera) -> Float[Array, ""]:
-    """Number of independent rays that a camera's ray stands for, at this distance from the object.
+    """Return the number of independent rays that one ray of a camera counts as, at this distance.
 
-    It is the ray's area on the object divided by the area within which rays have dependent errors.
+    The number is the ray's area on the object divided by the area within which rays have dependent errors.
+
+    - `away`: distance from the camera to the object, in scene units.
     """
     across, down = camera.focal_lengths
     return away**2 / (across * down * _APART**2)
 
 
 def misfit_of(distance: Float[Array, "*n"], tau: Float[Array, ""]) -> Float[Array, "*n"]:
-    """The misfit l of a residual in scene units, at most C."""
+    """Return the misfit l of residuals in scene units, clipped at C."""
     return jnp.minimum(jnp.log1p(distance**2 / (2.0 * tau**2)), MOST)
 
 
 def _deepest(
     distance: Callable[[Float[Array, "n 3"]], Float[Array, " n"]], rays: Rays
 ) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
-    """Smallest signed distance along each ray before its end, and whether the ray surely went there.
+    """Return the smallest signed distance along each ray before its end, and whether this distance counts.
 
-    The distance is zero if the ray passes beside the solid.
+    The distance is zero if the ray misses the solid. It counts for a ray with a return. For a ray without a return, it
+    counts if the position of the smallest distance was seen to be empty.
     """
 
     def stride(state, _):

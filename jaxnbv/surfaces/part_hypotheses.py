@@ -20,7 +20,7 @@ from jaxnbv.surfaces.shape_bank import ShapeBank
 NONE = "none of these"
 # Number of placements tried for each part.
 _NUM_STARTS = 1024
-# Without rays, for a cloud alone: number of rays that its points stand for, and the E of "none of these".
+# For a cloud alone, which has no rays: number of rays that its points count as, and the E of "none of these".
 _NUM_RAYS, _NONE_MISFIT = 0.3 * NUM_POINTS, 0.6
 
 
@@ -28,8 +28,9 @@ class PartHypotheses(eqx.Module):
     """Parts of a bank, each with a placement, the most likely first.
 
     - `bank`: the parts at true size, in scene units.
-    - `placed`: part and placement of each hypothesis. A part may have several; equal surfaces occur once.
-    - `weights`: probability of each hypothesis, and last of "none of these".
+    - `placed`: part and placement of each hypothesis. A part may have several placements. Of placements with equal
+      surfaces, only one counts.
+    - `weights`: probability of each hypothesis, followed by the probability of "none of these".
     - `tau`: scale of the distance between measured points and the surface, in scene units, see `part_evidence`.
     """
 
@@ -39,7 +40,7 @@ class PartHypotheses(eqx.Module):
     tau: Float[Array, ""]
 
     def surfaces(self, grid: Grid, count: int) -> GridSurface:
-        """The first `count` placed parts as surfaces on a grid, along a leading axis."""
+        """Return the first `count` placed parts as surfaces on a grid, along a leading axis."""
         return _on_grid(self, grid, count)
 
     @property
@@ -49,11 +50,11 @@ class PartHypotheses(eqx.Module):
 
     @property
     def part_weights(self) -> Float[Array, " k_and_none"]:
-        """Probability of each part of the bank, and last of "none of these"."""
+        """Probability of each part of the bank, followed by the probability of "none of these"."""
         return jnp.append(self.shape_weights, self.weights[-1])
 
     def names(self) -> dict[str, float]:
-        """Probability of each part by name, most likely first, including "none of these".
+        """Return the probability of each part by name, most likely first, including "none of these".
 
         Parts without a hypothesis are left out.
         """
@@ -72,9 +73,9 @@ class PartHypotheses(eqx.Module):
 
 
 def hypotheses_of(observations: Observations) -> PartHypotheses:
-    """The hypotheses about known parts in the observations.
+    """Return the hypotheses about known parts in the observations.
 
-    **Raises:** `ValueError` if there are none.
+    **Raises:** `ValueError` if the observations have no hypotheses.
     """
     if not isinstance(observations.hypotheses, PartHypotheses):
         raise InputError("there are no hypotheses: the planner knows no parts; use Planner.for_parts(bank)")
@@ -84,12 +85,12 @@ def hypotheses_of(observations: Observations) -> PartHypotheses:
 def identify(
     bank: ShapeBank, poses: ShapePoses, box: Box, observations: Observations, previous: PartHypotheses | None
 ) -> PartHypotheses:
-    """The hypotheses given the observations.
+    """Return the weighted hypotheses given the observations.
 
     - `bank`: the parts at true size, in scene units.
     - `poses`: the possible placements of the parts.
     - `box`: a box around the object.
-    - `previous`: the hypotheses of the previous view, which are kept while they fit.
+    - `previous`: the hypotheses after the previous view, which are kept while they fit; None for the first view.
     """
     targets = FitTargets.of(observations)
     placed = placeholder_hypotheses(targets.points.dtype) if previous is None else previous.placed

@@ -1,4 +1,4 @@
-"""The pose of the most likely part in the world, its covariance, and the equivalent poses of a symmetric part."""
+"""The world pose of the most likely part, its covariance, and the equivalent poses of a symmetric part."""
 
 import equinox as eqx
 import jax
@@ -17,24 +17,26 @@ from jaxnbv.surfaces.registration import FitTargets
 from jaxnbv.surfaces.shape_bank import Shape, values_and_gradients
 
 _NUM_PROBES = 4096
-# Step between the turns about each axis that are tested as symmetries of a part.
+# Step between the rotation angles about each axis that are tested as symmetries of a part.
 _STEP = np.radians(5.0)
-# Prior standard deviations of a turn (radians) and a shift (scene units), for directions that the points do not fix.
+# Prior standard deviations of a rotation (radians) and a shift (scene units). They matter in directions that the points
+# do not constrain.
 _UNKNOWN_TURN, _UNKNOWN_SHIFT = np.pi / np.sqrt(3.0), 1.0
-# Smallest error of the points in scene units, the accuracy of a part's surface on its grid. Standard deviation of a
-# normal distribution divided by the median of its absolute value.
+# Smallest error of the points in scene units, which is the accuracy of a part's surface on its grid; and the standard
+# deviation of a normal distribution divided by the median of its absolute value.
 _LEAST_ERROR, _BY_MEDIAN = 0.005, 1.4826
 
 
 class ObjectPose(eqx.Module):
-    """Pose of a part in the world.
+    """World pose of a part.
 
     - `name`: name of the part.
     - `matrix`: rigid motion from the coordinates of the part's mesh, in world units, to the world.
-    - `covariance`: covariance of a turn (rotation vector about the part's centre, radians, world axes) and of the
-      centre's position (world units). It reflects the errors of the points, and assumes that the part is right.
-    - `alternatives`: the equivalent matrices of a symmetric part, `matrix` first. A part that is round about an axis
-      has 72 of them, five degrees apart, or 144 if its ends are equal.
+    - `covariance`: joint covariance of the rotation (rotation vector about the part's centre, radians, world axes) and
+      of the centre's position (world units). It includes the errors of the points, and assumes that the object is this
+      part.
+    - `alternatives`: all equivalent matrices of a symmetric part, starting with `matrix`. A part that is round about an
+      axis has 72 alternatives, five degrees apart, or 144 if its two ends are equal.
     """
 
     name: str
@@ -44,7 +46,7 @@ class ObjectPose(eqx.Module):
 
 
 def object_pose(hypotheses: PartHypotheses, observations: Observations, frame: Frame) -> ObjectPose:
-    """The pose of the most likely part, in the world of a frame."""
+    """Return the pose of the most likely part in the world of a frame."""
     part, placement = hypotheses.most_likely
     bank = hypotheses.bank
     shape = bank.shape(jnp.asarray(part))
@@ -59,9 +61,10 @@ def object_pose(hypotheses: PartHypotheses, observations: Observations, frame: F
 
 
 def surface_error(hypotheses: PartHypotheses, observations: Observations) -> float:
-    """Expected error of the most likely part's surface, in scene units: root mean square over its surface.
+    """Return the expected error of the most likely part's surface: root mean square in scene units.
 
-    It includes the errors of the points and the differences from the other hypotheses.
+    The error includes the errors of the points, and the distances to the surfaces of the other hypotheses, weighted by
+    their probabilities.
     """
     part, placement = hypotheses.most_likely
     shape = hypotheses.bank.shape(jnp.asarray(part))
@@ -80,16 +83,16 @@ def surface_error(hypotheses: PartHypotheses, observations: Observations) -> flo
 
 @program
 def distances_to(hypotheses: PartHypotheses, points: Float[Array, "p 3"]) -> Float[Array, "h p"]:
-    """Signed distances of points to each hypothesis."""
+    """Return the signed distances of points to the placed part of each hypothesis."""
     solids = hypotheses.bank.shape(hypotheses.placed.shape).solid
     return jax.lax.map(lambda placed: placed[1].distance(placed[0], points), (solids, hypotheses.placed.placement))
 
 
 def symmetries(shape: Shape) -> Float[np.ndarray, "n 3 3"]:
-    """Rotations about a shape's centre that leave it unchanged, the identity first.
+    """Return the rotations about a shape's centre that leave the shape unchanged, the identity first.
 
-    The candidates are turns by multiples of five degrees about each axis, the turns of a cube, and products of one of
-    each.
+    Tested are rotations by multiples of five degrees about each axis, and the rotations of a cube onto itself. The
+    result also contains products of a symmetry of the first kind and a symmetry of the second kind.
     """
     vectors = [angle * axis for axis in np.eye(3) for angle in np.arange(0.0, 2.0 * np.pi, _STEP)]
     about_axes, of_cube = Rotation.from_rotvec(vectors).as_matrix(), Rotation.create_group("O").as_matrix()
@@ -116,10 +119,10 @@ def _largest_change(shape: Shape, turns: Float[Array, "n 3 3"], probes: Float[Ar
 
 
 def _covariance(shape: Shape, placement: Placement, targets: FitTargets) -> Float[np.ndarray, "6 6"]:
-    """Covariance of a turn about the part's centre and of its shift, in the scene.
+    """Return the joint covariance of the rotation about the part's centre and of the shift, in the scene.
 
-    It is the inverse of J^T J / s^2 plus a broad prior, with J the derivative of the points' distances and s their
-    error.
+    The covariance is (J^T J / s^2 + P)^-1, where J is the derivative of the distances from the points to the part, s
+    the standard deviation of these distances, and P the precision of a broad prior.
     """
     distance, gradient = values_and_gradients(lambda x: placement.distance(shape.solid, x), targets.points)
     mask = np.asarray(targets.mask)
@@ -138,6 +141,6 @@ def _matrix(linear: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"]) -> 
 
 
 def _rigid(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """The matrix with its linear part, which has rounding errors, replaced by the nearest rotation."""
+    """Return the matrix with its linear part, which has rounding errors, replaced by the nearest rotation."""
     left, _, right = np.linalg.svd(matrix[:3, :3])
     return _matrix(left @ right, matrix[:3, 3])

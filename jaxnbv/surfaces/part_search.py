@@ -1,9 +1,10 @@
-"""Search for parts of known size and their placements that fit the scan, with an equal share of tries for each part.
+"""Search for parts of known size, and their placements, that fit the scan.
 
-Each part is tried in many placements, and its best few are refined by Gauss-Newton steps on the misfit E of
-`registration`. The best distinct results are refined again on more points, together with the hypotheses of the previous
-view. Finally all parts are tried in each of the best placements so far. So look-alikes do not crowd a part out, and a
-part is also tried in the placements that its look-alikes reached. The time grows linearly with the number of parts.
+Each part is tried in the same number of placements, and its best few placements are refined by Gauss-Newton steps on
+the misfit E of `registration`. The best distinct results of each part are refined again on more points, together with
+the hypotheses of the previous view. Finally all parts are tried in each of the best placements so far. The search keeps
+results for every part, so similar parts cannot displace a part. The last stage also tries a part in placements that
+were reached only by similar parts. The time grows linearly with the number of parts.
 """
 
 import dataclasses
@@ -33,20 +34,23 @@ from jaxnbv.surfaces.shape_bank import ShapeBank
 NUM_HYPOTHESES = 32
 # Number of positions tried for each rotation.
 _PLACES = 4
-# Starts per part, points and steps of the first refinement, and of the second. Then the number of placements tried with
-# all parts, and the steps of the last refinement.
+# Starts per part, points and steps, for the first and for the second refinement; number of placements tried with all
+# parts; steps of the last refinement.
 _COARSE, _FINE, _SHARED, _LAST = (10, 48, 5), (4, 128, 10), 16, 3
-# Placements with nearly equal rotations count as one until the last stage if their shifts differ by less than this, in
-# scene units.
+# Before the last stage, placements with nearly equal rotations count as equal if their shifts differ by less than this,
+# in scene units.
 _MOVE = 0.15
-# How far a part may extend beyond the box, and the surface difference below which placements of a part count as one, in
-# scene units.
+# How far a part may extend beyond the box, and the difference of surfaces below which placements of a part count as
+# equal, in scene units.
 _ROOM, SAME = 0.2, 0.03
 _NUM_PROBES, _FEW_RAYS = 4096, 1024
 
 
 def placeholder_hypotheses(dtype: Any) -> Hypotheses:
-    """Placeholder hypotheses for the first view: the first part unmoved, a harmless extra start."""
+    """Return placeholders for the hypotheses of the view before the first.
+
+    They are the first part at the identity placement with infinite misfit, which are harmless extra starts.
+    """
     still = Placement(jnp.eye(3, dtype=dtype), jnp.zeros(3, dtype), jnp.ones(3, dtype))
     one = Hypotheses(jnp.zeros((), int), still, jnp.asarray(jnp.inf, dtype), jnp.asarray(False))
     return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (NUM_HYPOTHESES, *leaf.shape)), one)
@@ -62,10 +66,10 @@ def search_parts(
     previous: Hypotheses,
     num_starts: int,
 ) -> Hypotheses:
-    """The 32 placed parts of smallest misfit, best first.
+    """Return the 32 placed parts of smallest misfit, best first.
 
-    The misfit is the evidence of the rays, or E without rays. Placements with equal surfaces, for example by symmetry,
-    count once.
+    The misfit is L of the rays (see `part_evidence`), or E without rays. If placements of a part have equal surfaces,
+    for example by symmetry, all but the best get an infinite misfit.
 
     - `bank`: parts at true size, in scene units.
     - `box`: a box around the object.
@@ -94,9 +98,9 @@ def search_parts(
 
 
 def _of_each(hypotheses: Hypotheses, num_shapes: int) -> Hypotheses:
-    """Split hypotheses by shape: the second axis has those of one shape.
+    """Reshape hypotheses to a first axis of shapes, and a second axis of the hypotheses of one shape.
 
-    They must be sorted by shape, with equally many for each.
+    The hypotheses must be sorted by shape, with the same number for each shape.
     """
     return jax.tree.map(lambda rows: rows.reshape(num_shapes, -1, *rows.shape[1:]), hypotheses)
 
@@ -106,9 +110,9 @@ def _flat(hypotheses: Hypotheses) -> Hypotheses:
 
 
 def _apart(hypotheses: Hypotheses, count: int) -> Hypotheses:
-    """The best `count` hypotheses with distinct placements, whatever their shape.
+    """Return the best `count` hypotheses with distinct placements, regardless of their shapes.
 
-    If there are too few, others fill up with infinite misfit.
+    If there are fewer distinct placements, the remaining rows are hypotheses with infinite misfit.
     """
     ordered = hypotheses.best(len(hypotheses.misfit))
     shift = ordered.placement.shift
@@ -118,16 +122,16 @@ def _apart(hypotheses: Hypotheses, count: int) -> Hypotheses:
 
 
 def _starts(bank: ShapeBank, prior: Prior, targets: FitTargets, num_starts: int) -> Placement:
-    """Placements of each shape along a second axis: rotations, each at a few positions.
+    """Return the start placements of each shape along a second axis: rotations, each at a few positions.
 
-    The shape spans the scan at each of them. If the whole object was in view, there is one such position across the
-    line of sight, and along it one with the scan on the shape's front. If a view shows a patch, positions are spread
-    over all that contain the patch.
+    At each position the bounding box of the shape contains the scan, if the box is large enough. The first position of
+    a rotation centres the scan across the line of sight, and puts it on the shape's front. The other positions are
+    spread over all positions that contain the scan, so they differ much if the scan is a small patch of the shape.
     """
     dtype = targets.points.dtype
     rotations = jnp.asarray(prior.poses.rotations_of(len(bank), max(1, num_starts // _PLACES)), dtype)
     count = rotations.shape[1]
-    # A low-discrepancy sequence (Roberts 2018). The first position is the middle, with the scan on the front.
+    # A low-discrepancy sequence (Roberts 2018). The first position centres the scan and puts it on the shape's front.
     steps = np.array([0.8191725134, 0.6710436067, 0.5497004779])
     spread = (0.5 + np.arange(1, count * (_PLACES - 1) + 1)[:, None] * steps) % 1.0
     middle = np.tile([[[0.5, 0.5, 1.0]]], (1, count, 1))
@@ -157,7 +161,7 @@ def _starts(bank: ShapeBank, prior: Prior, targets: FitTargets, num_starts: int)
 
 
 def _axes_of_sight(targets: FitTargets) -> Float[Array, "3 3"]:
-    """Two directions across the line of sight, and the direction to the sensor: the mean of the normals."""
+    """Return two directions across the line of sight, and the direction to the sensor (mean of the normals)."""
     mean = jnp.sum(jnp.where(targets.mask[:, None], targets.normals, 0.0), axis=0)
     length = jnp.linalg.norm(mean)
     ahead = jnp.where(length > 0, mean / jnp.where(length > 0, length, 1.0), jnp.eye(3, dtype=mean.dtype)[2])
@@ -167,7 +171,10 @@ def _axes_of_sight(targets: FitTargets) -> Float[Array, "3 3"]:
 
 
 def _distinct(bank: ShapeBank, box: Box, hypotheses: Hypotheses) -> Hypotheses:
-    """The hypotheses, with `is_mode` false and infinite misfit if a better one has the same surface."""
+    """Mark each hypothesis for which a better hypothesis of the same part has the same surface.
+
+    Returns the hypotheses with `is_mode` false and infinite misfit for these.
+    """
     dtype = hypotheses.misfit.dtype
     low, high = jnp.asarray(box.low, dtype) - _ROOM, jnp.asarray(box.high, dtype) + _ROOM
     probes = low + (high - low) * jnp.asarray(np.random.default_rng(0).random((_NUM_PROBES, 3)), dtype)

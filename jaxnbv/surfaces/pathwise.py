@@ -1,14 +1,14 @@
 """Gaussian posteriors over band-limited functions: closed forms, and samples by pathwise conditioning.
 
-A sample is a draw of the prior plus a correction at the data (Matheron's rule; Wilson et al. 2020). It can be drawn
-about mean functions m_1, ..., m_S as well as about zero. The prior is then f_s = m_s + g, with g of mean zero:
+A sample is a draw of the prior plus a correction at the data (Matheron's rule; Wilson et al. 2020). Samples can have
+mean functions m_1, ..., m_S in place of zero. The prior is then f_s = m_s + g, with g of mean zero:
 
     data     g has the normals n_j - grad m_s(x_j) and the values z_k - m_s(y_k), in place of n_j and z_k
-    scale    the draws of the prior and of the noise are multiplied by rho_s. This leaves the posterior mean unchanged,
-             and the covariance becomes rho_s^2 times the posterior's
+    scale    the draws of the prior and of the noise are multiplied by rho_s. The posterior mean stays the same, and the
+             posterior covariance is multiplied by rho_s^2
     sample   f_s = m_s + g_s
 
-All covariances are those of g, so all means share one factorisation, and each adds a right-hand side.
+The covariances do not depend on m_s. So all mean functions share one factorisation, and each adds a right-hand side.
 """
 
 from abc import abstractmethod
@@ -28,7 +28,7 @@ from jaxnbv.surfaces.trigonometric import TrigonometricFields
 
 
 class MeansAtData(NamedTuple):
-    """Gradients of mean functions at a posterior's normals, and their values at its value points."""
+    """Gradients and values of mean functions at the `DataPoints` of a posterior."""
 
     gradients: Float[Array, "s n 3"]
     values: Float[Array, "s m"]
@@ -90,9 +90,9 @@ class TrigonometricPosterior(SurfacePosterior):
     @on_torus
     @program
     def probability_inside(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
-        """P(f(x) < level) = Phi((level - E f(x)) / sqrt(Var f(x))) at points in scene coordinates.
+        """Return P(f(x) < level) = Phi((level - E f(x)) / sqrt(Var f(x))) at points in scene coordinates.
 
-        It costs as much as the variance.
+        The cost is that of the variance.
         """
         variance = self.variance(x)
         deviation = jnp.sqrt(jnp.maximum(variance, jnp.finfo(variance.dtype).tiny))
@@ -110,13 +110,13 @@ class TrigonometricPosterior(SurfacePosterior):
     ) -> FieldsAbout:
         """Draw one sample m_s + g_s of f about each of S mean functions.
 
-        g_s is a sample given the normals n - grad m_s and the values minus those of m_s. A mean of zero gives the
-        samples of `sample` with the same key. Samples use the level of this posterior, whatever the level of the mean:
-        a surface is where `fields(x) == posterior.level`.
+        g_s is a sample given the normals n - grad m_s and the values z - m_s(y). If all mean functions are zero, the
+        result equals that of `sample` with the same key. For any mean function, the surface of a sample is where
+        `fields(x) == posterior.level`.
 
-        - `means`: any functions that are differentiable once.
-        - `noise_scale`: rho, one number, or one for each mean function. The samples' standard deviation is rho times
-          that of the posterior. 0 gives E f about each m_s, whatever the key.
+        - `means`: the mean functions m_s, which must be differentiable once.
+        - `noise_scale`: rho, a single number or one number for each mean function. Samples have rho times the
+          posterior's standard deviation. With 0, each sample is the posterior mean about m_s, for any key.
 
         **Raises:** `ValueError` for means that are not `Fields`, a noise scale that is negative or not finite, a number
         of noise scales that differs from the number of mean functions, or means that are not finite at the data.
@@ -150,19 +150,25 @@ class TrigonometricPosterior(SurfacePosterior):
 
     @abstractmethod
     def data_points(self) -> DataPoints:
-        """The points at which this posterior needs gradients and values of mean functions."""
+        """Return the points at which this posterior needs gradients and values of mean functions."""
 
     @abstractmethod
     def level_about(self, means: MeansAtData) -> Float[Array, " s"]:
-        """Difference between the level about each mean function and the level about zero."""
+        """Return the difference between the level about each mean function and the level about zero."""
 
     @abstractmethod
     def prior_draws(self, key: PRNGKeyArray, num_samples: int) -> Any:
-        """Draw the prior and the noise of the data: arrays of mean zero, with a leading axis of samples."""
+        """Draw from the prior and from the noise of the data.
+
+        The result is a tree of arrays of mean zero, with a leading axis of samples.
+        """
 
     @abstractmethod
     def conditioned(self, draws: Any, means: MeansAtData) -> Float[Array, "s a a a"]:
-        """Coefficients of the draws given the data minus the means: jointly linear in draws, data and means."""
+        """Condition the draws on the data minus the means, and return the coefficients of the samples.
+
+        The result is jointly linear in draws, data and means.
+        """
 
 
 class _Zeros(Fields):
@@ -178,15 +184,15 @@ class _Zeros(Fields):
 
 
 def fill_rows(points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Float[Array, "n 3"]:
-    """The points with the first filled row copied into all unfilled rows.
+    """Return the points with the first filled row copied into all unfilled rows.
 
-    Unfilled rows are zero. A mean function may have no gradient there, and its derivatives would then not be finite,
-    although the rows do not count.
+    Unfilled rows are zero. If a mean function has no gradient at zero, derivatives would not be finite, although the
+    rows are masked.
     """
     return jnp.where(mask[:, None], points, points[jnp.argmax(mask)])
 
 
-# Samples about zero and about means run the same two programs, so that they are equal to the last digit.
+# `sample` and `sample_about` run the same two programs, so that samples about zero are equal bit for bit.
 
 
 @program
@@ -205,7 +211,7 @@ def _sampled(
     posterior: TrigonometricPosterior, key: PRNGKeyArray, means: MeansAtData, scale: Float[Array, "*s"] | None
 ) -> Float[Array, "s a a a"]:
     draws = posterior.prior_draws(key, len(means.values))
-    # Multiplying by one would change how XLA rounds the sums around it.
+    # Do not multiply by a scale of one, which would change how XLA rounds the neighbouring sums.
     if scale is not None:
         draws = jax.tree.map(lambda draw: draw * scale.reshape(-1, *(1,) * (draw.ndim - 1)), draws)
     return posterior.conditioned(draws, means)

@@ -1,14 +1,14 @@
 """Search for known shapes and placements that fit the scan.
 
-A shape with signed distance d, placed by T, has the misfit
+A shape with signed distance d and placement T has the misfit
 
     E = mean_j [ log(1 + d(x_j)^2 / 2 tau^2) + (1 - n_j . grad d(x_j)) / 2 ]
         + 2 mean_i log(1 + min(d(z_i) + margin, 0)^2 / tau^2) + prior(T)
 
-for scanned points x_j with normals n_j, and points z_i that were seen to be empty. Without the latter, fits shrink onto
-the visible patch. The prior on shift and scale is weak. All shapes are tried in many rotations. The best are refined
-together by Gauss-Newton steps on E, with weights from its logarithms (iteratively reweighted least squares), while tau
-falls from 0.12 to 0.03.
+for scanned points x_j with normals n_j, and points z_i that were seen to be empty. Without the points z_i, shapes would
+shrink onto the visible patch. The prior on shift and scale is weak. All shapes are tried in many rotations. The
+hypotheses of smallest E are refined by Gauss-Newton steps (iteratively reweighted least squares, with weights from the
+logarithms in E), while tau falls from 0.12 to 0.03.
 """
 
 import dataclasses
@@ -33,7 +33,7 @@ _FIRST_TAU, _LAST_TAU = 0.12, 0.03
 # Prior standard deviations of the shift (scene units) and of the logarithm of the scale, relative to the placement that
 # fills the box, and the weight of this prior in E.
 _SHIFT, _STRETCH, _PRIOR = 0.2, 0.15, 0.02
-# Hypotheses, points and steps of the first refinement, of the second, and of the last.
+# Number of hypotheses, points and steps in the first, the second and the last refinement.
 _COARSE, _FINE, _LAST = (192, 48, 4), (48, 128, 8), (96, 128, 8)
 # Number of placements that are tried with all shapes.
 _NUM_SHARED = 4
@@ -43,9 +43,9 @@ _LARGEST_STEP = 0.3
 
 
 class FitTargets(NamedTuple):
-    """Data that shapes are fitted to: points with normals, and empty points, in scene coordinates.
+    """Data to which shapes are fitted: points with normals, and empty points, in scene coordinates.
 
-    The first rows of each are spread as evenly as all rows.
+    The first rows of each array are spread as evenly as all its rows.
     """
 
     points: Float[Array, "n 3"]
@@ -56,13 +56,13 @@ class FitTargets(NamedTuple):
 
     @classmethod
     def of(cls, observations: Observations) -> "FitTargets":
-        """Points of the cloud by farthest point sampling, and random nodes that are empty or inside obstacles."""
+        """Choose points of the cloud (farthest point sampling), and random nodes where the object cannot be."""
         cloud = farthest_point_subsample(observations.cloud, NUM_POINTS)
         empty, is_empty = _some_empty(observations)
         return cls(cloud.points, cloud.normals, cloud.mask, empty.astype(cloud.points.dtype), is_empty)
 
     def first(self, count: int) -> "FitTargets":
-        """The first `count` rows of each."""
+        """Return the first `count` rows of each array."""
         return FitTargets(*(rows[:count] for rows in self))
 
 
@@ -81,7 +81,7 @@ def _some_empty(observations: Observations) -> tuple[Float[Array, "m 3"], Bool[A
 def _first_empty(
     empty_nodes: Bool[Array, "g g g"], order: Int[Array, " nodes"]
 ) -> tuple[Int[Array, "m 3"], Bool[Array, " m"]]:
-    """Indices of the first empty nodes in an order, and a mask of the filled rows."""
+    """Return the grid indices of the first empty nodes in this order, and a mask of the filled rows."""
     is_empty = empty_nodes.reshape(-1)[order]
     place = jnp.where(is_empty, jnp.cumsum(is_empty) - 1, _NUM_EMPTY)
     chosen = jnp.zeros(_NUM_EMPTY, jnp.int32).at[place].set(order, mode="drop")
@@ -89,12 +89,13 @@ def _first_empty(
 
 
 class Hypotheses(eqx.Module):
-    """Shapes of a bank, each with a placement, best first.
+    """Shapes of a bank, each with a placement.
 
     - `shape`: index of each shape in the bank.
     - `placement`: placement of each shape.
-    - `misfit`: E.
-    - `is_mode`: false if a better hypothesis of the same shape is within 15 degrees.
+    - `misfit`: E. For parts it may be the L of `surfaces/part_evidence.py`.
+    - `is_mode`: false if a better hypothesis makes this one redundant. `register` tests whether a better hypothesis of
+      the same shape is within 15 degrees. `search_parts` tests whether one has the same surface.
     """
 
     shape: Int[Array, "*h"]
@@ -103,7 +104,7 @@ class Hypotheses(eqx.Module):
     is_mode: Bool[Array, "*h"]
 
     def best(self, count: int) -> "Hypotheses":
-        """The hypotheses of smallest misfit, best first."""
+        """Return the `count` hypotheses of smallest misfit, best first."""
         _, rows = jax.lax.top_k(-self.misfit, min(count, len(self.misfit)))
         return jax.tree.map(lambda leaf: leaf[rows], self)
 
@@ -112,8 +113,8 @@ class Prior(NamedTuple):
     """Prior over placements.
 
     - `poses`: the possible placements.
-    - `box`: a box that the object more or less fills.
-    - `is_true_size`: whether shapes are at true size. They keep their scale and need not fill the box.
+    - `box`: a box that the object approximately fills.
+    - `is_true_size`: whether shapes have their true size. If so, they keep their scale and need not fill the box.
     """
 
     poses: ShapePoses
@@ -122,11 +123,11 @@ class Prior(NamedTuple):
 
     @property
     def steps(self) -> Float[np.ndarray, "9 k"]:
-        """Independent steps of `Placement.moved`, as columns."""
+        """Basis of the possible steps of `Placement.moved`, as columns."""
         return self.poses.moves if self.is_true_size else self.poses.steps
 
     def filling(self, shape: Shape, rotation: Float[Array, "3 3"]) -> Placement:
-        """The placement with this rotation that centres the shape in the box, as large as fits."""
+        """Return the placement with this rotation that centres the shape in the box at the largest scale."""
         turned = jnp.matmul(shape.extremes, rotation.T, precision="highest")
         low, high = jnp.min(turned, axis=0), jnp.max(turned, axis=0)
         least, most = jnp.asarray(self.box.low, turned.dtype), jnp.asarray(self.box.high, turned.dtype)
@@ -134,7 +135,10 @@ class Prior(NamedTuple):
         return Placement(rotation, 0.5 * (least + most) - 0.5 * scale * (low + high), jnp.broadcast_to(scale, 3))
 
     def deviation(self, shape: Shape, placement: Placement) -> Float[Array, "9"]:
-        """Difference from the placement that fills the box: zero turn, shift, logarithms of scale ratios."""
+        """Return the step of `Placement.moved` from the placement that fills the box to this placement.
+
+        The rotation part of the step is zero. The whole step is zero for shapes at true size.
+        """
         if self.is_true_size:
             return jnp.zeros(9, placement.shift.dtype)
         usual = self.filling(shape, placement.rotation)
@@ -142,7 +146,7 @@ class Prior(NamedTuple):
         return jnp.concatenate([jnp.zeros_like(shift), shift, stretch])
 
     def within(self, shape: Shape, placement: Placement) -> Placement:
-        """The placement with its scale clipped to the possible range."""
+        """Return the placement with its scale clipped to the possible range."""
         if self.is_true_size:
             return placement
         usual = self.filling(shape, placement.rotation).scale
@@ -155,9 +159,10 @@ _PRECISION = _PRIOR * np.array([0.0] * 3 + [_SHIFT**-2] * 3 + [_STRETCH**-2 / 3.
 
 @program
 def register(bank: ShapeBank, prior: Prior, targets: FitTargets, num_starts: int) -> Hypotheses:
-    """The shapes and placements that fit the scan best.
+    """Return the shapes and placements that fit the scan best, best first.
 
-    All shapes are tried in many rotations. Then all shapes are tried in the placements of the best.
+    All shapes are tried in many rotations, and the best hypotheses are refined. Then all shapes are tried in the
+    placements of a few of the refined hypotheses, and the best of all are refined again.
     """
     few, some = targets.first(_COARSE[1]), targets.first(_FINE[1])
     turned = _turned(bank, prior, few, num_starts)
@@ -171,10 +176,10 @@ def register(bank: ShapeBank, prior: Prior, targets: FitTargets, num_starts: int
 
 
 def _turned(bank: ShapeBank, prior: Prior, targets: FitTargets, num_starts: int) -> Hypotheses:
-    """All shapes in several rotations each, filling the box."""
+    """Evaluate all shapes in several rotations each, scaled to fill the box."""
     all_of_them = jnp.asarray(prior.poses.rotations(num_starts), targets.points.dtype)
     count = max(1, min(len(all_of_them), num_starts // len(bank)))
-    # Each shape has rotations of its own, evenly spread, so that together the shapes leave no gaps.
+    # Each shape gets evenly spaced rotations with its own offset. Together the shapes cover the rotations without gaps.
     offsets = np.random.default_rng(0).permutation(len(bank)) / len(bank)
     places = (np.arange(count) + offsets[:, None]) * len(all_of_them) / count
 
@@ -186,9 +191,10 @@ def _turned(bank: ShapeBank, prior: Prior, targets: FitTargets, num_starts: int)
 
 
 def _exchanged(bank: ShapeBank, prior: Prior, first: Hypotheses, targets: FitTargets) -> Hypotheses:
-    """All shapes in the placements of a few of the best hypotheses with different rotations.
+    """Evaluate all shapes in the placements of a few of the best hypotheses with different rotations.
 
-    Each shape departs from filling the box by as much as that hypothesis does.
+    Each shape takes the rotation of the hypothesis, and its shift and scale relative to the placement that fills the
+    box.
     """
     ordered = first.best(len(first.misfit))
     mode = _modes(jnp.zeros_like(ordered.shape), ordered.placement.rotation)
@@ -203,7 +209,10 @@ def _exchanged(bank: ShapeBank, prior: Prior, first: Hypotheses, targets: FitTar
 
 
 def evaluate(bank: ShapeBank, prior: Prior, placements: Placement, targets: FitTargets) -> Hypotheses:
-    """Compute the misfit of each shape at its own placements, which lie along a second axis."""
+    """Compute the misfit of each shape at each of its placements.
+
+    - `placements`: batch with a first axis of shapes, and a second axis of placements of the shape.
+    """
     num_shapes, count = placements.scale.shape[:2]
 
     def of_shape(one):
@@ -219,7 +228,7 @@ def evaluate(bank: ShapeBank, prior: Prior, placements: Placement, targets: FitT
 def refine(bank: ShapeBank, prior: Prior, starts: Hypotheses, targets: FitTargets, num_steps: int) -> Hypotheses:
     """Refine each start by Gauss-Newton steps with falling tau.
 
-    The result is the iterate of smallest E at the last tau.
+    Returns the iterate for which E, evaluated at the last tau, is smallest.
     """
     taus = jnp.append(jnp.geomspace(_FIRST_TAU, _LAST_TAU, num_steps), _LAST_TAU)
     basis = jnp.asarray(prior.steps, targets.points.dtype)
@@ -231,7 +240,7 @@ def refine(bank: ShapeBank, prior: Prior, starts: Hypotheses, targets: FitTarget
             current, best, least = state
             step, misfit = _newton_step(shape, prior, current, targets, tau, basis)
             best = jax.tree.map(lambda a, b: jnp.where(misfit < least, a, b), current, best)
-            # The result of the last step is not evaluated, and is dropped.
+            # E is computed before each step. So the placement after the last step is never evaluated, and is dropped.
             return (prior.within(shape, current.moved(step)), best, jnp.minimum(misfit, least)), None
 
         state = start.placement, start.placement, jnp.asarray(jnp.inf, targets.points.dtype)
@@ -242,7 +251,7 @@ def refine(bank: ShapeBank, prior: Prior, starts: Hypotheses, targets: FitTarget
 
 
 def reevaluate(bank: ShapeBank, prior: Prior, hypotheses: Hypotheses, targets: FitTargets) -> Hypotheses:
-    """The hypotheses with E recomputed from all rows of `targets`, at the last tau."""
+    """Return the hypotheses with E recomputed from all rows of `targets`, at the last tau."""
 
     def judge(one):
         return _misfit(bank.shape(one.shape), prior, one.placement, targets, _LAST_TAU)
@@ -257,7 +266,7 @@ def _mean(values: Float[Array, " n"], mask: Bool[Array, " n"]) -> Float[Array, "
 def _misfit(
     shape: Shape, prior: Prior, placement: Placement, targets: FitTargets, tau: Float[Array, ""] | float
 ) -> Float[Array, ""]:
-    """E of a placement, with n_j . grad d from `jax.jvp`."""
+    """Return E of a placement. `jax.jvp` computes n_j . grad d."""
     distance, slope = jax.jvp(lambda x: placement.distance(shape.solid, x), (targets.points,), (targets.normals,))
     empty = placement.distance(shape.solid, targets.empty)
     return _summed(distance, slope, empty, prior.deviation(shape, placement), targets, tau)
@@ -285,14 +294,15 @@ def _newton_step(
     tau: Float[Array, ""],
     basis: Float[Array, "9 k"],
 ) -> tuple[Float[Array, "9"], Float[Array, ""]]:
-    """A damped Gauss-Newton step of E within a trust region, and E before the step at the last tau.
+    """Return a damped Gauss-Newton step on E, limited in size, and E before the step at the last tau.
 
-    Normals enter the step as (n - grad d)^2 / 4.
+    In the step, the normals contribute the term (n - grad d)^2 / 4.
     """
     points = jnp.concatenate([targets.points, targets.empty])
     distance, gradient = values_and_gradients(lambda x: placement.distance(shape.solid, x), points)
     count = len(targets.points)
-    # Derivatives of the distance at a fixed point of the scene, as the shape is turned about t, shifted and scaled.
+    # Derivatives of the distance at fixed points of the scene with respect to a rotation of the shape about t, its
+    # shift, and the logarithm of its scale.
     away = points - placement.shift
     own = jnp.matmul(away, placement.rotation, precision="highest")
     own_gradient = jnp.matmul(gradient, placement.rotation, precision="highest")
@@ -308,7 +318,7 @@ def _newton_step(
         [of_data / (tau**2 + 0.5 * distance[:count] ** 2), jnp.where(within < 0, of_empty, 0.0) / (tau**2 + within**2)]
     )
 
-    # The gradient of a flat piece turns with the shape: d(grad d) = omega x grad d.
+    # On flat parts of the surface, the gradient rotates with the shape: d(grad d) = omega x grad d.
     length = jnp.maximum(jnp.linalg.norm(gradient[:count], axis=1, keepdims=True), 1e-6)
     unit = gradient[:count] / length
     turning = jnp.cross(jnp.eye(3, dtype=unit.dtype), unit[:, None])
@@ -330,18 +340,24 @@ def _newton_step(
 
 
 def _modes(shape: Int[Array, " h"], rotation: Float[Array, "h 3 3"]) -> Bool[Array, " h"]:
-    """Whether each hypothesis, best first, is more than 15 degrees from all better modes of its shape."""
+    """True for each hypothesis that is more than 15 degrees from all better modes of its shape.
+
+    The hypotheses must be sorted, best first.
+    """
     return first_of_each(turned_alike(rotation) & (shape[:, None] == shape))
 
 
 def turned_alike(rotation: Float[Array, "h 3 3"]) -> Bool[Array, "h h"]:
-    """Whether each two rotations are within 15 degrees of each other."""
+    """True for each pair of rotations that are within 15 degrees of each other."""
     trace = jnp.einsum("aij,bij->ab", rotation, rotation, precision="highest")
     return 0.5 * (trace - 1.0) > np.cos(np.radians(15.0))
 
 
 def first_of_each(is_same: Bool[Array, "h h"]) -> Bool[Array, " h"]:
-    """Mask of the rows to keep: a row is dropped if it is the same as an earlier row that is kept."""
+    """Return the mask of rows to keep. A row is dropped if it equals an earlier row that is kept.
+
+    - `is_same`: for each pair of rows, whether they are equal.
+    """
     order = jnp.arange(is_same.shape[0])
 
     def keep(modes, index):

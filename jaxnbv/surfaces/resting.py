@@ -1,4 +1,4 @@
-"""Placements of parts that rest on a table: stable poses, turned about the vertical."""
+"""Placements of parts that rest on a table: stable poses, rotated about the vertical."""
 
 from typing import cast
 
@@ -12,7 +12,8 @@ from jaxnbv.checks import AnyArray, require
 from jaxnbv.surfaces.placement import ShapePoses
 from jaxnbv.surfaces.shape_bank import ShapeBank
 
-# Most stable poses used per part, and the angle between their upward directions below which two count as one (radians).
+# Largest number of stable poses per part, and the angle (radians) between upward directions below which two poses count
+# as equal.
 _MOST, _NEAR = 8, np.radians(10.0)
 _NODES = 32
 # Rotation from trimesh's upward axis z to y.
@@ -20,18 +21,20 @@ _UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
 class Resting(ShapePoses):
-    """Parts resting on a table, y upward: any turn about the vertical, in one of a part's stable poses.
+    """Placements of parts that rest on a table: a stable pose, rotated by any angle about the vertical y.
 
     A search starts from these poses. Refined hypotheses may tilt.
 
-    - `stable`: (k, p, 3, 3) rotations of each part of a bank, the most likely first.
+    - `stable`: (k, p, 3, 3) rotations of each part of a bank to its stable poses, the most likely pose first.
     """
 
     stable: Float[Array, "k p 3 3"]
 
     @classmethod
     def of(cls, bank: ShapeBank) -> "Resting":
-        """The stable poses of a bank's parts, from their convex hulls and their centres of mass as solids.
+        """Compute the stable poses of a bank's parts.
+
+        They follow from each part's convex hull, and from its centre of mass as a solid of uniform density.
 
         **Raises:** `ValueError` for an empty bank.
         """
@@ -43,11 +46,11 @@ class Resting(ShapePoses):
         return cls(jnp.asarray(np.stack(rows), jnp.result_type(float)))
 
     def rotations(self, count: int) -> Float[AnyArray, "m 3 3"]:
-        """The rotations of the first part."""
+        """Return the start rotations of the first part."""
         return self.rotations_of(1, count)[0]
 
     def rotations_of(self, num_shapes: int, count: int) -> Float[AnyArray, "k m 3 3"]:
-        """Evenly spaced turns of each stable pose of each part."""
+        """Return, for each part, its stable poses rotated by evenly spaced angles about the vertical."""
         stable = self.stable[:num_shapes]
         num_turns = max(1, count // stable.shape[1])
         angles = 2.0 * np.pi * np.arange(num_turns) / num_turns
@@ -71,7 +74,7 @@ def _stable_poses(bank: ShapeBank, index: int) -> Float[np.ndarray, "p 3 3"]:
     chosen: list[np.ndarray] = []
     for transform in transforms[np.argsort(-probabilities)]:
         rotation = _UPRIGHT @ transform[:3, :3]
-        # Poses that differ only by a turn about the vertical have the same upward direction in the part.
+        # Poses that differ only by a rotation about the vertical have the same upward direction in the part's frame.
         if all(rotation[1] @ other[1] < np.cos(_NEAR) for other in chosen):
             chosen.append(rotation)
     return np.stack(chosen[:_MOST]) if chosen else np.eye(3)[None]
