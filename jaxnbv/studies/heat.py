@@ -55,7 +55,8 @@ class Truth(NamedTuple):
     """The temperature of the true object.
 
     - `mesh`: the surface of the object.
-    - `points`: points on the surface, 1/40 of a scene unit apart; `temperatures`: temperatures of the points in degrees.
+    - `points`: points on the surface, 1/40 of a scene unit apart.
+    - `temperatures`: temperatures of the points, in degrees.
     """
 
     mesh: TriangleMesh
@@ -106,7 +107,8 @@ class HeatStudy(Study):
 
     It has the settings of `Study`, and:
 
-    - `num_points`: number of points to which D is thinned before an imagined scan is added and the temperature simulated.
+    - `num_points`: number to which the points of D are thinned before an imagined scan is added to simulate its
+      temperature.
     - `imagined_rays`: rays along each side of an imagined scan. True scans have 50 x 50 rays.
     - `true_grid`: grid on which a procedural object is meshed. The default resolves the thinnest rods (radius 0.04).
     """

@@ -70,7 +70,7 @@ def _below(share: float) -> Any:
 
 
 class IdentificationStudy(Study):
-    """Measures how well the views of a method tell which known part the object is, and in which pose it lies.
+    """Measures how well a method's views tell which known part the object is, and in which pose it lies.
 
     It has the settings of `Study`, and:
 
@@ -133,7 +133,9 @@ class IdentificationStudy(Study):
         setup: Setup | None = None,
         **options: Any,
     ) -> dict[str, Study]:
-        """Return one study for `setup`, or one study for each setup if `setup` is None. Keys are the names of setups.
+        """Return one study for `setup`, or one study for each setup if `setup` is None.
+
+        The keys of the result are the names of the setups.
 
         - `parts`: folder of meshes at true size; default: the shipped sets of parts that look alike.
 
@@ -192,7 +194,7 @@ class IdentificationStudy(Study):
         return int(scan.count) >= _ENOUGH * self.camera.num_rays
 
     def sampler_of(self, scene: Scene) -> SurfaceSampler:
-        """Return a sampler with the bank at the scene's scale. If there is a table, the parts rest on the table."""
+        """Return a sampler with the bank at the scene's scale. If there is a table, the parts rest on it."""
         return self.sampler.with_bank(scene.task.bank, scene.task.poses)
 
     def planner_of(self, acquisition: Acquisition, search: Search, scene: Scene) -> Planner:
@@ -247,7 +249,10 @@ class IdentificationStudy(Study):
         }
 
     def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
-        """Return tiles of the most likely part as placed after each view, coloured by its distance to the true part."""
+        """Return tiles that show the most likely part, as placed after each view.
+
+        The part is coloured by its distance to the true part.
+        """
         task, runs, eye = self.scene(record["scene"]).task, record["methods"], opposite_direction(record)
         true = task.mesh
         tree = cKDTree(true.sample_points(jax.random.key(0), 10 * _DENSE))

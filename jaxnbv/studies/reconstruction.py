@@ -96,7 +96,7 @@ class ReconstructionStudy(Study):
         return NewSurface() if method == "new-surface" else Coverage()
 
     def mesher(self, scene: Scene) -> Planner:
-        """Return the planner whose sampler reconstructs the surface for all methods, including the user's methods."""
+        """Return the planner whose sampler reconstructs the surface for all methods, also the user's."""
         return self.planner("farthest", scene)
 
     def truth(self, scene: Scene) -> Float[np.ndarray, "n 3"]:
@@ -118,8 +118,8 @@ class ReconstructionStudy(Study):
     ) -> Record:
         """Record the fraction of the surface covered after each view, and the errors of two reconstructions.
 
-        Both reconstructions are made from the observations after the last view. The errors of the Poisson reconstruction
-        are None if `pymeshlab` is not installed.
+        Both reconstructions are made from the observations after the last view. The errors of the Poisson
+        reconstruction are None if `pymeshlab` is not installed.
         """
         views = [view for view, *_ in episode]
         mesher = self.mesher(scene)
@@ -138,9 +138,9 @@ class ReconstructionStudy(Study):
         return {"chamfer": distance.chamfer, **distance._asdict()}
 
     def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
-        """Return tiles of each reconstruction after the last view, coloured by the distance to the true surface.
+        """Return tiles of each reconstruction after the last view, coloured by distance to the true surface.
 
-        **Raises:** `ValueError` if the record holds errors of the Poisson reconstruction, but `pymeshlab` is not installed.
+        **Raises:** `ValueError` if the record has a Poisson reconstruction but `pymeshlab` is not installed.
         """
         scene, runs = self.scene(record["scene"]), record["methods"]
         truth = cast(TriangleMesh, true_mesh(scene.surface))

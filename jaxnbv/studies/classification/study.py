@@ -1,4 +1,4 @@
-"""Base class of classification studies: which methods' views tell the class, and how soon?"""
+"""Base class of classification studies, which count the views that a method needs to tell the class of an object."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -38,11 +38,11 @@ from jaxnbv.tasks import Coverage, CrossEntropy, EntropyReduction, MixedEntropy
 from jaxnbv.tasks.classification import AnyClassifier, ClassAcquisition, Classifier, as_classifier
 from jaxnbv.viz.style import NEW, framed
 
-# Runs of random search in each scene.
+# Number of runs of random search in each scene.
 _RUNS = 8
 OTHERS = ("coverage", *BASELINES)
 _GRADIENT = ("gradient-2dof", "gradient-constrained")
-# All other methods maximise cross-entropy with different searches.
+# Methods without an entry here maximise cross-entropy and differ in their searches. None stands for `Coverage`.
 _ACQUISITIONS: dict[str, type[ClassAcquisition] | None] = {
     **dict.fromkeys(OTHERS),
     "entropy": EntropyReduction,
@@ -53,7 +53,12 @@ _PLAIN, _TINTED = np.array([0.68, 0.72, 0.78]), np.array(mpl.colors.to_rgb(NEW))
 
 
 class Truth(eqx.Module):
-    """The class, the object, and for each candidate its true noisy scan and the rays that hit the cue."""
+    """The class of a scene's object, and what the candidates show of the object.
+
+    - `label`: index of the class; `thing`: the object.
+    - `scans`: true noisy scan of each candidate.
+    - `pixels`: number of rays of each candidate that hit the cue.
+    """
 
     label: int
     scans: PointCloud
@@ -62,7 +67,7 @@ class Truth(eqx.Module):
 
 
 class OracleView(CandidateSearch):
-    """Oracle search: chooses the candidate whose true scan has the highest acquisition score.
+    """Oracle search that chooses the candidate whose true scan has the highest acquisition score.
 
     - `scans`: the true scan of each candidate.
     """
@@ -71,34 +76,36 @@ class OracleView(CandidateSearch):
     uses_samples: ClassVar[bool] = False
 
     def score(self, problem: Problem, candidates: Pose) -> Float[Array, "1 1 candidates"]:
-        """The acquisition scores of the true scans."""
+        """Return the acquisition scores of the true scans."""
         context = problem.acquisition.context(inputs_of(problem.observations))
         return scores(problem.acquisition, context, self.scans, problem.camera, candidates)[None, None]
 
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
-        """The best candidate that is not visited yet. The key is not used."""
+        """Return the best candidate that is not visited yet. The key is not used."""
         return best_unvisited(problem, candidates, scores[0, 0])
 
 
 class ClassificationStudy(Study):
-    """Base class: measures how many views a method needs to tell the class of an object.
+    """Base class of studies that measure how many views a method needs to tell the class of an object.
 
-    Settings as in `Study`, and
+    It has the settings of `Study`, and:
 
-    - `classifier`: classifier of clouds in scene coordinates, applied after each view.
-    - `imagined_classifier`: classifier of D u scan for imagined scans; default: `classifier`. One that gets fewer
-      points saves time.
-    - `framing`: size of the object, and so how much of it a view shows.
-    - `split`: split of the scenes. Tune settings on the validation split.
-    - `num_points`: D is thinned to this number, once a step, before imagined scans are added.
-    - `first`: which views may be the first.
+    - `classifier`: classifier of clouds in scene coordinates, applied to the cloud after each view.
+    - `imagined_classifier`: classifier applied to D u scan for imagined scans; default: `classifier`. A classifier that
+      gets fewer points saves time.
+    - `framing`: size of the object in the image, which decides how much of the object a view shows.
+    - `split`: split from which the scenes come. Tune settings on the validation split.
+    - `num_points`: number to which the points of D are thinned, once per step, before imagined scans are added.
+    - `first`: condition for first views, see `FirstView`.
 
     Class attributes:
 
-    - `objects`: the scenes and their classes; `cue`: name of the part that differs by class, "" for the whole object.
-    - `network`: name of the shipped classifier; `network_points`: numbers of points for `classifier` and for
-      `imagined_classifier`.
-    - `framings`: framings to study, one study each; `solid`: whether the objects have no thin parts, see `sampler`.
+    - `objects`: the scenes and their classes.
+    - `cue`: name of the part of the object that differs by class, such as "cargo"; "" for the whole object.
+    - `network`: name of the shipped classifier.
+    - `network_points`: numbers of points that `classifier` and `imagined_classifier` get.
+    - `framings`: framings to study. There is one study for each framing.
+    - `solid`: True if the objects have no thin parts, see `SurfaceSampler.preset`.
     """
 
     methods: ClassVar[tuple[str, ...]] = ("cross-entropy", "entropy", "mixed", "tie-break", *OTHERS, "oracle")
@@ -147,11 +154,12 @@ class ClassificationStudy(Study):
 
     @classmethod
     def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
-        """A study of one framing, or one study per framing if none is given.
+        """Return one study for the option `framing`, or one study for each of `framings` without this option.
 
-        - `classifier`: file of a network, see `load_checkpoint`; default: the one that ships.
+        - `classifier`: option with the file of a network, see `load_checkpoint`; default: the shipped network.
 
-        **Raises:** `ValueError` as `load_checkpoint` does, or if the network has another number of classes.
+        **Raises:** `ValueError` as `load_checkpoint` does, or if the network has a different number of classes than the
+        study.
         """
         if "meshes" in options:
             options["meshes"] = cls.files_in(options["meshes"])
@@ -187,16 +195,19 @@ class ClassificationStudy(Study):
 
     @classmethod
     def group(cls, record: Record) -> str:
-        """Whether the first view, which all methods share, shows any of the cue; "" without a cue."""
+        """Return a group name that says whether the first view, which all methods share, shows any of the cue.
+
+        The name is "" if the study has no cue.
+        """
         if not cls.cue:
             return ""
         pixels = next(iter(record["methods"].values()))["pixels"]
         return f"first view {'with' if pixels[0][0] else 'without'} {cls.cue}"
 
     def scene(self, index: int) -> Scene:
-        """An object. The task of the scene is its `Truth`.
+        """Return a scene with an object. The task of the scene is its `Truth`.
 
-        **Raises:** `ValueError` if there is no mesh of this index, or it cannot be read.
+        **Raises:** `ValueError` if there is no mesh with this index, or if the mesh cannot be read.
         """
         keys = jax.random.split(jax.random.fold_in(jax.random.key(3), index), self.num_candidates)
         name, thing = self.object_of(index)
@@ -204,7 +215,7 @@ class ClassificationStudy(Study):
         return Scene(index, name, surface_of(thing), Truth(int(thing.label), _noisy(scans, keys), thing, pixels))
 
     def object_of(self, index: int) -> tuple[str, ClassObject | ClassMesh]:
-        """The name of a scene and its object."""
+        """Return the name and the object of the scene with this index."""
         file = self.file(index)
         if file is None:
             assert self.objects.scene is not None
@@ -212,7 +223,7 @@ class ClassificationStudy(Study):
         return f"{self.objects.classes[file.label]} {file.name}", self.of_mesh(file, index)
 
     def of_mesh(self, file: MeshFile, index: int) -> ClassMesh:
-        """The object of a file of `meshes`."""
+        """Return the object of a mesh file for the scene with this index."""
         return ClassMesh(file.read(), file.label)
 
     def scene_record(self, scene: Scene, truth: Truth, first: int) -> Record:
@@ -224,7 +235,10 @@ class ClassificationStudy(Study):
         return Grid(self.grid_resolution, 0.7 * self.framing.longest_side)
 
     def shows_enough(self, scene: Scene, scan: PointCloud) -> bool:
-        """Whether a scan shows the object and, if `first` requires it, the classifier is wrong about it."""
+        """Return whether a scan shows the object and meets the condition `first`.
+
+        With `FirstView.MISCLASSIFIED`, the classifier must be wrong about the scan.
+        """
         shows = super().shows_enough(scene, scan)
         if self.first is FirstView.ANY or not shows:
             return shows
@@ -242,7 +256,7 @@ class ClassificationStudy(Study):
         return super().search(method, scene)
 
     def sensor(self, scene: Scene) -> Sensor:
-        """A sensor whose scan from a candidate is the same for all methods and views."""
+        """Return a sensor whose scan from a candidate is the same for all methods and views."""
         anywhere, poses = super().sensor(scene), self.candidates.poses()
 
         def look(pose, key):
@@ -253,19 +267,20 @@ class ClassificationStudy(Study):
         return look
 
     def episode_keys(self, method: str, scene: Scene) -> list[PRNGKeyArray]:
-        """The keys of the episodes: several for random search, one for other methods."""
+        """Return the random keys of a method's episodes: several for random search, and one for other methods."""
         keys = super().episode_keys(method, scene)
         return [jax.random.fold_in(keys[0], run) for run in range(_RUNS)] if method == "random" else keys
 
     def merge_runs(self, runs: Sequence[Record]) -> Record:
-        """The record of the first run, with the predictions and cue pixels of all runs."""
+        """Return the record of the first run, with the predictions and cue pixels of all runs."""
         return runs[0] | {name: [row for run in runs for row in run[name]] for name in ("log_p", "pixels")}
 
     def follow(self, scene: Scene, truth: Truth, planner: Planner, episode: Iterator[Step]) -> Record:
-        """Record the classes' log probabilities after each view, and the rays of the view that hit the cue.
+        """Record the log probabilities of the classes after each view, and measures of each view.
 
-        For the view that is chosen, also record the rank correlation of the candidates' values and true cue pixels, and
-        the roughness of the samples.
+        These are the number of the view's rays that hit the cue and, for each view that a method chose, the roughness
+        of the samples and the rank correlation between the candidates' values and the numbers of their rays that hit
+        the cue.
         """
         lists: dict[str, list] = {name: [] for name in ("log_p", "pixels", "rank_correlation", "roughness")}
         for view, _, inputs, _ in episode:
@@ -283,9 +298,9 @@ class ClassificationStudy(Study):
         return lists | {"log_p": [lists["log_p"]], "pixels": [lists["pixels"]] if self.cue else []}
 
     def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
-        """Tiles of the true surface in the sensor's field of view, with its cue tinted.
+        """Return tiles that show the true surface as the sensor sees it from each view, with the cue tinted.
 
-        Below is the class predicted after this view, and its probability.
+        The text below a tile gives the class predicted after the view, and the probability of this class.
         """
         runs, scene, names = record["methods"], self.scene(record["scene"]), self.objects.classes
         poses = {method: poses_of(runs[method]) for method in methods}
@@ -310,12 +325,12 @@ def _noisy(scans: PointCloud, keys: Key[Array, " candidates"]) -> PointCloud:
 
 @program
 def _classify(classifier: Classifier, cloud: PointCloud) -> Float[Array, " classes"]:
-    """Log probabilities of the classes, compiled."""
+    """Return the log probabilities of the classes for a cloud, by a compiled program."""
     return classifier(cloud)
 
 
 def _image(scene: Scene, camera: Camera, pose: Pose, tinted: bool) -> Float[np.ndarray, "h w 3"]:
-    """An image of the scene, lit from the sensor, with its cue tinted."""
+    """Return an image of the scene from a pose, lit from the camera. If `tinted`, the cue is tinted."""
     cloud = scan(scene.surface, camera, jax.tree.map(jnp.asarray, pose))
     on_cue = np.asarray(scene.task.thing.on_cue(cloud.points)) & tinted
     points, normals, hit = (np.asarray(array) for array in (cloud.points, cloud.normals, cloud.mask))

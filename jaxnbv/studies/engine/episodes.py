@@ -73,7 +73,7 @@ def episode_record(
 def replay_views(
     planner: Planner, sensor: Sensor, poses: Sequence[Pose], key: PRNGKeyArray, camera: Camera
 ) -> list[tuple[PointCloud, Observations]]:
-    """Recompute each scan of an episode and the observations after each scan from the poses of the episode.
+    """Recompute each scan of an episode, and the observations after each scan, from the episode's poses.
 
     - `planner`: any planner of the study, because observations depend only on the planner's capacity and carving.
     - `key`: random key of the episode.

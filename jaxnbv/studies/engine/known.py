@@ -25,7 +25,7 @@ def study_sampler(
 
     - `model`: name of a preset, or "known".
     - `bank`: name of a shipped bank of known shapes; "" for none.
-    - `files`: meshes to use as known shapes in place of `bank`. The shapes stay upright, and their proportions are free.
+    - `files`: meshes to use as known shapes in place of `bank`. The shapes stay upright, with free proportions.
     - `longest_side`, `quick`, `solid`: arguments of `SurfaceSampler.preset`.
 
     **Raises:** `ValueError` for an unknown model, or for "known" with neither meshes nor a bank.

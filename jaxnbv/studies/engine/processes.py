@@ -24,7 +24,7 @@ class Processes(Executor):
     - `workers`: number of processes.
 
     If a process dies during a call, for example from lack of memory, the call runs again in a new process. If the new
-    process dies too, the call's future raises `BrokenExecutor`. An error that leaves a `with` block kills running calls.
+    process dies too, the future raises `BrokenExecutor`. An error that leaves a `with` block kills running calls.
     """
 
     def __init__(self, workers: int):
@@ -91,7 +91,7 @@ class Processes(Executor):
 
 
 def _end_with(parent: int) -> None:
-    """Start a thread that ends this process when its parent is gone. A killed parent cannot end its processes itself."""
+    """Start a thread that ends this process when its parent is gone, because a killed parent cannot end it."""
 
     def watch() -> None:
         while os.getppid() == parent:

@@ -61,9 +61,10 @@ def _compared(part: pd.DataFrame, reference: str) -> pd.DataFrame:
 
 
 def interval(values: Float[np.ndarray, "scenes columns"]) -> Float[np.ndarray, "2 columns"]:
-    """Return the lower and upper ends of Efron's percentile bootstrap interval for the mean of each column.
+    """Return the ends of Efron's percentile bootstrap interval for the mean of each column.
 
-    Scenes are drawn with replacement, and all columns use the same draws. For one scene, the interval has width zero.
+    The first row of the result holds the lower ends, and the second row the upper ends. Scenes are drawn with
+    replacement, and all columns use the same draws. For one scene, the interval has width zero.
     """
     if len(values) < 2:
         return np.stack([values.sum(axis=0)] * 2)
@@ -159,8 +160,8 @@ class Verdict(NamedTuple):
 def verdicts(table: pd.DataFrame, study: type[Study]) -> list[Verdict]:
     """Check each claim over all scenes by comparing the reference with the claim's methods.
 
-    The comparison includes the runs of these methods without known shapes. The sentence calls the reference level with a
-    method if the interval of the lead includes zero. A claim is left out if none of its methods was run.
+    The comparison includes the runs of these methods without known shapes. The sentence calls the reference "level
+    with" a method if the interval of the lead includes zero. A claim is left out if none of its methods was run.
     """
     judged = []
     for claim in study.claims:

@@ -44,8 +44,9 @@ def search_of(
     iterations: int,
     learning_rate: float = 0.03,
 ) -> Search:
-    """Return the search that a method's name denotes, or `DiscreteSearch` over all candidates for any other name.
+    """Return the search named by a method, such as `RandomView` for "random".
 
+    Any other name gives `DiscreteSearch` over all candidates.
     A gradient search scores half of `num_candidates` poses and then climbs from the best `num_starts` of them.
 
     - `radius`: distance of the cameras from the scene's origin, in scene units.

@@ -190,7 +190,7 @@ class Study(eqx.Module):
         return dataclasses.replace(planner, sampler=planner.sampler.without_bank)
 
     def truth(self, scene: Scene) -> Any:
-        """Return the ground truth of a scene, by default its task. It is computed once per scene, for all methods."""
+        """Return the ground truth of a scene, by default its task. All methods share the result."""
         return scene.task
 
     @abstractmethod
@@ -206,7 +206,7 @@ class Study(eqx.Module):
         return {"name": scene.name}
 
     def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles | None:
-        """Return the picture of a scene in tiles of `pixels` x `pixels`, or None if the study draws no pictures."""
+        """Return the picture of a scene in tiles of `pixels` x `pixels`; None if the study draws none."""
         return None
 
     def sensor(self, scene: Scene) -> Sensor:
@@ -241,7 +241,7 @@ class Study(eqx.Module):
         return self.camera
 
     def sampler_of(self, scene: Scene) -> SurfaceSampler:
-        """Return the sampler for a scene. If its bank was made from `meshes`, the scene's own mesh is left out."""
+        """Return the sampler for a scene. A bank made from `meshes` leaves out the scene's own mesh."""
         return without_own_shape(self.sampler, self.meshes, scene.index) if self.meshes else self.sampler
 
     def planner_of(self, acquisition: Acquisition, search: Search, scene: Scene) -> Planner:

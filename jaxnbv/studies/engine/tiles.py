@@ -85,7 +85,7 @@ def draw_on(
     points: Float[np.ndarray, "n 3"],
     colours: Float[np.ndarray, "n channels"],
 ) -> None:
-    """Draw a still, and then the points that its surface does not hide, ordered so that near points cover far points."""
+    """Draw a still, and over it the points that its surface does not hide. Near points cover far points."""
     axes.imshow(still.image, interpolation="antialiased", zorder=1)
     pixels, in_front = still.project(points)
     depth = (points - np.asarray(still.pose.position)) @ np.asarray(still.pose.forward)

@@ -46,7 +46,7 @@ _DENSE = 8000
 
 
 class NearestPart(Segmenter):
-    """Oracle segmenter that knows the true parts. Studies use it to evaluate planning without a network's errors.
+    """Oracle segmenter that knows the true parts, to evaluate planning without a network's errors.
 
     The probability that point i belongs to part c is
 
@@ -86,7 +86,10 @@ class NearestPart(Segmenter):
         return jnp.argmin(self.distances_at(points), axis=-1).astype(jnp.int32)
 
     def distances_at(self, points: Float[Array, "n 3"]) -> Float[Array, "n parts"]:
-        """Return the distance of each point from each part. Points outside the grid get the value at its border."""
+        """Return the distance of each point from each part.
+
+        A point outside the grid gets the value at the border of the grid.
+        """
         at = (points.T + self.grid.half_extent) / self.grid.spacing
         interpolate = jax.vmap(lambda values: map_coordinates(values, list(at), order=1, mode="nearest"), out_axes=-1)
         return interpolate(self.distances)
@@ -97,9 +100,9 @@ PartSegmenter: TypeAlias = CloudSegmenter | NearestPart
 
 
 def discovery_time(counts: Int[np.ndarray, "views parts"], target: int) -> int | None:
-    """Return T_discovery, the first view after which every part has `target` points, or None if there is none.
+    """Return T_discovery, the first view (counted from 1) after which every part has `target` points.
 
-    Views are counted from 1.
+    Return None if there is no such view.
     """
     is_complete: Bool[np.ndarray, " views"] = np.all(np.asarray(counts) >= target, axis=1)
     return int(np.argmax(is_complete)) + 1 if is_complete.any() else None

@@ -1,4 +1,4 @@
-"""Recipes for the shipped banks of procedural shapes, made from the training split."""
+"""Recipes that make the shipped banks of procedural shapes from scenes of the training split."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -14,11 +14,11 @@ from jaxnbv.surfaces import ShapeBank
 
 
 class BankRecipe(NamedTuple):
-    """The contents of a bank.
+    """Defines the shapes of a bank.
 
-    - `number`: number of objects.
-    - `kinds`: their kinds, which take turns.
-    - `shape`: function from an index to its object, not turned.
+    - `number`: number of shapes.
+    - `kinds`: names of the kinds of shapes. Shape i is of kind `kinds[i % len(kinds)]`.
+    - `shape`: function that returns the shape of an index without a random rotation.
     """
 
     number: int
@@ -26,7 +26,7 @@ class BankRecipe(NamedTuple):
     shape: Callable[[int], SignedDistance]
 
     def make(self) -> ShapeBank:
-        """Make the bank. The name of a shape is its kind and index."""
+        """Make the bank. The name of a shape consists of its kind and its index."""
         names = [f"{self.kinds[index % len(self.kinds)]} {index}" for index in range(self.number)]
         return ShapeBank.of([self.shape(index) for index in range(self.number)], names)
 
@@ -43,4 +43,4 @@ RECIPES = {
     "parts": BankRecipe(520, PART_CATEGORIES, lambda i: part_scene(Split.TRAIN, i).solid),
     "heat": BankRecipe(256, HEAT_OBJECTS, _heated),
 }
-"""Recipes of the banks by name."""
+"""The recipe of each shipped bank, by the name of the bank."""

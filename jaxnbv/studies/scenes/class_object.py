@@ -1,4 +1,4 @@
-"""Objects of several classes, with the part of their surface that tells the class."""
+"""Objects of several classes. The part of an object's surface that tells its class is called the cue."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -22,9 +22,9 @@ from jaxnbv.studies.scenes.labelled import LabelledSolid
 
 
 class ClassObject(SignedDistance):
-    """Base class: a solid of one of several classes.
+    """Base class of solids that belong to one of several classes.
 
-    - `label`: index of its class.
+    - `label`: index of the class.
     """
 
     label: eqx.AbstractVar[Int[Array, ""]]
@@ -34,18 +34,21 @@ class ClassObject(SignedDistance):
         return self.label
 
     def on_cue(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[Array, "*n"]:
-        """Whether each point of the surface tells the class; here always True.
+        """Return whether each point of the surface lies on the cue. The base class always returns True.
 
-        - `x`: hits without noise.
+        - `x`: points on the surface without noise (scene units).
         - `tolerance`: largest distance from the cue, in scene units.
         """
         return jnp.ones(x.shape[:-1], bool)
 
 
 class SolidObject(ClassObject):
-    """A solid of labelled primitives; a bound. Primitives of label 0 do not tell the class.
+    """A solid made of labelled primitives. The primitives with a label above 0 are the cue.
+
+    The value is a bound of the signed distance, as for `LabelledSolid`.
 
     - `solid`: the primitives, in scene coordinates.
+    - `label`: index of the class.
     """
 
     solid: LabelledSolid
@@ -55,15 +58,15 @@ class SolidObject(ClassObject):
         return self.solid(x)
 
     def on_cue(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[Array, "*n"]:
-        """Whether each point lies on a primitive that tells the class."""
+        """Return whether each point lies on a primitive of the cue."""
         return least_of_last(jnp.where(self.solid.labels > 0, self.solid.distances(x), jnp.inf)) <= tolerance
 
 
 class ClassSet(NamedTuple):
-    """Scenes of several classes.
+    """Names of classes, and a function that makes scenes of these classes.
 
     - `classes`: names of the classes.
-    - `scene`: function from a split, an index and a framing to a scene; None if all scenes are meshes.
+    - `scene`: function that returns the object for a split, an index and a framing; None if all objects are meshes.
     """
 
     classes: tuple[str, ...]
@@ -71,10 +74,10 @@ class ClassSet(NamedTuple):
 
 
 class ClassMesh(eqx.Module):
-    """A mesh of one of several classes.
+    """A mesh that belongs to one of several classes.
 
-    - `label`: index of its class.
-    - `part`: the triangles of `mesh` that tell the class; default: all.
+    - `label`: index of the class.
+    - `part`: the triangles of `mesh` that are the cue; default: all triangles.
     """
 
     mesh: TriangleMesh
@@ -82,7 +85,7 @@ class ClassMesh(eqx.Module):
     part: TriangleMesh | None = None
 
     def on_cue(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[np.ndarray, "*n"]:
-        """Whether each point of the surface tells the class, see `ClassObject.on_cue`. Runs on the host."""
+        """Return whether each point lies on the cue, see `ClassObject.on_cue`. Runs on the host."""
         if self.part is None:
             return np.ones(x.shape[:-1], bool)
         points = np.asarray(x, np.float64).reshape(-1, 3)
@@ -91,12 +94,12 @@ class ClassMesh(eqx.Module):
 
 
 def surface_of(thing: ClassObject | ClassMesh) -> Surface:
-    """The surface of an object, for ray tracing."""
+    """Return the surface of an object for ray tracing."""
     return thing.mesh if isinstance(thing, ClassMesh) else SDFSurface(thing)
 
 
 def scan_cue(thing: ClassObject | ClassMesh, camera: Camera, poses: Pose) -> tuple[Int[Array, " poses"], PointCloud]:
-    """The number of rays from each pose that hit the cue of the class, and the scans without noise."""
+    """Return the number of rays from each pose that hit the cue, and the scans without noise."""
     return _scan_telling(thing, camera, poses) if isinstance(thing, ClassMesh) else _compiled(thing, camera, poses)
 
 
@@ -113,9 +116,9 @@ _compiled = program(_scan_telling)
 def hidden_view(
     thing: ClassObject | ClassMesh, key: PRNGKeyArray, camera: Camera = Camera(), poses: Pose | None = None
 ) -> Pose:
-    """A random pose from which the object is visible but not the cue of its class.
+    """Return a random pose from which the object is visible but its cue is hidden.
 
-    - `poses`: poses to draw from uniformly; default: the paper's 120.
+    - `poses`: poses from which the result is drawn uniformly; default: the paper's 120 candidates.
 
     **Raises:** `ValueError` if there is no such pose.
     """
@@ -124,7 +127,9 @@ def hidden_view(
 
 
 def choose_hidden(cue_pixels: Int[AnyArray, " poses"], scans: PointCloud, key: PRNGKeyArray) -> int:
-    """Index of a random pose whose scan hits the object but not the cue of its class, drawn uniformly.
+    """Return the index of a random pose whose scan hits the object but not its cue, drawn uniformly.
+
+    - `cue_pixels`: number of rays of each pose that hit the cue; `scans`: scan from each pose.
 
     **Raises:** `ValueError` if there is no such pose.
     """

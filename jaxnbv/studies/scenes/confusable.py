@@ -1,6 +1,6 @@
-"""Sets of parts that look alike: the same housing with one different feature, which few views show.
+"""Sets of eight parts that look alike. The parts of a set differ in one feature, which few views show.
 
-Lengths are scene units. No part reaches beyond 1.35 from the origin along an axis.
+Lengths are in scene units. Along each axis, all parts lie between -1.35 and 1.35.
 """
 
 import functools
@@ -18,11 +18,12 @@ from jaxnbv.scanning.sdf import Cuboid, Cylinder, Difference, Sampled, SignedDis
 from jaxnbv.surfaces import ShapeBank
 
 PARTS_OF_SET = 8
-# Two spacings of the bank's grid are smaller than the smallest feature, 0.12. The meshes are finer.
+# The smallest feature (0.12) is larger than two spacings of the bank's grid. The grid of the meshes is finer.
 _BANK_GRID, _MESH_GRID = Grid(64, 1.5), Grid(100, 1.4)
-# Every part keeps this distance from the faces of the bank's grid.
+# Smallest distance between a part and the faces of the bank's grid.
 _PADDING = 0.15
-# The pocket of the housing: x of its centre, its floor, and a higher floor that shows the holes in it.
+# The pocket of the housing: x of its centre, height of its floor, and height of the floor for housings with holes. The
+# second floor is higher, because a deep floor would hide the holes.
 _ACROSS, _FLOOR, _SHALLOW = 0.15, 0.05, 0.45
 
 
@@ -35,9 +36,9 @@ def _pin(radius: float, half_height: float, center: Sequence[float]) -> SignedDi
 
 
 def _housing(side: float = 1.0, floor: float = _FLOOR) -> SignedDistance:
-    """A block with a deep pocket, open above, and a notch at one corner that breaks its symmetry.
+    """Make a block with a deep pocket that is open above, and a notch at one corner that breaks the block's symmetry.
 
-    - `side`: 1, or -1 for its mirror image; `floor`: height of the pocket's floor.
+    - `side`: 1, or -1 for the mirror image; `floor`: height of the pocket's floor.
     """
     block = Cuboid(np.array([0.75, 1.25, 0.55]))
     pocket = _box([0.42, 0.7, 0.3], [side * _ACROSS, floor + 0.7, 0.0])
@@ -45,7 +46,7 @@ def _housing(side: float = 1.0, floor: float = _FLOOR) -> SignedDistance:
 
 
 def _bosses() -> list[SignedDistance]:
-    """Housings with a boss on the floor of the pocket that differs in place, radius and height."""
+    """Make housings with a boss on the floor of the pocket. The position, radius and height of the boss differ."""
     variants = [
         (-0.25, 0.0, 0.12, 0.25),
         (0.25, 0.0, 0.12, 0.25),
@@ -60,7 +61,7 @@ def _bosses() -> list[SignedDistance]:
 
 
 def _bores() -> list[SignedDistance]:
-    """Housings with a blind hole in the floor of the pocket that differs in place and radius."""
+    """Make housings with a blind hole in the floor of the pocket. The position and radius of the hole differ."""
     places = [(-0.25, 0.0), (0.25, 0.0), (0.0, 0.15), (0.0, -0.15), (0.0, 0.0), (0.0, 0.0), (-0.25, 0.15), (0.25, 0.15)]
     radii = [0.12, 0.12, 0.12, 0.12, 0.12, 0.22, 0.12, 0.12]
     return [
@@ -70,7 +71,7 @@ def _bores() -> list[SignedDistance]:
 
 
 def _ribs() -> list[SignedDistance]:
-    """Housings with a rib on the floor of the pocket that differs in place and direction."""
+    """Make housings with a rib on the floor of the pocket. The position and direction of the rib differ."""
     along = [(-0.28, 0.0, 90.0), (0.0, 0.0, 90.0), (0.28, 0.0, 90.0)]
     across = [(0.0, -0.2, 0.0), (0.0, 0.0, 0.0), (0.0, 0.2, 0.0)]
     aslant = [(0.0, 0.0, 45.0), (0.0, 0.0, -45.0)]
@@ -83,7 +84,7 @@ def _ribs() -> list[SignedDistance]:
 
 
 def _connectors() -> list[SignedDistance]:
-    """Housings with a connector on the floor of the pocket that differs in size and place."""
+    """Make housings with a connector on the floor of the pocket. The size and position of the connector differ."""
     variants = [
         (0.3, 0.1, 0.0, 0.0),
         (0.1, 0.22, 0.0, 0.0),
@@ -100,12 +101,12 @@ def _connectors() -> list[SignedDistance]:
 
 
 def _pins() -> list[SignedDistance]:
-    """Housings with pins at some of four places on the floor of the pocket."""
+    """Make housings with pins at two to four of four positions on the floor of the pocket."""
     places = [(-0.24, -0.15), (-0.24, 0.15), (0.24, -0.15), (0.24, 0.15)]
     patterns = ["1111", "0111", "1011", "1101", "1110", "1001", "0110", "1010"]
 
     def part(pattern: str) -> SignedDistance:
-        # An absent pin lies inside the block, so that all parts have the same structure.
+        # An absent pin is placed inside the block, because all parts of a set need the same structure.
         heights = [_FLOOR + (0.2 if digit == "1" else -0.6) for digit in pattern]
         pins = [_pin(0.1, 0.25, [_ACROSS + x, y, z]) for (x, z), y in zip(places, heights, strict=True)]
         return functools.reduce(Union, pins, _housing())
@@ -114,7 +115,7 @@ def _pins() -> list[SignedDistance]:
 
 
 def _channels() -> list[SignedDistance]:
-    """Blocks with a channel and a boss in it that differs in depth and wall."""
+    """Make blocks with a channel and a boss on one of its walls. The wall and the position along the channel differ."""
     block = Difference(Cuboid(np.array([0.7, 0.6, 1.25])), _box([0.28, 0.28, 1.5], [0.0, 0.1, 0.0]))
     block = Difference(block, _box([0.2, 0.2, 0.2], [0.7, -0.6, 1.25]))
     places = [(wall, z) for wall in (-0.24, 0.24) for z in (-0.6, -0.2, 0.2, 0.6)]
@@ -129,22 +130,22 @@ def _cup(floor: float, size: float = 1.0) -> SignedDistance:
 
 
 def _cups() -> list[SignedDistance]:
-    """Cups that differ in the height of their floor, which the outside does not show."""
+    """Make cups that differ in the height of their floor, which is not visible from outside."""
     return [_cup(floor) for floor in np.linspace(-1.1, -0.05, PARTS_OF_SET)]
 
 
 def _sizes() -> list[SignedDistance]:
-    """Cups whose sizes differ by 4 %."""
+    """Make cups of the same shape, whose sizes decrease by a factor of 1.04 from one cup to the next."""
     return [_cup(-1.1 * size, size) for size in 1.04 ** -np.arange(PARTS_OF_SET)]
 
 
 def _mugs() -> list[SignedDistance]:
-    """Mugs whose handle differs in place and length. The mug hides it from behind."""
+    """Make mugs whose handles differ in height and length. The body of a mug hides its handle from behind."""
     variants = [(y, half) for half in (0.2, 0.4) for y in (-0.6, -0.2, 0.2, 0.6)]
 
     def part(y: float, half: float) -> SignedDistance:
         grip = Difference(_box([0.22, half, 0.1], [0.86, y, 0.0]), _box([0.12, half - 0.1, 0.2], [0.82, y, 0.0]))
-        # Cut the handle at the wall, so that it does not show inside.
+        # Cut the handle off at the wall. Otherwise it would be visible inside the mug.
         mug = Union(_cup(-1.1), Difference(grip, Cylinder(0.65, 1.5)))
         return Translated(mug, np.array([-0.19, 0.0, 0.0]))
 
@@ -152,7 +153,7 @@ def _mugs() -> list[SignedDistance]:
 
 
 def _mirrored() -> list[SignedDistance]:
-    """Four housings with a boss, and the mirror image of each."""
+    """Make four housings with a boss, and the mirror image of each."""
     places = [(-0.25, 0.0), (0.25, 0.0), (0.0, 0.15), (0.0, -0.15)]
     return [
         Union(_housing(side), _pin(0.12, 0.25, [side * (_ACROSS + x), _FLOOR + 0.2, z]))
@@ -174,19 +175,19 @@ _SETS: dict[str, Callable[[], list[SignedDistance]]] = {
     "size": _sizes,
 }
 CONFUSABLE_SETS = tuple(_SETS)
-"""Names of the sets."""
+"""Names of all sets."""
 HIDDEN_CUES = ("boss", "bore", "rib", "connector", "pins", "channel", "cup")
-"""The sets whose parts look the same from at least two thirds of all directions."""
+"""Names of the sets whose parts look the same from at least two thirds of all directions."""
 
 
 def confusable_solids(name: str) -> list[SignedDistance]:
-    """The parts of a set as solids with the same structure."""
+    """Return the parts of a set as solids. All solids have the same pytree structure."""
     return _SETS[name]()
 
 
 @functools.cache
 def confusable_meshes(name: str) -> tuple[TriangleMesh, ...]:
-    """The parts of a set as meshes. Meshing rounds edges to 0.03."""
+    """Return the parts of a set as meshes. Meshing rounds the edges by about 0.03."""
     values = [np.array(_values(solid, _nodes(_MESH_GRID))) for solid in confusable_solids(name)]
     triangles = [level_triangles(rows, _MESH_GRID) for rows in values]
     return tuple(TriangleMesh(mesh[0], mesh[1], Frame()) for mesh in triangles if mesh is not None)
@@ -194,9 +195,9 @@ def confusable_meshes(name: str) -> tuple[TriangleMesh, ...]:
 
 @functools.cache
 def confusable_bank(name: str) -> ShapeBank:
-    """The parts of a set as a bank at true size.
+    """Return the parts of a set as a bank at true size.
 
-    It stores signed distances on a grid, since a tree of operations takes minutes to compile in a search.
+    The bank stores signed distances on a grid, because a tree of set operations takes minutes to compile in a search.
     """
     nodes = _nodes(_BANK_GRID)
     low, spacing = np.full(3, -_BANK_GRID.half_extent), _BANK_GRID.spacing
@@ -209,7 +210,7 @@ def _nodes(grid: Grid) -> Float[Array, "g g g 3"]:
     return jnp.stack(jnp.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
 
 
-# Solids of one set share a compilation.
+# A compiled program, which all solids of one set share.
 @program
 def _values(solid: SignedDistance, nodes: Float[Array, "*n 3"]) -> Float[Array, "*n"]:
     return solid(nodes)

@@ -1,4 +1,4 @@
-"""The demonstration object: a mug on a saucer, with surface that only few views show."""
+"""The demonstration object, a mug on a saucer. Parts of its surface are visible from few directions."""
 
 import math
 
@@ -7,11 +7,11 @@ from jaxnbv.scanning.sphere_tracing import SDFSurface
 
 
 def demo_object() -> SDFSurface:
-    """An empty mug on a saucer, with a spoon in it and two lumps of sugar beside it. The y axis is up.
+    """Return an empty mug on a saucer, with a spoon in the mug and two lumps of sugar beside the mug.
 
-    The longest side, across the saucer, is 2.5. The inside of the mug, the bowl of the spoon, the underside of the
-    saucer and the objects behind the mug show from few directions. No part is thinner than 0.06, except the lip of the
-    spoon's bowl.
+    The y axis is up. The longest side, across the saucer, is 2.5. Four regions are visible from few directions: the
+    inside of the mug, the bowl of the spoon, the underside of the saucer, and the objects behind the mug. Nothing is
+    thinner than 0.06, except the lip of the spoon's bowl.
     """
     return SDFSurface((_saucer() | _mug() | _spoon() | _sugar()).translate([0.0, -0.87, 0.0]))
 

@@ -1,13 +1,16 @@
-"""Options for the size and place of an object and for its first view.
+"""Options of studies for the size and position of an object and for its first view.
 
-Commands offer these options, so this module does not import JAX.
+The command line offers these options, so this module does not import JAX.
 """
 
 from enum import StrEnum
 
 
 class Framing(StrEnum):
-    """Size of the object: a view shows a patch of it (close-up) or nearly all of its near side (whole)."""
+    """Size of the object relative to the camera's field of view.
+
+    A view shows a patch of the object (`CLOSE_UP`) or nearly all of the side that faces the camera (`WHOLE`).
+    """
 
     CLOSE_UP = "close-up"
     WHOLE = "whole"
@@ -19,7 +22,11 @@ class Framing(StrEnum):
 
 
 class FirstView(StrEnum):
-    """Allowed first views of an object: any, or only views after which the classifier is wrong."""
+    """Condition for the first view of an object.
+
+    With `ANY`, every view of the object may be the first. With `MISCLASSIFIED`, only a view after which the classifier
+    is wrong may be the first.
+    """
 
     ANY = "any"
     MISCLASSIFIED = "misclassified"
@@ -28,8 +35,10 @@ class FirstView(StrEnum):
 class Setup(StrEnum):
     """Setup in which a known part is scanned.
 
-    A view shows nearly all of the part's near side (whole) or a patch of it (close-up), the part rests on a table
-    (table), or it rests there beside a box that hides half of it (hidden).
+    - `WHOLE`: a view shows nearly all of the side of the part that faces the camera.
+    - `CLOSE_UP`: a view shows a patch of the part.
+    - `TABLE`: the part rests on a table.
+    - `HIDDEN`: the part rests on a table beside a box that hides half of one side of the part.
     """
 
     WHOLE = "whole"
@@ -39,7 +48,7 @@ class Setup(StrEnum):
 
     @property
     def radius(self) -> float:
-        """Distance of the cameras from the part's centre, in scene units (longest side 2.5)."""
+        """Distance of the cameras from the part's centre, in scene units. The part's longest side is 2.5."""
         return 2.2 if self is Setup.CLOSE_UP else 5.0
 
     @property

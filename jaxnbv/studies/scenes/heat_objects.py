@@ -1,4 +1,4 @@
-"""Heated objects, in which heat flows through legs, panels, a handle or fins that few views show."""
+"""Heated objects. Heat flows through their legs, panels, handle or fins, which are visible in few views."""
 
 from functools import partial
 
@@ -16,7 +16,7 @@ from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.studies.scenes import labelled
 from jaxnbv.studies.scenes.labelled import assemble, generator
 
-# Labels of heated objects are not used.
+# All primitives have the label 0, because labels of heated objects are not used.
 bar, box, ring, rod = (partial(make, 0) for make in (labelled.bar, labelled.box, labelled.ring, labelled.rod))
 path = partial(labelled.path, 0)
 FIRST_TRAINING = 100_000
@@ -25,9 +25,10 @@ FIRST_TRAINING = 100_000
 class HeatScene(eqx.Module):
     """A connected object and its heat source.
 
-    - `surface`: the object, centred, with longest side 2.5. Procedural ones stand upright along y.
-    - `name`: the kind of object, such as one of `HEAT_OBJECTS`.
-    - `source`: the point of the surface (scene coordinates) around which power enters.
+    - `surface`: surface of the object, which is centred and has longest side 2.5. Procedural objects stand upright
+      along y.
+    - `name`: kind of the object, such as one of `HEAT_OBJECTS`.
+    - `source`: point of the surface (scene coordinates) around which the object is heated.
     """
 
     surface: Surface
@@ -36,10 +37,10 @@ class HeatScene(eqx.Module):
 
 
 def heat_scene(index: int, turned: bool = True) -> HeatScene:
-    """The heated scene of an index. The kinds of objects take turns.
+    """Return the heated scene with this index. Its kind of object is `HEAT_OBJECTS[index % 4]`.
 
-    Proportions and source are random, and so is the turn about y if `turned`. Reported results never include indices
-    from `FIRST_TRAINING` on.
+    Proportions and heat source are random. If `turned`, the object is also rotated about y by a random angle. Indices
+    from `FIRST_TRAINING` on are reserved for training, so reported results never include them.
 
     **Raises:** `ValueError` if the index is negative.
     """
@@ -55,7 +56,7 @@ def heat_scene(index: int, turned: bool = True) -> HeatScene:
 
 
 def source_view(scene: HeatScene, key: PRNGKeyArray, num_candidates: int = 100, radius: float = 3.0) -> Pose:
-    """A random candidate on the sphere from which the heat source is visible, drawn uniformly.
+    """Return a random candidate on the sphere from which the heat source is visible, drawn uniformly.
 
     **Raises:** `ValueError` if there is no such candidate.
     """
@@ -67,7 +68,8 @@ def source_view(scene: HeatScene, key: PRNGKeyArray, num_candidates: int = 100, 
     return poses[int(jax.random.choice(key, shown))]
 
 
-# Each function returns the primitives, the heated one first, and the source in the frame of that one, in half sizes.
+# Each function below returns the primitives of an object and the position of the heat source. The first primitive is
+# heated. The position is in the frame of this primitive, in units of its half sizes.
 
 
 def _on_top(rng):
@@ -75,7 +77,7 @@ def _on_top(rng):
 
 
 def _desk(rng):
-    """A desk with four legs, a panel behind and a drawer, heated on its top."""
+    """Build a desk with four legs, a back panel and a drawer. It is heated on its top."""
     half_depth, half_width, height = rng.uniform(0.5, 0.65), rng.uniform(0.95, 1.2), rng.uniform(1.0, 1.3)
     thick, leg = rng.uniform(0.05, 0.08), rng.uniform(0.05, 0.08)
     parts = [box((0, height, 0), (half_depth, thick, half_width))]
@@ -89,7 +91,7 @@ def _desk(rng):
 
 
 def _chair(rng):
-    """A chair with rails between its four legs and an open back, heated on its seat."""
+    """Build a chair with rails between its four legs and an open back. It is heated on its seat."""
     half_depth, half_width, height = rng.uniform(0.5, 0.6), rng.uniform(0.5, 0.6), rng.uniform(1.0, 1.2)
     thick, leg, rise = rng.uniform(0.05, 0.08), rng.uniform(0.05, 0.07), rng.uniform(0.8, 1.1)
     parts = [box((0, height, 0), (half_depth, thick, half_width), 0.03)]
@@ -109,7 +111,7 @@ def _chair(rng):
 
 
 def _mug(rng):
-    """A hollow mug with a handle, heated from below."""
+    """Build a hollow mug with a handle. It is heated from below."""
     radius, half_height, wall = rng.uniform(0.65, 0.8), rng.uniform(0.75, 0.95), rng.uniform(0.045, 0.06)
     parts = [
         rod((0, -half_height, 0), (0, -half_height + 0.12, 0), radius - wall),
@@ -123,7 +125,7 @@ def _mug(rng):
 
 
 def _fins(rng):
-    """A comb of upright fins on a plate, heated from below."""
+    """Build a plate with a row of upright fins. It is heated from below."""
     count, half_depth, half_width = int(rng.integers(6, 10)), rng.uniform(0.6, 0.9), rng.uniform(1.0, 1.2)
     rise, thick = rng.uniform(0.6, 1.0), rng.uniform(0.06, 0.1)
     parts = [box((0, 0, 0), (half_depth, thick, half_width))]

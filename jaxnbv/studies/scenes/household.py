@@ -20,10 +20,11 @@ path = partial(labelled.path, 1)
 
 
 def household_scene(split: Split, index: int, framing: Framing = Framing.CLOSE_UP, turned: bool = True) -> SolidObject:
-    """The household scene of an index in a split: a random object. The classes `HOUSEHOLD` take turns.
+    """Return the random household object with this index in a split, of class `HOUSEHOLD[index % 10]`.
 
-    The object stands upright along y, turned about y at random, or along x if not `turned`. Its bounding box is
-    centred. At a longest side of 2.5, no primitive is thinner than 0.05. Built on the host: does not run under `jit`.
+    The object stands upright along y. If `turned`, it is rotated about y by a random angle, else it faces x. Its
+    bounding box is centred. At a longest side of 2.5, no primitive is thinner than 0.05. The object is built on the
+    host, so the function does not run under `jit`.
 
     **Raises:** `ValueError` if the index is negative.
     """
@@ -38,7 +39,7 @@ def _corners(x: float, z: float) -> list[tuple[float, float]]:
 
 
 def _bathtub(rng):
-    """A basin on feet or on a plinth, with or without a rim and a tap."""
+    """Build a bathtub: a basin on feet or on a plinth, with or without a rim and a tap."""
     x, z, height, wall = rng.uniform(0.42, 0.52), rng.uniform(0.95, 1.15), rng.uniform(0.25, 0.34), 0.06
     soft = rng.uniform(0.02, 0.06)
     yield box((0, -height + wall, 0), (x - 0.02, wall, z - 0.02), soft)
@@ -59,7 +60,7 @@ def _bathtub(rng):
 
 
 def _bed(rng):
-    """A mattress in a frame with pillows, a headboard, and a lower footboard or none."""
+    """Build a bed: a mattress in a frame, with pillows and a headboard, and with or without a lower footboard."""
     x, z, level = rng.uniform(0.95, 1.15), rng.uniform(0.45, 0.9), rng.uniform(0.2, 0.35)
     thick, frame = rng.uniform(0.09, 0.16), 0.07
     yield box((0, level, 0), (x, frame, z))
@@ -80,7 +81,7 @@ def _bed(rng):
 
 
 def _desk(rng):
-    """A wide top on two chests of drawers, or on one and legs or a panel, with a panel behind."""
+    """Build a desk with a back panel. It stands on two chests of drawers, or on one chest and on legs or a panel."""
     x, z, height, thick = rng.uniform(0.45, 0.6), rng.uniform(0.95, 1.2), rng.uniform(0.9, 1.1), 0.05
     yield box((0, height, 0), (x, thick, z))
     sides = (-1, 1) if rng.random() < 0.5 else (rng.choice([-1, 1]),)
@@ -105,7 +106,7 @@ def _desk(rng):
 
 
 def _dresser(rng):
-    """A wide chest on feet or a plinth, with two or three columns of drawers with knobs."""
+    """Build a dresser: a wide chest on feet or a plinth, with two or three columns of drawers with knobs."""
     x, z, height = rng.uniform(0.32, 0.42), rng.uniform(0.85, 1.1), rng.uniform(0.45, 0.6)
     yield box((0, 0, 0), (x, height, z))
     yield box((0.02, height + 0.02, 0), (x + 0.05, 0.045, z + 0.04))
@@ -125,7 +126,7 @@ def _dresser(rng):
 
 
 def _monitor(rng):
-    """A flat screen with a frame, on a neck with a round or square foot."""
+    """Build a monitor: a flat screen with a frame, on a neck with a round or square foot."""
     z, height, thick = rng.uniform(0.85, 1.1), rng.uniform(0.5, 0.7), rng.uniform(0.05, 0.08)
     tilt = rng.uniform(0.0, 0.15)
     level = height + rng.uniform(0.25, 0.4)
@@ -151,7 +152,7 @@ def _monitor(rng):
 
 
 def _night_stand(rng):
-    """A small chest on legs, as high as wide, with two drawers, or one above an open shelf."""
+    """Build a night stand: a chest on legs, as high as wide, with two drawers or one drawer above an open shelf."""
     x, z, height, legs = rng.uniform(0.55, 0.7), rng.uniform(0.6, 0.75), rng.uniform(0.5, 0.7), rng.uniform(0.25, 0.6)
     wall, top = 0.05, legs + 2 * height
     yield box((0, top, 0), (x + 0.06, wall, z + 0.06))
@@ -170,7 +171,7 @@ def _night_stand(rng):
 
 
 def _sofa(rng):
-    """Two or three seats with cushions between arms, and a back with or without cushions."""
+    """Build a sofa: two or three seats with cushions between arms, and a back with or without cushions."""
     x, z, seat = rng.uniform(0.4, 0.52), rng.uniform(0.85, 1.15), rng.uniform(0.18, 0.26)
     rise, arm = rng.uniform(0.35, 0.55), rng.uniform(0.1, 0.16)
     soft = rng.uniform(0.03, 0.08)
@@ -189,7 +190,7 @@ def _sofa(rng):
 
 
 def _toilet(rng):
-    """A bowl on a foot, with a seat, a lid that is open or shut, and a tank behind."""
+    """Build a toilet: a bowl on a foot, with a seat, a lid that is open or shut, and a tank behind the bowl."""
     bowl, level = rng.uniform(0.4, 0.48), rng.uniform(0.55, 0.7)
     deep, slant = 0.2, rng.uniform(0.3, 0.6)
     foot = rng.uniform(0.22, 0.3)
@@ -208,7 +209,7 @@ def _toilet(rng):
         out = np.array([np.cos(lean), np.sin(lean), 0.0])
         yield rod(lid - 0.035 * out, lid + 0.035 * out, bowl)
         return
-    # Fill the bowl under a shut lid, where no view sees.
+    # Fill the bowl if the lid is shut, because no view can see into it.
     inside = rod((0.1, level - deep, 0), (0.1, level + 0.07, 0), bowl - 0.1)
     yield inside
     yield rod((0.1, level + 0.05, 0), (0.1, level + 0.12, 0), bowl + 0.02)

@@ -1,7 +1,8 @@
-"""Builds solids with labelled surfaces from primitives. One compiled program scans any of them.
+"""Functions that build solids with labelled surfaces from primitives.
 
-An object is a list of primitives, which `assemble` joins into a `LabelledSolid`. A primitive is a rounded box, or a
-rounded rectangle revolved about an axis: a ring, a wheel, a rod, a cone or a ball.
+An object is a list of primitives, which `assemble` joins into a `LabelledSolid`. A primitive is a rounded box, or the
+solid that a rounded rectangle sweeps when it revolves about an axis: a ring, a wheel, a rod, a cone or a ball. All
+solids of one capacity share one compiled program for scanning.
 """
 
 import dataclasses
@@ -16,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from jaxnbv.checks import require
 from jaxnbv.scanning.sdf import UNUSED, LabelledSolid
 
-# Number of primitives that a solid has room for. Larger solids use a multiple of it.
+# Number of slots for primitives in a solid. Larger solids use a multiple of this number.
 CAPACITY = 24
 
 _UNTURNED, _UNMOVED = np.eye(3), np.zeros(3)
@@ -24,7 +25,7 @@ _UNTURNED, _UNMOVED = np.eye(3), np.zeros(3)
 
 @dataclasses.dataclass(frozen=True)
 class Primitive:
-    """One slot of a `LabelledSolid` on the host. It has the same fields as the solid."""
+    """One primitive of a `LabelledSolid`, as NumPy arrays on the host. The fields are those of the solid."""
 
     label: int
     centre: np.ndarray
@@ -36,12 +37,12 @@ class Primitive:
     revolved: bool = False
 
     def bounds(self) -> Float[np.ndarray, "2 3"]:
-        """The exact lowest and highest coordinates of the primitive."""
+        """Compute the exact lowest and highest coordinates of the primitive."""
         inner = self.half_size - self.rounding
         if not self.revolved:
             reach = np.abs(self.rotation) @ inner + self.rounding
             return self.centre + np.stack([-reach, reach])
-        # Both directions of each axis in the plane of the profile, then their image under the shear.
+        # Take both directions of each coordinate axis in the plane of the profile, and then apply the shear to them.
         up = np.stack([-self.rotation[:, 1], self.rotation[:, 1]])
         out = np.sqrt(np.maximum(1.0 - up**2, 0.0))
         up = up + self.slant * out
@@ -50,14 +51,20 @@ class Primitive:
 
 
 def box(label: int, centre, half_size, rounding: float = 0.02, turn: tuple | None = None) -> Primitive:
-    """A box with rounded edges. `turn` = (axis, angle in radians) turns it about its centre, right-handed."""
+    """Return a box with rounded edges.
+
+    - `turn`: axis and angle (radians) of a right-handed rotation of the box about its centre; None for no rotation.
+    """
     half_size = np.asarray(half_size, dtype=float)
     rotation = np.eye(3) if turn is None else rotation_about(*turn)
     return Primitive(label, np.asarray(centre, dtype=float), rotation, half_size, min(rounding, half_size.min()))
 
 
 def bar(label: int, start, end, half_width: float, half_depth: float, rounding: float = 0.02) -> Primitive:
-    """A box from `start` to `end`. Its width is horizontal, and along z if the bar is upright."""
+    """Return a box that extends from `start` to `end`.
+
+    Its width is horizontal. If the bar is upright, its width is along z.
+    """
     start, end = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
     half_size = np.array([half_depth, 0.5 * np.linalg.norm(end - start), half_width])
     rotation = _upright(end - start)
@@ -74,14 +81,23 @@ def ring(
     rounding: float = 0.02,
     slant: float = 0.0,
 ) -> Primitive:
-    """A rounded rectangle revolved about `axis` at mean distance `radius`, which grows with slope `slant`."""
+    """Return the solid that a rounded rectangle sweeps when it revolves about `axis`.
+
+    - `centre`: point of the axis at half the solid's height.
+    - `radius`: distance of the rectangle's centre from the axis.
+    - `half_width`, `half_height`: half sizes of the rectangle across and along the axis.
+    - `slant`: growth of the distance from the axis per unit of height.
+    """
     half_size = np.array([half_width, half_height, half_height])
     rounding = min(rounding, half_width, half_height)
     return Primitive(label, np.asarray(centre, dtype=float), _upright(axis), half_size, rounding, radius, slant, True)
 
 
 def rod(label: int, start, end, radius: float, end_radius: float | None = None, rounding: float = 0.02) -> Primitive:
-    """A solid with circular section and flat ends, whose radius changes linearly to `end_radius`."""
+    """Return a solid with circular cross-section and flat ends.
+
+    The radius changes linearly from `radius` at `start` to `end_radius` at `end`; default: constant radius.
+    """
     start, end = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
     length = float(np.linalg.norm(end - start))
     end_radius = radius if end_radius is None else end_radius
@@ -91,7 +107,7 @@ def rod(label: int, start, end, radius: float, end_radius: float | None = None, 
 
 
 def path(label: int, points, radius: float) -> list[Primitive]:
-    """Rods with round ends along the polyline through the points."""
+    """Return rods with round ends that follow the polyline through the points."""
     points = np.asarray(points, dtype=float)
     rods = []
     for start, end in itertools.pairwise(points):
@@ -101,22 +117,22 @@ def path(label: int, points, radius: float) -> list[Primitive]:
 
 
 def ball(label: int, centre, radius: float) -> Primitive:
-    """A ball."""
+    """Return a ball."""
     return ring(label, centre, (0.0, 1.0, 0.0), 0.0, radius, radius, radius)
 
 
 def shifted(point, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Float[np.ndarray, "3"]:
-    """A point moved along the axes."""
+    """Return a point moved by x, y and z along the coordinate axes."""
     return np.asarray(point, dtype=float) + np.array([x, y, z])
 
 
 def rotation_about(axis, angle: float) -> Float[np.ndarray, "3 3"]:
-    """The right-handed rotation about an axis by an angle in radians."""
+    """Return the matrix of the right-handed rotation about an axis by an angle in radians."""
     return Rotation.from_rotvec(angle * np.asarray(axis, dtype=float) / np.linalg.norm(axis)).as_matrix()
 
 
 def _upright(axis):
-    """A rotation whose second column is the direction `axis` and whose third column is horizontal."""
+    """Return a rotation whose second column is the direction `axis` and whose third column is horizontal."""
     axis = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
     level = np.cross(axis, [0.0, 1.0, 0.0])
     if np.linalg.norm(level) < 1e-6:
@@ -126,16 +142,16 @@ def _upright(axis):
 
 
 def assemble(primitives: list[Primitive], turn: float = 0.0, longest_side: float = 2.5) -> LabelledSolid:
-    """The union of primitives, turned about the y axis by `turn` (radians), then moved and scaled.
+    """Return the union of primitives, rotated about the y axis by `turn` (radians), then moved and scaled.
 
-    Its bounding box is centred in the scene and has the given longest side.
+    The bounding box of the result is centred in the scene, and its longest side is `longest_side`.
     """
     turned = rotation_about((0.0, 1.0, 0.0), turn)
     return united(fitted([moved(p, rotation=turned) for p in primitives], longest_side))
 
 
 def moved(p: Primitive, scale: float = 1.0, rotation=_UNTURNED, offset=_UNMOVED) -> Primitive:
-    """The image of a primitive under x -> scale rotation x + offset."""
+    """Return the image of a primitive under x -> scale rotation x + offset."""
     return dataclasses.replace(
         p,
         centre=scale * rotation @ p.centre + offset,
@@ -147,22 +163,24 @@ def moved(p: Primitive, scale: float = 1.0, rotation=_UNTURNED, offset=_UNMOVED)
 
 
 def bounds(primitives: list[Primitive]) -> Float[np.ndarray, "2 3"]:
-    """The lowest and highest coordinates of a list of primitives."""
+    """Compute the lowest and highest coordinates of a list of primitives."""
     lows, highs = zip(*(p.bounds() for p in primitives), strict=True)
     return np.stack([np.min(lows, axis=0), np.max(highs, axis=0)])
 
 
 def fitted(primitives: list[Primitive], longest_side: float) -> list[Primitive]:
-    """The primitives, moved and scaled so that their bounding box is centred and has this longest side."""
+    """Move and scale primitives so that their joint bounding box is centred and has this longest side."""
     low, high = bounds(primitives)
     scale = longest_side / (high - low).max()
     return [moved(p, scale, offset=-0.5 * scale * (low + high)) for p in primitives]
 
 
 def united(primitives: list[Primitive], capacity: int = CAPACITY) -> LabelledSolid:
-    """The union of primitives, without moving them.
+    """Return the union of primitives without moving them.
 
-    **Raises:** `ValueError` if there are no primitives or more than the capacity.
+    - `capacity`: number of slots for primitives in the solid.
+
+    **Raises:** `ValueError` if there are no primitives, or more primitives than the capacity.
     """
     count = len(primitives)
     require(1 <= count <= capacity, f"the object has {count} primitives; a solid holds 1 to {capacity}")
@@ -173,5 +191,5 @@ def united(primitives: list[Primitive], capacity: int = CAPACITY) -> LabelledSol
 
 
 def generator(key) -> np.random.Generator:
-    """A NumPy generator seeded by a JAX key, for objects that are built on the host."""
+    """Return a NumPy random generator seeded by a JAX key, for objects that are built on the host."""
     return np.random.default_rng(np.asarray(jax.random.key_data(key)))

@@ -1,4 +1,4 @@
-"""Scenes of objects with labelled parts, in all procedural categories."""
+"""Scenes with one procedural object whose parts are labelled."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -30,16 +30,16 @@ _BUILDERS = {
 # The categories that have procedural objects, in the order of `networks.CATEGORIES`.
 PART_CATEGORIES = tuple(_BUILDERS)
 
-# Objects face one way, as in ShapeNet, up to a small turn about the y axis.
+# All objects face along x, as in ShapeNet, up to this rotation about the y axis.
 _LARGEST_TURN = np.radians(10.0)
 
 
 class PartScene(eqx.Module):
-    """An object with its category and parts.
+    """An object with its category and its parts, of the fifty parts of ShapeNet-part.
 
     - `solid`: the object. Its labels are indices of the fifty parts.
-    - `category`: index of its category in `networks.CATEGORIES`.
-    - `parts`: whether it has each of the fifty parts.
+    - `category`: index of the object's category in `networks.CATEGORIES`.
+    - `parts`: True for each of the fifty parts that the object has.
     """
 
     solid: LabelledSolid
@@ -48,10 +48,11 @@ class PartScene(eqx.Module):
 
 
 def part_scene(split: Split, index: int) -> PartScene:
-    """The part scene of an index in a split: a random object. The categories `PART_CATEGORIES` take turns.
+    """Return the scene with this index in a split, which holds a random object with labelled parts.
 
-    The object stands upright along y and faces x to within 10 degrees. Its bounding box is centred and has longest side
-    2.5. No part is thinner than 0.05. Built on the host: does not run under `jit`.
+    The category is `PART_CATEGORIES[index % 13]`. The object stands upright along y and faces x to within 10 degrees.
+    Its bounding box is centred and has longest side 2.5. No part is thinner than 0.05. The object is built on the host,
+    so the function does not run under `jit`.
 
     **Raises:** `ValueError` if the index is negative.
     """

@@ -1,4 +1,4 @@
-"""Known parts placed in a scene: turned at random, or resting on a table, perhaps beside a box."""
+"""Known parts placed in a scene, either with a random rotation or resting on a table, with or without a box."""
 
 import dataclasses
 import functools
@@ -20,15 +20,20 @@ from jaxnbv.studies.scenes.framing import Setup
 from jaxnbv.surfaces import FreeRotation, Resting, ShapeBank, ShapePoses
 
 _LONGEST_SIDE = 2.5
-# The box beside a part: its gap to the part, half its thickness, and its excess over the part, in scene units.
+# The box beside a part, in scene units: gap between box and part, half the thickness of the box, and length by which
+# the box extends beyond the part.
 _GAP, _THIN, _BEYOND = 0.3, 0.15, 0.2
-# Seed of the order of parts, the same for all seeds of a study.
+# Seed of the order of parts, which does not depend on the seed of the study.
 _ORDER = 123
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Parts:
-    """A bank at true size, and the meshes of its parts in the coordinates of its shapes."""
+    """Parts at true size.
+
+    - `bank`: the bank of the parts, at true size.
+    - `meshes`: the mesh of each part, in the coordinates of the bank's shapes.
+    """
 
     bank: ShapeBank
     meshes: tuple[TriangleMesh, ...]
@@ -39,14 +44,19 @@ class Parts:
         return Resting.of(self.bank)
 
     def choose(self, index: int) -> int:
-        """The part of a scene. Even and odd scenes share no part, and all parts come once before any repeats."""
+        """Return the index of the part for the scene with this index.
+
+        Scenes with even and odd indices share no part. Every part comes once before any part repeats.
+        """
         half = np.random.default_rng(_ORDER).permutation(len(self.meshes))[index % 2 :: 2]
         return int(half[index // 2 % len(half)])
 
 
 @functools.cache
 def parts_in(files: tuple[MeshFile, ...]) -> Parts:
-    """Read the parts from files. A `UserWarning` names each file that cannot be used, which is left out.
+    """Read parts from mesh files.
+
+    A file that cannot be used is left out, and a `UserWarning` names it.
 
     **Raises:** `ValueError` if there is only one part.
     """
@@ -66,7 +76,10 @@ def _at_true_size(mesh: TriangleMesh) -> TriangleMesh:
 
 
 def confusable_parts(index: int) -> tuple[str, Parts, int]:
-    """The name of a scene's set of parts, its parts, and the index of the scene's part. Sets take turns."""
+    """Return the name of a set of look-alike parts, its parts, and the index of the part for a scene.
+
+    - `index`: index of the scene. The set is `CONFUSABLE_SETS[index % 10]`.
+    """
     turn, set_index = divmod(index, len(CONFUSABLE_SETS))
     name = CONFUSABLE_SETS[set_index]
     order = np.random.default_rng(_ORDER + set_index).permutation(PARTS_OF_SET)
@@ -76,10 +89,10 @@ def confusable_parts(index: int) -> tuple[str, Parts, int]:
 class PlacedPart(eqx.Module):
     """A part placed in a scene. Its bounding box is centred and has longest side 2.5.
 
-    - `part`: index of the part in the bank; `parts`: all candidate parts, at true size.
-    - `scale`: scene units per unit of the parts.
-    - `rotation`, `shift`: the placement. A point u of the shape lies at rotation (scale u) + shift.
-    - `obstacles`: a table, perhaps with a box on it; None for no obstacles.
+    - `part`: index of the part in the bank; `parts`: all parts that the object may be, at true size.
+    - `scale`: scene units per unit of the parts' coordinates.
+    - `rotation`, `shift`: the placement. A point u of the part is placed at rotation (scale u) + shift.
+    - `obstacles`: a table, with or without a box on it; None for no obstacles.
     """
 
     part: int = eqx.field(static=True)
@@ -91,12 +104,12 @@ class PlacedPart(eqx.Module):
 
     @property
     def bank(self) -> ShapeBank:
-        """The bank in scene units."""
+        """The bank of the parts in scene units."""
         return self.parts.bank.in_scene(Frame(scale=self.scale))
 
     @property
     def poses(self) -> ShapePoses:
-        """The poses in which the parts can lie: stable on the table if there is one, else any."""
+        """Possible poses of the parts: the stable poses if there is a table, else all rotations."""
         return FreeRotation() if self.obstacles is None else self.parts.resting
 
     @property
@@ -105,13 +118,19 @@ class PlacedPart(eqx.Module):
         return self.placed(self.part, self.rotation, self.shift)
 
     def placed(self, part: int, rotation: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"]) -> TriangleMesh:
-        """The mesh of any of the parts with a given placement, in scene coordinates."""
+        """Return the mesh of a part with a given placement, in scene coordinates.
+
+        - `part`: index of the part in the bank, which need not be the scene's part.
+        """
         mesh = self.parts.meshes[part]
         return TriangleMesh(self.scale * mesh.vertices @ np.asarray(rotation).T + shift, mesh.faces, Frame())
 
 
 def place_part(parts: Parts, part: int, setup: Setup, key: PRNGKeyArray) -> PlacedPart:
-    """Place a part at random, as a setup requires."""
+    """Place a part at random in a setup.
+
+    The part gets a random rotation, or rests on a table in a random stable pose if `Setup.is_resting`.
+    """
     random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     vertices = parts.meshes[part].vertices
     rotation = _resting(vertices, random) if setup.is_resting else Rotation.random(rng=random).as_matrix()
@@ -123,7 +142,10 @@ def place_part(parts: Parts, part: int, setup: Setup, key: PRNGKeyArray) -> Plac
 
 
 def _resting(vertices: Float[np.ndarray, "v 3"], random: np.random.Generator) -> Float[np.ndarray, "3 3"]:
-    """The rotation of a random stable pose on a table, y up, drawn by the probability that the part lands so."""
+    """Return the rotation of a random stable pose on a table. The y axis is up.
+
+    A pose is drawn with the probability that a dropped part comes to rest in this pose.
+    """
     hull = trimesh.Trimesh(vertices, process=False).convex_hull
     matrices, shares = trimesh.poses.compute_stable_poses(hull)
     resting = matrices[random.choice(len(shares), p=shares / shares.sum())][:3, :3]
@@ -133,7 +155,10 @@ def _resting(vertices: Float[np.ndarray, "v 3"], random: np.random.Generator) ->
 
 
 def _obstacles(half: Float[np.ndarray, "3"], has_box: bool, random: np.random.Generator) -> Obstacles:
-    """The table below a part of this half size, and perhaps a box on it that hides half of one side of the part."""
+    """Return the table below a part of half size `half`.
+
+    If `has_box`, a box on the table hides half of one side of the part.
+    """
     table = HalfSpace(np.array([0.0, -half[1], 0.0]), np.array([0.0, 1.0, 0.0]))
     if not has_box:
         return Obstacles((table,))

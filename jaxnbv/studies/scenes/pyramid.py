@@ -1,4 +1,4 @@
-"""The synthetic pyramid: five classes that differ only in a pattern imprinted on the base."""
+"""Synthetic pyramids of five classes, which differ only in a pattern imprinted on the base."""
 
 import functools
 
@@ -14,10 +14,10 @@ from jaxnbv.studies.scenes.splits import Split, scene_key
 
 
 class Pyramid(ClassObject):
-    """A pyramid whose class is its pattern.
+    """A pyramid with a pattern imprinted on its base, which tells its class.
 
     - `solid`: the pyramid in scene coordinates.
-    - `label`: the class, an index of `PATTERNS`.
+    - `label`: index of the pattern in `PATTERNS`.
     """
 
     solid: ImprintedPyramid
@@ -27,9 +27,9 @@ class Pyramid(ClassObject):
         return self.solid(x)
 
     def on_cue(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[Array, "*n"]:
-        """Whether each point of the surface lies on the floor or the walls of the pattern.
+        """Return whether each point of the surface lies on the floor or the walls of the pattern.
 
-        - `x`: hits without noise, since the floor is only a few hundredths below the base.
+        - `x`: points on the surface without noise, because the floor is only a few hundredths below the base.
         - `tolerance`: largest distance from the pattern, in scene units.
         """
         distance, height = self.solid.imprint(x)
@@ -39,10 +39,11 @@ class Pyramid(ClassObject):
 def pyramid_scene(
     split: Split, index: int | Int[Array, ""], framing: Framing = Framing.CLOSE_UP, turned: bool = True
 ) -> Pyramid:
-    """The pyramid scene of an index in a split, the same pyramid in both framings. The classes take turns.
+    """Return the pyramid with this index in a split. Its class is `PATTERNS[index % 5]`.
 
-    The pyramid has a random height, and its pattern a random size, place, turn and depth. It is centred in the scene
-    with a random rotation, or upright along z if not `turned`. Runs under `jit` and `vmap`.
+    The pyramid has a random height. The size, position, rotation and depth of its pattern are random too. The pyramid
+    is centred in the scene. It has a random rotation if `turned`, else it is upright along z. The two framings give the
+    same pyramid at different sizes. The function runs under `jit` and `vmap`.
 
     **Raises:** `ValueError` if the index is negative.
     """
@@ -50,7 +51,7 @@ def pyramid_scene(
     return _pyramid(key, label, framing.longest_side, turned)
 
 
-# Least distance of a pattern from the base's edge. With the ranges below, no pattern breaks through a side.
+# Smallest distance between a pattern and the base's edge. With the ranges below, no pattern breaks through a side.
 _MARGIN = 0.1
 
 

@@ -1,4 +1,4 @@
-"""Splits of procedural scenes, and the random keys of their scenes."""
+"""Splits of procedural scenes into training, validation and test sets, and the random keys of scenes."""
 
 from enum import StrEnum
 
@@ -17,7 +17,7 @@ class Split(StrEnum):
 
 
 def scene_key(seed: int, split: Split, index: int | Int[Array, ""]) -> PRNGKeyArray:
-    """The random key of the scene of an index in a split. Each kind of scene has its own `seed`.
+    """Return the random key of a scene with this index in a split. Each kind of scene has its own `seed`.
 
     **Raises:** `ValueError` if the index is negative.
     """

@@ -1,4 +1,4 @@
-"""A truck whose open bed carries an object of one of ten classes. Only the cargo tells the class."""
+"""Trucks whose open bed carries an object of one of ten classes. Only the cargo tells the class."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,16 +21,16 @@ from jaxnbv.studies.scenes.labelled import (
 )
 from jaxnbv.studies.scenes.splits import Split, scene_key
 
-# Label of the truck, which does not tell the class. Primitives of the cargo have other labels.
+# Label of the truck's primitives, which do not tell the class. Primitives of the cargo have labels above 0.
 _TRUCK = 0
 
 
 def truck_scene(split: Split, index: int, framing: Framing = Framing.CLOSE_UP, turned: bool = True) -> SolidObject:
-    """The truck scene of an index in a split. The classes of the cargo take turns.
+    """Return the loaded truck with this index in a split. The cargo's class is `HOUSEHOLD[index % 10]`.
 
-    The cargo is turned about the vertical at random and scaled to fill the bed. The loaded truck has a random rotation,
-    or stands upright along y and faces x if not `turned`. Its bounding box is centred in the scene. Built on the host:
-    does not run under `jit`.
+    The cargo is rotated about the vertical by a random angle and scaled to fill the bed. The loaded truck has a random
+    rotation if `turned`, else it stands upright along y and faces x. Its bounding box is centred in the scene. The
+    truck is built on the host, so the function does not run under `jit`.
 
     **Raises:** `ValueError` if the index is negative.
     """
@@ -48,9 +48,11 @@ def truck_scene(split: Split, index: int, framing: Framing = Framing.CLOSE_UP, t
 def stowed(
     room: Float[np.ndarray, "2 3"], cargo: Float[np.ndarray, "2 3"], rng: np.random.Generator
 ) -> tuple[float, Float[np.ndarray, "3"]]:
-    """The scale and the shift that place a cargo at random on the floor of a bed.
+    """Compute a scale and a shift that place a cargo at a random position on the floor of a bed.
 
-    The scale is 85 to 95 % of the largest that fits. `room` and `cargo` are boxes (lowest and highest corner).
+    The scale is a random 85 to 95 % of the largest scale at which the cargo fits into the space above the bed.
+
+    - `room`, `cargo`: bounding boxes (lowest and highest corner) of the space above the bed and of the cargo.
     """
     side, size = np.diff(room, axis=0)[0], np.diff(cargo, axis=0)[0]
     scale = float((rng.uniform(0.85, 0.95) * side / size).min())
@@ -59,7 +61,7 @@ def stowed(
 
 
 def random_rotation(rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:
-    """A uniformly random rotation, from the QR decomposition of a Gaussian matrix."""
+    """Draw a uniformly random rotation, by QR decomposition of a Gaussian matrix."""
     rotation, triangle = np.linalg.qr(rng.normal(size=(3, 3)))
     rotation = rotation * np.sign(np.diag(triangle))
     rotation[:, 0] *= np.linalg.det(rotation)
@@ -67,7 +69,7 @@ def random_rotation(rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:
 
 
 def _truck(rng: np.random.Generator) -> tuple[list[Primitive], Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """The primitives of a truck that faces x, and the lowest and highest corner of the room on its bed."""
+    """Return the primitives of a truck that faces x, and the lowest and highest corner of the space above its bed."""
     wheel, half_width = rng.uniform(0.16, 0.22), rng.uniform(0.52, 0.62)
     bed, cab, rail = rng.uniform(1.05, 1.35), rng.uniform(0.4, 0.6), rng.uniform(0.4, 0.5)
     hood = rng.choice([0.0, rng.uniform(0.3, 0.45)])

@@ -1,4 +1,4 @@
-"""Trucks and cargo from mesh files: finds the bed of a truck and places cargo on it."""
+"""Functions that find the bed of a truck mesh and place a cargo mesh on it."""
 
 import operator
 from collections.abc import Iterator
@@ -12,19 +12,19 @@ from jaxnbv.studies.scenes.class_object import ClassMesh
 from jaxnbv.studies.scenes.labelled import generator, rotation_about
 from jaxnbv.studies.scenes.truck import random_rotation, stowed
 
-# Rows and columns of rays that look at the truck from above.
+# Number of rows and of columns of rays that are traced down onto the truck.
 _LINES = 96
-# Shares of a truck's height: the lowest and highest floor of a bed, and the range of heights within a floor.
+# Fractions of a truck's height: lowest and highest possible floor of a bed, and range of heights within one floor.
 _LOWEST, _HIGHEST, _EVEN = 0.15, 0.85, 0.02
 
 
 def bed_of(truck: TriangleMesh) -> Float[np.ndarray, "2 3"]:
-    """The lowest and highest corner of the room above an upright truck's bed, in scene coordinates.
+    """Return the lowest and highest corner of the space above a truck's bed, in scene coordinates.
 
-    The floor is the largest level, axis-aligned rectangle visible from above, between 15 and 85 % of the truck's
-    height. The room reaches to the truck's top.
+    The truck must be upright. The floor of the bed is the largest level, axis-aligned rectangle that is visible from
+    above between 15 and 85 % of the truck's height. The space above the bed ends at the height of the truck's top.
 
-    **Raises:** `ValueError` if no such rectangle covers a tenth of the truck's outline.
+    **Raises:** `ValueError` if no such rectangle covers 10 % of the truck's bounding rectangle as seen from above.
     """
     low, high = truck.vertices.min(axis=0), truck.vertices.max(axis=0)
     across = [np.linspace(low[axis], high[axis], 2 * _LINES + 1)[1::2] for axis in (0, 2)]
@@ -48,7 +48,7 @@ def bed_of(truck: TriangleMesh) -> Float[np.ndarray, "2 3"]:
 
 
 def _rectangles(flags: Bool[np.ndarray, "m n"]) -> Iterator[tuple[int, slice, slice]]:
-    """Area, rows and columns of the widest all-True rectangle for each pair of first and last row."""
+    """Yield the area, rows and columns of the widest all-True rectangle for each pair of first and last row."""
     for top in range(len(flags)):
         whole = np.ones(flags.shape[1], bool)
         for bottom in range(top, len(flags)):
@@ -63,10 +63,12 @@ def _rectangles(flags: Bool[np.ndarray, "m n"]) -> Iterator[tuple[int, slice, sl
 
 
 def loaded_truck(truck: TriangleMesh, cargo: TriangleMesh, label: int, key: PRNGKeyArray) -> ClassMesh:
-    """A truck mesh that carries an object of a class, placed as in `truck_scene`.
+    """Return a truck mesh that carries a cargo mesh, placed as in `truck_scene`.
 
-    Both meshes must be upright. The cargo is turned about the vertical at random and scaled to fill the bed, and the
-    loaded truck has a random rotation.
+    Both meshes must be upright. The cargo is rotated about the vertical by a random angle and scaled to fill the bed.
+    The loaded truck has a random rotation.
+
+    - `label`: index of the cargo's class.
 
     **Raises:** `ValueError` as `bed_of` does.
     """

@@ -16,7 +16,7 @@ BARREL, GRIP, TRIGGER = CATEGORIES[category_index("pistol")].labels
 
 
 def bag(rng: np.random.Generator) -> Iterator[Primitive]:
-    """A box or a roll with one or two handles above, with or without a pocket in front."""
+    """Build a bag: a box or a roll with one or two handles on top, with or without a pocket in front."""
     half_width, handles = rng.uniform(0.8, 1.1), int(rng.integers(1, 3))
     half_height, half_depth = rng.uniform(0.5, 0.75), rng.uniform(0.22, 0.4)
     if rng.random() < 0.3:
@@ -36,7 +36,7 @@ def bag(rng: np.random.Generator) -> Iterator[Primitive]:
 
 
 def guitar(rng: np.random.Generator) -> Iterator[Primitive]:
-    """An upright guitar, strings in front, with a waisted body or a solid one with horns, and pegs."""
+    """Build an upright guitar with pegs and the strings in front. Its body has a waist and may have horns."""
     lower, upper = rng.uniform(0.42, 0.52), rng.uniform(0.32, 0.4)
     depth, thin = rng.uniform(0.08, 0.16), rng.uniform(0.04, 0.055)
     waist, neck = rng.uniform(0.5, 0.6), rng.uniform(0.95, 1.15)
@@ -64,7 +64,7 @@ def guitar(rng: np.random.Generator) -> Iterator[Primitive]:
 
 
 def earphone(rng: np.random.Generator) -> Iterator[Primitive]:
-    """Headphones: two cups under an arched band, with or without a hanging wire."""
+    """Build headphones: two cups under an arched band, with or without a hanging wire."""
     half_width, rise = rng.uniform(0.75, 0.95), rng.uniform(0.95, 1.2)
     radius, thick, width = rng.uniform(0.32, 0.42), rng.uniform(0.1, 0.16), rng.uniform(0.06, 0.09)
     angle = np.linspace(0, np.pi, 9)
@@ -82,7 +82,7 @@ def earphone(rng: np.random.Generator) -> Iterator[Primitive]:
 
 
 def laptop(rng: np.random.Generator) -> Iterator[Primitive]:
-    """A laptop, opened by 90 to 130 degrees."""
+    """Build a laptop that is open at an angle of 90 to 130 degrees."""
     half_width, half_depth, thick = rng.uniform(1.1, 1.25), rng.uniform(0.7, 0.9), rng.uniform(0.04, 0.06)
     lean = rng.uniform(0.0, np.radians(40))
     hinge = np.array([-half_depth + 0.03, 0.0, 0.0])
@@ -92,7 +92,7 @@ def laptop(rng: np.random.Generator) -> Iterator[Primitive]:
 
 
 def pistol(rng: np.random.Generator) -> Iterator[Primitive]:
-    """A pistol with a slide and barrel or a revolver's drum, a slanted grip and a trigger guard."""
+    """Build a pistol with slide, barrel, slanted grip and trigger guard. It may have a revolver's drum."""
     half, length, drop = rng.uniform(0.13, 0.17), rng.uniform(0.9, 1.1), rng.uniform(0.75, 0.95)
     yield box(BARREL, (0.1, 0, 0), (length, half, 0.75 * half), 0.04)
     yield rod(BARREL, (length - 0.1, 0.02, 0), (length + rng.uniform(0.2, 0.35), 0.02, 0), 0.08)
@@ -109,7 +109,7 @@ def pistol(rng: np.random.Generator) -> Iterator[Primitive]:
 
 
 def mug(rng: np.random.Generator) -> Iterator[Primitive]:
-    """A mug with a hollow body, straight or widening, and a round or square handle behind."""
+    """Build a mug with a hollow body, nearly straight or widening, and a round or square handle behind."""
     radius, half_height = rng.uniform(0.6, 0.85), rng.uniform(0.75, 1.0)
     slant, wall = rng.uniform(-0.05, 0.2), 0.05
     yield ring(MUG_BODY, (0, 0, 0), (0, 1, 0), radius - wall, wall, half_height, 0.03, slant)
@@ -117,7 +117,7 @@ def mug(rng: np.random.Generator) -> Iterator[Primitive]:
     reach = rng.uniform(0.5, 0.7)
     top, bottom = rng.uniform(0.5, 0.7) * half_height, rng.uniform(-0.7, -0.5) * half_height
     angle = np.linspace(0.5 * np.pi, -0.5 * np.pi, 6)
-    # A superellipse, between an ellipse and a square.
+    # The handle follows an ellipse (power 1) or a superellipse, whose shape is between an ellipse and a square.
     power = rng.choice([1.0, 0.55])
     out = reach * np.cos(angle) ** power
     y = 0.5 * (top + bottom) + 0.5 * (top - bottom) * np.sign(np.sin(angle)) * np.abs(np.sin(angle)) ** power

@@ -13,7 +13,7 @@ BASE, SHADE, CANOPY, TUBE = CATEGORIES[category_index("lamp")].labels
 
 
 def chair(rng: np.random.Generator) -> Iterator[Primitive]:
-    """A chair on legs, a star base or runners, with a panel or slats behind and perhaps armrests."""
+    """Build a chair on legs, a star base or runners, with a panel or slats behind and perhaps armrests."""
     half_width, half_depth = rng.uniform(0.5, 0.65), rng.uniform(0.5, 0.62)
     height, rise = rng.uniform(0.9, 1.15), rng.uniform(1.0, 1.4)
     thick = rng.uniform(0.05, 0.09)
@@ -82,7 +82,7 @@ def _chair_back(rng, half_width, half_depth, height, rise, lean):
 
 
 def table(rng: np.random.Generator) -> Iterator[Primitive]:
-    """A rectangular or round table on legs, a pedestal or two panels, perhaps with drawers or a shelf."""
+    """Build a rectangular or round table on legs, a pedestal or panels, perhaps with drawers or a shelf."""
     height, thick = rng.uniform(1.0, 1.5), rng.uniform(0.045, 0.08)
     if rng.random() < 0.3:
         radius = rng.uniform(0.95, 1.2)
@@ -127,7 +127,7 @@ def _table_legs(rng, x, z, height):
 
 
 def lamp(rng: np.random.Generator) -> Iterator[Primitive]:
-    """A standing lamp, a desk lamp with a bent arm, or a hanging lamp. The shade is open below."""
+    """Build a standing lamp, a desk lamp with a bent arm, or a hanging lamp. The shade is open below."""
     kind = rng.choice(["standing", "desk", "hanging"], p=[0.4, 0.3, 0.3])
     tube = rng.uniform(0.045, 0.07)
     if kind == "desk":
@@ -146,7 +146,7 @@ def lamp(rng: np.random.Generator) -> Iterator[Primitive]:
     low, high = pole - 0.5 * tall, pole + 0.5 * tall
     yield rod(TUBE, (0, 0.05, 0), (0, pole, 0), tube)
     yield rod(BASE, (0, 0, 0), (0, rng.uniform(0.1, 0.3), 0), foot, rng.uniform(0.4, 0.9) * foot)
-    # Two spokes carry the shade.
+    # Two crossing spokes carry the shade.
     reach = 0.5 * (narrow + wide)
     yield rod(TUBE, (0, pole, -reach), (0, pole, reach), 0.035)
     yield rod(TUBE, (-reach, pole, 0), (reach, pole, 0), 0.035)
@@ -167,7 +167,7 @@ def _desk_lamp(rng, tube):
 
 
 def _shade(low, high, wide, narrow):
-    """A cone without caps, from its wide rim at `low` to its narrow rim at `high`."""
+    """Build a cone without caps, from its wide rim at `low` to its narrow rim at `high`."""
     low, high = np.asarray(low, dtype=float), np.asarray(high, dtype=float)
     length = float(np.linalg.norm(high - low))
     slant = (narrow - wide) / length

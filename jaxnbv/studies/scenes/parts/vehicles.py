@@ -14,7 +14,7 @@ SKATE_WHEEL, DECK, TRUCK = CATEGORIES[category_index("skateboard")].labels
 
 
 def airplane(rng: np.random.Generator) -> Iterator[Primitive]:
-    """An airplane with swept wings, and two or four engines below them or two beside a high tail."""
+    """Build an airplane with swept wings, and engines below the wings (two or four) or at the rear (two)."""
     radius, sweep = rng.uniform(0.12, 0.17), rng.uniform(0.1, 0.6)
     yield rod(BODY, (-0.55, 0, 0), (0.85, 0, 0), radius, rounding=0.0)
     yield rod(BODY, (0.83, 0, 0), (1.22, -0.02, 0), radius, 0.35 * radius, rounding=0.03)
@@ -45,7 +45,7 @@ def airplane(rng: np.random.Generator) -> Iterator[Primitive]:
 
 
 def rocket(rng: np.random.Generator) -> Iterator[Primitive]:
-    """An upright rocket with a pointed nose and three or four fins, with or without boosters between them."""
+    """Build an upright rocket with three or four fins, and with or without boosters between the fins."""
     radius = rng.uniform(0.2, 0.32)
     nose = rng.uniform(0.45, 0.7)
     yield rod(HULL, (0, 0, 0), (0, 1.75, 0), radius, radius * rng.uniform(0.85, 1.0))
@@ -64,13 +64,13 @@ def rocket(rng: np.random.Generator) -> Iterator[Primitive]:
 
 
 def motorbike(rng: np.random.Generator) -> Iterator[Primitive]:
-    """A motorbike with fork, engine, exhaust, tank, seat, handles, head light and perhaps a tail light."""
+    """Build a motorbike with fork, engine, exhaust, tank, seat, handles, lamp and perhaps a tail light."""
     radius, base, tyre = rng.uniform(0.38, 0.44), rng.uniform(0.74, 0.82), rng.uniform(0.08, 0.11)
     rear, front = np.array([-base, 0.0, 0.0]), np.array([base, 0.0, 0.0])
     for hub in (rear, front):
         yield ring(WHEEL, hub, (0, 0, 1), radius - tyre, tyre, tyre, 0.8 * tyre)
         yield rod(WHEEL, shifted(hub, z=-0.035), shifted(hub, z=0.035), radius - tyre)
-    # The steering head stands behind and above the front wheel by the fork's rake.
+    # The steering head is above the front wheel and behind it, because the fork is raked.
     head = shifted(front, -rng.uniform(0.28, 0.4), rng.uniform(0.78, 0.86))
     apart = tyre + 0.05
     for joint in (rear, front, head):
@@ -100,7 +100,7 @@ def motorbike(rng: np.random.Generator) -> Iterator[Primitive]:
 
 
 def skateboard(rng: np.random.Generator) -> Iterator[Primitive]:
-    """A deck with raised or flat ends, on two trucks with two wheels each."""
+    """Build a skateboard: a deck with raised or flat ends, on two trucks with two wheels each."""
     half_width, flat = rng.uniform(0.3, 0.4), rng.uniform(0.7, 0.9)
     rise, end, thick = rng.choice([0.0, rng.uniform(0.1, 0.3)]), rng.uniform(0.3, 0.4), rng.uniform(0.035, 0.05)
     yield box(DECK, (0, 0, 0), (flat, thick, half_width), 0.03)
