@@ -9,8 +9,9 @@ covariance k:
     mean     E g(x) = m(x) + (k(x, Y) + tau^2 1^T) w,   w = S^-1 (h value - m(Y))
     sample   f a sample given the normals, c and e from the prior;   w = S^-1 (h value - f(Y) + c - e)
 
-So f changes by k(., Y) w: the weights of the normals change by u_d = -A^-1 K_df w, the coefficients of f also by
-s(n) / |n|^2 sum_k w_k e^{-i n.y_k}, and c by -tau^2 1^T w. The components still share A.
+The values change f by k(., Y) w. This consists of a change u_d = -A^-1 K_df w of the weights of the normals, and of a
+direct change s(n) / |n|^2 sum_k w_k e^{-i n.y_k} of the coefficients of f. The level c changes by -tau^2 1^T w. The
+three components of v still share A.
 """
 
 import math
@@ -44,17 +45,17 @@ class ScreenedSPSR(SurfaceModel):
 
     The defaults were the best over validation objects in `benchmarks/imagination.py`.
 
-    - `base`: the prior, and the noise of the normals. The default has a short lengthscale for detail, and a long one
-      for the body, which values can use.
+    - `base`: the prior, and the noise of the normals. The default has a short lengthscale for detail, and a long
+      lengthscale for the overall shape, over which values can act.
     - `values`: sources of values, see `jaxnbv.surfaces.values`.
     - `level_deviation`: tau, the prior standard deviation of the level, which is broad compared with the values of f.
-    - `offset`: distance to both sides of the data, in scene units. h is half the median over the data of
-      E f(x_j + offset n_j) - E f(x_j - offset n_j) given the normals alone. It is at least half the prior standard
-      deviation of f, because the two sides of a thin sheet cancel.
+    - `offset`: distance from the data, to both sides, at which h is measured, in scene units. h is half the median over
+      the data of E f(x_j + offset n_j) - E f(x_j - offset n_j) given the normals alone. h is at least half the prior
+      standard deviation of f, because the two sides of a thin sheet cancel.
 
-    N normals and M values cost 3 N^2 M + M^3 in addition to `base`.
+    N normals and M values take 3 N^2 M + M^3 operations in addition to the cost of `base`.
 
-    **Raises:** `ValueError` without values, or if tau or the offset is not positive.
+    **Raises:** `ValueError` if there are no values, or if tau or the offset is not positive.
     """
 
     base: GeometricSPSR = eqx.field(default_factory=lambda: GeometricSPSR((0.01, 0.06), (0.2, 0.25), truncation=32))
@@ -78,9 +79,9 @@ class ScreenedSPSR(SurfaceModel):
         self.base.check(cloud)
 
     def condition(self, observations: Observations | PointCloud) -> "ScreenedSPSRPosterior":
-        """The posterior p(g | D, empty space).
+        """Return the posterior p(g | D, empty space).
 
-        It costs as much as the base, plus M triangular solves with the base's factor.
+        The cost is that of the base, plus M triangular solves with the base's factor.
 
         **Raises:** `ValueError` as `GeometricSPSR.condition` does, for a capacity above 16,384, for values that are not
         finite or at points outside [-pi/2, pi/2]^3, and if S is singular in the dtype's precision. Under `jit` values
@@ -108,7 +109,7 @@ class ScreenedSPSR(SurfaceModel):
 def _condition(
     model: ScreenedSPSR, base: GeometricSPSRPosterior, observations: Observations
 ) -> "ScreenedSPSRPosterior":
-    # The contents of unfilled rows must not reach the products.
+    # `base.cloud` has zeros in unfilled rows, where the cloud may hold NaN.
     observations = eqx.tree_at(lambda e: e.cloud, observations, base.cloud)
     spectrum, rows = model.base.spectrum, concatenate_rows(model.values, observations)
     half_jump = _half_jump(base, model.offset)
@@ -120,7 +121,7 @@ def _condition(
     # An unfilled row is a row of the identity, and its weight is zero.
     factor = CholeskyFactor.of(block + jnp.diag(jnp.where(rows.mask, (half_jump * rows.noise) ** 2, 1.0)))
 
-    # The posterior given the normals alone, until the weights of the values are computed.
+    # This is the posterior given the normals alone. The weights of the values and the mean replace its fields below.
     level, nothing = jnp.zeros_like(base.level), jnp.zeros_like(rows.values)
     posterior = ScreenedSPSRPosterior(
         level, base.mean_coefficients, model, base, rows, half_jump, whitened, factor, nothing
@@ -135,7 +136,10 @@ def _condition(
 
 
 def _half_jump(base: GeometricSPSRPosterior, offset: float) -> Float[Array, ""]:
-    """h: half the median rise of E f given the normals, from `offset` behind the data to `offset` in front."""
+    """Return h: half the median rise of E f, given the normals, from `offset` behind to `offset` in front of the data.
+
+    h is at least half the prior standard deviation of f.
+    """
     chosen = some_rows(base.cloud, _JUMP_POINTS)
     points, step = base.cloud.points[chosen], offset * base.cloud.normals[chosen]
     mean = base.mean_field
@@ -144,7 +148,7 @@ def _half_jump(base: GeometricSPSRPosterior, offset: float) -> Float[Array, ""]:
 
 
 class ScreenedDraws(NamedTuple):
-    """Draws of v and eps, of the level c, and of the noise e of the values, from the prior."""
+    """Draws from the prior: v and eps, the level c, and the noise e of the values."""
 
     normals: NormalDraws
     level: Float[Array, " s"]
@@ -161,7 +165,7 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
     - `half_jump`: h, the unit of the values.
     - `whitened`: C^-1 K_df with A = C C^T.
     - `factor`: the Cholesky factor of S.
-    - `weights`: the w of the mean.
+    - `weights`: w of the posterior mean.
     """
 
     level: Float[Array, ""]
@@ -192,15 +196,15 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
         return jax.lax.map(at_point, x, batch_size=points_at_once(len(x), self.base.cloud.capacity))
 
     def data_points(self) -> DataPoints:
-        """The points of the cloud for gradients, and the points of the value rows for values."""
+        """Return the points of the cloud for gradients, and the points of the value rows for values."""
         return DataPoints(self.base.data_points().gradients, fill_rows(self.rows.points, self.rows.mask))
 
     def level_about(self, means: MeansAtData) -> Float[Array, " s"]:
-        """Zeros: g is relative to the level, which the values tie to m_s + f."""
+        """Return zeros, because g is measured relative to the level for every mean function."""
         return jnp.zeros(len(means.values), self.weights.dtype)
 
     def prior_draws(self, key: PRNGKeyArray, num_samples: int) -> ScreenedDraws:
-        """Draws of v and eps, of c, and of e."""
+        """Draw v and eps, the level c, and the noise e of the values from the prior."""
         base_key, level_key, noise_key = jax.random.split(key, 3)
         normals = self.base.prior_draws(base_key, num_samples)
         dtype, shape = normals.at_data.dtype, self.rows.noise.shape
@@ -209,18 +213,18 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
         return ScreenedDraws(normals, level, noise)
 
     def conditioned(self, draws: ScreenedDraws, means: MeansAtData) -> Float[Array, "s a a a"]:
-        """Coefficients of g: the draws, conditioned on the normals and then on the values."""
+        """Condition the draws on the normals and then on the values, and return the coefficients of g."""
         residual = self.base.whitened_residual(draws.normals, means)
         coefficients, level, noise = draws.normals.coefficients, draws.level, draws.noise
         transform = NonuniformTransform(self.rows.points, self.model.base.truncation)
         at_rows = shared_map(_values, coefficients, transform)
-        # f at the values given the normals: k(Y, X) A^-1 r = B^T C^-1 r, with B the whitened covariance.
+        # Condition f at the value points on the normals: add k(Y, X) A^-1 r = B^T C^-1 r, where B is `whitened`.
         at_rows = at_rows + jnp.einsum("dnm,snd->sm", self.whitened, residual, precision="highest") + means.values
         weights = jax.vmap(self.solve)(self.half_jump * self.rows.values - at_rows + level[:, None] - noise)
         return self._updated(coefficients, residual, -level, weights)
 
     def solve(self, residual: Float[Array, " m"]) -> Float[Array, " m"]:
-        """The weights w = S^-1 r; zero in unfilled rows."""
+        """Return the weights w = S^-1 r of a residual r, with zeros in unfilled rows."""
         return self.factor.solve(jnp.where(self.rows.mask, residual, 0.0))
 
     def _updated(
@@ -230,7 +234,13 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
         constant: Float[Array, " s"],
         weights: Float[Array, "s m"],
     ) -> Float[Array, "s a a a"]:
-        """Coefficients of g for each sample's v, whitened residual at the normals, negative level, and w."""
+        """Return the coefficients of g for each sample.
+
+        - `coefficients`: coefficients of v.
+        - `residual`: whitened residual of the normals.
+        - `constant`: the level c of the draw, negated.
+        - `weights`: w.
+        """
         moved = residual - jnp.einsum("dnm,sm->snd", self.whitened, weights, precision="highest")
         fields = self.base.updated(coefficients, moved)
         transform = NonuniformTransform(self.rows.points, self.model.base.truncation)
@@ -242,14 +252,17 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
 
 
 def _values(normals: Float[Array, "3 a a a"], transform: NonuniformTransform) -> Float[Array, " m"]:
-    """Values, at the points of the transform, of the f that is reconstructed from a normal field."""
+    """Return the values of f = Poisson(v) at the points of the transform.
+
+    - `normals`: coefficients of v.
+    """
     return transform.evaluate(solve_poisson(normals)[None])[:, 0]
 
 
 def _reconstructed(
     weights: Float[Array, " m"], transform: NonuniformTransform, variance: Float[Array, "a a a"]
 ) -> Float[Array, "a a a"]:
-    """Coefficients of -cov(f, f(Y)) w, where Y are the transform's points.
+    """Return the coefficients of -cov(f, f(Y)) w, where Y are the transform's points, and w the weights.
 
     - `variance`: prior variances of the coefficients of v.
     """

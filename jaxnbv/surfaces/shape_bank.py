@@ -22,15 +22,15 @@ from jaxnbv.surfaces.mesh_shapes import as_tuple, mesh_paths, shapes_of_meshes
 
 NUM_EXTREMES, _FAR, _STRIDES, _ARRIVED = 128, 4.0, 40, 0.01
 _LONGEST_NAME = 64
-# Units that meshes may be drawn in, in metres.
+# Lengths, in metres, of the units that meshes may use.
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 
 
 class Shape(NamedTuple):
     """One shape of a bank, or several along a leading axis.
 
-    - `solid`: its signed distance.
-    - `extremes`: points on its surface that include, nearly, the farthest one in every direction.
+    - `solid`: signed distance of the shape.
+    - `extremes`: points on the surface. For every direction, one of them is nearly the farthest point of the shape.
     """
 
     solid: SignedDistance
@@ -38,13 +38,13 @@ class Shape(NamedTuple):
 
 
 class ShapeBank(eqx.Module):
-    """Known shapes, each centred in its own frame. Shapes of one kind have the same orientation in it.
+    """Known shapes, each centred in its own frame. Shapes of the same kind are oriented alike.
 
     - `solids`: all shapes as one batch, whose arrays have a leading axis of shapes; None for an empty bank.
     - `extremes`: extreme points of each shape, as in `Shape`.
-    - `codes`: the names in UTF-8, as arrays so that compiled programs do not depend on them.
-    - `from_mesh`: (k, 4, 4) similarities from the coordinates of each mesh to those of its shape; None if the shapes
-      do not come from meshes.
+    - `codes`: the names in UTF-8. They are arrays so that compiled programs do not depend on the names.
+    - `from_mesh`: (k, 4, 4) similarity transforms from the coordinates of each mesh to the coordinates of its shape;
+      None if the shapes do not come from meshes.
     - `is_true_size`: whether the shapes are as large as the real objects, so that placements do not scale them.
 
     **Raises:** `ValueError` if the arrays have different numbers of rows.
@@ -70,15 +70,15 @@ class ShapeBank(eqx.Module):
     def of(
         cls, solids: Sequence[SignedDistance], names: Sequence[str] | None = None, is_true_size: bool = False
     ) -> "ShapeBank":
-        """A bank of solids of one type.
+        """Make a bank of solids of one type.
 
-        Their distances stay exact, and one compiled program evaluates any of the solids.
+        The signed distances are evaluated exactly, without a grid. One compiled program evaluates any of the solids.
 
         - `names`: by default the indices.
-        - `is_true_size`: whether they are as large as the real objects, see `from_meshes`.
+        - `is_true_size`: whether the solids are as large as the real objects, see `from_meshes`.
 
         **Raises:** `ValueError` for entries that are not solids, for solids of several types, or if the number of names
-        differs from that of solids.
+        differs from the number of solids.
         """
         solids = as_tuple(solids, "the bank's solids")
         for index, solid in enumerate(solids):
@@ -109,23 +109,25 @@ class ShapeBank(eqx.Module):
         scale: float | str | None = None,
         up: str = "y",
     ) -> "ShapeBank":
-        """A bank of centred meshes, stored as signed distances on grids.
+        """Make a bank of centred meshes, which are stored as signed distances on grids.
 
         Triangle soups and open meshes also work. The grids are cached in the user's cache folder.
 
         - `meshes`: a list of files and `trimesh` meshes, or a folder, which is searched with its subfolders.
         - `resolution`: nodes along the longest side.
-        - `sheet`: thickness given to faces with the outside on both sides, where the mesh's longest side is 2.5.
-        - `names`: by default file names, paths within the folder, or for meshes their indices.
-        - `scale`: the length of the meshes' unit in world units, for parts at true size. A number, or "m", "cm", "mm",
-          "in" or "ft" for a world in metres. None for examples of categories, whose size does not matter: the longest
-          side becomes 2.5.
+        - `sheet`: thickness given to faces that have the outside on both sides, in units in which the mesh's longest
+          side is 2.5.
+        - `names`: by default the name of each file, the path within the folder, or the index of a `trimesh` mesh.
+        - `scale`: the length of the meshes' unit in world units, for parts at true size. Give a number, or for a world
+          in metres one of "m", "cm", "mm", "in" and "ft". Use None for examples of categories, whose size does not
+          matter. Their longest side becomes 2.5.
         - `up`: the upward axis of the meshes, see `Frame`.
 
-        A `UserWarning` names each unusable mesh, which is left out, and parts at true size that are the same.
+        A `UserWarning` names each unusable mesh, which is left out. A `UserWarning` also names each pair of parts at
+        true size that are equal.
 
-        **Raises:** `ValueError` if no mesh can be used, if the number of names differs from that of meshes, for numbers
-        out of range, or for another unit.
+        **Raises:** `ValueError` if no mesh can be used, if the number of names differs from the number of meshes, for
+        numbers out of range, or for an unknown unit.
         """
         factor = None if scale is None else _metres(scale)
         require(resolution >= 8, f"the resolution is {resolution}; it must be at least 8")
@@ -149,11 +151,14 @@ class ShapeBank(eqx.Module):
         return dataclasses.replace(bank, is_true_size=True)._resized(sizes)
 
     def in_scene(self, frame: Frame) -> "ShapeBank":
-        """A copy in scene units of a frame, if the bank is at true size in world units; otherwise unchanged."""
+        """Return a copy with true sizes converted from a frame's world units to scene units.
+
+        A bank without true sizes is returned unchanged.
+        """
         return self._resized(jnp.full(len(self), frame.scale)) if self.is_true_size else self
 
     def _resized(self, factors: Float[Array, " k"]) -> "ShapeBank":
-        """A copy with each shape enlarged by its factor."""
+        """Return a copy with each shape scaled by its factor."""
         if self.solids is None:
             return self
         if isinstance(self.solids, Scaled):
@@ -174,7 +179,7 @@ class ShapeBank(eqx.Module):
         return Shape(self.solids, self.extremes)
 
     def shape(self, index: Int[Array, "*s"]) -> Shape:
-        """The shape at an index, or a batch of shapes at several."""
+        """Return the shape at an index, or a batch of shapes for an array of indices."""
         return jax.tree.map(lambda rows: rows[index], self.shapes)
 
     def __len__(self) -> int:
@@ -186,7 +191,7 @@ class ShapeBank(eqx.Module):
         return tuple(bytes(code).rstrip(b"\0").decode(errors="ignore") for code in np.asarray(self.codes))
 
     def select(self, indices: Sequence[int]) -> "ShapeBank":
-        """A bank of the shapes at these indices.
+        """Return a bank of the shapes at these indices.
 
         **Raises:** `ValueError` for an index out of range.
         """
@@ -201,7 +206,7 @@ class ShapeBank(eqx.Module):
 
 
 def _metres(scale: float | str) -> float:
-    """Length of a unit in metres, or the number itself.
+    """Return the length of a named unit in metres, or a number unchanged.
 
     **Raises:** `ValueError` for an unknown unit, or a length that is not positive.
     """
@@ -230,7 +235,10 @@ def encoded(names: Sequence[str]) -> UInt8[Array, "k c"]:
 
 @program
 def _extremes(solids: SignedDistance) -> Float[Array, "k p 3"]:
-    """Points on each solid's surface: points of a large sphere around it, moved along the gradient."""
+    """Return points on each solid's surface.
+
+    They start on a large sphere around the solid, and move along the gradient by Newton steps.
+    """
     start = fibonacci_sphere(NUM_EXTREMES, _FAR)
 
     def of_solid(solid):
@@ -240,7 +248,8 @@ def _extremes(solids: SignedDistance) -> Float[Array, "k p 3"]:
             return points - (distance / jnp.where(square > 0, square, 1.0))[:, None] * gradient, None
 
         points = jax.lax.scan(stride, start, length=_STRIDES)[0]
-        # If the distance is only a bound, some points have not reached the surface yet.
+        # If a solid gives only a bound of the distance, some points may not reach the surface. A point that did reach
+        # the surface replaces each of them.
         arrived = jnp.abs(solid(points)) < _ARRIVED
         return jnp.where(arrived[:, None], points, points[jnp.argmax(arrived)])
 
@@ -250,9 +259,9 @@ def _extremes(solids: SignedDistance) -> Float[Array, "k p 3"]:
 def values_and_gradients(
     function: Callable[[Float[Array, "n 3"]], Float[Array, " n"]], points: Float[Array, "n 3"]
 ) -> tuple[Float[Array, " n"], Float[Array, "n 3"]]:
-    """Values and gradients of a function at points, by one forward sweep for each of three directions.
+    """Return the values and gradients of a function at points, by one forward sweep for each direction.
 
-    - `function`: must treat each point separately.
+    - `function`: maps points to values. The value at a point must depend on this point alone.
     """
     values, along = jax.linearize(function, points)
     columns = [along(jnp.broadcast_to(direction, points.shape)) for direction in jnp.eye(3, dtype=points.dtype)]

@@ -1,4 +1,4 @@
-"""Banks of known shapes that ship with jaxnbv: procedural objects of the training scenes, and a few real ones."""
+"""Banks of known shapes that ship with jaxnbv: procedural objects of the training scenes, and some real furniture."""
 
 from collections.abc import Callable
 from importlib import resources
@@ -16,14 +16,14 @@ from jaxnbv.surfaces.shape_bank import ShapeBank, encoded
 
 # Unit of the stored distances of a mesh, which are clipped to 127 units.
 QUANTUM = 0.008
-# Upright, with any proportions.
+# Upright, with a separate scale for each axis.
 _FURNITURE = Upright(by_axis=True)
 
 
 class ShippedBank(NamedTuple):
-    """Description of a bank that ships.
+    """Description of a bank that ships with jaxnbv.
 
-    - `form`: makes a solid with the structure of the bank's solids.
+    - `form`: returns a solid with the same tree structure as the bank's solids.
     - `poses`: the possible placements of the bank's objects.
     """
 
@@ -54,16 +54,16 @@ SHIPPED_BANKS = {
     "heat": ShippedBank(_labelled, _FURNITURE),
     "household-real": ShippedBank(_sampled, _FURNITURE),
 }
-"""Banks that ship, by name."""
+"""The banks that ship with jaxnbv, keyed by name."""
 
 
 def shape_bank(name: str) -> ShapeBank:
-    """Load a bank that ships.
+    """Load a bank that ships with jaxnbv.
 
     - `name`: "pyramid", "truck", "household", "parts" or "heat" for procedural objects of the training split;
       "household-real" for furniture modelled by people, credited in `docs/how_to/known_shapes.md`.
 
-    **Raises:** `ValueError` for another name.
+    **Raises:** `ValueError` for an unknown name.
     """
     check_type(name, str, "the bank's name")
     there = ", ".join(SHIPPED_BANKS)
@@ -73,7 +73,7 @@ def shape_bank(name: str) -> ShapeBank:
 
 
 def bank_poses(name: str) -> ShapePoses:
-    """The possible placements of the shapes of a bank that ships."""
+    """Return the possible placements of the shapes of a bank that ships with jaxnbv."""
     return SHIPPED_BANKS[name].poses
 
 
@@ -83,7 +83,7 @@ def read_bank(path: Path, like: SignedDistance) -> ShapeBank:
     The file stores numbers in 16 bits, and integers in 8. Distances on grids are 8-bit differences of neighbours in
     units of `QUANTUM`.
 
-    - `like`: a solid with the structure of the bank's solids.
+    - `like`: a solid with the same tree structure as the bank's solids.
     """
     wide = {"f": np.float32, "i": np.int32, "b": np.bool_}
     with np.load(path) as stored:

@@ -4,7 +4,8 @@
     ConjugateGradientSolver   never forms A: A = Phi S Phi^T + noise^2 I, with Phi the basis at the data and S the
                               variances of the modes, so a product is a transform to coefficients and back
 
-Clouds are partly filled. Unfilled rows of A are rows of the identity, which changes neither solves nor determinants.
+If rows of a cloud are unfilled, the corresponding rows of A are rows of the identity, which change neither solves nor
+determinants.
 """
 
 import functools
@@ -31,7 +32,7 @@ from jaxnbv.surfaces.factor import CholeskyFactor
 from jaxnbv.surfaces.trigonometric import NonuniformTransform
 
 MOST_FACTORISED = 16384
-"""Largest capacity for which A is factorised. It takes 1.1 GB in float32, and twice that during factorisation."""
+"""Largest capacity for which A is factorised. A then takes 1.1 GB in float32, and 2.2 GB during factorisation."""
 
 _CHUNK_VALUES = 2**24
 _ALWAYS_WHOLE = 2048
@@ -45,7 +46,7 @@ class Solver(eqx.Module):
     - `spectrum`: spectrum of the prior.
     - `noise`: standard deviation of the normals' components.
 
-    `whiten`, `unwhiten` and `whitened_cross` need the factor, and raise as `factor` does if there is none.
+    `whiten`, `unwhiten` and `whitened_cross` need the factor. They raise `ValueError` if A is not factorised.
     """
 
     cloud: eqx.AbstractVar[PointCloud]
@@ -66,7 +67,7 @@ class Solver(eqx.Module):
 
     @abstractmethod
     def explained_variance(self, x: Float[Array, "n 3"]) -> Float[Array, " n"]:
-        """Reduction of Var f(x) by the data, at points in scene coordinates."""
+        """Return how much the data reduce Var f(x), at points in scene coordinates."""
 
     def whiten(self, blocks: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
         """Apply C^-1 to the columns of each block."""
@@ -77,7 +78,7 @@ class Solver(eqx.Module):
         return _of_columns(self.factor.unwhiten, blocks)
 
     def whitened_cross(self, x: Float[Array, "n 3"]) -> Float[Array, "3 capacity n"]:
-        """C^-1 cov(v_d(X), f(x)). The sum of its squares is the variance that the data explain."""
+        """Return C^-1 cov(v_d(X), f(x)). The sum of squares over d and X is the variance that the data explain."""
         capacity, factor = self.cloud.capacity, self.factor
 
         def leading(size: int):
@@ -90,7 +91,7 @@ class Solver(eqx.Module):
 
 
 class DenseSolver(Solver):
-    """A solver with the Cholesky factor of A, which has one row for each row of the cloud. See `Solver`."""
+    """A solver that uses the Cholesky factor of A. A has one row for each row of the cloud. See `Solver`."""
 
     cloud: PointCloud
     spectrum: Spectra
@@ -99,7 +100,7 @@ class DenseSolver(Solver):
 
     @classmethod
     def of(cls, cloud: PointCloud, spectrum: Spectra, noise: Scalar) -> "DenseSolver":
-        """Factorise the A of a cloud."""
+        """Compute the Cholesky factor of A for a cloud."""
         capacity = cloud.capacity
 
         def leading(size: int):
@@ -119,7 +120,7 @@ class DenseSolver(Solver):
         return _of_columns(self.cholesky.solve, blocks)
 
     def explained_variance(self, x: Float[Array, "n 3"]) -> Float[Array, " n"]:
-        """Reduction of Var f(x) by the data. The cost grows with (number of points) x (capacity)^2."""
+        """Return how much the data reduce Var f(x). The cost grows with (number of points) x (capacity)^2."""
         return jax.lax.map(
             lambda point: jnp.sum(self.whitened_cross(point[None]) ** 2),
             x,
@@ -130,8 +131,8 @@ class DenseSolver(Solver):
 class ConjugateGradientSolver(Solver):
     """A solver by conjugate gradients, for more points than can be factorised. See `Solver`.
 
-    A solve takes about 200 products for 50,000 points with L = 50. The result is accurate to 1e-4 of the largest value
-    in float32, or NaN if the solve did not converge.
+    A solve takes about 200 products with A for 50,000 points and L = 50. In float32 the error of the result is at most
+    1e-4 of the largest value. The result is NaN if the solve did not converge.
     """
 
     cloud: PointCloud
@@ -161,7 +162,7 @@ class ConjugateGradientSolver(Solver):
         return shared_map(solved, blocks, transform, mode_variance(self.spectrum), self.noise, self.cloud.mask[:, None])
 
     def explained_variance(self, x: Float[Array, "n 3"]) -> Float[Array, " n"]:
-        """Reduction of Var f(x) by the data. It takes one solve per point."""
+        """Return how much the data reduce Var f(x). Each point takes one solve."""
 
         def at_point(point):
             cross = function_normal_covariance(point[None], self.cloud.points, self.spectrum)[:, 0].T
@@ -172,22 +173,22 @@ class ConjugateGradientSolver(Solver):
 
 
 def solver_of(cloud: PointCloud, spectrum: Spectra, noise: Scalar) -> Solver:
-    """The solver of a cloud: dense up to a capacity of `MOST_FACTORISED`, conjugate gradients above."""
+    """Return a dense solver for a capacity of at most `MOST_FACTORISED`, else one by conjugate gradients."""
     if cloud.capacity > MOST_FACTORISED:
         return ConjugateGradientSolver(cloud, spectrum, noise)
     return DenseSolver.of(cloud, spectrum, noise)
 
 
 def points_at_once(count: int, capacity: int) -> int:
-    """Number of points, out of `count`, to whiten together so that memory stays bounded."""
+    """Return how many of `count` points to whiten together, so that memory stays bounded."""
     return max(1, min(count, _CHUNK_VALUES // capacity))
 
 
 def _on_filled_rows(cloud: PointCloud, leading: Callable[[int], Float[Array, "*of"]]) -> Float[Array, "*of"]:
     """Call `leading(size)` with the smallest of a few sizes for which the leading rows include all filled rows.
 
-    So the time follows the number of filled rows, while shapes stay fixed. A small cloud uses its capacity, because
-    each size is compiled separately.
+    The time thus depends on the number of filled rows, although array shapes are fixed. A small cloud always uses its
+    capacity as the size, because each size is compiled separately.
     """
     capacity = cloud.capacity
     if capacity <= _ALWAYS_WHOLE:

@@ -49,16 +49,16 @@ class GeometricSPSR(SurfaceModel):
     """Matern prior on the normal field over the torus, with f as its Poisson reconstruction.
 
     - `lengthscale`: ell, in units of the circumference 2 pi: 0.005 is 0.031 in scene units. Several lengthscales make a
-      sum of independent priors: short ones for detail, long ones for the body.
+      sum of independent priors: short lengthscales for detail, and long lengthscales for the overall shape.
     - `variance`: variance per axis, one for each lengthscale. Without truncation, Var v_d = variance^3.
     - `noise`: standard deviation of each component of the observed normals.
     - `nu`: smoothness, 1/2, 3/2 or 5/2.
-    - `truncation`: L, the largest frequency along each axis. Frequencies up to L hold `kept_variance` of the prior's
-      variance: 49 % for the defaults, which are the paper's values.
+    - `truncation`: L, the largest frequency along each axis. Frequencies up to L have `kept_variance` of the prior's
+      variance, which is 49 % for the defaults. The defaults are the paper's values.
 
     `lengthscale`, `variance` and `noise` are array leaves, so the posterior is differentiable in them.
 
-    **Raises:** `ValueError` for values that are not positive, or another `nu`. Warns if less than a third of the
+    **Raises:** `ValueError` for values that are not positive, or for any other `nu`. Warns if less than a third of the
     variance is kept.
     """
 
@@ -104,14 +104,14 @@ class GeometricSPSR(SurfaceModel):
 
     @property
     def kept_variance(self) -> Float[Array, ""]:
-        """Share of the prior's variance at frequencies up to L, in three dimensions."""
+        """Fraction of the prior's variance at frequencies up to L, in three dimensions."""
         return _kept_variance(self)
 
     def check(self, cloud: PointCloud) -> None:
-        """Warn if the points are more than 2.5 of the longest lengthscale apart.
+        """Warn if neighbouring points are more than 2.5 times the longest lengthscale apart (median).
 
-        Between such points samples vary nearly as in the prior: at 2.5 lengthscales the standard deviation of f minus
-        its level, at the data, is 0.9 of the prior's.
+        Such points hardly constrain the samples. At 2.5 lengthscales, the standard deviation of f minus its level at
+        the data is 0.9 times its prior standard deviation.
         """
         points, _ = cloud.to_numpy()
         if len(points) < 2 or is_traced(self):
@@ -127,10 +127,10 @@ class GeometricSPSR(SurfaceModel):
             )
 
     def condition(self, observations: Observations | PointCloud) -> GeometricSPSRPosterior:
-        """The posterior p(f | D), given only the cloud of the observations.
+        """Return the posterior p(f | D), given only the cloud of the observations.
 
-        The cost is one Cholesky factorisation with the cloud's capacity as its size. Beyond a capacity of 16,384 it is
-        some hundred transforms per solve.
+        The cost is one Cholesky factorisation of a matrix with one row per row of the cloud. Above a capacity of 16,384
+        the cost is a few hundred transforms per solve.
 
         **Raises:** `ValueError` if the cloud is empty, has entries that are not finite, a normal longer than 10 or
         points outside [-pi/2, pi/2]^3 (scene coordinates), or if A is singular in the dtype's precision. Under `jit`

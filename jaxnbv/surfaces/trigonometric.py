@@ -1,11 +1,11 @@
 """Band-limited functions on the torus of period 2 pi, in a real tensor basis.
 
 The basis on the circle is phi_a(x) = cos(a x) for a = 0, ..., L and phi_a(x) = sin(-a x) for a = -L, ..., -1. The
-products phi_a(x1) phi_b(x2) phi_c(x3) span the same space as the paper's exponentials. There are as many of them as the
-Hermitian half of the exponentials has real and imaginary parts. In this basis evaluation is a chain of real matrix
-products, and the derivative of a function with coefficients C_a has the coefficients a C_{-a}.
+products phi_a(x1) phi_b(x2) phi_c(x3) span the same space as the paper's exponentials, with the same number of real
+coefficients. In this basis evaluation is a chain of real matrix products, and the derivative of a function with
+coefficients C_a has the coefficients a C_{-a}.
 
-All products request full float32 precision, which some GPUs would otherwise trade for speed.
+All products request full float32 precision, because some GPUs use a lower precision by default.
 """
 
 import math
@@ -25,30 +25,36 @@ _CHUNK_VALUES = 2**24
 
 
 def circle_basis(x: Float[Array, "*n"], truncation: int) -> Float[Array, "*n a"]:
-    """phi_a(x) for a = -L, ..., L, along a new last axis of length 2 L + 1."""
+    """Return phi_a(x) for a = -L, ..., L, along a new last axis of length 2 L + 1."""
     angle = x[..., None] * jnp.arange(1, truncation + 1)
     return jnp.concatenate([jnp.sin(angle)[..., ::-1], jnp.ones_like(x)[..., None], jnp.cos(angle)], axis=-1)
 
 
 def basis_variance(spectrum: Float[Array, "l_plus_1"]) -> Float[Array, " a"]:
-    """Variances of the coefficients of phi_a for the kernel sum_n s1(n) cos(n t), n in Z, on the circle."""
+    """Return variances of the coefficients of phi_a for the kernel sum_n s1(n) cos(n t) (n in Z) on the circle."""
     positive = 2.0 * spectrum[1:]
     return jnp.concatenate([positive[::-1], spectrum[:1], positive])
 
 
 def differentiate(coefficients: Float[Array, "*s a a a"], axis: int) -> Float[Array, "*s a a a"]:
-    """Coefficients of the partial derivative along an axis (0, 1 or 2)."""
+    """Return the coefficients of the partial derivative along an axis (0, 1 or 2)."""
     return _frequency(coefficients, axis) * jnp.flip(coefficients, axis - 3)
 
 
 def solve_poisson(vector_field: Float[Array, "*s 3 a a a"]) -> Float[Array, "*s a a a"]:
-    """Coefficients of the zero-mean f with Laplacian f = div v: f_hat(n) = -i n . v_hat(n) / |n|^2."""
+    """Return the coefficients of the zero-mean f with Laplacian div v.
+
+    f_hat(n) = -i n . v_hat(n) / |n|^2
+    """
     x, y, z = (differentiate(vector_field[..., axis, :, :, :], axis) for axis in range(3))
     return inverse_laplacian(x + y + z)
 
 
 def inverse_laplacian(function: Float[Array, "*s a a a"]) -> Float[Array, "*s a a a"]:
-    """Coefficients of the zero-mean f whose Laplacian is g minus its mean: f_hat(n) = -g_hat(n) / |n|^2."""
+    """Return the coefficients of the zero-mean f whose Laplacian is the function g minus the mean of g.
+
+    f_hat(n) = -g_hat(n) / |n|^2
+    """
     a, b, c = (_frequency(function, axis) for axis in range(3))
     squared = a**2 + b**2 + c**2
     return -function / jnp.where(squared == 0, jnp.inf, squared)
@@ -64,14 +70,17 @@ def _frequency(coefficients: Float[Array, "*s a a a"], axis: int) -> Float[Array
 def evaluate_on_grid(
     coefficients: Float[Array, "*s a a a"], basis: Float[Array, "g a"] | Float[np.ndarray, "g a"]
 ) -> Float[Array, "*s g g g"]:
-    """Values on a tensor grid, given the basis at its axis' nodes: three matrix products per function."""
+    """Return the values on a tensor grid, by three matrix products per function.
+
+    - `basis`: values of the basis at the nodes along one axis of the grid.
+    """
     values = jnp.einsum("...abc,kc->...abk", coefficients, basis, precision="highest")
     values = jnp.einsum("...abk,jb->...ajk", values, basis, precision="highest")
     return jnp.einsum("...ajk,ia->...ijk", values, basis, precision="highest")
 
 
 class TrigonometricFields(Fields):
-    """Band-limited functions, exact everywhere on the torus.
+    """Band-limited functions, which are evaluated exactly anywhere on the torus.
 
     - `coefficients`: coefficients of phi_a(x1) phi_b(x2) phi_c(x3), one block per function.
     """
@@ -80,7 +89,7 @@ class TrigonometricFields(Fields):
 
     @on_torus
     def __call__(self, x: Float[AnyArray, "n 3"]) -> Float[Array, "s n"]:
-        """Values of all functions at the points x (scene coordinates).
+        """Return the values of all functions at the points x (scene coordinates).
 
         The sum over the first axis of frequencies is one matrix product.
         """
@@ -102,7 +111,10 @@ class TrigonometricFields(Fields):
 
     @on_grid_of_torus
     def on_grid(self, axis: Float[AnyArray, " g"]) -> Float[Array, "s g g g"]:
-        """Values on the tensor grid axis x axis x axis, one function at a time to bound the memory."""
+        """Return the values on the tensor grid axis x axis x axis.
+
+        Functions are evaluated one at a time to bound the memory.
+        """
         basis = circle_basis(jnp.asarray(axis, dtype=self.coefficients.dtype), self.coefficients.shape[-1] // 2)
         return shared_map(evaluate_on_grid, self.coefficients, basis)
 
@@ -110,10 +122,10 @@ class TrigonometricFields(Fields):
 class NonuniformTransform(eqx.Module):
     """Fast transforms between coefficients up to frequency L and values at given points of the scene.
 
-    A function is evaluated on a tensor grid that covers the scene, twice as fine as its highest frequency needs. Values
-    are interpolated from there with a Kaiser-Bessel window, whose effect on each frequency is divided out first (Dutt
-    and Rokhlin 1993; Barnett, Magland and af Klinteberg 2019 on windows). The error is near rounding error, some 1e-6
-    in float32 and 1e-12 in float64. The adjoint is the transpose.
+    `evaluate` evaluates a function on a tensor grid that covers the scene, twice as fine as its highest frequency
+    needs. It then interpolates the values with a Kaiser-Bessel window. The effect of the window on each frequency is
+    divided out beforehand (Dutt and Rokhlin 1993; Barnett, Magland and af Klinteberg 2019 on windows). The error is
+    close to rounding error, about 1e-6 in float32 and 1e-12 in float64. `adjoint` is the transpose of `evaluate`.
 
     - `start`: first node of each point's window, per axis.
     - `weights`: the window's values at its nodes, per axis.
@@ -125,26 +137,27 @@ class NonuniformTransform(eqx.Module):
 
     def __init__(self, points: Float[Array, "n 3"], truncation: int):
         window, beta, step = _window(truncation, points.dtype)
-        # XLA may compute `first` once for `start` and again for `weights`. It may round a multiplication followed by a
-        # subtraction differently each time, and the two would be a node apart. So only ceil follows the multiplication.
+        # XLA may compute `first` once for `start` and again for `weights`, and may round a multiplication followed by a
+        # subtraction differently each time. The two results would then be a node apart. So only ceil directly follows
+        # the multiplication.
         position = (points + HALF_WIDTH) * (1.0 / step)
         first = jnp.ceil(position) - window // 2
         offset = position[..., None] - first[..., None] - jnp.arange(window)
         radicand = jnp.maximum(1.0 - (2.0 * offset / window) ** 2, jnp.finfo(points.dtype).eps ** 2)
         self.start = (first + window // 2).astype(jnp.int32)
         weights = jnp.i0(beta * jnp.sqrt(radicand)) / float(i0(beta))
-        # JAX clamps a slice that starts beyond its array, so it would contain other nodes.
+        # JAX clamps a slice that starts outside its array, and would use the wrong nodes. Such points give NaN instead.
         in_grid = (self.start >= 0) & (self.start <= 2 * truncation + 1)
         self.weights = jnp.where(in_grid[..., None], weights, jnp.nan)
         self.truncation = truncation
 
     def evaluate(self, coefficients: Float[Array, "k a a a"]) -> Float[Array, "n k"]:
-        """Values of k functions at the points."""
+        """Return the values of k functions at the points."""
         values = evaluate_on_grid(coefficients, self._node_basis(coefficients.dtype))
         return self._interpolate(jnp.moveaxis(values, 0, -1))
 
     def adjoint(self, values: Float[Array, "n k"]) -> Float[Array, "k a a a"]:
-        """sum_j values_j phi_a(x_j1) phi_b(x_j2) phi_c(x_j3): the transpose of `evaluate`."""
+        """Return sum_j values_j phi_a(x_j1) phi_b(x_j2) phi_c(x_j3): the transpose of `evaluate`."""
         basis = self._node_basis(values.dtype)
         spread = self._spread(values, basis.shape[0])
         return evaluate_on_grid(jnp.moveaxis(spread, -1, 0), basis.T)
@@ -159,7 +172,7 @@ class NonuniformTransform(eqx.Module):
         return jax.lax.map(lambda point: at_point(*point), (self.start, self.weights), batch_size=128)
 
     def _spread(self, values: Float[Array, "n k"], nodes: int) -> Float[Array, "nodes nodes nodes k"]:
-        """The transpose of `_interpolate`."""
+        """Apply the transpose of `_interpolate`."""
         grid = jnp.zeros((nodes, nodes, nodes, values.shape[1]), values.dtype)
         if not on_cpu():
             return jax.linear_transpose(self._interpolate, grid)(values)[0]
@@ -177,7 +190,7 @@ class NonuniformTransform(eqx.Module):
         return jax.lax.dynamic_slice(grid, (*start, jnp.int32(0)), (window, window, window, grid.shape[-1]))
 
     def _node_basis(self, dtype) -> Float[Array, "g a"]:
-        """The basis at the grid's nodes, with each frequency divided by the window's Fourier transform at it."""
+        """Return the basis at the grid's nodes, divided by the window's Fourier transform at each frequency."""
         window, beta, step = _window(self.truncation, dtype)
         nodes = -HALF_WIDTH + step * (np.arange(2 * self.truncation + window + 1) - window // 2)
         frequency = np.abs(np.arange(-self.truncation, self.truncation + 1))
@@ -187,6 +200,6 @@ class NonuniformTransform(eqx.Module):
 
 
 def _window(truncation: int, dtype) -> tuple[int, float, float]:
-    """Number of nodes under the window, its shape parameter, and the spacing of the grid."""
+    """Return the number of nodes under the window, the window's shape parameter, and the spacing of the grid."""
     nodes = 8 if dtype == jnp.float32 else 14
     return nodes, 0.75 * math.pi * nodes, HALF_WIDTH / truncation

@@ -1,7 +1,7 @@
-"""Observed values of f relative to the level, at points. They add to the normals, which observe its gradient.
+"""Observed values of f relative to its level, in addition to the normals, which observe the gradient of f.
 
-Values are in units of h, half the rise across the scanned sheet of the mean of f given the normals. The prior sets the
-scale of f, and h is this scale at the data.
+Values are in units of h. Given the normals alone, the mean of f rises across the scanned surface, and h is half this
+rise (see `ScreenedSPSR.offset`). These units are used because the scale of f depends on the prior.
 """
 
 import math
@@ -28,7 +28,7 @@ class ValueRows(eqx.Module):
 
     - `points`: y_k in scene coordinates, within [-pi/2, pi/2]^3.
 
-    **Raises:** `ValueError` for arrays of other shapes.
+    **Raises:** `ValueError` for arrays whose shapes differ from the annotated shapes.
     """
 
     points: Float[Array, "m 3"] = eqx.field(converter=native)
@@ -73,10 +73,11 @@ class ValueSource(eqx.Module):
 
     @abstractmethod
     def rows(self, observations: Observations) -> ValueRows:
-        """The rows that this source adds. Called under `jit`, so their number may depend only on the capacity.
+        """Return the rows that this source adds.
 
-        Conditioning the model raises an error for a filled row outside [-pi/2, pi/2]^3. If that runs under `jit` too,
-        values cannot be checked, and the posterior is NaN.
+        The method is called under `jit`, so the number of rows may depend only on the capacity of the cloud.
+        `condition` of the model raises an error for a filled row outside [-pi/2, pi/2]^3. If the user calls `condition`
+        under `jit`, it cannot check the rows, and the posterior is NaN.
         """
 
 
@@ -85,11 +86,11 @@ class OutsideBoundary(ValueSource):
 
     This is the "envelope" of Poisson reconstruction (Kazhdan et al. 2020) as an observation.
 
-    - `volume`: see `jaxnbv.geometry.volume`; by default the box that scenes are scaled to.
+    - `volume`: see `jaxnbv.geometry.volume`; by default the box to which scenes are scaled.
     - `num_points`: number of points, spread evenly as seen from the origin.
     - `value`, `noise`: mean and standard deviation, in units of h.
-    - `room`: distance of the points outside the boundary, in scene units, limited to the scene. A volume that cuts the
-      object needs room, so that the object does not close at the cut.
+    - `room`: distance by which the points lie outside the boundary, in scene units. Points are clipped to the scene.
+      If the volume cuts the object, give a positive distance. Otherwise sampled objects would close at the cut.
 
     **Raises:** `ValueError` for a count below one, noise that is not positive, negative room, or a boundary that leaves
     the scene, [-pi/2, pi/2]^3, or does not enclose the origin.
@@ -127,7 +128,7 @@ class OutsideBoundary(ValueSource):
 
     def rows(self, observations: Observations) -> ValueRows:
         points = boundary_points(self.volume, self.num_points, self.room).astype(observations.cloud.points.dtype)
-        # Clipped to the scene's border as this dtype rounds it.
+        # Clip to the border of the scene, because the points may lie beyond it by `room` or by rounding in this dtype.
         points = jnp.clip(points, -HALF_WIDTH, HALF_WIDTH)
         return _rows(points, self.value, self.noise, jnp.ones(self.num_points, bool))
 
@@ -135,7 +136,7 @@ class OutsideBoundary(ValueSource):
 class OnSurface(ValueSource):
     """f(x_j) - c ~ N(0, s_f^2) at some of the data: the "screening" of Kazhdan and Hoppe (2013).
 
-    - `num_points`: number of points, chosen by farthest point sampling; all if there are fewer.
+    - `num_points`: number of points, chosen by farthest point sampling. If D has fewer points, all are used.
     - `noise`: standard deviation s_f, in units of h.
 
     **Raises:** `ValueError` for a count below one or noise that is not positive.
@@ -156,10 +157,10 @@ class OnSurface(ValueSource):
 class EmptySpace(ValueSource):
     """f(z) - c ~ N(value, s^2) with a positive value, at points z that were seen to be empty.
 
-    It says that unseen space next to empty space is likely to be empty too. This holds for thin objects such as
-    furniture, but not for a body whose hidden side is as large as its visible side.
+    The positive value makes unseen space next to empty space likely to be empty too. This assumption holds for thin
+    objects such as furniture, but not for a body whose hidden side is as large as its visible side.
 
-    - `num_points`: number of points, chosen by farthest point sampling; all if there are fewer.
+    - `num_points`: number of points, chosen by farthest point sampling. If there are fewer empty points, all are used.
     - `value`, `noise`: mean and standard deviation, in units of h.
 
     **Raises:** `ValueError` for a count below one or noise that is not positive.
@@ -191,7 +192,7 @@ def concatenate_rows(sources: tuple[ValueSource, ...], observations: Observation
     for source, part in zip(sources, parts, strict=True):
         check_type(part, ValueRows, f"the result of {type(source).__name__}.rows")
     rows = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
-    # The contents of unfilled rows, which may be NaN, must not reach the products.
+    # Unfilled rows may hold NaN, and become zero so that NaN does not spread through products.
     points = jnp.where(rows.mask[:, None], rows.points, 0.0)
     values, noise = (jnp.where(rows.mask, leaf, 0.0) for leaf in (rows.values, rows.noise))
     return ValueRows(points, values, noise, rows.mask)
