@@ -15,7 +15,7 @@ from jaxnbv.geometry.volume import Box
 
 # Largest rounding of coordinates, in scene units: 1 % of the sensor noise.
 _ROUNDING = 1e-4
-# Rotations whose second row, the scene's up, is an axis of the world.
+# Rotation from world to scene for each upward axis of the world. The second row, the scene's y axis, is this axis.
 _UP = {
     "y": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
     "-y": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
@@ -28,14 +28,14 @@ AXES = tuple(_UP)
 
 
 class Frame(eqx.Module):
-    """The similarity between the user's world and the scene: scene = scale R (world - center).
+    """The similarity transform from the user's world to the scene: scene = scale R (world - center).
 
     - `scale`: scene units per world unit.
     - `center`: the world point that becomes the scene's origin.
-    - `up`: the world's axis that becomes the scene's y, upward in pictures: "y" (R is the identity), "z" (most robots),
-      "x", or one of these with a minus.
+    - `up`: the world's upward axis, which becomes the scene's y axis: "y" (R is the identity), "z" (most robots), "x",
+      "-y", "-z" or "-x".
 
-    **Raises:** `ValueError` for a scale that is not positive, or another axis.
+    **Raises:** `ValueError` for a scale that is not positive, or an `up` that is none of these axes.
     """
 
     scale: float = 1.0
@@ -50,9 +50,12 @@ class Frame(eqx.Module):
     @classmethod
     @checked
     def fit(cls, points: Float[AnyArray, "n 3"], longest_side: float = 2.5, up: str = "y") -> "Frame":
-        """The frame that centres the points' bounding box and scales its longest side to `longest_side`.
+        """Return the frame that centres the points' bounding box and scales its longest side.
 
-        **Raises:** `ValueError` if there are no points, if all coincide, or if one is not finite.
+        - `points`: world coordinates, (n, 3).
+        - `longest_side`: length that the longest side of the bounding box gets, in scene units.
+
+        **Raises:** `ValueError` if there are no points, if all points coincide, or if a point is not finite.
         """
         points = as_numbers(points, "points", np.float64)
         require(points.ndim == 2 and points.shape[1] == 3, f"the points must be (n, 3), got {points.shape}")
@@ -66,26 +69,27 @@ class Frame(eqx.Module):
 
     @property
     def unit(self) -> str:
-        """The name of the world's unit of length: "scene units" if the world is the scene, else "world units"."""
+        """Name of the world's unit of length: "scene units" if the frame is the identity, else "world units"."""
         identity = self.scale == 1.0 and self.center == (0.0, 0.0, 0.0) and self.up == "y"
         return "scene units" if identity else "world units"
 
     @own_settings()
     def length_to_world(self, length: Float[AnyArray, "*n"] | float, power: int = 1):
-        """A length (power 1), area (power 2) or volume (power 3) in scene units, converted to world units."""
+        """Convert a length (power 1), an area (power 2) or a volume (power 3) from scene units to world units."""
         return length / self.scale**power
 
     @property
     def rotation(self) -> Float[np.ndarray, "3 3"]:
-        """The rotation R, which maps directions of the world to the scene."""
+        """The rotation R, which maps directions from the world to the scene."""
         return np.array(_UP[self.up], np.float64)
 
     @own_settings()
     def to_scene(self, value):
-        """Points (..., 3), a `PointCloud`, a `Pose`, a `Box` or a `Camera`'s range, from world to scene.
+        """Convert points (..., 3), a `PointCloud`, a `Pose`, a `Box` or a `Camera` from world to scene.
 
-        Clouds and poses have JAX's floating-point type. For coordinates far from the world's origin, such as a map's,
-        bring arrays to the scene first and make clouds and poses of the result.
+        Of a camera, only the limits of the range change. Clouds and poses have JAX's floating-point type, which rounds
+        coordinates far from the world's origin, such as map coordinates. In that case convert the arrays to the scene
+        first, and build clouds and poses from the result.
 
         **Raises:** `ValueError` for a cloud or a pose whose coordinates are rounded by more than 1e-4 scene units.
         """
@@ -96,7 +100,7 @@ class Frame(eqx.Module):
 
     @own_settings()
     def to_world(self, value):
-        """The inverse of `to_scene`, for the same types."""
+        """Convert from scene to world: the inverse of `to_scene`, for the same types."""
         center = np.asarray(self.center)
         return _apply(value, lambda points: self._back(points / self.scale) + center, self._back, 1.0 / self.scale)
 
@@ -118,7 +122,7 @@ class Frame(eqx.Module):
 
 
 def _apply(value, place, turn, scale: float):
-    """The value with `place` applied to its points, `turn` to its directions, and its lengths scaled."""
+    """Apply `place` to the points of a value and `turn` to its directions, and multiply its lengths by `scale`."""
     if isinstance(value, PointCloud):
         points = jnp.where(value.mask[..., None], place(value.points), 0.0).astype(value.points.dtype)
         sight = None if value.sight is None else scale * value.sight

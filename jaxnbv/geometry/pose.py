@@ -1,7 +1,7 @@
 """Poses, `look_at`, and points on a sphere.
 
-OpenCV convention: in the camera's own frame x points right, y down and z forward, along the view.
-A pose is camera-to-scene. Angles are in radians, lengths in scene units.
+A pose maps the camera's frame to the scene. The camera's frame follows OpenCV: x points right, y down, and z forward
+along the viewing direction. Angles are in radians, lengths in scene units.
 """
 
 import math
@@ -15,9 +15,10 @@ from jaxtyping import Array, Bool, Float
 
 from jaxnbv.checks import AnyArray, as_floats, check_batch, check_index, checked, is_traced, own_settings, require
 
-# Largest |R R^T - I| of a matrix that counts as a rotation, and of one written to three digits, which is corrected.
+# A matrix counts as a rotation if no entry of |R R^T - I| exceeds `_ORTHONORMAL`. Up to `_ROUNDED`, it counts as a
+# rotation that was written to three digits, and is corrected.
 _ORTHONORMAL, _ROUNDED = 1e-3, 5e-3
-# Signs of the camera's axes, given as right, down and forward.
+# Signs that convert the axes of each convention to OpenCV's right, down and forward axis.
 _CONVENTIONS = {"opencv": (1.0, 1.0, 1.0), "opengl": (1.0, -1.0, -1.0)}
 
 
@@ -48,14 +49,15 @@ class Pose(eqx.Module):
     @classmethod
     @checked
     def from_matrix(cls, matrix: Float[AnyArray, "*batch 4 4"], convention: str = "opencv") -> "Pose":
-        """The pose of a camera-to-scene (or camera-to-world) matrix [[R, t], [0, 1]].
+        """Convert a camera-to-scene (or camera-to-world) matrix [[R, t], [0, 1]] to a pose.
 
-        - `convention`: "opencv" for cameras that look along +z with y down, "opengl" (also Blender's and NeRF's) for
-          cameras that look along -z with y up.
+        A rotation that was rounded to three digits is made orthonormal.
 
-        A matrix written to three digits is made orthonormal.
+        - `convention`: "opencv" for cameras that look along +z with y down, or "opengl" (also used by Blender and NeRF)
+          for cameras that look along -z with y up.
 
-        **Raises:** `ValueError` for another convention, a last row other than (0, 0, 0, 1), or as `Pose` does.
+        **Raises:** `ValueError` for an unknown convention, a last row other than (0, 0, 0, 1), or for the same reasons
+        as `Pose`.
         """
         axes = _axes(convention)
         matrices = as_floats(matrix, "the matrix of a pose")
@@ -63,7 +65,7 @@ class Pose(eqx.Module):
         rotation: AnyArray = matrices[..., :3, :3]
         position: AnyArray = matrices[..., :3, 3]
         if not is_traced(matrices):
-            # NumPy, since each operation of JAX would be a program to compile.
+            # This uses NumPy, since JAX would compile a program for each operation.
             numbers = np.asarray(matrices)
             last, rotation, position = numbers[..., 3, :], numbers[..., :3, :3], numbers[..., :3, 3]
             require(
@@ -83,9 +85,9 @@ class Pose(eqx.Module):
 
     @own_settings()
     def to_matrix(self, convention: str = "opencv") -> Float[Array, "*batch 4 4"]:
-        """The camera-to-scene matrix in the given convention, as `from_matrix` takes it.
+        """Return the camera-to-scene matrix in a convention of `from_matrix`.
 
-        **Raises:** `ValueError` for another convention.
+        **Raises:** `ValueError` for an unknown convention.
         """
         rotation = self.rotation * _axes(convention).astype(self.rotation.dtype)
         last = jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 1.0], self.position.dtype), (*self.position.shape[:-1], 1, 4))
@@ -94,25 +96,25 @@ class Pose(eqx.Module):
     @property
     @own_settings()
     def forward(self) -> Float[Array, "*batch 3"]:
-        """Unit viewing direction in the scene."""
+        """The unit viewing direction in scene coordinates."""
         return self.rotation[..., :, 2]
 
     @own_settings()
     def to_scene(self, points: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
-        """Points from the camera's frame to scene coordinates. Needs a single pose."""
+        """Convert points from the camera's frame to scene coordinates. The pose must not be a batch."""
         return jnp.matmul(points, self.rotation.T, precision="highest") + self.position
 
     @own_settings()
     def __getitem__(self, index) -> "Pose":
-        """The pose, or poses, at an index of the leading axes.
+        """Return the pose, or the batch of poses, at an index of the leading axes.
 
-        **Raises:** `ValueError` for a single pose, or if there is no such index.
+        **Raises:** `ValueError` for a single pose, or if the index is out of range.
         """
         check_index(index, self.position.shape[:-1], "the pose")
         return jax.tree.map(lambda leaf: leaf[index], self)
 
     def __iter__(self) -> Iterator["Pose"]:
-        """The poses along the first axis of a batch."""
+        """Iterate over the poses along the first axis of a batch."""
         check_batch(self.position.shape[:-1], "the pose")
         return (self[index] for index in range(self.position.shape[0]))
 
@@ -125,9 +127,10 @@ def _axes(convention: str) -> np.ndarray:
 def rigid_matrices(
     matrices: Float[np.ndarray, "n 4 4"],
 ) -> tuple[Float[np.ndarray, "n 4 4"], Bool[np.ndarray, " n"]]:
-    """Matrices [[R, t], [0, 1]] with R made orthonormal, and whether each is a rigid motion.
+    """Make R in matrices [[R, t], [0, 1]] orthonormal, and return whether each is a rigid motion.
 
-    R may be written to three digits. Matrices that are not rigid motions are returned unchanged.
+    A matrix whose R is rounded to three digits still counts as a rigid motion. Matrices that are not rigid motions are
+    returned unchanged.
     """
     is_rigid = np.isfinite(matrices).all(axis=(1, 2)) & (_off_rotation(matrices[:, :3, :3]) <= _ROUNDED)
     is_rigid &= (np.abs(matrices[:, 3] - [0.0, 0.0, 0.0, 1.0]) < 1e-6).all(axis=1)
@@ -137,14 +140,14 @@ def rigid_matrices(
 
 
 def _off_rotation(rotation: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n"]:
-    """The largest entry of |R R^T - I|; infinite for a reflection and for entries that are not finite."""
+    """Return the largest entry of |R R^T - I|; infinite for a reflection or an entry that is not finite."""
     finite = np.where(np.isfinite(rotation).all(axis=(-1, -2), keepdims=True), rotation, 0.0)
     error = np.abs(finite @ np.swapaxes(finite, -1, -2) - np.eye(3)).max(axis=(-1, -2))
     return np.where(np.linalg.det(finite) > 0, error, np.inf)
 
 
 def _nearest_rotation(rotation: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n 3 3"]:
-    """The nearest rotation in the Frobenius norm (orthogonal Procrustes)."""
+    """Return the nearest rotation in the Frobenius norm (orthogonal Procrustes)."""
     left, _, right = np.linalg.svd(rotation)
     return left @ right
 
@@ -166,13 +169,17 @@ def look_at(
     target=(0.0, 0.0, 0.0),
     up=(0.0, 1.0, 0.0),
 ) -> Pose:
-    """The pose at `position` whose forward axis points to `target`.
+    """Return the pose at `position` whose forward axis points to `target`.
 
-    **Arguments** (scene coordinates, anything `jnp.asarray` takes): `position` (*batch, 3); `target` (3,), by default
-    the origin; `up` (3,), the direction that is up in the image. If the camera looks along `up`, the coordinate axis
-    with the smallest component of `up` replaces it.
+    All arguments are in scene coordinates and can be anything that `jnp.asarray` accepts.
 
-    **Raises:** `ValueError` for other shapes, if `position` equals `target`, or `up` is zero.
+    - `position`: position of the camera, (*batch, 3).
+    - `target`: the point that the camera looks at, (3,). The default is the origin.
+    - `up`: the direction that is up in the image, (3,). If the camera looks along `up`, the coordinate axis in which
+      `up` has its smallest component is used instead.
+
+    **Raises:** `ValueError` for other shapes, entries that are not finite, if `position` equals `target`, or if `up` is
+    zero.
     """
     position, target, up = (
         as_floats(value, f"look_at's {name}")
@@ -206,7 +213,7 @@ def look_at(
 def _facing(
     position: Float[Array, "*batch 3"], target: Float[Array, "3"], up: Float[Array, "3"]
 ) -> tuple[Float[Array, "*batch 3 3"], Float[Array, "*batch 1"], Float[Array, ""]]:
-    """The rotation of `look_at`, the distance to the target, and the length of `up`."""
+    """Return the rotation of `look_at`, the distance to the target, and the length of `up`."""
     offset, length = target - position, jnp.linalg.norm(up)
     distance = jnp.linalg.norm(offset, axis=-1, keepdims=True)
     forward = offset / distance
@@ -219,11 +226,12 @@ def _facing(
 
 @checked
 def fibonacci_sphere(count: int, radius: float = 1.0, min_elevation: float = -0.5 * math.pi) -> Float[Array, "count 3"]:
-    """`count` almost evenly spaced points on a sphere about the origin.
+    """Return `count` almost evenly spaced points on a sphere about the origin.
 
-    By the spherical Fibonacci lattice (Gonzalez 2010).
+    The points are those of the spherical Fibonacci lattice (Gonzalez 2010).
 
-    - `min_elevation`: least elevation above the plane y = 0, in radians. The default gives the whole sphere.
+    - `min_elevation`: least elevation of the points above the plane y = 0, in radians. The default gives the whole
+      sphere.
 
     **Raises:** `ValueError` if `count` < 1, `radius` <= 0 or the elevation is not within [-pi/2, pi/2).
     """

@@ -1,4 +1,4 @@
-"""Rotations, and norms and directions of vectors with finite derivatives at zero."""
+"""Rotations, and norms and directions of vectors whose derivatives are finite at zero."""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ from jaxnbv.checks import AnyArray
 
 @jax.custom_jvp
 def safe_norm(*components: Float[AnyArray, "*#n"]) -> Float[Array, "*n"]:
-    """Euclidean length of the vectors with these components, with derivative zero at zero."""
+    """Return the Euclidean length of the vectors with these components. Its derivative is zero at zero."""
     return jnp.sqrt(sum(c * c for c in components))
 
 
@@ -22,18 +22,18 @@ def _safe_norm_jvp(components, tangents):
 
 @jax.jit
 def rotation_about(axis: Float[Array, "3"], angle: Float[Array, ""]) -> Float[Array, "3 3"]:
-    """The right-handed rotation about an axis by an angle in radians; NaN for an axis of zero.
+    """Return the right-handed rotation about an axis by an angle in radians; NaN for an axis of zero.
 
-    Rodrigues' formula with the unit axis k: cos I + sin [k]_x + (1 - cos) k k^T.
+    With the unit axis k, Rodrigues' formula gives cos I + sin [k]_x + (1 - cos) k k^T.
     """
     unit = axis / safe_norm(*axis)
     return jnp.cos(angle) * jnp.eye(3) + jnp.sin(angle) * _cross(unit) + (1.0 - jnp.cos(angle)) * unit[:, None] * unit
 
 
 def rotation_from_vector(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """The rotation about a vector by its length in radians.
+    """Return the rotation about a vector by an angle (radians) that equals the vector's length.
 
-    Rodrigues' formula in terms of w = angle k, which has derivatives at zero too.
+    Rodrigues' formula is written in terms of w = angle k, which is differentiable at zero too.
     """
     square = jnp.sum(vector**2)
     small = square < 1e-12
@@ -45,7 +45,7 @@ def rotation_from_vector(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
 
 
 def _cross(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """[v]_x, with [v]_x u = v x u."""
+    """Return the matrix [v]_x for which [v]_x u = v x u."""
     x, y, z = vector
     zero = jnp.zeros_like(x)
     return jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
@@ -53,23 +53,24 @@ def _cross(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
 
 @jax.jit
 def rotation_to_6d(rotation: Float[AnyArray, "*batch 3 3"]) -> Float[Array, "*batch 6"]:
-    """The first two columns of a rotation, concatenated: the 6-D representation of Zhou et al. (2019)."""
+    """Return the first two columns of a rotation, the 6-D representation of Zhou et al. (2019)."""
     rotation = jnp.asarray(rotation)
     return jnp.concatenate([rotation[..., :, 0], rotation[..., :, 1]], axis=-1)
 
 
 @jax.jit
 def rotation_from_6d(columns: Float[AnyArray, "*batch 6"]) -> Float[Array, "*batch 3 3"]:
-    """The rotation whose first two columns are two vectors (a, b) made orthonormal (Zhou et al. 2019).
+    """Return the rotation of the 6-D representation (a, b) of Zhou et al. (2019).
 
-    b_1 = a / |a|;  b_2 = b - (b_1 . b) b_1, normalised;  b_3 = b_1 x b_2. Every pair gives a rotation: if a is zero, or
-    if b is zero or parallel to a, a coordinate axis replaces it.
+    Its columns are b_1 = a / |a|;  b_2 = b - (b_1 . b) b_1, normalised;  b_3 = b_1 x b_2. Every pair (a, b) gives a
+    rotation. If a is zero, the x axis replaces a. If b is zero or parallel to a, a coordinate axis replaces b.
     """
     columns = jnp.asarray(columns, dtype=jnp.result_type(float))
     first = normalise(columns[..., :3], jnp.asarray([1.0, 0.0, 0.0], columns.dtype))
     spare = _any_orthogonal(first)
     second = normalise(_reject(normalise(columns[..., 3:], spare), first), spare, _rounding(columns))
-    # For nearly parallel vectors the difference has lost digits and is not orthogonal. Repeating the step mends that.
+    # For nearly parallel vectors, the difference has lost digits and is not orthogonal to `first`. A second projection
+    # corrects this.
     second = normalise(_reject(second, first), spare)
     return jnp.stack([first, second, jnp.cross(first, second)], axis=-1)
 
@@ -78,10 +79,14 @@ def rotation_from_6d(columns: Float[AnyArray, "*batch 6"]) -> Float[Array, "*bat
 def rotation_between(
     start: Float[AnyArray, "*batch 3"], end: Float[AnyArray, "*batch 3"]
 ) -> Float[Array, "*batch 3 3"]:
-    """The smallest rotation that maps one unit vector to another; any one of these if they are opposite."""
+    """Return the smallest rotation that maps `start` to `end`, which are unit vectors.
+
+    If the vectors are opposite, the smallest rotation is not unique, and any of them is returned.
+    """
     start, end = jnp.asarray(start), jnp.asarray(end)
     halfway = normalise(start + end, _any_orthogonal(start), _rounding(start))
-    # The sum of nearly opposite vectors has lost digits. Their difference has not, and the sum is orthogonal to it.
+    # The sum of nearly opposite vectors has lost digits, but their difference has not. The exact sum is orthogonal to
+    # the difference, so the part of the sum along the difference is removed.
     opposed = jnp.sum(start * end, axis=-1, keepdims=True) < 0
     apart = normalise(jnp.where(opposed, start - end, 0.0), jnp.zeros_like(start))
     halfway = normalise(_reject(halfway, apart), halfway)
@@ -89,15 +94,19 @@ def rotation_between(
 
 
 def _reflection(unit: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
-    """I - 2 u u^T."""
+    """Return the reflection I - 2 u u^T."""
     return jnp.eye(3, dtype=unit.dtype) - 2.0 * unit[..., :, None] * unit[..., None, :]
 
 
 def normalise(
     vector: Float[Array, "*batch n"], spare: Float[Array, "*#batch n"], least: float = 0.0
 ) -> Float[Array, "*batch n"]:
-    """The unit vector along a vector, or `spare` if no entry exceeds `least` and the least normal float."""
-    # In units of the largest entry, no square overflows.
+    """Return the unit vector along a vector, or `spare` if the vector is too short.
+
+    A vector is too short if the magnitude of its largest entry does not exceed both `least` and the smallest normal
+    float.
+    """
+    # The vector is divided by its largest entry, so that no square overflows.
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(vector), axis=-1, keepdims=True))
     usable = largest > max(least, float(jnp.finfo(vector.dtype).tiny))
     vector = vector / jnp.where(usable, largest, 1.0)
@@ -106,16 +115,16 @@ def normalise(
 
 
 def _rounding(unit: Float[Array, "*batch n"]) -> float:
-    """A length well above the rounding of sums of unit vectors. A shorter sum has no reliable direction."""
+    """Return a length well above the rounding of sums of unit vectors. A shorter sum has no reliable direction."""
     return 16.0 * float(jnp.finfo(unit.dtype).eps)
 
 
 def _reject(vector: Float[Array, "*batch 3"], unit: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
-    """The part of a vector that is orthogonal to a unit vector."""
+    """Return the component of a vector that is orthogonal to a unit vector."""
     return vector - jnp.sum(vector * unit, axis=-1, keepdims=True) * unit
 
 
 def _any_orthogonal(unit: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
-    """A unit vector orthogonal to a unit vector."""
+    """Return a unit vector that is orthogonal to a given unit vector."""
     axis = jnp.eye(3, dtype=unit.dtype)[jnp.argmin(jnp.abs(unit), axis=-1)]
     return normalise(_reject(axis, unit), axis)

@@ -1,4 +1,4 @@
-"""The volume that can hold the object, as a signed distance, and points on its boundary."""
+"""The volume that can hold the object, given as a signed distance, and points on the volume's boundary."""
 
 import functools
 import math
@@ -16,11 +16,11 @@ from jaxnbv.geometry.pose import fibonacci_sphere
 from jaxnbv.programs import program
 
 Volume = Callable[[Float[Array, "n 3"]], Float[Array, " n"]]
-"""A function of points (scene coordinates): negative inside the volume, positive outside. Its magnitude is at most the
-distance to the boundary. `Box` and the solids of `jaxnbv.scanning.sdf` are volumes."""
+"""A function of points (scene coordinates) that is negative inside the volume and positive outside. Its magnitude is at
+most the distance to the boundary. `Box` and the solids of `jaxnbv.scanning.sdf` are volumes."""
 
 _BISECTIONS = 40
-# A radius beyond the corners of the cube that a scene may fill, in scene units.
+# A radius that exceeds the distance from the origin to the corners of the cube that holds all scenes, in scene units.
 _FAR = 3.0
 
 
@@ -32,11 +32,12 @@ def _corner(values) -> Float[np.ndarray, " 3"]:
 
 
 class Box(eqx.Module):
-    """The box between two opposite corners, in scene coordinates. The default holds any `Frame.fit` scene.
+    """The box between two opposite corners. The default holds every scene that `Frame.fit` scales.
 
-    - `low`, `high`: three numbers each. They become arrays (3,), so that a program compiled for one box runs for any.
+    - `low`, `high`: the corners, three numbers each, in scene coordinates unless stated otherwise. The numbers become
+      arrays (3,), so that a program compiled for one box runs for any box.
 
-    **Raises:** `ValueError` if a side is not positive or a corner not finite.
+    **Raises:** `ValueError` if a side is not positive or a corner is not finite.
     """
 
     low: Any = eqx.field(converter=_corner, default=(-1.25, -1.25, -1.25))
@@ -57,14 +58,17 @@ class Box(eqx.Module):
         return f"from {low} to {high}"
 
     def widened(self, by: float) -> "Box":
-        """The box with all faces but the lower one (y is up) moved outward by this length.
+        """Return the box with all faces but the lower one (y is up) moved outward by the length `by`.
 
-        The lower face stays, since the support of the object is below.
+        The lower face stays, since the surface that the object stands on is below it.
         """
         return Box(self.low - np.array([by, 0.0, by]), self.high + by)
 
     def shares_beyond(self, points: Float[np.ndarray, "n 3"], by: float) -> dict[str, float]:
-        """The share of points that lie more than a length beyond each face, by its name such as "+x"."""
+        """Return, for each face, the fraction of points that lie more than the length `by` beyond the face.
+
+        The keys are the names of the faces, such as "+x". The dictionary is empty if there are no points.
+        """
         if len(points) == 0:
             return {}
         beyond = {"-": points < self.low - by, "+": points > self.high + by}
@@ -73,13 +77,13 @@ class Box(eqx.Module):
 
     @classmethod
     def cube(cls, side: float) -> "Box":
-        """The cube with sides of this length about the origin."""
+        """Return the cube with sides of this length about the origin."""
         return cls((-0.5 * side,) * 3, (0.5 * side,) * 3)
 
     @takes_native
     @program
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
-        """The exact signed distance at the points x."""
+        """Return the exact signed distance at the points x."""
         x = jnp.asarray(x)
         low, high = jnp.asarray(self.low, x.dtype), jnp.asarray(self.high, x.dtype)
         center, half = 0.5 * (low + high), 0.5 * (high - low)
@@ -94,11 +98,11 @@ def ray_interval(
     low: Sequence[float] | Float[AnyArray, "3"],
     high: Sequence[float] | Float[AnyArray, "3"],
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
-    """Ray parameters t at which rays origin + t direction enter and leave a box (Kay and Kajiya 1986).
+    """Return the t at which rays origin + t direction enter and leave a box (Kay and Kajiya 1986).
 
-    A ray misses the box if it enters after it leaves.
+    A ray misses the box if its entering t is larger than its leaving t.
 
-    - `origin`, `direction`: three components, each an array.
+    - `origin`, `direction`: x, y and z components of the rays, each an array.
     - `low`, `high`: two opposite corners of the box.
     """
     safe = [jnp.where(jnp.abs(d) < 1e-9, 1e-9, d) for d in direction]
@@ -110,12 +114,13 @@ def ray_interval(
 
 @program
 def boundary_points(volume: Volume, count: int, beyond: float = 0.0) -> Float[Array, "count 3"]:
-    """Points where `count` evenly spread rays from the origin cross the volume's boundary.
+    """Return points where `count` evenly spread rays from the origin cross the boundary of a volume.
 
-    By bisection between the origin and a sphere beyond the scene. If the volume is not star-shaped about the origin, a
-    ray may have several crossings, and any one of them is returned.
+    The points are found by bisection between the origin and a sphere beyond the scene. If the volume is not star-shaped
+    about the origin, a ray may have several crossings, and any one of the crossings is returned.
 
-    - `beyond`: move the points outward to this distance from the boundary, in scene units.
+    - `beyond`: value of the volume's function at the returned points, in scene units. The default gives points on the
+      boundary, a positive value points outside it.
     """
     directions = fibonacci_sphere(count)
 
@@ -131,7 +136,7 @@ def boundary_points(volume: Volume, count: int, beyond: float = 0.0) -> Float[Ar
 
 
 def bounding_box(volume: Volume) -> Box:
-    """The bounding box of a volume's boundary points along a thousand rays; a `Box` stays unchanged."""
+    """Return the bounding box of a volume's boundary points along 1,000 rays, or a `Box` unchanged."""
     if isinstance(volume, Box):
         return volume
     points = np.asarray(boundary_points(volume, 1000), np.float64)
