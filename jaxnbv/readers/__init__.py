@@ -1,4 +1,4 @@
-"""Readers of local copies of data sets: recorded sequences, meshes by class."""
+"""Readers of local copies of data sets: recorded depth sequences, and folders of meshes sorted by class."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Meshes by class in a local folder, in the layouts of common data sets."""
+"""Lists and reads the meshes of each class in a local folder, in the layouts of common data sets."""
 
 import itertools
 import os
@@ -13,7 +13,7 @@ from jaxnbv.networks.categories import CATEGORIES
 from jaxnbv.scanning import TriangleMesh, load_mesh
 
 _T = TypeVar("_T")
-# Patterns of the meshes in the folder of a class, and their upward axis. {name} is the name of the folder.
+# Patterns of the mesh files in the folder of a class, and the up axis in these files. {name} is the name of the folder.
 _LAYOUTS = {
     "test/{name}_[0-9]*.off": "z",  # ModelNet
     "*/Scan/Scan.obj": "y",  # OmniObject3D
@@ -22,14 +22,14 @@ _LAYOUTS = {
     "test/**/*": "y",
     "**/*": "y",
 }
-# Folders of ShapeNet's categories are named by WordNet's numbers.
+# ShapeNet names the folder of a category by its WordNet number.
 _SYNSETS = {category.name: category.synset for category in CATEGORIES}
 
 
 class MeshFile(NamedTuple):
-    """The file of a mesh, and facts about it that do not need reading it.
+    """A mesh file with the class, the name and the up axis of its object. The file is read only on request.
 
-    - `label`: index of its class.
+    - `label`: index of the object's class.
     - `name`: name of the object.
     - `path`: path of the file.
     - `up`: upward axis in the file, see `Frame`.
@@ -41,7 +41,7 @@ class MeshFile(NamedTuple):
     up: str = "y"
 
     def read(self) -> TriangleMesh:
-        """The mesh in scene coordinates, upright and with a longest side of 2.5, see `load_mesh`.
+        """Read the mesh into scene coordinates, upright and with a longest side of 2.5, see `load_mesh`.
 
         **Raises:** `ValueError` if the file is missing or damaged.
         """
@@ -49,19 +49,20 @@ class MeshFile(NamedTuple):
 
 
 def interleave(groups: Iterable[Sequence[_T]]) -> list[_T]:
-    """The first item of each group, then the second of each group that has one, and so on."""
+    """List the first item of each group, then the second item of each group that has a second item, and so on."""
     turns = itertools.chain.from_iterable(itertools.zip_longest(*groups))
     return [item for item in turns if item is not None]
 
 
 @checked
 def class_meshes(folder: str | Path, classes: Sequence[str]) -> tuple[MeshFile, ...]:
-    """The meshes of some classes in the layout `folder/class/.../name`, the classes taking turns.
+    """List the mesh files of some classes in the layout `folder/class/.../name`.
 
-    Labels are indices in `classes`. Classes without a folder and folders of other classes are skipped. Folders may be
-    named with underscores. The layout of a class follows from its files: that of ModelNet, of OmniObject3D, of ShapeNet
-    (whose folders are numbers, which also work as names of classes), or any other. If there is a split `test`, only its
-    meshes are used.
+    The list has the first object of each class, then the second of each, and so on. Labels are indices in `classes`.
+    Classes without a folder are skipped, and so are folders that match none of `classes`. The name of a folder may have
+    underscores instead of spaces. The files of a class determine its layout: ModelNet, OmniObject3D, ShapeNet, or any
+    other layout. For ShapeNet, whose folders have numbers as names, `classes` may have the names or the numbers. If a
+    class has a folder `test`, only the meshes in this folder are listed.
 
     **Raises:** `ValueError` if there is no such folder, if no class has a folder, if the folder of a class has no mesh,
     or if `classes` is not a list of names.
@@ -82,7 +83,7 @@ def _plain(name: str) -> str:
 
 
 def mesh_files(folder: str | Path) -> tuple[MeshFile, ...]:
-    """The meshes in a folder at any depth, sorted, all with label 0.
+    """List the mesh files in a folder at any depth, sorted by path, all with label 0.
 
     **Raises:** `ValueError` if there is no such folder, or no mesh in it.
     """
@@ -100,7 +101,7 @@ def _of_class(folder: Path, label: int) -> list[MeshFile]:
         matches = sorted(folder.glob(pattern.format(name=folder.name)))
         files = [file for file in matches if file.suffix[1:].lower() in formats and file.is_file()]
         if files:
-            # If each object has a folder, this has the object's name.
+            # If each object has its own folder, the folder has the name of the object.
             names = [file.relative_to(folder).parts[0] if pattern.startswith("*/") else file.stem for file in files]
             return [MeshFile(label, name, str(file), up) for name, file in zip(names, files, strict=True)]
     raise InputError(f"the folder {folder} holds no mesh: its files must end in {', '.join(sorted(formats))}")

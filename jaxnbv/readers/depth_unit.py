@@ -1,4 +1,4 @@
-"""Finds the unit of recorded depth images: the usual unit with which frames of the same place agree."""
+"""Finds the unit of recorded depth images: the common unit with which frames that show the same surface agree."""
 
 import math
 from collections.abc import Callable
@@ -9,22 +9,23 @@ from jaxtyping import Float, UInt16
 from jaxnbv.geometry.camera import Camera
 
 UNITS_A_METRE = (1000.0, 5000.0, 10000.0, 4000.0, 6553.5, 1.0)
-"""Common units of depth images, by their number in a metre. 1 means that the world has the unit of the images."""
+"""Common units of depth images, each as the number of units per metre. 1 is for images in the unit of the world."""
 
-# Number of pairs of frames, cosine of the largest angle between their views, number of pixels of each, and relative
-# difference up to which depths count as equal.
+# Number of pairs of frames, cosine of the largest angle between the viewing directions of a pair, number of pixels used
+# of each frame, and relative difference up to which depths count as equal.
 _PAIRS, _SAME_WAY, _PIXELS, _ALIKE = 12, math.cos(math.radians(45.0)), 2000, 0.02
-# Least share of points that agree, and least ratio of their number to that with any other unit.
+# Least fraction of the points that must agree with the best unit, and least ratio of the number of these points to the
+# number for the second-best unit.
 _ENOUGH, _CLEAR = 0.03, 2.0
 
 
 def depth_unit(
     image: Callable[[int], UInt16[np.ndarray, "h w"]], matrices: Float[np.ndarray, "n 4 4"], camera: Camera
 ) -> float | None:
-    """The length of a unit of the images in world units, or None if the frames do not show it.
+    """Return the length of the images' unit in world units, or None if the frames do not determine it.
 
-    It projects points of a frame into another frame with a similar direction and another position. With the right unit,
-    their depths agree with the image there.
+    Projects the points of a frame into a second frame, which has a similar viewing direction and a different position.
+    With the right unit, the depths of the projected points agree with the second image.
 
     - `image`: returns the depth image of a frame, 0 where nothing was measured.
     - `matrices`: poses of the frames, camera to world, OpenCV's axes.

@@ -1,4 +1,4 @@
-"""Reads the intrinsics of a recording's depth camera, in the usual forms and files."""
+"""Reads the intrinsics of a recording's depth camera from an argument or from a file of a common format."""
 
 import json
 from pathlib import Path
@@ -9,15 +9,15 @@ from jaxtyping import Float
 from jaxnbv.checks import AnyArray, InputError, as_numbers, require, short_text
 from jaxnbv.readers.text_files import read_rows, read_table, read_text
 
-# In this order, so that intrinsics of a depth camera come before those of a colour camera.
+# The order matters: intrinsics of a depth camera are preferred to intrinsics of a colour camera.
 _FILES = ("*depth*intrinsic*", "*intrinsic*depth*", "*camera*intrinsic*", "*intrinsic*", "calibration.txt", "info.txt")
 _BUNDLE_FUSION = "m_calibrationDepthIntrinsic"
 
 
 def intrinsic_matrix(values: Float[AnyArray, "..."] | list | tuple, name: str) -> Float[np.ndarray, "3 3"]:
-    """The 3 x 3 matrix, in pixels, from a matrix of 3 x 3 or 4 x 4 or from fx, fy, cx, cy.
+    """Return the 3 x 3 matrix of intrinsics in pixels, given a 3 x 3 or 4 x 4 matrix, or fx, fy, cx, cy.
 
-    **Raises:** `ValueError` for another shape.
+    **Raises:** `ValueError` if `values` have none of these shapes.
     """
     array = np.squeeze(as_numbers(values, name, np.float64))
     if array.shape == (4,):
@@ -28,12 +28,13 @@ def intrinsic_matrix(values: Float[AnyArray, "..."] | list | tuple, name: str) -
 
 
 def stored_intrinsics(folder: Path) -> Float[np.ndarray, "3 3"] | None:
-    """The matrix from a file of intrinsics (.txt, .json) in a folder or else in its parent, or None.
+    """Read the 3 x 3 matrix from a file of intrinsics (.txt or .json) in a folder or its parent.
 
-    A text file holds a matrix of 3 x 3 or 4 x 4, or fx, fy, cx, cy, or is BundleFusion's `info.txt`. A JSON file holds
-    Open3D's format, the four numbers by name, or the matrix alone.
+    Returns None if there is no such file. A file in the folder is preferred to a file in its parent. A text file holds
+    a 3 x 3 or 4 x 4 matrix, or fx, fy, cx, cy, or is BundleFusion's `info.txt`. A JSON file has Open3D's format, holds
+    the four numbers with their names as keys, or holds only the matrix.
 
-    **Raises:** `ValueError` if the file holds something else.
+    **Raises:** `ValueError` if the file has none of these formats.
     """
     for place in (folder, folder.resolve().parent):
         for pattern in _FILES:
@@ -57,6 +58,6 @@ def _of_file(file: Path) -> Float[np.ndarray, "3 3"]:
     if not isinstance(content, dict):
         return intrinsic_matrix(content, str(file))
     if "intrinsic_matrix" in content:
-        # Open3D writes it column by column.
+        # Open3D writes the matrix column by column.
         return intrinsic_matrix(np.reshape(content["intrinsic_matrix"], (3, 3), "F"), str(file))
     return intrinsic_matrix([content.get(name) for name in ("fx", "fy", "cx", "cy")], str(file))

@@ -1,4 +1,4 @@
-"""Finds parts of a camera's own mount, such as a gripper, in a recording. They move with the camera."""
+"""Finds pixels of a recording that show the camera's own mount, such as a gripper. The mount moves with the camera."""
 
 from collections.abc import Callable
 
@@ -10,13 +10,16 @@ from scipy.sparse.csgraph import connected_components
 
 from jaxnbv.geometry.camera import Camera
 
-# Number of frames to compare, least number that show a part, and number of blocks along the longer side of an image.
+# Number of frames to compare, least number of frames that must show the mount, and number of blocks along the longer
+# side of an image.
 _FRAMES, _FEWEST, _BLOCKS = 16, 4, 80
-# Relative difference up to which depths count as equal: of a block in several frames, and of surfaces of two frames.
+# Relative difference up to which depths count as equal: the depths of a block in different frames, and the depths of a
+# point in two frames.
 _EQUAL, _ALIKE = 0.02, 0.05
-# Neighbours in the image of a block of a part belong to the same part if they are at most this factor farther.
+# Neighbouring blocks belong to the same component if their depths differ by at most this factor.
 _OF_PART = 1.1
-# A part must be looked through more than this many times as often as it is seen again at its place in the world.
+# A component belongs to the mount if other frames see something deeper at its position in the world more than this many
+# times as often as they see a surface there.
 _CLEAR = 4
 
 
@@ -26,11 +29,12 @@ def own_parts(
     camera: Camera,
     scale: float,
 ) -> Float[np.ndarray, "h w"]:
-    """Depth up to which each pixel shows a part of the camera's mount, in units of the images, or zero.
+    """Return, for each pixel, the depth up to which it shows the camera's mount; zero where it does not.
 
-    Most frames show such a part at the same place of the image and at the same depth. At its place in the world, other
-    frames see something deeper, since the camera has moved. A vase in the middle of an orbit has equal depths too, but
-    other frames see it at the same place in the world.
+    Depths are in units of the images. Most frames show the mount at the same pixels and at the same depth. At the
+    mount's position in the world during one frame, frames from different poses see something deeper. A vase in the
+    middle of an orbit also has nearly equal depths in all frames, but all frames see the vase at the same position in
+    the world.
 
     - `image`: returns the depth image of a frame, 0 where nothing was measured.
     - `matrices`: poses of the frames, camera to world, OpenCV's axes.
@@ -55,7 +59,7 @@ def own_parts(
 
 
 def _nearest_of_blocks(image: UInt16[np.ndarray, "h w"], side: int) -> Float[np.ndarray, "k l"]:
-    """The least depth in each block of `side` x `side` pixels, or zero if nothing was measured."""
+    """Return the least depth in each block of `side` x `side` pixels, or zero if nothing was measured in the block."""
     image = np.pad(image, [(0, -size % side) for size in image.shape]).astype(float)
     blocks = np.where(image > 0, image, np.inf).reshape(image.shape[0] // side, side, image.shape[1] // side, side)
     least = blocks.min(axis=(1, 3))
@@ -69,9 +73,12 @@ def _is_looked_through(
     camera: Camera,
     side: int,
 ) -> Bool[np.ndarray, "k l"]:
-    """Mask of the connected pieces of a part that frames look through at the place where another frame shows them.
+    """Return a mask of the connected components of `part` that belong to the mount.
 
-    - `part`, `depths`: depths of the blocks of the part (positive) and of all frames, in world units.
+    A component belongs to the mount if other frames see something deeper at its position in the world during one frame.
+
+    - `part`: depths of the blocks with the same depth in most frames, in world units; zero in all other blocks.
+    - `depths`: depths of the blocks in each frame, in world units.
     """
     row, column = np.nonzero(part)
     own, count = _pieces(part)
@@ -80,7 +87,8 @@ def _is_looked_through(
     rays = np.stack([(side * (column + 0.5) - cx - skew * down) / fx, down, np.ones(len(row))], axis=-1)
     points = part[row, column, None] * rays
     deeper, alike = np.zeros(count), np.zeros(count)
-    # Bounds of the depths around a block, since the surface may be slanted and the point is anywhere in the block.
+    # Use bounds of the depths around a block, since the surface may be slanted and the point may be anywhere in the
+    # block.
     window = (1, 3, 3)
     least = minimum_filter(np.where(depths > 0, depths, np.inf), window)
     most = maximum_filter(depths, window)
@@ -105,9 +113,9 @@ def _is_looked_through(
 
 
 def _pieces(part: Float[np.ndarray, "k l"]) -> tuple[Int[np.ndarray, " blocks"], int]:
-    """The piece of each block of positive depth, and the number of pieces.
+    """Return the index of the connected component of each block with positive depth, and the number of components.
 
-    Neighbours in the image at about the same depth belong to one piece.
+    Neighbouring blocks at about the same depth belong to the same component.
     """
     padded = np.pad(part, 1)
     number = np.zeros(padded.shape, int)

@@ -24,7 +24,7 @@ from jaxnbv.readers.text_files import read_rows, read_table, read_text
 
 # Largest difference in seconds between the times of an image and of its pose in a TUM sequence.
 _APART = 0.02
-# 7-Scenes stores the largest number where nothing was measured.
+# 7-Scenes stores this number where nothing was measured.
 _NOT_MEASURED = np.iinfo(np.uint16).max
 _ASK_INTRINSICS = (
     "give intrinsics=(fx, fy, cx, cy) in pixels (on the command line --intrinsics FX FY CX CY), or put a "
@@ -39,7 +39,7 @@ _ASK_UNIT = (
 
 
 class _Layout(NamedTuple):
-    """Files and their matrices (camera to world), and intrinsics and length of a unit if the layout has them."""
+    """Image files of a recording, their camera-to-world matrices, and the intrinsics and length unit if stored."""
 
     files: list[Path]
     matrices: Float[np.ndarray, "n 4 4"]
@@ -48,30 +48,33 @@ class _Layout(NamedTuple):
 
 
 class RecordedFrames:
-    """The frames of a recorded sequence: depth images, each read on request, and their poses.
+    """The frames of a recorded sequence: depth images, which are read on request, and their poses.
 
-    - `folder`: the unpacked folder of one of these formats,
+    - `folder`: the unpacked folder, in one of these formats:
         - 7-Scenes: `frame-000000.depth.png` (16 bit) and `frame-000000.pose.txt` (4 x 4, camera to world);
-        - TUM RGB-D: `depth.txt` (time, file) and `groundtruth.txt` (time, position, quaternion). An image without a
-          pose within 20 ms is left out;
+        - TUM RGB-D: `depth.txt` (time, file) and `groundtruth.txt` (time, position, quaternion). An image is left out
+          if no pose was recorded within 20 ms of it;
         - `frames.json`: `{"intrinsics": 3 x 3, "depth_scale": 0.001, "frames": [{"depth": FILE, "pose": 4 x 4}, ...]}`,
-          files relative to the folder, camera to world in OpenCV's axes. The first two may be left out.
-    - `up`: upward direction in the world. If given, the world is rotated so that it becomes z, and x stays in its
-      plane.
-    - `intrinsics`: of the depth camera, in pixels: 3 x 3, or fx, fy, cx, cy. By default those of `frames.json`, or of a
-      file in the folder or its parent: `camera-intrinsics.txt` (3 x 3) or a similar file of 3DMatch, ScanNet, ETH3D,
-      BundleFusion or Open3D. The other formats have no intrinsics of their own.
-    - `depth_scale`: length of a unit of the images in the poses' units, 1/5000 say. By default that of `frames.json`,
-      or the usual one (1/1000, 1/5000, 1/10000...) with which frames of the same place agree.
+          with file names relative to the folder, and poses from camera to world in OpenCV's axes. `intrinsics` and
+          `depth_scale` may be left out.
+    - `up`: upward direction in the world. If given, the world is rotated: the upward direction becomes z, and the
+      former x axis has y = 0.
+    - `intrinsics`: intrinsics of the depth camera in pixels: a 3 x 3 matrix, or fx, fy, cx, cy. By default they are
+      read from `frames.json`, or from a file in the folder or its parent: `camera-intrinsics.txt` (3 x 3) or a similar
+      file of 3DMatch, ScanNet, ETH3D, BundleFusion or Open3D. The formats 7-Scenes and TUM RGB-D do not store
+      intrinsics.
+    - `depth_scale`: length of the images' unit in the unit of the poses, for example 1/5000. By default it is read from
+      `frames.json`, or it is the common unit (1/1000, 1/5000, 1/10000, ...) with which frames that show the same
+      surface agree.
 
     `camera` is the sensor, and `matrices` (n, 4, 4) are its poses in world units, with OpenCV's axes. `depth_scale`
     times an image is in world units. To add frame i to a session, call
-    `session.add(frames.depth(i), frames.matrices[i], frames.depth_scale)`. Frames with a lost pose (not finite, zeros,
-    or no rotation) are left out with a `UserWarning`. So are parts of the camera's own mount, such as a gripper, which
-    is at the same place in all images.
+    `session.add(frames.depth(i), frames.matrices[i], frames.depth_scale)`. Frames without a valid pose (not finite,
+    zeros, or no rotation) are left out with a `UserWarning`. Pixels that show the camera's own mount, such as a
+    gripper, are also left out with a `UserWarning`.
 
     **Raises:** `ValueError` if the folder has none of these formats, or is incomplete or damaged, if there are no
-    intrinsics, if the frames do not show the unit, or if most poses are lost.
+    intrinsics, if the frames do not determine the unit, or if most poses are invalid.
     """
 
     def __init__(
@@ -119,12 +122,12 @@ class RecordedFrames:
         return len(self.files)
 
     def depth(self, index: int) -> UInt16[np.ndarray, "height width"]:
-        """A depth image in its own units, 0 where nothing of the scene was measured.
+        """Return a depth image in the unit of the images, 0 where nothing of the scene was measured.
 
         **Raises:** `ValueError` for an index out of range, or an image that cannot be read or is not a depth image.
         """
         pixels = self._stored(index)
-        # The session refuses an image of another size.
+        # An image whose size differs from the first image's is returned as it is: the session raises an error for it.
         is_own = pixels <= self._own_parts if pixels.shape == self._own_parts.shape else False
         return np.where(is_own, 0, pixels).astype(np.uint16)
 
@@ -141,7 +144,7 @@ class RecordedFrames:
         return parts
 
     def _stored(self, index: int) -> UInt16[np.ndarray, "height width"]:
-        """The depth image in a file, 0 where nothing was measured."""
+        """Read the depth image of a frame, including the mount, 0 where nothing was measured."""
         require(0 <= index < len(self), f"there is no frame {index}: {self.folder} has {len(self)}, counted from 0")
         file = self.files[index]
         try:
@@ -187,7 +190,7 @@ def _plain(folder: Path) -> _Layout:
     )
 
 
-# Each format by a pattern of its files.
+# The reader of each format, keyed by a pattern of the format's files.
 _READERS: dict[str, Callable[[Path], _Layout]] = {
     "frames.json": _plain,
     "groundtruth.txt": _tum,
@@ -196,9 +199,9 @@ _READERS: dict[str, Callable[[Path], _Layout]] = {
 
 
 def _with_pose(files: list[Path], has_pose: Bool[np.ndarray, " n"], folder: Path) -> list[Path]:
-    """The files with a pose, with a `UserWarning` if others have none.
+    """Return the files that have a valid pose, with a `UserWarning` if any file has none.
 
-    **Raises:** `ValueError` if most have none.
+    **Raises:** `ValueError` if most files have no valid pose.
     """
     lost = [file.name for file, is_posed in zip(files, has_pose, strict=True) if not is_posed]
     problem = f"{len(lost)} of the {len(files)} poses in {folder} are no rigid motion, the first that of {lost[:1]}"
@@ -212,11 +215,11 @@ def _with_pose(files: list[Path], has_pose: Bool[np.ndarray, " n"], folder: Path
 
 
 def _upward(up: tuple[float, float, float]) -> Float[np.ndarray, "4 4"]:
-    """Rotation of the world that maps a direction to z and keeps x in its plane."""
+    """Return the rotation that maps `up` to z and the x axis into the plane y = 0."""
     direction = as_numbers(up, "up", np.float64)
     length = float(np.linalg.norm(direction)) if direction.shape == (3,) else 0.0
     require(0 < length < math.inf, f"up is {short_text(up)}; give a direction, such as (0, -1, 0)")
-    # If x is upward, y stays in its plane instead.
+    # If `up` is nearly parallel to x, map the y axis into this plane instead.
     beside = np.eye(3)[int(abs(direction[0]) > 0.9 * length)]
     rotation, _ = Rotation.align_vectors(np.eye(3)[[2, 0]], [direction / length, beside], weights=[np.inf, 1.0])
     turn = np.eye(4)

@@ -1,4 +1,4 @@
-"""Label images of a recording: the object that each pixel shows."""
+"""Reads the label images or masks of a recording, which say which object each pixel shows."""
 
 from pathlib import Path
 
@@ -13,16 +13,16 @@ _BETWEEN = "._-"
 
 
 class Segmentation:
-    """The object that each pixel shows, from a folder of label images or masks.
+    """A folder of label images or masks, which say which object each pixel of a recording shows.
 
-    For each frame that shows an object, the folder has one of
+    For each frame that shows an object, the folder has one of these:
 
     - a label image with the frame's name and an object number in each pixel, zero for none: `000012.png` for
       `000012.png`;
     - a mask for each object, named by frame and object, not zero where the object is seen: `000012.cup.png` or
       `000012_cup.png`.
 
-    **Raises:** `ValueError` if there is no such folder, or it has no image for any frame.
+    **Raises:** `ValueError` if there is no such folder, or if the folder has no image for any frame.
     """
 
     def __init__(self, folder: str | Path, frames: tuple[Path, ...]):
@@ -41,11 +41,11 @@ class Segmentation:
 
     @property
     def names(self) -> dict[int, str]:
-        """Names of the objects by their numbers in masks. Numbers in label images have no name here."""
+        """Names of the objects with masks, keyed by object number. Objects of label images have no names."""
         return {number: name for name, number in self._numbers.items()}
 
     def labels(self, index: int) -> Int[np.ndarray, "height width"] | None:
-        """The object's number in each pixel of a frame, zero for none. None if the frame has no image.
+        """Return the object number of each pixel of a frame (zero for no object), or None without an image.
 
         **Raises:** `ValueError` for an image that cannot be read, or has several channels.
         """
@@ -67,7 +67,7 @@ def _stem(file: Path) -> str:
 
 
 def _of_frame(stem: str, files: dict[str, Path]) -> dict[str, Path]:
-    """The images of a frame by object name, which is "" for a label image."""
+    """Return the images of a frame, keyed by object name. The key of a label image is ""."""
     if stem in files:
         return {"": files[stem]}
     return {

@@ -1,4 +1,4 @@
-"""Reads text files of other programs, which may have a byte order mark, UTF-16 or blank lines."""
+"""Reads text files that other programs wrote. Such files may have a byte order mark, UTF-16 or blank lines."""
 
 import json
 import re
@@ -14,7 +14,7 @@ _NOT_FINITE = re.compile(r"[+-]?1\.#[A-Z]+\d*")
 
 
 def read_text(path: Path) -> str:
-    """The text of a file in UTF-8, UTF-16 or UTF-32, without its byte order mark.
+    """Read the text of a file in UTF-8, UTF-16 or UTF-32, without its byte order mark.
 
     **Raises:** `OSError` if it cannot be read.
     """
@@ -23,7 +23,7 @@ def read_text(path: Path) -> str:
 
 
 def read_rows(path: Path) -> list[list[str]]:
-    """The words of each line of a file, without blank lines and lines that begin with #.
+    """Read the words of each line of a file, without blank lines and lines that begin with #.
 
     **Raises:** `OSError` if it cannot be read.
     """
@@ -32,7 +32,7 @@ def read_rows(path: Path) -> list[list[str]]:
 
 
 def read_table(path: Path) -> Float[np.ndarray, "rows columns"]:
-    """The numbers in a text file.
+    """Read a table of numbers from a text file.
 
     **Raises:** `ValueError` if it holds something else, nothing, or rows of different lengths; `OSError` if it cannot
     be read.
