@@ -1,4 +1,4 @@
-"""Noise of each pixel of a depth image. It grows with the distance and depends on the material."""
+"""Estimation of each pixel's noise in a depth image. The noise grows with the distance and depends on the material."""
 
 import functools
 import math
@@ -9,39 +9,43 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Shaped
 
-# Noise is estimated from a tile of pixels and the eight tiles around it, over three steps of 10 % in depth.
+# The image is divided into at most 40 x 40 square tiles of at least 8 x 8 pixels, and depths into steps of 10 %. The
+# noise is estimated from a pixel's tile and the eight tiles around it, at the pixel's depth step and the two beside it.
 _TILES, _SMALLEST_TILE = 40, 8
 _DEPTH_STEP, _DEPTH_STEPS = math.log(1.1), 48
-# Third differences, divided by the depth, are counted by powers of two from this one on. The largest are edges.
+# Third differences, divided by the depth, are counted in a histogram whose bins are powers of two from this value on.
+# The largest differences come from edges.
 _LEAST_DIFFERENCE, _LEVELS = 1e-5, 16
 _ENOUGH = 16
-# Median size of the third difference of independent errors, over the standard deviation of one error.
+# Median magnitude of the third difference of independent normal errors, divided by the standard deviation of one error.
 _MEDIAN_SIZE = math.sqrt(20.0) * NormalDist().inv_cdf(0.75)
 
 
 def depth_noise(
     depth: Float[Array, "h w"], valid: Bool[Array, "h w"], least: float | Float[Array, ""]
 ) -> Float[Array, "h w"]:
-    """Standard deviation of each pixel's noise and rounding, in units of the depth; at least `least`.
+    """Return the standard deviation of each pixel's noise and rounding, in units of the depth.
 
-    It follows from the median of third differences along rows and columns, which are mostly noise on smooth surface.
-    The differences are those near the pixel and at its depth. If these are few, all of the image at this depth count,
-    and if these are few too, those at all depths. If half or more of them are zero but a quarter is not, the depth is
-    in steps, whose size follows from the ones that are not zero.
+    It is at least `least`. It is computed from the median of third differences along rows and columns, which on a smooth surface are mostly
+    noise. Differences near the pixel and at its depth are used. If there are few of these, all differences in the image
+    at this depth are used, and if there are few of these too, the differences at all depths. If at least half but at
+    most three quarters of the differences are zero, depths are rounded to steps. The size of the steps is then computed
+    from the other differences.
     """
     tile = max(-(-max(depth.shape) // _TILES), _SMALLEST_TILE)
     tiles = tuple(-(-size // tile) for size in depth.shape)
-    # Relative to the nearest pixel, so that the unit of the depth does not matter.
+    # Depth steps are relative to the nearest pixel, so that the unit of the depth does not matter.
     nearest = jnp.min(jnp.where(valid, depth, jnp.inf))
     step = jnp.floor(jnp.log(jnp.where(valid, depth / nearest, 1.0)) / _DEPTH_STEP).astype(jnp.int32) % _DEPTH_STEPS
     row, column = (index // tile for index in jnp.indices(depth.shape))
     cell = row, column, step
     counts = jnp.zeros((*tiles, _DEPTH_STEPS, _LEVELS), depth.dtype)
     for axis in (0, 1):
-        # Every second pixel, since sensors smooth their images and the errors of neighbours are correlated.
+        # The differences use every second pixel. The errors of direct neighbours are correlated, since sensors smooth
+        # their images.
         a, b, c, d = (_every_second(depth, axis, index) for index in range(4))
         is_smooth = functools.reduce(operator.and_, (_every_second(valid, axis, index) for index in range(4)))
-        # Beside an edge, pixels mix a near and a far surface.
+        # Pixels beside an edge are left out, since they mix a near and a far surface.
         is_smooth &= functools.reduce(operator.and_, (jnp.abs(other - a) <= _DEPTH_STEP * a for other in (b, c, d)))
         size = jnp.abs(d - 3.0 * c + 3.0 * b - a) / jnp.where(is_smooth, a, 1.0)
         level = 1 + jnp.floor(jnp.log2(jnp.maximum(size / _LEAST_DIFFERENCE, 0.5))).astype(jnp.int32)
@@ -57,15 +61,16 @@ def depth_noise(
 
 
 def _every_second(image: Shaped[Array, "h w"], axis: int, index: int) -> Shaped[Array, "k l"]:
-    """The pixel with this index (0 to 3) of each four pixels that are two apart along an axis."""
+    """Return one pixel of each group of four pixels that are two apart along an axis: the one with this index (0-3)."""
     kept = slice(2 * index, 2 * index + max(image.shape[axis] - 6, 0))
     return image[kept] if axis == 0 else image[:, kept]
 
 
 def _median(counts: Float[Array, "*n levels"]) -> Float[Array, "*n"]:
-    """The median of numbers counted by powers of two, linear within one; zero if there are none.
+    """Return the median of a histogram whose bins are powers of two; zero for an empty histogram.
 
-    Numbers at the first level are left out if they are between a half and three quarters of all.
+    The median is interpolated linearly within its bin. The first bin holds numbers that are nearly zero. It is left out
+    if it holds between a half and three quarters of all numbers.
     """
     zeros = counts[..., 0] / jnp.maximum(jnp.sum(counts, axis=-1), 1.0)
     counts = counts.at[..., 0].multiply((zeros < 0.5) | (zeros > 0.75))

@@ -1,6 +1,6 @@
-"""Lens distortion by OpenCV's model of five or eight coefficients (Brown 1971), undone in depth images.
+"""Lens distortion by OpenCV's model with four, five or eight coefficients (Brown 1971), and its removal from images.
 
-With (x, y) = (X / Z, Y / Z) and r^2 = x^2 + y^2 a point appears at
+With (x, y) = (X / Z, Y / Z) and r^2 = x^2 + y^2, a point (X, Y, Z) appears at
 
     x' = x g + 2 p1 x y + p2 (r^2 + 2 x^2),    y' = y g + p1 (r^2 + 2 y^2) + 2 p2 x y,
     g = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)
@@ -14,17 +14,18 @@ from jaxnbv.checks import AnyArray, as_numbers, require
 from jaxnbv.programs import program
 
 _SHAPES = ((4,), (5,), (8,))
-# Neighbouring depths are not averaged if their relative difference exceeds both _ALIKE and _STEEPEST / focal length.
+# Neighbouring depths are not averaged if their relative difference exceeds both `_ALIKE` and `_STEEPEST` divided by the
+# focal length in pixels.
 _ALIKE, _STEEPEST = 0.01, 4.0
-# Lenses of depth cameras move a point by at most a third of its distance from the axis. Each iteration leaves about
-# this share of the error.
+# Lenses of depth cameras move a point by at most a third of its distance from the axis. So each iteration reduces the
+# error to about a third.
 _ITERATIONS = 25
 
 
 def distort_points(
     x: Float[AnyArray, "*n"], y: Float[AnyArray, "*n"], coefficients: tuple[float, ...]
 ) -> tuple[Float[AnyArray, "*n"], Float[AnyArray, "*n"]]:
-    """Distorted coordinates in the plane Z = 1 of points (x, y) of this plane."""
+    """Return the distorted coordinates of points (x, y) in the plane Z = 1."""
     k1, k2, p1, p2, k3, k4, k5, k6 = (*coefficients, *[0.0] * (8 - len(coefficients)))
     r2 = x**2 + y**2
     radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
@@ -36,9 +37,9 @@ def distort_points(
 def undistort_points(
     x: Float[np.ndarray, "*n"], y: Float[np.ndarray, "*n"], coefficients: tuple[float, ...]
 ) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
-    """Undistorted coordinates in the plane Z = 1 of distorted points (x, y).
+    """Return the undistorted coordinates of distorted points (x, y) in the plane Z = 1.
 
-    The inverse of `distort_points`, by fixed-point iteration as in OpenCV.
+    This inverts `distort_points` by fixed-point iteration, as in OpenCV.
     """
     across, down = x, y
     for _ in range(_ITERATIONS):
@@ -50,18 +51,18 @@ def undistort_points(
 def pixels_of(
     place: Float[AnyArray, "*n 2"], matrix: Float[AnyArray, "3 3"], coefficients: tuple[float, ...]
 ) -> tuple[Float[AnyArray, "*n"], Float[AnyArray, "*n"]]:
-    """Column and row, in pixels, at which each point of the plane Z = 1 appears through the lens."""
+    """Return the column and row in pixels at which the lens shows each point of the plane Z = 1."""
     across, down = distort_points(place[..., 0], place[..., 1], coefficients)
     return across * matrix[0, 0] + matrix[0, 2], down * matrix[1, 1] + matrix[1, 2]
 
 
 def check_distortion(coefficients: tuple[float, ...], radius: float) -> None:
-    """Check the coefficients of a lens.
+    """Check that the coefficients of a lens are valid for an image.
 
-    - `radius`: largest distance of the image from the axis, in the plane Z = 1.
+    - `radius`: largest distance from the axis to a point of the image, in the plane Z = 1.
 
-    **Raises:** `ValueError` for another number of coefficients, or if the distorted radius stops growing within the
-    image.
+    **Raises:** `ValueError` for a number of coefficients other than four, five and eight, a coefficient that is not
+    finite, or if the distorted radius does not grow with the radius everywhere in the image.
     """
     array = as_numbers(coefficients, "the distortion", np.float64)
     require(
@@ -85,15 +86,16 @@ def undistort_image(
     matrix: Float[Array, "3 3"],
     coefficients: tuple[float, ...],
 ) -> tuple[Float[Array, "h w"], Bool[Array, "h w"]]:
-    """The depth image of a pinhole camera without distortion, and whether each of its rays met nothing.
+    """Return the depth image without distortion, and whether each ray of the new image met nothing.
 
-    Depths are linear in inverse depth among four pixels of one surface, else those of the nearest pixel. They are 0
-    beyond the original image.
+    Each pixel of the new image is interpolated between the four nearest pixels of the distorted image, linearly in
+    inverse depth. If these pixels do not belong to one surface, the depth of the nearest pixel is used. The depth is 0
+    outside the distorted image.
 
-    - `depth`: the distorted image; valid depths are positive and finite.
+    - `depth`: the distorted image, in which valid depths are positive and finite.
     - `missed`: whether each ray of the distorted image met nothing.
-    - `place`: positions of the pinhole's pixels in the plane Z = 1.
-    - `matrix`: intrinsics of both the pinhole and the lens.
+    - `place`: positions of the new image's pixels in the plane Z = 1.
+    - `matrix`: intrinsic matrix of both images.
     """
     focal = jnp.diagonal(matrix)[:2]
     column, row = (jnp.asarray(pixel) for pixel in pixels_of(place, matrix, coefficients))

@@ -12,11 +12,11 @@ from jaxnbv.checks import require
 
 @functools.partial(jax.jit, static_argnames="count")
 def farthest_point_indices(points: Float[Array, "n d"], mask: Bool[Array, " n"], count: int) -> Int[Array, " count"]:
-    """Indices of `count` rows, each as far as possible from those before it, in order of choice.
+    """Return the indices of `count` rows, each chosen as far as possible from all earlier chosen rows.
 
-    Starts at the first filled row. Ties go to the first row. No row is chosen twice while a filled one is left, even if
-    points coincide. If there are fewer points than `count`, the first filled row repeats at the end. The indices carry
-    no derivative; `points[indices]` has the derivatives of the points.
+    The first filled row is chosen first. Ties go to the first row. No row is chosen twice while an unchosen filled row
+    is left, even if points coincide. If there are fewer points than `count`, the first filled row repeats at the end.
+    The indices have no derivative, but `points[indices]` can be differentiated in the points.
 
     **Raises:** `ValueError` if `count` < 1.
     """
@@ -37,16 +37,19 @@ def farthest_point_indices(points: Float[Array, "n d"], mask: Bool[Array, " n"],
     return jax.lax.scan(choose, start, length=count)[1]
 
 
-# Stand in for distances. In IEEE bits, -2.0 is a smaller integer than any distance, and a greater one than -1.0.
+# These values take the place of distances for chosen and for empty rows. If the bits of floats are read as integers,
+# -1.0 is smaller than -2.0, and both are smaller than any distance.
 _CHOSEN, _EMPTY = -2.0, -1.0
-# On a CPU, elementwise operations between this many parts of an array are several times as fast as its reduction.
+# An array is first reduced elementwise across this many parts of it. On a CPU this is several times as fast as reducing
+# the whole array.
 _FOLDS = 8
 
 
 def _first_of_largest(distance: Float[Array, " n"], rows: Int[Array, " n"]) -> Int[Array, ""]:
-    """argmax in the order of the numbers' bits, which is the order of floats that are not negative.
+    """Return the argmax of `distance`, with the bits of the floats compared as integers.
 
-    On a CPU a maximum of integers, then a minimum of rows, is several times as fast as `jnp.argmax`.
+    For floats that are not negative, the order of the bits is the order of the floats. On a CPU, a maximum of integers
+    followed by a minimum of rows is several times as fast as `jnp.argmax`.
     """
     bits = jax.lax.bitcast_convert_type(distance, jnp.dtype(f"int{8 * distance.dtype.itemsize}"))
     largest = jnp.max(_folded(jnp.maximum, bits))

@@ -1,22 +1,27 @@
-"""Samples of depth images with gaps between pixels, from lidars or images aligned to a finer camera."""
+"""Sampling of depth images that have gaps between valid pixels.
+
+Such images come from lidars, or from depth images that were aligned to a camera of higher resolution.
+"""
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.ndimage import correlate
 
-# Sides of blocks. Blocks must be filled at least this share as often as blocks of four times the side.
+# Sides of blocks that are tried. A side fits if the fraction of filled blocks is at least `_FILLED` times the fraction
+# for blocks of four times the side.
 _SIDES, _FILLED = (2, 3, 4, 6, 8, 12, 16, 24), 0.7
-# Without gaps, at least this share of the pixels has enough valid pixels around it for a plane: four of nine.
+# In an image without gaps, at least the fraction `_WITH_PLANE` of the valid pixels has enough valid pixels in its 3 x 3
+# neighbourhood for a plane, that is, `_FEWEST` with the pixel itself.
 _WITH_PLANE, _FEWEST = 0.8, 4
 
 
 def gap_of(valid: Bool[np.ndarray, "h w"]) -> int:
-    """The gap between a depth image's pixels: the side of blocks with one sample each; 1 for no gap.
+    """Return the gap between a depth image's valid pixels: the side of square blocks with one sample each.
 
-    There is no gap if most valid pixels have enough neighbours for a plane, whatever holes the image has. Otherwise it
-    is the least side for which blocks are filled about as often as blocks of four times the side: 8 if every eighth row
-    is valid.
+    The gap is 1 if most valid pixels have enough neighbours for a plane, even if the image has holes. Otherwise it is
+    the smallest side for which the fraction of blocks with a valid pixel is about that of blocks of four times the
+    side. For example, the gap is 8 if every eighth row is valid.
     """
     around = correlate(valid.astype(np.uint8), np.ones((3, 3), np.uint8), mode="constant")
     if not valid.any() or np.mean(around[valid] >= _FEWEST) >= _WITH_PLANE:
@@ -33,9 +38,12 @@ def gap_of(valid: Bool[np.ndarray, "h w"]) -> int:
 def block_samples(
     depth: Float[Array, "h w"], valid: Bool[Array, "h w"], side: int
 ) -> tuple[Float[Array, "k l"], Bool[Array, "k l"], Int[Array, "k l 2"]]:
-    """Depth of each block's valid pixel nearest to its middle, whether there is one, and its place.
+    """Return the depth of each block's sample, whether the block has a sample, and the sample's position.
 
-    - `side`: side of the blocks in pixels. The place is the column and the row within the block.
+    The sample is the valid pixel that is nearest to the middle of the block. Its position is its column and row within
+    the block.
+
+    - `side`: side of the blocks in pixels.
     """
     if side == 1:
         return depth, valid, jnp.zeros((*depth.shape, 2), int)

@@ -1,4 +1,4 @@
-"""Distances from many points to a cloud: exact, or on a grid."""
+"""Distances from many points to a cloud, either exact or interpolated on a grid."""
 
 import equinox as eqx
 import jax
@@ -8,41 +8,46 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxnbv.geometry.cloud import PointCloud, some_rows
 
 _UNROLL = 8
-# Number of points whose nearest neighbour is computed.
+# Number of points whose nearest neighbours `spacing` computes.
 _ASKED = 256
 
 
 @jax.jit
 def nearest_squared_distance(x: Float[Array, "n 3"], cloud: PointCloud) -> Float[Array, " n"]:
-    """min_j |x - y_j|^2 over the filled rows y_j of a cloud; infinite if the cloud is empty.
+    """Return min_j |x - y_j|^2 over the filled rows y_j of a cloud; infinite if the cloud is empty.
 
-    The loop runs over the rows of the cloud, so memory is linear, and time depends on the number of filled rows and not
-    on the capacity. Differentiable once or more in x and in the cloud's points.
+    A loop runs over the rows of the cloud up to the last filled row. So memory is linear in the number of points x, and
+    time does not depend on the capacity. The result can be differentiated repeatedly in x and in the cloud's points.
     """
     return _nearest_squared_distance(x, cloud.points, cloud.mask)
 
 
 def spacing(cloud: PointCloud) -> Float[Array, ""]:
-    """Median distance of a cloud's points to their nearest neighbours, in the cloud's units.
+    """Return the median distance from a point of a cloud to its nearest neighbour, in the cloud's units.
 
-    The median is over 256 evenly spaced rows. It is zero for fewer than two points.
+    The median is over 256 evenly spaced filled rows. It is zero for a cloud with fewer than two points.
     """
     nearest = distance_to_others(cloud, some_rows(cloud, _ASKED))
     return jnp.where(cloud.count > 1, jnp.median(nearest), 0.0)
 
 
 def distance_to_others(cloud: PointCloud, rows: Int[Array, " r"]) -> Float[Array, " r"]:
-    """Distance from the points of these rows of a cloud to their nearest neighbours; infinite without one."""
+    """Return the distance from the point in each row to its nearest neighbour in a cloud.
+
+    The distance is infinite if the cloud has no other point.
+
+    - `rows`: indices of rows of the cloud.
+    """
     offsets = cloud.points[rows, None] - cloud.points
     other = cloud.mask & (jnp.arange(cloud.capacity) != rows[:, None])
     return jnp.sqrt(jnp.min(jnp.where(other, jnp.sum(offsets**2, axis=-1), jnp.inf), axis=1))
 
 
 class DistanceField(eqx.Module):
-    """Distances to a cloud at the nodes of a cube, linear between them: fast at many points.
+    """Distances to a cloud, interpolated linearly between the nodes of a cube, fast for many points.
 
     - `values`: distance at each node.
-    - `low`: the first node.
+    - `low`: position of the first node.
     - `spacing`: distance between neighbouring nodes.
     """
 
@@ -52,9 +57,10 @@ class DistanceField(eqx.Module):
 
     @classmethod
     def of(cls, cloud: PointCloud, margin: Float[Array, ""] | float, resolution: int = 64) -> "DistanceField":
-        """The distance field of a cloud that is not empty.
+        """Compute the distance field of a cloud, which must not be empty.
 
-        - `margin`: distance between the cloud and the sides of the cube. Points outside are at least this far away.
+        - `margin`: least distance between the cloud and the sides of the cube. Any point outside the cube is at least
+          this far from the cloud.
         - `resolution`: number of nodes along each side of the cube.
         """
         rows = cloud.mask[:, None]
@@ -67,7 +73,10 @@ class DistanceField(eqx.Module):
         return cls(jnp.sqrt(squared).reshape(nodes.shape[:-1]), low, spacing)
 
     def __call__(self, x: Float[Array, "n 3"]) -> Float[Array, " n"]:
-        """The distance at each point x; outside the cube, that of the nearest place inside. Differentiable in x."""
+        """Return the distance at each point x. Differentiable in x.
+
+        Outside the cube, it is the distance at the nearest point of the cube.
+        """
         places = jnp.moveaxis((x - self.low) / self.spacing, -1, 0)
         return jax.scipy.ndimage.map_coordinates(self.values, list(places), order=1, mode="nearest")
 
@@ -101,7 +110,10 @@ def _nearest_index(x: Float[Array, "n 3"], points: Float[Array, "m 3"], mask: Bo
 
 
 def _loop(x, points, mask, best, closer):
-    """Fold `closer(best, row, |y|^2 - 2 x.y)` over the rows up to the last filled one, several rows a turn."""
+    """Fold `closer(best, row, |y|^2 - 2 x.y)` over the rows y up to the last filled row.
+
+    Each iteration of the loop processes `_UNROLL` rows.
+    """
     padding = -points.shape[0] % _UNROLL
     squared = jnp.where(mask, jnp.sum(points**2, axis=-1), jnp.inf)
     planes = jnp.concatenate([jnp.where(mask[:, None], -2.0 * points, 0.0), squared[:, None]], axis=-1)

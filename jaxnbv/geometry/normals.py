@@ -1,4 +1,4 @@
-"""Estimates of normals, from planes through the neighbours of each point."""
+"""Estimation of normals from planes that are fitted to the neighbours of each point."""
 
 import numpy as np
 from jaxtyping import Float
@@ -13,16 +13,18 @@ def estimate_normals(
     viewpoint: Float[AnyArray, "3"] | Float[AnyArray, "n 3"] | tuple | list,
     neighbours: int = 16,
 ) -> Float[np.ndarray, "n 3"]:
-    """Unit normals of points by least-squares planes through their nearest neighbours, towards the sensor.
+    """Estimate unit normals of points, which point towards the sensor.
 
-    For a depth image use `PointCloud.from_depth`, which takes its noise into account.
+    The normal of a point is that of the least-squares plane through its nearest neighbours. For a depth image, use
+    `PointCloud.from_depth`, which takes the noise of the image into account.
 
-    - `points`, `viewpoint`: the points, and the sensor's position for all or for each, in the same coordinates.
-    - `neighbours`: number of points that define a plane, the point itself included. More of them smooth noise, but
-      also edges.
+    - `points`: the points.
+    - `viewpoint`: position of the sensor, either one for all points or one per point, in the coordinates of the points.
+    - `neighbours`: number of points that define a plane, the point itself included. A larger number smooths noise more,
+      but also smooths edges.
 
-    **Raises:** `ValueError` for fewer points than `neighbours`, fewer than three neighbours, a point or viewpoint that
-    is not finite, or a point at the viewpoint.
+    **Raises:** `ValueError` for wrong shapes, fewer points than `neighbours`, fewer than three neighbours, a point or
+    viewpoint that is not finite, or a point at the viewpoint.
     """
     places = as_numbers(points, "the points", np.float64)
     sensor = as_numbers(viewpoint, "the viewpoint", np.float64)
@@ -37,7 +39,7 @@ def estimate_normals(
     require(bool((np.linalg.norm(toward, axis=1) > 0).all()), "a point lies where the sensor stands: drop it")
     _, index = cKDTree(places).query(places, neighbours)
     around = places[index] - places[index].mean(axis=1, keepdims=True)
-    # Eigenvalues ascend: the first direction is the one in which the points vary least.
+    # `eigh` returns eigenvalues in ascending order, so the points vary least in the first direction.
     _, directions = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
     normals = directions[:, :, 0]
     return np.where(np.sum(normals * toward, axis=1, keepdims=True) < 0, -normals, normals)

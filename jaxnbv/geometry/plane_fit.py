@@ -1,15 +1,16 @@
-"""Planes fitted to the neighbours of each pixel of a depth image, for depths and normals with less noise.
+"""Planes fitted to the neighbours of each pixel of a depth image, which give depths and normals with less noise.
 
-A plane is linear in inverse depth. With (u, v) the point where a ray meets depth 1, and z0 the pixel's depth,
+The inverse depth of a plane is linear in (u, v), the point where a ray meets depth 1. For a pixel with depth z0 at
+(u0, v0), the function
 
-    z0 / z(u, v) = a + b (u - u0) + c (v - v0),     normal towards  (b, c, a - b u0 - c v0)
+    z0 / z(u, v) = a + b (u - u0) + c (v - v0),     normal along  (b, c, a - b u0 - c v0)
 
-is fitted by least squares to the pixels of a window that can belong to the same surface. The window grows with the
-noise: a slope fitted to (2 r + 1)^2 pixels that are p apart on the surface has the error
+is fitted by least squares to those pixels of a window that can belong to the same surface. If the pixels are a distance
+p apart on the surface and their noise is sigma, a slope fitted to (2 r + 1)^2 pixels has the error
 
-    sqrt(3) sigma / (p r (2 r + 1)),
+    sqrt(3) sigma / (p r (2 r + 1)).
 
-which is kept below 2.5 degrees if a window of at most 21 x 21 pixels can.
+The radius r is the smallest one for which this error is below 2.5 degrees, and at most 10.
 """
 
 import math
@@ -24,11 +25,12 @@ from jaxnbv.geometry.gaps import block_samples
 
 _LARGEST_RADIUS = 10
 _SLOPE_ERROR = math.radians(2.5)
-# A neighbour on the same surface is at most this steep (76 degrees), plus this many standard deviations of noise.
+# A neighbour can be on the same surface if its depth differs from the pixel's by at most `_STEEPEST` times their
+# distance across the image (a slope of 76 degrees), plus `_SPREAD` standard deviations of the noise.
 _STEEPEST, _SPREAD = 4.0, 6.0
 _FEWEST = 4
-# Two pixels of one surface mostly differ by less than this, in standard deviations of one. A pixel that differs by more
-# from over five of the eight beside it mixes a near and a far surface.
+# Noise makes two pixels of one surface differ by less than `_DIFFERENCE` standard deviations of a pixel's noise in most
+# cases. A pixel that differs by more from over five of its eight neighbours mixes a near and a far surface.
 _DIFFERENCE, _MOST_UNLIKE = 3.0 * math.sqrt(2.0), 5
 
 
@@ -40,15 +42,16 @@ def fitted_planes(
     least_noise: float | Float[Array, ""],
     gap: int = 1,
 ) -> tuple[Float[Array, "k l"], Float[Array, "k l 3"], Bool[Array, "k l"]]:
-    """Depth and normal of every `stride`-th row and column, and whether there is a plane.
+    """Return the depth and normal at every `stride`-th row and column, and whether there is a plane.
 
-    Normals are in the camera's frame and point towards the camera. A depth moves to its plane by at most three standard
-    deviations of the noise.
+    Normals are in the camera's frame and point towards the camera. The depth is that of the plane, but without gaps it
+    moves by at most three standard deviations of the noise.
 
     - `depth`: depths, positive and finite where `valid`.
     - `camera`: the camera of the whole image.
-    - `least_noise`: lower bound of the noise's standard deviation, such as that of rounding.
-    - `gap`: side of the blocks of pixels that give one sample each, see `gaps`. Windows are then counted in blocks.
+    - `least_noise`: lower bound on the standard deviation of the noise, such as that of rounding.
+    - `gap`: side of the blocks of pixels that give one sample each, see `gaps`. With gaps, the sizes of windows are
+      counted in blocks.
     """
     focal = jnp.asarray(camera.focal_lengths, depth.dtype)
     strided = slice(stride // 2, None, stride)
@@ -60,7 +63,7 @@ def fitted_planes(
     padded = jnp.pad(jnp.where(is_sample, samples, 0.0), _LARGEST_RADIUS)
     offset = jnp.pad(offset, ((_LARGEST_RADIUS, _LARGEST_RADIUS), (_LARGEST_RADIUS, _LARGEST_RADIUS), (0, 0)))
     inside = jnp.stack(jnp.meshgrid(pixels[1] % gap, pixels[0] % gap), axis=-1)
-    # Offset (column, row) in pixels from each pixel to the sample of its block.
+    # `own` is the offset (column, row) in pixels from each pixel to the sample of its block.
     own = offset[rows[:, None], columns[None]] - inside
     middle, has_middle = padded[rows[:, None], columns[None]], padded[rows[:, None], columns[None]] > 0
     middle = jnp.where(has_middle, middle, 1.0)
@@ -70,7 +73,10 @@ def fitted_planes(
     width = 2 * jnp.max(jnp.where(has_middle, radius, 1)) + 1
 
     def add(index, sums):
-        """Add a neighbour of each pixel to the sums if it can belong to the same surface. Places are in windows."""
+        """Add one neighbour of each pixel to the sums, if both pixels can belong to the same surface.
+
+        Positions are in units of the window's radius.
+        """
         down, right = index // width - width // 2, index % width - width // 2
         near = padded[(rows + down)[:, None], (columns + right)[None]]
         place = gap * jnp.stack([right, down]) - inside
@@ -91,7 +97,7 @@ def fitted_planes(
     regular = jnp.where(has_plane[..., None, None], normal, jnp.eye(3, dtype=depth.dtype))
     plane = jnp.linalg.solve(regular, right_hand[..., None])[..., 0]
     has_plane = has_plane & (plane[..., 0] > 0)
-    # From slopes per window to slopes per unit of (u, v).
+    # Convert slopes per radius of the window to slopes per unit of (u, v).
     slope = plane[..., 1:] * focal / window
     towards = jnp.concatenate([slope, plane[..., :1] - jnp.sum(slope * place, axis=-1, keepdims=True)], axis=-1)
     length = jnp.linalg.norm(towards, axis=-1, keepdims=True)
@@ -101,14 +107,20 @@ def fitted_planes(
 
 
 def _radius(spacing: Float[Array, "k l"], sigma: Float[Array, "k l"]) -> Int[Array, "k l"]:
-    """Radius in pixels of the smallest window whose slope error is small enough."""
+    """Return the radius in pixels of the smallest window whose slope error is below `_SLOPE_ERROR`.
+
+    The radius is at most `_LARGEST_RADIUS`.
+    """
     radii = jnp.arange(1, _LARGEST_RADIUS + 1)
     error = math.sqrt(3.0) * sigma[..., None] / (spacing[..., None] * radii * (2 * radii + 1))
     return jnp.minimum(1 + jnp.sum(error > _SLOPE_ERROR, axis=-1), _LARGEST_RADIUS)
 
 
 def _breadth(normal: Float[Array, "k l 3 3"]) -> Float[Array, "k l"]:
-    """Spread of the neighbours about their mean: zero along a line, one if it is the same in all directions."""
+    """Return how evenly the neighbours spread about their mean: 0 if they lie on a line, 1 if evenly in all directions.
+
+    - `normal`: matrix of the normal equations.
+    """
     total = jnp.maximum(normal[..., 0, 0], 1e-12)
     mean = normal[..., 0, 1:] / total[..., None]
     spread = normal[..., 1:, 1:] / total[..., None, None] - mean[..., :, None] * mean[..., None, :]

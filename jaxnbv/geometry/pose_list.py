@@ -10,14 +10,15 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxnbv.geometry.pose import Pose
 
-# Poses nearer than this in position (scene units) and in viewing direction are the same.
+# Two poses count as the same view if their positions (scene units) and their viewing directions differ by less.
 _SAME = 1e-3
 
 
 class PoseList(eqx.Module):
     """A list of poses in scene coordinates, with fixed capacity.
 
-    - `rows`: a batch of poses. The first `count` are the list; the others are the identity.
+    - `rows`: a batch of poses. The first `count` poses are the list. The remaining rows are the identity.
+    - `count`: number of poses in the list.
     """
 
     rows: Pose
@@ -25,7 +26,7 @@ class PoseList(eqx.Module):
 
     @classmethod
     def empty(cls, capacity: int) -> "PoseList":
-        """An empty list with capacity `capacity`."""
+        """Return an empty list with this capacity."""
         dtype = jnp.result_type(float)
         rows = Pose(np.tile(np.eye(3, dtype=dtype), (capacity, 1, 1)), np.zeros((capacity, 3), dtype))
         return cls(rows, jnp.asarray(0, jnp.int32))
@@ -41,16 +42,19 @@ class PoseList(eqx.Module):
         return jax.tree.map(lambda rows: rows[self.count - 1], self.rows)
 
     def append(self, pose: Pose) -> "PoseList":
-        """A list with one more pose; a full list stays as it is."""
+        """Return a list with one more pose. A full list is returned unchanged."""
         rows = jax.tree.map(lambda rows, row: rows.at[self.count].set(row), self.rows, pose)
         return dataclasses.replace(self, rows=rows, count=jnp.minimum(self.count + 1, self.capacity))
 
     def contains(self, poses: Pose) -> Bool[Array, " poses"]:
-        """Whether each of a batch of poses equals one of the list, to 1e-3 in position and viewing direction."""
+        """Return, for each pose of a batch, whether the list contains the same view (see `is_same_view`)."""
         return jnp.any(is_same_view(poses[:, None], self.rows[None]) & self.is_filled, axis=1)
 
     def distance(self, poses: Pose) -> Float[Array, " poses"]:
-        """Distance from each of a batch of positions to the nearest of the list; infinite if it is empty."""
+        """Return the distance from each pose of a batch to the nearest position in the list.
+
+        The distance is in scene units, and infinite if the list is empty.
+        """
         distance = jnp.linalg.norm(poses.position[:, None] - self.rows.position[None], axis=-1)
         return jnp.min(jnp.where(self.is_filled, distance, jnp.inf), axis=1)
 
@@ -61,6 +65,9 @@ class PoseList(eqx.Module):
 
 
 def is_same_view(poses: Pose, others: Pose) -> Bool[Array, "*batch"]:
-    """Whether poses equal others to 1e-3 in position (scene units) and viewing direction. Broadcasts."""
+    """Return whether two poses agree to 1e-3 in position (scene units) and in viewing direction.
+
+    Leading axes of the two arguments are broadcast.
+    """
     near = jnp.linalg.norm(poses.position - others.position, axis=-1) < _SAME
     return near & (jnp.linalg.norm(poses.forward - others.forward, axis=-1) < _SAME)

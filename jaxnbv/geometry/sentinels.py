@@ -1,26 +1,27 @@
-"""Sentinels: values of a depth image that stand for "not measured", such as 65535, 10000 or 2047."""
+"""Detection of sentinels: values in a depth image that mean "not measured", such as 65535, 10000 or 2047."""
 
 import warnings
 
 import numpy as np
 from jaxtyping import Bool, Real
 
-# A sentinel fills more pixels than this many rows or columns, which a noise-free image of a floor does not. It fills
-# this many times as many pixels as any value within this share of it.
+# A sentinel fills more pixels than `_ROWS` rows or columns. No value in a noise-free image of a floor does. A sentinel
+# also fills at least `_ABOVE` times as many pixels as any value that differs from it by at most the fraction `_NEAR`.
 _ROWS, _ABOVE, _NEAR = 2, 20, 0.05
-# If the sensor's reach is unknown, a sentinel is at least this many times any other value.
+# If the largest relevant depth is unknown, a sentinel must exceed any other value by at least this factor.
 _BEYOND = 2.0
 
 
 def sentinel_pixels(image: Real[np.ndarray, "h w"], reach: float) -> Bool[np.ndarray, "h w"]:
-    """Whether each pixel holds a sentinel, a value that a sensor writes where it measured nothing.
+    """Return, for each pixel, whether it holds a sentinel: a value that means "not measured".
 
-    A sentinel is the largest value of an integer type, or a value beyond the reach that fills far more pixels than any
-    value near it (with a `UserWarning`). If all pixels hold the same value, it is no sentinel, since it may be a wall.
+    Two kinds of values are sentinels. The first is the largest value of an integer type. The second is a value beyond
+    `reach` that fills far more pixels than any value near it. It gives a `UserWarning`. If all measured pixels hold
+    the same value, this value is not a sentinel, since the image may show a wall.
 
     - `image`: depths in any units.
-    - `reach`: the largest depth that matters, in the image's units; infinite if unknown. A sentinel is then at least
-      twice any other value.
+    - `reach`: the largest relevant depth, in the image's units. If it is infinite (unknown), a sentinel of the second
+      kind must be more than twice any other value.
     """
     is_integer = np.issubdtype(image.dtype, np.integer)
     largest = image == np.iinfo(image.dtype).max if is_integer else np.zeros(image.shape, bool)

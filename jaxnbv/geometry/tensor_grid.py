@@ -1,4 +1,4 @@
-"""Functions at the nodes of a tensor grid."""
+"""Evaluation of functions at the nodes of a tensor grid."""
 
 from collections.abc import Callable
 
@@ -12,7 +12,10 @@ from jaxnbv.checks import AnyArray
 def on_tensor_grid(
     function: Callable[[Float[Array, "n 3"]], Shaped[Array, "*s n"]], axis: Float[AnyArray, " g"]
 ) -> Shaped[Array, "*s g g g"]:
-    """Values of a function of points at the nodes of axis x axis x axis, slab by slab to save memory."""
+    """Return the values of a function of points at the nodes of the grid axis x axis x axis.
+
+    The function is evaluated slab by slab to save memory.
+    """
     axis = jnp.asarray(axis)
     y, z = jnp.meshgrid(axis, axis, indexing="ij")
 
