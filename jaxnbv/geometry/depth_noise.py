@@ -26,11 +26,11 @@ def depth_noise(
 ) -> Float[Array, "h w"]:
     """Return the standard deviation of each pixel's noise and rounding, in units of the depth.
 
-    It is at least `least`. It is computed from the median of third differences along rows and columns, which on a smooth surface are mostly
-    noise. Differences near the pixel and at its depth are used. If there are few of these, all differences in the image
-    at this depth are used, and if there are few of these too, the differences at all depths. If at least half but at
-    most three quarters of the differences are zero, depths are rounded to steps. The size of the steps is then computed
-    from the other differences.
+    The result is at least `least`. It is computed from the median of third differences along rows and columns, which
+    are mostly noise on a smooth surface. The median is over the differences near the pixel and at its depth. If there
+    are few of them, it is over all differences in the image at this depth, and if there are few of them too, over the
+    differences at all depths. If at least half but at most three quarters of the differences are zero, depths are
+    rounded to steps, and the size of the steps is computed from the other differences.
     """
     tile = max(-(-max(depth.shape) // _TILES), _SMALLEST_TILE)
     tiles = tuple(-(-size // tile) for size in depth.shape)
