@@ -1,6 +1,6 @@
 """Studies that compare methods, their scenes, and the engine that runs them.
 
-The rest of the library does not import this package.
+Only the command line imports this package. The rest of the library does not.
 """
 
 import lazy_loader

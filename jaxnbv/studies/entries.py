@@ -16,12 +16,12 @@ MESHES = {
 CLASSES = {
     "classifier": Annotated[
         Path | None,
-        typer.Option(help="A network's checkpoint: .safetensors, .pth or .pt.", show_default="the one that ships"),
+        typer.Option(help="Checkpoint of a network: .safetensors, .pth or .pt.", show_default="the shipped network"),
     ],
     "first": Annotated[
         FirstView | None,
         typer.Option(
-            help="First views to start from: any, or only those after which the classifier is wrong.",
+            help="Allowed first views: any, or only views after which the classifier is wrong.",
             show_default="any",
         ),
     ],
@@ -30,7 +30,7 @@ FRAMING = {
     "framing": Annotated[
         Framing | None,
         typer.Option(
-            help="How large a pyramid appears: a view shows a patch of it, or nearly all.", show_default="both"
+            help="Size of the pyramid: a view shows a patch of it, or nearly all of one side.", show_default="both"
         ),
     ]
 }
@@ -78,7 +78,7 @@ KNOWN_PARTS = {
     "setup": Annotated[
         Setup | None,
         typer.Option(
-            help="Setup of a part's scan: all of it in view, a patch of it, on a table, or beside a box.",
+            help="Setup of the part: one side in view, a patch in view, on a table, or on a table beside a box.",
             show_default="all four",
         ),
     ],
@@ -94,8 +94,8 @@ PYRAMID = Entry(
 )
 TRUCK = Entry(
     "jaxnbv.studies.classification.objects:TruckStudy",
-    "What does a truck carry? Most views do not show it. The paper's Truck-ModelNet10, on procedural trucks and "
-    "cargo, or on meshes: a folder `trucks` and one per class of cargo.",
+    "What does a truck carry? Most views do not show the cargo. The paper's Truck-ModelNet10, on procedural trucks and "
+    "cargo, or on meshes: a folder `trucks` and one folder per class of cargo.",
     scenes=100,
     views=5,
     model="known",
@@ -129,8 +129,8 @@ PARTS = Entry(
 )
 HEAT = Entry(
     "jaxnbv.studies.heat:HeatStudy",
-    "Where is a heated object coldest? On procedural objects whose coldest point few views show, or on your meshes, "
-    "heated at one place.",
+    "Where is a heated object coldest? The objects are procedural, with a coldest point that few views show, or your "
+    "meshes, heated at one place.",
     scenes=24,
     views=6,
     model="known",
@@ -145,8 +145,8 @@ RECONSTRUCTION = Entry(
 )
 RECORDED = Entry(
     "jaxnbv.studies.recorded:RecordedStudy",
-    "Which frames of a recording show the most of a box? On a folder of 7-Scenes, of TUM RGB-D, or with a "
-    "frames.json (see RecordedFrames).",
+    "Which frames of a recording show the most of a box? The recording is a folder of 7-Scenes, of TUM RGB-D, or with "
+    "a frames.json (see RecordedFrames).",
     scenes=6,
     views=6,
     options=RECORDING,

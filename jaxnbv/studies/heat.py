@@ -65,7 +65,7 @@ class Truth(NamedTuple):
 
     @property
     def coldest(self) -> Float[np.ndarray, "3"]:
-        """The coldest point."""
+        """The coldest of `points`."""
         return self.points[np.argmin(self.temperatures)]
 
     @property
@@ -115,10 +115,11 @@ class HeatStudy(Study):
 
     title: ClassVar[str] = "The coldest point"
     explanation: ClassVar[str] = (
-        "The estimate is the coldest of all points of the cloud, as in the paper, or of the points that the source\n"
-        "warms. The object's coldest points are within 1 % of its temperature range from the lowest. A step is\n"
-        "saturated if every view has the value zero, and the first candidate is chosen. This happens when a piece of\n"
-        "the cloud is not connected to the source, since it keeps the temperature before heating, which is the lowest."
+        "The estimate is the coldest point of the cloud, among all points (as in the paper) or among the points that\n"
+        "the heat source warms. The object's coldest points exceed its lowest temperature by at most 1 % of its\n"
+        "temperature range. A step is saturated if every candidate has the value zero. The first candidate is then\n"
+        "chosen. This happens if some points of the cloud are not connected to the heat source: they keep the initial\n"
+        "temperature, which is the lowest, so that no view improves on it."
     )
     methods: ClassVar[tuple[str, ...]] = (*HEAT_METHODS, *_OTHERS)
     pictured: ClassVar[tuple[str, ...]] = ("heat", "heat-reached", *BASELINES)

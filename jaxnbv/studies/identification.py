@@ -83,11 +83,13 @@ class IdentificationStudy(Study):
 
     title: ClassVar[str] = "Which part it is, and how it lies"
     explanation: ClassVar[str] = (
-        "Name right: the likeliest name is the true one. 'None of these' counts as wrong, a tie of n names as 1/n.\n"
-        "Pose right: the name is right, and the true part's surface is on average within 1 % of its size of the\n"
-        "placed part. ADD-S: the mean distance from the true part's points to the nearest points of the placed part,\n"
-        "as a share of the diameter.\n"
-        "There is no oracle, because scoring each candidate by its true scan takes a search of the bank for each."
+        "Name right: the most likely name is the true name. 'None of these' counts as wrong. If n names are tied and\n"
+        "the true name is one of them, the scene counts as 1/n.\n"
+        "Pose right: the name is right, and the mean distance from the true part's surface to the placed part is\n"
+        "below 1 % of the part's size.\n"
+        "ADD-S: the mean distance from points of the true part to the nearest points of the placed part, as a\n"
+        "fraction of the true part's diameter.\n"
+        "There is no oracle, because scoring a candidate by its true scan needs a search of the bank."
     )
     methods: ClassVar[tuple[str, ...]] = (IDENTIFY, BY_NAME, "farthest", "random")
     extra_methods: ClassVar[tuple[str, ...]] = ("new-surface", "uncertainty")
@@ -141,7 +143,7 @@ class IdentificationStudy(Study):
 
         **Raises:** `ValueError` if the model is not "known", or if the folder holds no meshes.
         """
-        require(model == KNOWN, f"the study is about known parts: give the model {KNOWN}, or none")
+        require(model == KNOWN, f"the study is about known parts: give the model {KNOWN}, or leave it out")
         settings: dict[str, Any] = {
             "sampler": SurfaceSampler.preset("screened", quick=quick),
             "meshes": () if parts is None else cls.files_in(parts),

@@ -58,8 +58,8 @@ class ReconstructionStudy(Study):
     explanation: ClassVar[str] = (
         "In scene units (longest side 2.5). Accuracy is the mean distance from the reconstruction to the truth,\n"
         "completeness the mean distance from the truth to the reconstruction, and the Chamfer distance CD their sum.\n"
-        "HD is the Hausdorff distance, the largest of both kinds. A reconstruction that no scene has is left out\n"
-        "(Poisson needs pip install pymeshlab)."
+        "HD, the Hausdorff distance, is the largest distance in both directions. A reconstruction is left out if no\n"
+        "scene has it: screened Poisson needs pip install pymeshlab."
     )
     bank: ClassVar[str] = "parts"
     without_bank: ClassVar[tuple[str, ...]] = ("coverage", "new-surface", "uncertainty")

@@ -137,8 +137,9 @@ class RecordedStudy(Study):
 
     title: ClassVar[str] = "Voxels of a recorded place that were seen"
     explanation: ClassVar[str] = (
-        "Share of the voxels in the box that the chosen frames show. A voxel counts if three frames or more show it.\n"
-        "The oracle knows what each frame shows. Evenly spaced frames divide the recording in time."
+        "Fraction of the box's voxels that the chosen frames show. Only voxels that at least three frames show count.\n"
+        "The oracle chooses the frame that shows the most new voxels. Evenly spaced frames divide the recording into\n"
+        "equal intervals."
     )
     methods: ClassVar[tuple[str, ...]] = (NEW_AREA, COVERAGE, *BASELINES, EVEN, ORACLE)
     reference: ClassVar[str] = NEW_AREA
@@ -179,7 +180,8 @@ class RecordedStudy(Study):
         """
         require(
             "num_candidates" not in options,
-            f"--candidates {options.get('num_candidates')}: candidates are the frames of the recording: leave it out",
+            f"--candidates {options.get('num_candidates')} cannot be used, because the candidates are the frames of "
+            "the recording: leave it out",
         )
         require(model in MODELS, f"a recording has no known shapes: give one of the models {', '.join(MODELS)}")
         folder = str(Path(options["folder"]).resolve())
@@ -229,7 +231,7 @@ class RecordedStudy(Study):
         **Raises:** `ValueError` if there is no such frame.
         """
         enough = np.flatnonzero(self.recording.is_shown.mean(axis=1) >= _ENOUGH)
-        require(len(enough) > 0, f"no frame of {self.folder} shows a twentieth of {self.box}: give a smaller box")
+        require(len(enough) > 0, f"no frame of {self.folder} shows 5 % of the voxels in {self.box}: give a smaller box")
         order = jax.random.permutation(jax.random.key(self.seed), len(enough))
         return int(enough[order[scene.index % len(enough)]])
 

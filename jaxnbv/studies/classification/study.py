@@ -113,9 +113,10 @@ class ClassificationStudy(Study):
     pictured: ClassVar[tuple[str, ...]] = ("cross-entropy", "farthest", "uncertainty")
     reference: ClassVar[str] = "cross-entropy"
     explanation: ClassVar[str] = (
-        "First hit: some prediction so far was right. Stable hit: all predictions from this view on are right. For\n"
-        f"random search, both are means over {_RUNS} runs. Cue seen: some view shows at least {CUE_PIXELS} pixels of\n"
-        "the part that differs by class. Rank correlation and roughness belong to the view that is chosen."
+        "First hit: at least one prediction up to this view is right. Stable hit: all predictions from this view on\n"
+        f"are right. For random search, both are means over {_RUNS} runs. Cue seen: this view or an earlier one shows\n"
+        f"at least {CUE_PIXELS} pixels of the part that differs by class. Rank correlation and roughness at a view\n"
+        "belong to the search that proposed this view."
     )
     measures: ClassVar[tuple[Measure, ...]] = MEASURES
     claims: ClassVar[tuple[Claim, ...]] = (
@@ -231,7 +232,7 @@ class ClassificationStudy(Study):
 
     @property
     def grid(self) -> Grid:
-        """The grid of samples, in proportion to the object's size."""
+        """The grid on which samples are evaluated. Its extent is proportional to the object's size."""
         return Grid(self.grid_resolution, 0.7 * self.framing.longest_side)
 
     def shows_enough(self, scene: Scene, scan: PointCloud) -> bool:

@@ -1,1 +1,1 @@
-"""Base class of studies, the runs of their scenes, and tables, charts and pages of the results."""
+"""Engine of studies: their base class, and functions that run scenes and make tables, charts and pages."""

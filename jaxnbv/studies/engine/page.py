@@ -21,8 +21,9 @@ _REMEDY = "give a folder that `jaxnbv study` has written"
 
 
 class Chapter(NamedTuple):
-    """The part of the page about one study.
+    """The section of the page about one study.
 
+    - `title`: title of the section; `verdicts`: checks of the study's claims.
     - `scenes`: number of scenes; `facts`: sentences on times and versions.
     - `explanation`: text that explains the measures and the cells of the tables.
     - `tables`: titles and HTML of the tables, for each group of scenes.

@@ -156,7 +156,7 @@ def _checksum(index: int, record: dict[str, Any]) -> str:
 
 def _read(file: Path, index: int) -> dict[str, Any]:
     """Read the record of scene `index`, and check its format, index and checksum."""
-    remedy = "delete it, and it is made again"
+    remedy = "delete it, and run the study again"
     content = read_json(file, "is damaged", remedy)
     check_format(content.get("format"), _FORMAT, file)
     require(content.get("index") == index, f"{file} is damaged (it is scene {content.get('index')!s:.20}): {remedy}")

@@ -137,8 +137,9 @@ class PartDiscoveryStudy(Study):
 
     title: ClassVar[str] = "Views until all parts are found"
     explanation: ClassVar[str] = (
-        "T_discovery for each N_target: views until the segmenter gives that many points to every part of the object.\n"
-        "If some part never gets them, it is one more than the number of views, so that means are lower bounds."
+        "T_discovery for an N_target: number of views until the segmenter assigns N_target points to every part of\n"
+        "the object. If a part never gets N_target points, T_discovery is set to the number of views plus one. The\n"
+        "means are therefore lower bounds."
     )
     methods: ClassVar[tuple[str, ...]] = (*_BY_PARTS, *_OTHERS)
     pictured: ClassVar[tuple[str, ...]] = ("discrete", "gradient-2dof", "farthest", "uncertainty")

@@ -50,8 +50,8 @@ class MeshPartStudy(PartDiscoveryStudy):
     """
 
     explanation: ClassVar[str] = (
-        f"{PartDiscoveryStudy.explanation}\nAn oracle gives each point to the nearest part. A part counts if all "
-        f"candidates\ntogether show {max(TARGETS)} of its points among {NETWORK_POINTS}."
+        f"{PartDiscoveryStudy.explanation}\nAn oracle assigns each point to the nearest part. A part counts only if the "
+        f"oracle assigns {max(TARGETS)}\nof {NETWORK_POINTS} points to it in the scans from all candidates together."
     )
     seed: ClassVar[int] = 12
 
