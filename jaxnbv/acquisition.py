@@ -1,9 +1,9 @@
 """Acquisition functions of the paper: the value of a pose, computed from imagined scans.
 
-    alpha(theta) = E alpha(D, scan(theta; f | D)),   estimated by the mean over the step's samples f_1, ..., f_S,
+    alpha(theta) = E alpha(D, scan(theta; f | D)),   estimated by the mean over the step's samples f_1, ..., f_S
 
-the same samples for all poses (common random numbers). An acquisition computes its *context* once a step, from the
-observations, and the *score* of each imagined view from the context.
+All poses use the same samples (common random numbers). An acquisition computes its *context* from the observations once
+per step, and the *score* of each imagined view from the context.
 """
 
 from abc import abstractmethod
@@ -46,18 +46,19 @@ class ImaginedView(eqx.Module):
 
 
 class Acquisition(eqx.Module):
-    """Base class: the worth of one imagined scan, given the observations.
+    """Base class of acquisitions: the score of one imagined scan, given the observations.
 
-    A search maximises its mean over the samples.
+    A search maximises the mean score over the samples.
 
-    - `needs_posterior`: whether `context` reads the posterior. A planner then puts the posterior into the step.
-    - `cloud_only`: whether `context` reads D alone, so that a planner can try it before there are observations.
-    - `measurable_only`: whether to drop sampled surface that a view should have measured and did not, see `Looks`.
-    - `needs_hypotheses`: whether it reads the hypotheses of a model of known parts, and no posterior. The step's only
-      sample is then the likeliest part.
-    - `gains_once`: whether a second view from the same pose gains nothing. The value at the poses of earlier views is
-      then an error, and counts in which candidates are tied with the best (`Proposal.tied_with_best`). A search over
-      candidates takes the one of these that is farthest from the cameras so far.
+    - `needs_posterior`: whether `context` reads the posterior. A planner then puts the posterior into the step inputs.
+    - `cloud_only`: whether `context` reads only D. A planner can then test the acquisition before the first view.
+    - `measurable_only`: whether to drop sampled surface that an earlier view should have measured but did not, see
+      `Looks`.
+    - `needs_hypotheses`: whether `context` reads the hypotheses of a model of known parts, and no posterior. The most
+      likely part is then the only sample of the step.
+    - `gains_once`: whether a second view from the same pose gains nothing. The true value at the poses of earlier views
+      is then zero, so the estimated value there is an error. `Proposal.tied_with_best` uses this error as a tolerance,
+      and a search over candidates proposes the tied candidate that is farthest from the cameras so far.
     """
 
     needs_posterior: ClassVar[bool] = False
@@ -68,11 +69,14 @@ class Acquisition(eqx.Module):
 
     @abstractmethod
     def context(self, step: StepInputs) -> Any:
-        """All that does not depend on the view. Computed once a step."""
+        """Compute everything that does not depend on the view. Called once per step."""
 
     @abstractmethod
     def score(self, context: Any, view: ImaginedView) -> Float[Array, "*values"]:
-        """The score of one view. It must be finite, and an empty scan must not score higher than any other."""
+        """Return the score of one view.
+
+        The score must be finite, and no scan may score lower than an empty scan.
+        """
 
     def sample_scores(
         self,
@@ -82,11 +86,11 @@ class Acquisition(eqx.Module):
         poses: Pose,
         barrier: Float[Array, "poses rays"] | None = None,
     ) -> Float[Array, "samples poses *scores"]:
-        """Scores of the imagined scans of each sampled surface from each pose of a batch.
+        """Return the scores of the imagined scans of each sampled surface from each pose of a batch.
 
-        An acquisition that is not a mean over samples may return a single row. `samples_at_once` samples are scanned
-        together from all poses, and memory must hold these scans. Their scores are computed `batch_size` at a time.
-        Devices share the samples, or the poses if there are fewer samples than devices.
+        An acquisition that is not a mean over samples may return a single row. Scans of `samples_at_once` samples from
+        all poses are computed together, and must fit into memory. `batch_size` scans are scored together. The samples
+        are divided among devices, or the poses if there are fewer samples than devices.
 
         - `barrier`: see `scan`.
         """
@@ -95,7 +99,7 @@ class Acquisition(eqx.Module):
         return shared_map(_of_sample, surfaces, context, views, self, camera, together, at_once=together)
 
     def inputs(self, step: StepInputs) -> StepInputs:
-        """The inputs that `context` reads. Steps for which these have equal shapes share one compilation."""
+        """Return the inputs that `context` reads. Steps with inputs of equal shapes share one compilation."""
         if self.cloud_only:
             return inputs_of(step.observations.cloud)
         return StepInputs(step.observations, step.posterior if self.needs_posterior else None)
@@ -107,23 +111,26 @@ class Acquisition(eqx.Module):
 
     @property
     def quantity(self) -> Quantity:
-        """Name, unit and meaning of its expected value."""
+        """Name, unit and meaning of the acquisition's expected value."""
         meaning = "value of an imagined scan, mean over posterior samples."
         return Quantity(f"acquisition, {type(self).__name__}", "", meaning)
 
     def answer(self, cloud: PointCloud) -> Answer | None:
-        """The answer that D gives to the acquisition's question, or None if there is no such answer."""
+        """Return the answer that D gives to the acquisition's question, or None if there is no such answer."""
         return None
 
     def answer_values(self, cloud: PointCloud) -> Float[Array, " n"] | None:
-        """The values of `answer` by JAX operations. None without an answer, or if it needs host code."""
+        """Return the values of `answer`, computed by JAX operations.
+
+        None if there is no answer, or if the answer needs host code.
+        """
         return None
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> Answer | None:
-        """The correct `answer`, or None if it is not known.
+        """Return the correct answer, or None if it is not known.
 
         - `scene`: the true surface.
-        - `cloud`: points on all of it, uniform by area.
+        - `cloud`: points on the whole true surface, uniform by area.
         """
         return self.answer(cloud)
 
@@ -139,8 +146,8 @@ class ExpectedUtilityImprovement(Acquisition):
     """max(0, u(D u scan) - u(D)) for any utility u(cloud). Its mean over samples is the paper's alpha^(u).
 
     - `utility`: a `Utility`, or a function from a `PointCloud` (masked rows) to a scalar, made of JAX operations.
-    - `num_points`: if not None, D is thinned to this number by farthest point sampling, once a step, before scans are
-      added. Use it for a utility that would otherwise thin D to this number again for every scan.
+    - `num_points`: if not None, D is thinned to this number of points by farthest point sampling, once per step, before
+      scans are added. Use it for a utility that would otherwise thin D to this number for every scan.
     """
 
     cloud_only: ClassVar[bool] = True
@@ -152,7 +159,7 @@ class ExpectedUtilityImprovement(Acquisition):
         require(self.num_points is None or self.num_points >= 1, f"num_points is {self.num_points}; give at least 1")
 
     def context(self, step: StepInputs) -> tuple[PointCloud, Array]:
-        """D, thinned to `num_points`, and u(D)."""
+        """Return D, thinned to `num_points`, and u(D)."""
         cloud = step.observations.cloud
         cloud = cloud if self.num_points is None else limit_capacity(cloud, self.num_points)
         return cloud, self._value(cloud)
@@ -161,7 +168,7 @@ class ExpectedUtilityImprovement(Acquisition):
         return checked_result(self.utility(cloud), f"the {self.utility.name} of a cloud", 0, "a utility is one number")
 
     def score(self, context: tuple[PointCloud, Float[Array, ""]], view: ImaginedView) -> Float[Array, ""]:
-        """max(0, u(D u scan) - u(D))."""
+        """Return max(0, u(D u scan) - u(D))."""
         cloud, utility = context
         return zero_if_empty(view.scan, jnp.maximum(0.0, self._value(concatenate(cloud, view.scan)) - utility))
 
@@ -176,19 +183,19 @@ class ExpectedUtilityImprovement(Acquisition):
         return self.utility.improvement
 
     def answer(self, cloud: PointCloud) -> Answer:
-        """The utility's own answer, or u(D)."""
+        """Return the utility's own answer, or u(D) if the utility has no answer."""
         own = self.utility.answer(cloud)
         return Answer((self.utility.name,), np.array([float(context_of(self, cloud)[1])])) if own is None else own
 
     def answer_values(self, cloud: PointCloud) -> Float[Array, " n"] | None:
-        """The values of the utility's own answer, or u(D)."""
+        """Return the values of the utility's own answer, or u(D) if the utility has no answer."""
         own = self.utility.answer_values(cloud)
         if own is None and type(self.utility).answer is Utility.answer:
             return jnp.atleast_1d(context_of(self, cloud)[1])
         return own
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> Answer:
-        """The utility's own true answer, or its answer on all of the surface."""
+        """Return the utility's own true answer, or the answer that points on the whole surface give."""
         own = self.utility.true_answer(scene, cloud)
         return self.answer(cloud) if own is None else own
 
@@ -201,9 +208,9 @@ class ExpectedUtilityImprovement(Acquisition):
 
 
 def as_acquisition(value: Any) -> Acquisition:
-    """The value itself if it is an acquisition, else the expected improvement of this utility.
+    """Return an acquisition unchanged, or the expected improvement of a utility.
 
-    A plain function of a cloud will do as a utility.
+    A plain function of a cloud also counts as a utility.
 
     **Raises:** `ValueError` for anything else.
     """
@@ -213,10 +220,10 @@ def as_acquisition(value: Any) -> Acquisition:
 
 
 class AcquisitionList(Acquisition):
-    """Several acquisitions on the same samples and the same scans, so each pose is scanned only once.
+    """Several acquisitions on the same samples and the same scans. Each pose is scanned only once.
 
-    Its value is the vector of the members' values in order, and a member with a vector value takes as many places.
-    Use it with `expected_value` and `Problem.scores`, not in a planner.
+    The value is a vector: the members' values, concatenated in order. A member's value may itself be a vector.
+    Use an `AcquisitionList` with `expected_value` and `Problem.scores`, not in a planner.
     """
 
     members: tuple[Acquisition, ...]
@@ -234,11 +241,11 @@ class AcquisitionList(Acquisition):
         return any(member.needs_posterior for member in self.members)
 
     def context(self, step: StepInputs) -> tuple[Any, ...]:
-        """The context of each member."""
+        """Return the context of each member."""
         return tuple(member.context(member.inputs(step)) for member in self.members)
 
     def score(self, context: tuple[Any, ...], view: ImaginedView) -> Float[Array, " values"]:
-        """The members' scores of one view."""
+        """Return the members' scores of one view, concatenated."""
         values = [member.score(own, view) for member, own in zip(self.members, context, strict=True)]
         return jnp.concatenate([jnp.atleast_1d(value) for value in values])
 
@@ -254,15 +261,15 @@ class AcquisitionList(Acquisition):
 
 
 def inputs_of(observations: StepInputs | Observations | PointCloud) -> StepInputs:
-    """Inputs of a step: those given, or observations or a cloud as inputs without posterior and samples."""
+    """Return step inputs unchanged, or wrap observations or a cloud as inputs without posterior and samples."""
     return observations if isinstance(observations, StepInputs) else StepInputs(as_observations(observations))
 
 
 def context_of(acquisition: Acquisition, observations: StepInputs | Observations | PointCloud) -> Any:
-    """The acquisition's context, computed by a compiled function.
+    """Compute the acquisition's context by a compiled function.
 
-    **Raises:** `ValueError` if JAX cannot trace a function of the user's, or if the acquisition needs a posterior and
-    there is none.
+    **Raises:** `ValueError` if JAX cannot trace a user's function, or if the acquisition needs a posterior and there is
+    none.
     """
     inputs = _inputs(acquisition, observations)
     with functions_of_users():
@@ -284,20 +291,21 @@ def _context_of(acquisition: Acquisition, inputs: StepInputs) -> Any:
 
 
 def zero_if_empty(scan: PointCloud, value: Float[Array, "*values"]) -> Float[Array, "*values"]:
-    """The value or values, or zero if the scan is empty."""
+    """Return the value or values unchanged, or zero if the scan is empty."""
     return jnp.where(jnp.any(scan.mask), value, 0.0)
 
 
 def check_traceable(
     acquisition: Acquisition, observations: Observations | int, camera: Camera, differentiable: bool = False
 ) -> None:
-    """Check that JAX can trace an acquisition. Uses shapes alone and computes nothing.
+    """Check that JAX can trace an acquisition. The check uses only shapes and computes nothing.
 
     - `observations`: observations, or the capacity of a cloud D.
-    - `camera`: the camera of the scans that it scores.
-    - `differentiable`: whether it must have derivatives in the points and normals of a scan.
+    - `camera`: the camera of the scans to score.
+    - `differentiable`: whether to check that scores have derivatives in the points and normals of a scan.
 
-    **Raises:** `ValueError` if JAX cannot trace it (a utility in NumPy, say) or cannot differentiate it (host code).
+    **Raises:** `ValueError` if JAX cannot trace the acquisition (for example a utility in NumPy), or cannot
+    differentiate it (host code).
     """
     if acquisition.needs_posterior or acquisition.needs_hypotheses:
         # There is no posterior and there are no hypotheses yet.
@@ -335,20 +343,20 @@ def expected_value(
     poses: Pose,
     barrier: Float[Array, "poses rays"] | None = None,
 ) -> Float[Array, "poses *scores"]:
-    """The acquisition at each pose of a batch: mean score of the imagined scans over the samples.
+    """Return the expected value at each pose: the mean score of imagined scans over the samples.
 
-    Supports `jit`, `grad` and `vmap`, in the poses and in `observations`. `AcquisitionList` adds an axis for its
-    members.
+    The function supports `jit`, `grad` and `vmap`, in the poses and in `observations`. An `AcquisitionList` adds an
+    axis for its members.
 
-    - `observations`: the observations, or a cloud D alone. Acquisitions that need the posterior take `StepInputs`.
+    - `observations`: the observations, or a cloud D. An acquisition that needs the posterior requires `StepInputs`.
     - `surfaces`: the samples along a leading axis.
     - `barrier`: see `scan`.
 
-    **Raises:** `ValueError` if the acquisition's `check` does (not run on traced values), or if JAX cannot trace a
-    function of the user's.
+    **Raises:** `ValueError` if the acquisition's `check` does (traced values are not checked), or if JAX cannot trace a
+    user's function.
     """
     inputs = _inputs(acquisition, observations)
-    # The zero is traced under jit even if all inputs are concrete. `check` needs concrete results.
+    # `check` needs concrete results. Under jit, results (and this zero) are traced even if all inputs are concrete.
     if not is_traced(acquisition, inputs, jnp.zeros(())):
         acquisition.check(inputs.observations.cloud)
     with functions_of_users():
@@ -359,9 +367,9 @@ def expected_value(
 def scores(
     acquisition: Acquisition, context: Any, scans: PointCloud, camera: Camera, poses: Pose, samples: int = 1
 ) -> Float[Array, "poses *scores"]:
-    """Scores of a batch of scans, one scan from each pose.
+    """Return the scores of a batch of scans, one scan from each pose.
 
-    `batch_size // samples` of them are computed at a time.
+    `batch_size // samples` scans are scored at a time.
 
     - `samples`: number of samples whose scans are scored together.
     """
@@ -372,7 +380,7 @@ def scores(
     )
 
 
-# Poses, and the distance to obstacles along the rays of each.
+# Poses, and the distances to obstacles along the rays of each pose.
 _Views: TypeAlias = tuple[Pose, Float[Array, "poses rays"] | None]
 
 

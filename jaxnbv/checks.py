@@ -26,7 +26,7 @@ AnyArray = Array | np.ndarray
 _F = TypeVar("_F", bound=Callable[..., Any])
 _LONGEST_SHOWN = 60
 _hints_of = functools.cache(get_type_hints)
-# Folders of code that is not the user's.
+# Folders of code that does not belong to the user.
 _OWN = tuple(
     f"{Path(str(file)).parent}{os.sep}" for file in (jax.__file__, equinox.__file__, jaxtyping.__file__, __file__)
 )
@@ -53,7 +53,7 @@ _LARGEST = float(np.finfo(np.float32).max)
 
 
 def check_device() -> None:
-    """**Raises:** `ValueError` if JAX finds no device of the kind in JAX_PLATFORMS."""
+    """**Raises:** `ValueError` if JAX finds no device of the platform in `JAX_PLATFORMS`."""
     try:
         jax.devices()
     # The type of the error depends on the plugins that are installed.
@@ -76,11 +76,11 @@ def is_traced(*trees) -> bool:
 
 
 def check_fields(module: Any) -> None:
-    """Check the fields of a module that are annotated by plain types, see `check_type`.
+    """Check the fields of a module that are annotated with plain types, see `check_type`.
 
-    Call it first in `__check_init__`, so that later checks compare numbers with numbers.
+    Call this first in `__check_init__`, so that later checks can rely on the types.
 
-    **Raises:** `ValueError` that names the field.
+    **Raises:** `ValueError` that names the first field whose value contradicts its annotation.
     """
     hints = get_type_hints(type(module))
     for field in dataclasses.fields(module):
@@ -91,14 +91,14 @@ def check_fields(module: Any) -> None:
 def own_settings() -> Iterator[None]:
     """Context manager or decorator: allow rank promotion, type promotion and transfers in JAX.
 
-    Strict settings of a user in `jax.config` are meant for the user's own code. `jax_debug_nans` stays as it is.
+    A user's strict settings in `jax.config` are meant for the user's own code. `jax_debug_nans` is not changed.
     """
     with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"), jax.transfer_guard("allow"):
         yield
 
 
 def checked(function: _F) -> _F:
-    """Decorator: check the arguments by `check_type`, and run the function under `own_settings`."""
+    """Decorator: check the arguments with `check_type`, and run the function under `own_settings`."""
     signature = inspect.signature(function)
 
     @functools.wraps(function)
@@ -116,7 +116,7 @@ def checked(function: _F) -> _F:
 
 
 def check_type(value: Any, hint: Any, name: str) -> None:
-    """**Raises:** `ValueError` if the value contradicts a plain type hint. Ignores other hints."""
+    """**Raises:** `ValueError` if the value contradicts a plain type hint. Other type hints are ignored."""
     if hint is int:
         whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
         require(whole, f"{name} is {short_text(value)}; it must be a whole number")
@@ -139,7 +139,10 @@ def check_type(value: Any, hint: Any, name: str) -> None:
 
 
 def check_index(index: Any, batch: tuple[int, ...], name: str) -> None:
-    """**Raises:** `ValueError` for a number that indexes no batch or is out of range (JAX clamps it)."""
+    """Check an index of a batch, because JAX clamps an index that is out of range.
+
+    **Raises:** `ValueError` for an integer that is out of range, or if there are no batch axes.
+    """
     if isinstance(index, int | np.integer):
         check_batch(batch, name)
         require(-batch[0] <= index < batch[0], f"{name} has {batch[0]} along its first axis: there is no index {index}")
@@ -157,9 +160,10 @@ def check_key(key: Any) -> None:
 
 
 def native(value: Any) -> Any:
-    """A NumPy array converted to native byte order and at most double precision.
+    """Convert a NumPy array to native byte order and at most double precision.
 
-    Returns anything else as it is. Under `jit`, JAX reads arrays of the other byte order without swapping bytes.
+    Any other value is returned unchanged. The conversion is necessary because under `jit` JAX reads an array of
+    non-native byte order without swapping the bytes.
     """
     if isinstance(value, np.ndarray) and (value.dtype.char == "g" or not value.dtype.isnative):
         return value.astype(np.float64 if value.dtype.char == "g" else value.dtype.newbyteorder("="))
@@ -178,9 +182,11 @@ def takes_native(function: _F) -> _F:
 
 @own_settings()
 def as_floats(value: Any, name: str) -> Array:
-    """The numbers as an array of JAX's default floating-point type.
+    """Return the value as an array of JAX's default floating-point type.
 
-    **Raises:** `ValueError` if this is not an array of real numbers.
+    - `name`: name of the value, for the error message.
+
+    **Raises:** `ValueError` if the value is not an array of real numbers.
     """
     # A JAX array of real numbers stays on its device.
     is_real = isinstance(value, Array) and any(jnp.issubdtype(value.dtype, kind) for kind in _REAL)
@@ -188,11 +194,12 @@ def as_floats(value: Any, name: str) -> Array:
 
 
 def as_numbers(value: Any, name: str, dtype: Any = float) -> np.ndarray:
-    """The numbers as a NumPy array.
+    """Return the value as a NumPy array.
 
-    - `dtype`: `float` means JAX's default floating-point type. None keeps the type.
+    - `name`: name of the value, for the error message.
+    - `dtype`: type of the result. `float` means JAX's default floating-point type. None keeps the type of the value.
 
-    **Raises:** `ValueError` if this is not an array of real numbers, or if it is a masked array with masked entries.
+    **Raises:** `ValueError` if the value is not an array of real numbers, or is a masked array with masked entries.
     """
     masked = isinstance(value, np.ma.MaskedArray) and bool(np.ma.getmaskarray(value).any())
     require(not masked, f"{name} is a masked array: give what is valid in it as a plain array")
@@ -212,9 +219,10 @@ def as_numbers(value: Any, name: str, dtype: Any = float) -> np.ndarray:
 
 @contextmanager
 def functions_of_users() -> Iterator[None]:
-    """Context manager for calls of the user's functions: explains JAX's tracing errors.
+    """Context manager for calls of a user's functions: explain JAX's tracing errors.
 
-    **Raises:** `ValueError` for a function that calls NumPy, picks rows by a mask, or branches in Python on a value.
+    **Raises:** `ValueError` for a function that calls NumPy, selects rows by a mask, or uses a traced value in Python
+    to count, to index or to branch.
     """
     try:
         yield
@@ -233,10 +241,10 @@ def functions_of_users() -> Iterator[None]:
 
 
 def checked_result(value: Any, name: str, axes: int, wanted: str) -> Any:
-    """The value itself, after a check of what a function of the user's returned.
+    """Check a value that a user's function returned, and return it unchanged.
 
-    - `axes`: the number of axes. For 0 a plain number will do.
-    - `name`, `wanted`: the name of the value and what the function should return, for the error.
+    - `axes`: the required number of axes. If it is 0, a plain number is valid too.
+    - `name`, `wanted`: the name of the value, and a description of valid values, for the error message.
 
     **Raises:** `ValueError` unless the value is an array of real numbers with this number of axes.
     """
@@ -247,7 +255,7 @@ def checked_result(value: Any, name: str, axes: int, wanted: str) -> Any:
 
 
 def short_text(value: Any) -> str:
-    """Short text for a value in an error message: shape and type for an array."""
+    """Return a short text for a value in an error message. For an array it gives shape and type."""
     if isinstance(value, AnyArray):
         return f"an array of shape {value.shape} and type {value.dtype}" if value.ndim else str(value)
     if isinstance(value, str | int | float | complex | tuple | list | dict | None):
@@ -269,8 +277,8 @@ def _is_number(value: Any) -> bool:
 
 
 def _classes(hint: Any) -> tuple[type, ...]:
-    """The classes in a hint, or none if the hint holds anything else than classes."""
+    """Return the classes in a type hint, or an empty tuple if the hint contains anything but classes."""
     kinds = get_args(hint) if isinstance(hint, types.UnionType) or get_origin(hint) is Union else (hint,)
-    # A jaxtyping annotation is a class too, but `isinstance` does not apply: shapes are checked elsewhere.
+    # A jaxtyping annotation is a class too, but does not count here, because shapes are checked elsewhere.
     plain = all(isinstance(kind, type) and not hasattr(kind, "dim_str") and kind is not object for kind in kinds)
     return kinds if plain else ()

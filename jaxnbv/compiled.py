@@ -13,31 +13,33 @@ from jaxnbv.errors import InputError
 # The variable that names the folder of the package's own programs.
 PROGRAMS = "JAXNBV_PROGRAMS"
 _FOLDER = "jax_compilation_cache_dir"
-# By default JAX leaves out programs that compile within a second, which most programs of a step do.
+# By default JAX does not store programs that compile within a second. Most programs of a step compile that fast.
 _THRESHOLDS = {"jax_persistent_cache_min_compile_time_secs": 0.0, "jax_persistent_cache_min_entry_size_bytes": 0}
 
 
 def keep_compiled(folder: str | Path | None = None) -> str:
-    """Keep the programs that JAX compiles for later processes and child processes. Returns the folder.
+    """Store compiled programs on disk, where later processes and child processes load them.
 
-    Call it before the first step. Compiling takes 10 to 90 seconds. Later processes load the package's own programs in
-    two seconds without tracing them again (see `jaxnbv.programs`), and what else JAX compiles from its cache.
+    Returns the folder. Call this function before the first step. Compiling takes 10 to 90 seconds. Later processes load
+    the package's own programs in two seconds without tracing them again (see `jaxnbv.programs`). They load all other
+    programs from JAX's cache.
 
-    - `folder`: by default that of JAX (`JAX_COMPILATION_CACHE_DIR`), else one in the user's cache. Nothing empties it,
-      and you may delete it at any time.
+    - `folder`: by default JAX's cache folder (`JAX_COMPILATION_CACHE_DIR`), or a folder in the user's cache if that is
+      not set. The folder is never emptied automatically, and you may delete it at any time.
 
-    **Raises:** `ValueError` if no file can be written there.
+    **Raises:** `ValueError` if no file can be written to the folder.
     """
     # If JAX is not imported yet, it will read the environment variables.
     jax = sys.modules.get("jax")
     configured = getattr(jax.config, _FOLDER) if jax else os.environ.get(_FOLDER.upper())
     path = str(folder or configured or platformdirs.user_cache_path("jaxnbv") / "xla")
-    # JAX itself checks buckets in the cloud.
+    # A path with :// is a bucket in the cloud, which JAX itself checks.
     if "://" not in path:
         _check_writable(Path(path))
         os.environ[PROGRAMS] = str(Path(path) / "programs")
     if importlib.metadata.version("jaxlib").startswith("0.9."):
-        # This version logs two long lines on many CPUs for each program that it reads, and runs it (jax issue 38445).
+        # On many CPUs, this version logs two long lines for each program that it loads. The program runs correctly all
+        # the same (jax issue 38445).
         os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     os.environ[_FOLDER.upper()] = path
     for name, value in _THRESHOLDS.items():
@@ -48,7 +50,7 @@ def keep_compiled(folder: str | Path | None = None) -> str:
         jax.config.update(_FOLDER, path)
         for name, value in _THRESHOLDS.items():
             jax.config.update(name, type(value)(os.environ[name.upper()]))
-        # Earlier compilations have already fixed the folder.
+        # Reset the cache, because its folder is fixed once JAX has compiled something.
         compilation_cache.reset_cache()
     return path
 

@@ -20,11 +20,11 @@ EXTRAS = {
     "threadpoolctl": "cluster",
     "viser": "view",
 }
-"""The extra that installs each optional module."""
+"""Name of the extra that installs each optional module."""
 
 
 def install(extra: str) -> str:
-    """The command that installs an extra from a clone, since no release is on a package index yet."""
+    """Return the command that installs an extra from a clone (no release is on a package index yet)."""
     return f'pip install ".[{extra}]" in a clone of jaxnbv'
 
 
@@ -33,7 +33,7 @@ class InputError(ValueError):
 
 
 def suggestion(name: str, names: Iterable[str]) -> str:
-    """A question that suggests the nearest of some names, after a space. "" if none is near."""
+    """Return " Did you mean ...?" with the most similar name, or an empty string if no name is similar."""
     by_lower = {one.lower(): one for one in names}
     near = difflib.get_close_matches(name.lower(), by_lower, n=1)
     return f" Did you mean {by_lower[near[0]]!r}?" if near else ""
@@ -55,9 +55,9 @@ def explained_imports() -> Iterator[None]:
 
 
 def optional(module: str) -> Any:
-    """Import a module of an extra.
+    """Import a module that an extra installs.
 
-    **Raises:** `ValueError` with the command that installs it, if it is missing.
+    **Raises:** `ValueError` with the command that installs the extra, if the module is missing.
     """
     with explained_imports():
         return importlib.import_module(module)

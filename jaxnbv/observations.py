@@ -17,9 +17,10 @@ from jaxnbv.geometry.pose_list import PoseList
 from jaxnbv.programs import program
 from jaxnbv.scanning import Carving, Grid, Looks, Obstacles, barrier_of
 
-# A model uses 100 to 200 empty points, and the time to choose them grows with the number offered.
+# A model uses 100 to 200 empty points. The time to choose them grows with the number of points to choose from.
 _POINTS_ALONG_AXIS = 20
-# Points checked per scan, since the time grows with this times the capacity. Others wait for the next scan.
+# Largest number of points that are checked for stray points per scan. The time is proportional to this number times the
+# capacity. Further points are checked after the next scan.
 _MOST_STRAY = 512
 
 
@@ -33,12 +34,12 @@ class EmptyPoints(NamedTuple):
 class Observations(eqx.Module):
     """Everything observed so far, in scene coordinates. Immutable.
 
-    Shapes are fixed, so that nothing recompiles.
+    Array shapes are fixed, so that views do not recompile programs.
 
     - `cloud`: D, the kept points.
     - `poses`: the poses of the views.
-    - `grid`: the grid of `looks`, `empty_nodes` and `obstacle_nodes`; None if they are not kept.
-    - `looks`: the measured surface, and how far each view saw.
+    - `grid`: the grid of `looks`, `empty_nodes` and `obstacle_nodes`; None if there are none of these.
+    - `looks`: the measured surface and the measured ray lengths of each view, see `Looks`.
     - `empty_nodes`: mask of the nodes that some scan showed to be empty.
     - `obstacle_nodes`: mask of the nodes inside known obstacles, where the object cannot be.
     - `hypotheses`: the state that a model carries from view to view, see `SurfaceModel.add_state`; None without one.
@@ -61,9 +62,10 @@ class Observations(eqx.Module):
         obstacle_nodes: Bool[Array, "g g g"] | None = None,
         camera: Camera = Camera(),
     ) -> "Observations":
-        """The observations of a cloud before any view, with room for `max_views` poses. No node is empty yet.
+        """Return the observations of a cloud before any view. No node is marked empty yet.
 
-        - `camera`: the camera along whose rays `looks` stores how far each view saw.
+        - `max_views`: number of poses for which memory is reserved.
+        - `camera`: `looks` stores ray lengths along the rays of this camera.
         """
         empty = None if grid is None else jnp.zeros((grid.resolution,) * 3, bool)
         looks = None if grid is None else Looks.empty(grid, camera, max_views).with_points(cloud)
@@ -76,7 +78,7 @@ class Observations(eqx.Module):
 
     @property
     def empty_points(self) -> EmptyPoints:
-        """Empty nodes from a coarser subgrid of at most 20 nodes per axis, for a model to condition on."""
+        """Nodes of a coarser subgrid (at most 20 per axis) and the mask of empty nodes, for use by models."""
         if self.empty_nodes is None or self.grid is None:
             return EmptyPoints(jnp.zeros((1, 3), self.cloud.points.dtype), jnp.zeros(1, bool))
         stride = -(-self.grid.resolution // _POINTS_ALONG_AXIS)
@@ -85,31 +87,31 @@ class Observations(eqx.Module):
         return EmptyPoints(nodes, self.empty_nodes[::stride, ::stride, ::stride].reshape(-1))
 
     def add_points(self, scan: PointCloud) -> "Observations":
-        """A copy with a scan's points added to D.
+        """Return a copy with a scan's points added to D.
 
-        D is thinned to its capacity by farthest point sampling. It loses stray points, which lie alone in space that a
-        view saw to be empty.
+        D is thinned to its capacity by farthest point sampling. Then stray points are removed, which are isolated
+        points in space that a view saw to be empty.
         """
         return dataclasses.replace(self, cloud=_joined(self.cloud, scan, self.empty_nodes, self.grid))
 
     def add_view(
         self, pose: Pose, scan: PointCloud, camera: Camera, carving: Carving | None, obstacles: Obstacles | None
     ) -> "Observations":
-        """A copy with a view's pose, the surface that its scan measured, and the nodes that it saw empty.
+        """Return a copy with a view's pose, its measured surface, and the nodes that it showed to be empty.
 
         - `carving`: the margin around rays within which nodes count as empty; None leaves `empty_nodes` unchanged.
-        - `obstacles`: solids that may hide the object; a ray shows nothing behind them.
+        - `obstacles`: solids that may hide the object. A ray shows nothing behind them.
         """
-        # D is left out, so that another capacity does not compile this again.
+        # D is not an argument of the program, because the program would be compiled again for each capacity of D.
         fields = self.poses, self.looks, self.empty_nodes
         poses, looks, empty = _with_view(*fields, pose, scan, camera, carving, obstacles)
         return dataclasses.replace(self, poses=poses, looks=looks, empty_nodes=empty)
 
 
 def as_observations(value: Observations | PointCloud) -> Observations:
-    """Convert a cloud alone to observations without views; return observations unchanged.
+    """Convert a cloud to observations without views, or return observations unchanged.
 
-    **Raises:** `ValueError` for another type, and for a batch of clouds.
+    **Raises:** `ValueError` for any other type, and for a batch of clouds.
     """
     check_type(value, Observations | PointCloud, "the observations")
     if isinstance(value, Observations):
@@ -125,10 +127,10 @@ def _joined(cloud: PointCloud, scan: PointCloud, empty: Bool[Array, "g g g"] | N
 
 
 def _is_stray(cloud: PointCloud, empty: Bool[Array, "g g g"], grid: Grid) -> Bool[Array, " n"]:
-    """Whether each point lies in a cell that was seen to be empty, and has no neighbour within twice the spacing.
+    """True for each point that lies in a cell seen to be empty and has no neighbour within twice the spacing.
 
-    Points of a thin part that a view missed, or of a surface whose images have slightly wrong poses, do have such a
-    neighbour: in a thinned cloud, points of connected surface are about one spacing apart.
+    Points on a connected surface are about one spacing apart in a thinned cloud, so they do have such a neighbour. This
+    keeps points of a thin part that a view missed, and points of images with slightly wrong poses.
     """
     crossed = jax.lax.reduce_window(empty, True, jax.lax.bitwise_and, (2, 2, 2), (1, 1, 1), "VALID")
     cell = tuple(grid.cell_of(cloud.points).T)

@@ -1,7 +1,7 @@
 """Compiled programs that later processes load without tracing them again.
 
-JAX's own cache of compiled programs saves compilation. A later process still traces and lowers each function to find
-its entry, which takes longer than everything else in it. A `program` finds its entry from the arguments alone.
+JAX's own cache saves only the compilation. A later process must still trace and lower each function to find its cache
+entry, which takes longer than all other work of the process. A `program` finds its entry from the arguments alone.
 """
 
 import dataclasses
@@ -31,30 +31,35 @@ from jax.sharding import get_abstract_mesh
 
 from jaxnbv.compiled import PROGRAMS
 
-# Code of these decides, with their versions, what a program computes.
+# Arguments of a stored program may contain code of this package and of these modules. The versions of the libraries are
+# part of the key.
 _LIBRARIES = ("jax", "jaxlib", "numpy", "equinox", "optimistix", "lineax", "optax")
 _STANDARD = ("builtins", "collections", "copyreg", "functools", "math", "operator", "pathlib")
-# The event that JAX's monitoring hears of when a program was loaded.
+# Name of the event that is reported to `jax.monitoring` after a program was loaded.
 LOADED = "/jaxnbv/program_load_duration"
 _compiling = threading.Lock()
 
 
 @dataclasses.dataclass(frozen=True)
 class _Slot:
-    """The place of an array in the result of a program."""
+    """Placeholder for an array in the result of a program: its index in the list of output arrays."""
 
     index: int
 
 
 class _Executable(NamedTuple):
-    """A program for arguments of one kind: the compiled function of their arrays, and its result with slots."""
+    """A program that is compiled for arguments with certain shapes, types and static values.
+
+    - `call`: the compiled function from the arguments' arrays to the output arrays.
+    - `result`: the result with a `_Slot` in place of each array.
+    """
 
     call: Callable[[list], list]
     result: Any
 
 
 class _Program:
-    """`eqx.filter_jit` of a function, kept on disk once `keep_compiled` was called."""
+    """`eqx.filter_jit` of a function. Its compiled programs are stored on disk after `keep_compiled` was called."""
 
     def __init__(self, function: Callable[..., Any]):
         functools.update_wrapper(self, function)
@@ -83,7 +88,10 @@ class _Program:
         return jax.tree.map(lambda x: outputs[x.index] if isinstance(x, _Slot) else x, executable.result)
 
     def _executable(self, folder: Path, static: Any, tree: Any, leaves: list, kinds: tuple) -> _Executable | None:
-        """The program for these arguments, read or else compiled; None if code of others is part of it."""
+        """Load or compile the program for these arguments.
+
+        Returns None if the arguments contain code of a module that is not permitted.
+        """
         function = self._function.__module__, self._function.__qualname__
         try:
             description = _pickled(
@@ -100,7 +108,11 @@ class _Program:
         return self._compiled(entry, static, tree, leaves)
 
     def _compiled(self, entry: Path, static: Any, tree: Any, leaves: list) -> _Executable:
-        """The program for these arguments, traced anew; compiled and written unless it is there by another name."""
+        """Trace the function for these arguments, and return the program.
+
+        If the same lowered code is already stored, for a different entry, the program is loaded. Otherwise it is
+        compiled and stored.
+        """
         result = None
 
         def of_arrays(leaves: list) -> list:
@@ -114,10 +126,11 @@ class _Program:
         of_arrays.__name__ = of_arrays.__qualname__ = self._function.__name__
         lowered = jax.jit(of_arrays).lower(leaves)
         code = lowered.as_text()
-        # A call back to Python holds an address of this process.
+        # A program with a callback to Python cannot be stored, because it contains an address of this process.
         if "callback" in code:
             return _Executable(lowered.compile(), result)
-        # Another program may be the same one: after an edit of the package, or where the arguments differ in name only.
+        # The same code may be stored for a different entry: after an edit of the package that leaves this code as it
+        # was, or for arguments that differ only in names.
         name = hashlib.sha256(repr((_without_names(code), _settings(), _machine())).encode()).hexdigest()
         num_outputs = len(jax.tree.leaves(lowered.out_info))
         payload = _read(entry.parent / name)
@@ -129,7 +142,7 @@ class _Program:
             try:
                 payload, _, _ = serialize_executable.serialize(compiled)
             except (ValueError, NotImplementedError):
-                # JAX cannot do this for every program, such as one with large constants in its later versions.
+                # JAX cannot serialize every program. Later versions refuse programs with large constants.
                 return _Executable(call, result)
             _write(entry.parent / name, payload)
         _write(entry, pickle.dumps((name, result, num_outputs)))
@@ -137,38 +150,38 @@ class _Program:
 
 
 def program(function: Callable[..., Any]) -> Any:
-    """`eqx.filter_jit(function)` for a function of this package.
+    """Decorator: `eqx.filter_jit` for a function of this package, with compiled programs stored on disk.
 
-    After `keep_compiled` its programs are kept on disk. Kept programs are for arguments that are arrays on the first
-    device, objects of this package, JAX, NumPy or Equinox, and plain values. Others (an own utility, or transformation
-    by `grad` or `vmap`) are jitted as usual.
+    Programs are stored after `keep_compiled` was called, for arguments that are arrays on the first device, objects of
+    this package, JAX, NumPy or Equinox, and plain values. Other calls are jitted as usual, for example with a user's
+    own utility, or under `grad` or `vmap`.
     """
     return _Program(function)
 
 
 def _is_plain(leaf: Any) -> bool:
-    """Whether an array is in memory, or whole on the first device."""
+    """Whether an array is concrete, and either a NumPy array or entirely on the first device."""
     if isinstance(leaf, jax.core.Tracer):
         return False
     return not isinstance(leaf, jax.Array) or leaf.sharding.device_set == {jax.local_devices()[0]}
 
 
 def _is_plain_context() -> bool:
-    """Whether programs run on one device, and JAX's debugging, which looks into functions, is off."""
+    """Whether programs run on the first device only, and JAX's debugging options are off."""
     config: Any = jax.config
     debugs = config.jax_disable_jit or config.jax_debug_nans or config.jax_debug_infs
     return not debugs and config.jax_default_device is None and get_abstract_mesh().empty
 
 
 def _settings() -> tuple:
-    """JAX's settings, those of a context manager included, but where it keeps its cache."""
+    """Return JAX's settings, including settings by context managers, but without the settings of its cache."""
     names = [name for name in jax.config.values if "cache" not in name]
     return tuple([str(getattr(jax.config, name, jax.config.values[name])) for name in names])
 
 
 @functools.cache
 def _source() -> str:
-    """Digest of the package's code."""
+    """Return a digest of the package's code."""
     digest, root = hashlib.sha256(), Path(__file__).parent
     for path in sorted(root.rglob("*.py")):
         digest.update(str(path.relative_to(root)).encode() + path.read_bytes())
@@ -177,7 +190,7 @@ def _source() -> str:
 
 @functools.cache
 def _machine() -> str:
-    """The libraries and the processor that programs are compiled by and for."""
+    """Describe the versions of the libraries and the processor for which programs are compiled."""
     versions = [importlib.metadata.version(name) for name in _LIBRARIES]
     device, cpu = jax.local_devices()[0], Path("/proc/cpuinfo")
     lines = cpu.read_text().splitlines() if cpu.exists() else []
@@ -187,11 +200,14 @@ def _machine() -> str:
 
 
 class _ForeignCodeError(Exception):
-    """An argument's code is not the package's, so that a kept program could be older than the code."""
+    """An argument contains code of a module that is not permitted.
+
+    A stored program could be outdated, because changes of this code do not change the key.
+    """
 
 
 class _Pickler(pickle.Pickler):
-    """Refuses classes and functions of others."""
+    """A pickler that refuses classes and functions of modules that are not permitted."""
 
     def reducer_override(self, obj: Any) -> Any:
         if isinstance(obj, type | types.FunctionType | types.BuiltinFunctionType):
@@ -202,13 +218,13 @@ class _Pickler(pickle.Pickler):
 
 
 def _pickled(x: Any) -> bytes:
-    """The same bytes for equal arguments.
+    """Pickle an object so that equal objects give equal bytes.
 
-    **Raises:** `_ForeignCodeError` for what cannot be pickled, too.
+    **Raises:** `_ForeignCodeError` for code of a module that is not permitted, or for an object that pickle refuses.
     """
     file = io.BytesIO()
     pickler = _Pickler(file)
-    # Without a memo, in which two equal objects and one object twice differ.
+    # Turn off the memo, with which two equal objects give different bytes than the same object twice.
     pickler.fast = True
     try:
         pickler.dump(x)
@@ -218,7 +234,10 @@ def _pickled(x: Any) -> bytes:
 
 
 def _without_names(code: str) -> str:
-    """Lowered code with its functions numbered in order: JAX names them by what this process lowered before."""
+    """Return lowered code with its functions numbered in order of appearance.
+
+    JAX's own names of the functions depend on what the process lowered before.
+    """
     numbers: dict[str, int] = {}
 
     def number(match: re.Match[str]) -> str:
@@ -228,7 +247,7 @@ def _without_names(code: str) -> str:
 
 
 def _without_cache(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
-    """Compiled anew: what JAX's cache gives on a CPU cannot be written again whole."""
+    """Compile without JAX's cache, because on a CPU a program from this cache cannot be serialized completely."""
     with _compiling:
         before = jax.config.values["jax_enable_compilation_cache"]
         jax.config.update("jax_enable_compilation_cache", False)
@@ -254,12 +273,15 @@ def _loaded(payload: bytes, leaves: list, num_outputs: int) -> Callable[[list], 
 
 @functools.cache
 def _initialise_lapack() -> None:
-    """JAX looks LAPACK up when it first lowers a call to it. A loaded program that calls it before would crash."""
+    """Lower a call to LAPACK, so that JAX initialises its LAPACK functions.
+
+    JAX initialises them when it first lowers such a call. A loaded program that calls LAPACK earlier would crash.
+    """
     jax.jit(jax.lax.linalg.cholesky).lower(jax.ShapeDtypeStruct((1, 1), np.float32))
 
 
 def _read(path: Path) -> bytes | None:
-    """The bytes that `_write` was given. None if the file is missing or damaged."""
+    """Return the bytes that `_write` stored, or None if the file is missing or damaged."""
     if not path.exists():
         return None
     data = path.read_bytes()
@@ -268,7 +290,7 @@ def _read(path: Path) -> bytes | None:
 
 
 def _write(path: Path, data: bytes) -> None:
-    """Write a file at once, so that other processes never read half of it."""
+    """Write a file atomically, so that other processes never read a part of it."""
     packed = zlib.compress(data, 1)
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f"{path.name}.{uuid.uuid4().hex}")

@@ -55,7 +55,7 @@ class StepInputs(eqx.Module):
 
     - `observations`: the observations so far.
     - `posterior`: p(f | observations); None if nothing needs it.
-    - `surfaces`: S samples of it along a leading axis; None if nothing needs them.
+    - `surfaces`: S samples of the posterior along a leading axis; None if nothing needs them.
     """
 
     observations: Observations
@@ -67,13 +67,13 @@ class SurfaceSampler(eqx.Module):
     """A distribution over surfaces, and the settings for sampling it.
 
     - `model`: the prior over surfaces.
-    - `grid`: the grid on which samples are evaluated and scanned, and empty space is stored.
-    - `num_samples`: S, posterior samples per step.
+    - `grid`: the grid on which samples are evaluated and scanned, and on which empty space is stored.
+    - `num_samples`: S, the number of posterior samples per step.
     - `carving`: removes sampled surface in empty space and outside a volume. A model that can use empty space is also
-      conditioned on it. None leaves samples as the model draws them from D, as in the paper.
+      conditioned on empty space. With None, samples depend only on D, as in the paper.
 
-    No sample extends into a known obstacle, with or without carving. Methods accept `Observations` of the same grid, or
-    a cloud alone.
+    No sample extends into a known obstacle, with or without carving. Methods accept `Observations` on the same grid, or
+    a `PointCloud`.
 
     **Raises:** `ValueError` if `num_samples` is below 1, or if the grid extends beyond the torus [-pi, pi]^3.
     """
@@ -101,17 +101,20 @@ class SurfaceSampler(eqx.Module):
         volume: Volume | None = None,
         solid: bool = False,
     ) -> "SurfaceSampler":
-        """The sampler with this name, for an object whose box has this longest side, in scene units.
+        """Return the sampler with this name for an object of this size.
 
         - `name`: "screened" is the default `ScreenedSPSR`, with lengths in proportion to the longest side. The boundary
           of the volume counts as outside. Samples are carved, so they avoid empty space and stay in the volume.
-          "paper" is the published model with its published values. It uses normals only and is not carved.
+          "paper" is the published model with its published values. It uses normals only, and its samples are not
+          carved.
+        - `longest_side`: longest side of the object's bounding box, in scene units.
         - `quick`: use fewer frequencies.
-        - `volume`: by default the cube of the longest side about the origin. A volume given here may cut the object.
-        - `solid`: set this for a body that is nowhere thin, such as the pyramid. Its hidden side is as large as the
-          visible one, so space next to empty space need not be empty: `EmptySpace` is left out.
+        - `volume`: by default a cube about the origin whose sides are `longest_side`. A volume that you pass may cut
+          the object.
+        - `solid`: leave out `EmptySpace`. Set this for a body that is nowhere thin, such as the pyramid. The hidden
+          side of such a body is as large as its visible side, so unseen space next to empty space need not be empty.
 
-        **Raises:** `ValueError` for another name, or a longest side that is not positive.
+        **Raises:** `ValueError` for an unknown name, or a longest side that is not positive.
         """
         require(longest_side > 0, f"the longest side is {longest_side}; it must be positive")
         require(name in MODELS, f"there is no model {name!r}: choose from {', '.join(MODELS)}")
@@ -128,9 +131,9 @@ class SurfaceSampler(eqx.Module):
 
     @own_settings()
     def with_bank(self, bank: ShapeBank, poses: ShapePoses) -> "SurfaceSampler":
-        """A copy whose prior is `KnownShapes`, a mixture over a bank.
+        """Return a copy whose prior is `KnownShapes`, a mixture over a bank.
 
-        Shapes are registered within the volume. The present model is the mixture's "none of these".
+        Shapes are registered within the volume. The current model becomes the mixture's "none of these".
 
         - `poses`: the possible placements of the shapes in the scene.
         """
@@ -150,7 +153,7 @@ class SurfaceSampler(eqx.Module):
 
     @own_settings()
     def within(self, volume: Box) -> "SurfaceSampler":
-        """A copy with this box in place of every default one, `Box()`. The box may cut the object."""
+        """Return a copy with this box in place of every default `Box()`. The box may cut the object."""
 
         def replace(leaf):
             if isinstance(leaf, OutsideBoundary):
@@ -161,9 +164,10 @@ class SurfaceSampler(eqx.Module):
 
     @own_settings()
     def posterior(self, observations: Observations | PointCloud) -> SurfacePosterior:
-        """p(f | observations) before carving. Only empty nodes within the volume count.
+        """Return p(f | observations), without carving. Empty nodes outside the volume are ignored.
 
-        **Raises:** `ValueError` as the model's `condition` does, and for observations of another grid.
+        **Raises:** `ValueError` if the model's `condition` does, or if the observations have a different grid than the
+        sampler.
         """
         observations = self.adapt(observations)
         if self.carving is None or observations.empty_nodes is None:
@@ -175,16 +179,18 @@ class SurfaceSampler(eqx.Module):
     def sample(
         self, observations: Observations | PointCloud, key: PRNGKeyArray, posterior: SurfacePosterior | None = None
     ) -> GridSurface:
-        """S samples of the surface given the observations, on the grid and carved, along a leading axis.
+        """Draw S samples of the surface given the observations, on the grid and carved.
+
+        The samples lie along a leading axis.
 
         - `posterior`: the result of `posterior(observations)`, if it is already computed.
 
-        **Raises:** `ValueError` as `posterior` does, and if the samples are not finite.
+        **Raises:** `ValueError` if `SurfaceSampler.posterior` does, or if the samples are not finite.
         """
         check_key(key)
         check_type(posterior, SurfacePosterior | None, "the posterior")
         observations = self.adapt(observations)
-        # A program of its own, so that callers who also use the posterior compile it once.
+        # The posterior is a separate program. So callers that also use the posterior do not compile it twice.
         posterior = self.posterior(observations) if posterior is None else posterior
         surfaces = _sample(self, observations, key, posterior)
         if not is_traced(surfaces):
@@ -197,9 +203,9 @@ class SurfaceSampler(eqx.Module):
 
     @own_settings()
     def step_inputs(self, observations: Observations | PointCloud, key: PRNGKeyArray) -> StepInputs:
-        """The observations, their posterior and S samples of it.
+        """Return the observations, their posterior and S samples of the posterior.
 
-        **Raises:** `ValueError` as `sample` does.
+        **Raises:** `ValueError` if `sample` does.
         """
         observations = self.adapt(observations)
         posterior = self.posterior(observations)
@@ -212,9 +218,9 @@ class SurfaceSampler(eqx.Module):
     ) -> Float[Array, "*s g g g"]:
         """Carve values of f minus its level at the grid's nodes.
 
-        They become positive where the object cannot be: at empty nodes, outside the volume, and inside obstacles.
+        Values become positive where the object cannot be: at empty nodes, outside the volume, and inside obstacles.
 
-        **Raises:** `ValueError` if the values or the observations are of another grid.
+        **Raises:** `ValueError` if the values or the observations have a different grid than the sampler.
         """
         observations, nodes = self.adapt(observations), (self.grid.resolution,) * 3
         require(jnp.shape(values)[-3:] == nodes, f"the values are {short_text(values)}, but the grid has {nodes} nodes")
@@ -228,9 +234,9 @@ class SurfaceSampler(eqx.Module):
     def mean(
         self, observations: Observations | PointCloud, posterior: SurfacePosterior | None = None
     ) -> Float[Array, "g g g"]:
-        """E f minus the level at the grid's nodes, carved like the samples.
+        """Return E f minus the level at the grid's nodes, carved like the samples.
 
-        **Raises:** `ValueError` as `posterior` does.
+        **Raises:** `ValueError` if `SurfaceSampler.posterior` does.
         """
         posterior = self.posterior(observations) if posterior is None else posterior
         values = posterior.mean_on_grid(self.grid.axis.astype(posterior.level.dtype)) - posterior.level
@@ -238,23 +244,25 @@ class SurfaceSampler(eqx.Module):
 
     @own_settings()
     def probability_inside(self, observations: Observations | PointCloud) -> Float[Array, "g g g"]:
-        """P(f < level | observations) at the grid's nodes: the share of S carved samples with a fixed key.
+        """Return P(f < level | observations) at the grid's nodes.
 
-        This works for any model.
+        The estimate is the fraction of S carved samples, drawn with a fixed key, that are below the level. It exists
+        for any model.
 
-        **Raises:** `ValueError` as `sample` does.
+        **Raises:** `ValueError` if `sample` does.
         """
         return jnp.mean(self.sample(observations, jax.random.key(0)).values < 0, axis=0)
 
     @own_settings()
     def mean_mesh(self, observations: Observations | PointCloud) -> TriangleMesh:
-        """The surface where the carved posterior mean equals its level, by marching cubes on the grid.
+        """Return a mesh of the surface where the carved posterior mean equals its level (marching cubes).
 
         The mesh is in scene coordinates (its frame is the identity), with faces wound outward. Where nothing was
-        scanned it is the model's guess. Pieces with fewer than four points of the cloud are left out, and a warning
-        says how many. The mesh is open where it leaves the grid.
+        scanned, the surface is the model's prediction. Connected components with fewer than four points of the cloud
+        are left out, and a warning gives their number. The mesh is open where it leaves the grid.
 
-        **Raises:** `ValueError` if the mean does not cross its level within the grid, and as `posterior` does.
+        **Raises:** `ValueError` if the mean does not cross its level within the grid, or if `SurfaceSampler.posterior`
+        does.
         """
         values = np.array(self.mean(observations))
         triangles = level_triangles(values, self.grid)
@@ -275,11 +283,12 @@ class SurfaceSampler(eqx.Module):
         return TriangleMesh(vertices, faces, Frame())
 
     def adapt(self, observations: Observations | PointCloud) -> Observations:
-        """The observations in the form that this sampler uses.
+        """Return the observations in the form that this sampler uses.
 
-        Without carving, empty nodes are dropped. A cloud alone becomes observations without an empty node.
+        Without carving, empty nodes are dropped. A `PointCloud` becomes observations in which no node is empty.
 
-        **Raises:** `ValueError` for observations of another grid, or without a grid if samples are carved.
+        **Raises:** `ValueError` if the observations have a different grid than the sampler, or if they have no grid
+        although samples are carved.
         """
         grid = None if self.carving is None else self.grid
         if isinstance(observations, PointCloud):
@@ -306,5 +315,5 @@ def _sample(
     surfaces = GridSurface.from_values(sampler.carve(observations, values), 0.0, sampler.grid)
     if sampler.carving is None:
         return surfaces
-    # The cut that a volume makes through an object that continues beyond it is no surface.
+    # If an object continues beyond the volume, the volume cuts it. The cut is not part of the object's surface.
     return surfaces.without_cells(touched_cells((values <= 0) & sampler.carving.outside(sampler.grid)))

@@ -3,9 +3,9 @@
     with jax.set_mesh(jax.sharding.Mesh(jax.devices(), "devices")):
         proposal = planner.propose(observations, key)
 
-Each device computes an equal share of the samples, or of the candidates if there are fewer samples than devices. Values
-equal those of one device up to the order of sums. Mesh axes that JAX does not shard automatically (`AxisType.Explicit`,
-or axes of an enclosing `shard_map`) are not used.
+Each device computes an equal part of the samples, or of the candidates if there are fewer samples than devices. The
+values equal the values that one device computes, up to the order of sums. Mesh axes that JAX does not shard
+automatically (`AxisType.Explicit`, or axes of an enclosing `shard_map`) are not used.
 """
 
 import math
@@ -19,7 +19,7 @@ from jax.sharding import AxisType, PartitionSpec, get_abstract_mesh
 
 
 def shared_map(function: Callable[..., Any], rows: Any, *common: Any, at_once: int = 1) -> Any:
-    """`jax.lax.map` of `function(row, *common)` over the rows of a tree, shared among devices.
+    """Map `function(row, *common)` over the rows of a tree by `jax.lax.map`, with rows divided among devices.
 
     - `at_once`: number of rows that a device computes together.
     """
@@ -31,15 +31,19 @@ def shared_map(function: Callable[..., Any], rows: Any, *common: Any, at_once: i
 
 
 def batched_map(function: Callable[..., Any], rows: Any, at_once: int) -> Any:
-    """`jax.lax.map` over batches of `at_once` rows. Without batches for 1, since XLA would be 50 % slower."""
+    """Map a function over batches of `at_once` rows by `jax.lax.map`.
+
+    If `at_once` is 1, rows are not batched, because XLA would be 50 % slower with batches of one row.
+    """
     return jax.lax.map(function, rows, batch_size=at_once if at_once > 1 else None)
 
 
 def shared(function: Callable[..., Any], rows: Any, *common: Any) -> Any:
-    """`function(rows, *common)` with a share of the leading rows on each device.
+    """Return `function(rows, *common)`, with the rows along the leading axis divided among devices.
 
-    All devices get the whole result. The function must treat the rows independently. With more devices than rows, each
-    device computes all rows. All arrays must be arguments, since arrays in a closure do not reach the devices.
+    All devices get the whole result. The function must treat the rows independently. If there are more devices than
+    rows, each device computes all rows. All arrays must be arguments, because arrays in a closure do not reach the
+    devices.
     """
     axes, devices = _axes()
     count = len(jax.tree.leaves(rows)[0])
@@ -59,19 +63,19 @@ def shared(function: Callable[..., Any], rows: Any, *common: Any) -> Any:
 
 
 def share_of(count: int) -> int:
-    """Number of rows that each device computes out of `count`."""
+    """Return how many of `count` rows each device computes."""
     _, devices = _axes()
     return count if count < devices else -(-count // devices)
 
 
 def on_cpu() -> bool:
-    """Whether programs run on the CPU, by `jax_default_device` or else by JAX's default backend."""
+    """Whether programs run on the CPU, according to `jax_default_device` or else JAX's default backend."""
     device = jax.config.jax_default_device  # type: ignore[attr-defined]
     return (jax.default_backend() if device is None else getattr(device, "platform", device)) == "cpu"
 
 
 def _axes() -> tuple[tuple[str, ...], int]:
-    """Names of the mesh axes that share rows, and their number of devices."""
+    """Return the names of the mesh axes along which rows are divided, and the number of devices on them."""
     mesh = get_abstract_mesh()
     sizes = {
         name: size

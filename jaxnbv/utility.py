@@ -33,13 +33,15 @@ class Quantity(eqx.Module):
     length_power: int = 0
 
     def unit_in(self, frame: Frame) -> str:
-        """The whole unit in words, with lengths in the unit of the frame's world."""
+        """Return the whole unit in words, with lengths in the unit of the frame's world."""
         length = f"{frame.unit}{_POWERS.get(self.length_power, f'^{self.length_power}')}" if self.length_power else ""
         return f"{length} {self.unit}".strip()
 
 
 class Answer(eqx.Module):
-    """The answer of a cloud D to the question of a task: named numbers. `jaxnbv.viz` puts them into words.
+    """The answer that a cloud D gives to the question of a task: named numbers.
+
+    `jaxnbv.viz` puts the numbers into words.
 
     - `names`, `values`: one name for each value.
     - `form`: format of a value, for `str.format`.
@@ -50,27 +52,27 @@ class Answer(eqx.Module):
     form: str = "{:.4g}"
 
     def in_world(self, frame: Frame) -> "Answer":
-        """The answer, with points and lengths converted to the frame's world when they are put into words."""
+        """Return a copy whose text gives points and lengths in the frame's world. By default unchanged."""
         return self
 
 
 def default_batch_size() -> int:
-    """Number of clouds to pass to a function at once: 128, or 1 on a CPU with its smaller cache."""
+    """Return the number of clouds to evaluate together: 128, or 1 on a CPU because of its smaller cache."""
     return 1 if on_cpu() else 128
 
 
 class Utility(eqx.Module):
-    """Base class of utilities u(D), the worth of a cloud as one number.
+    """Base class of utilities u(D), which give the value of a cloud as one number.
 
-    Subclasses must define `__call__` only.
+    Subclasses need to define only `__call__`.
 
-    - `name`: in words.
+    - `name`: name of the utility in words.
     - `improvement`: name, unit and meaning of the expected improvement by a view.
     """
 
     @abstractmethod
     def __call__(self, cloud: PointCloud) -> Float[Array, ""]:
-        """u(D) of a cloud (masked rows), by JAX operations."""
+        """Return u(D) of a cloud (masked rows), by JAX operations."""
 
     @property
     def name(self) -> str:
@@ -88,15 +90,18 @@ class Utility(eqx.Module):
         return default_batch_size()
 
     def answer(self, cloud: PointCloud) -> Answer | None:
-        """The answer of D, or None if u(D) itself is the answer."""
+        """Return the answer that D gives, or None if u(D) itself is the answer."""
         return None
 
     def answer_values(self, cloud: PointCloud) -> Float[Array, " n"] | None:
-        """See `Acquisition.answer_values`."""
+        """Return the values of `answer`, see `Acquisition.answer_values`."""
         return None
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> Answer | None:
-        """The correct `answer`, see `Acquisition.true_answer`. None means `answer` on all of the surface."""
+        """Return the correct answer, see `Acquisition.true_answer`.
+
+        None means that `answer`, applied to points on the whole surface, gives the correct answer.
+        """
         return None
 
     def check(self, cloud: PointCloud) -> None:
@@ -105,11 +110,11 @@ class Utility(eqx.Module):
 
 
 class FunctionUtility(Utility):
-    """A utility from a plain function of a cloud. It has the function's name."""
+    """A utility that calls a plain function of a cloud. The utility is named after the function."""
 
     function: Callable[[PointCloud], Float[Array, ""]]
 
-    # `Acquisition.check` checks the result, since it can name the function in the error.
+    # `ExpectedUtilityImprovement` checks the result, because it can name the utility in the error.
     def __call__(self, cloud: PointCloud) -> Any:
         return self.function(cloud)
 
@@ -121,11 +126,11 @@ class FunctionUtility(Utility):
 
 
 def plain_function(value: Any, name: str, example: str = "") -> Callable[..., Any]:
-    """The value itself if it is a function of a cloud.
+    """Return the value unchanged if it is a function.
 
-    - `name`, `example`: name of the argument and an example of a valid one, for the error.
+    - `name`, `example`: name of the argument, and an example of a valid argument, for the error message.
 
-    **Raises:** `ValueError` for anything else, a class included.
+    **Raises:** `ValueError` for anything else, including a class.
     """
     proper = callable(value) and not isinstance(value, type)
     require(proper, f"{name} is {short_text(value)}: give one{example}, or a function of a cloud")
@@ -133,7 +138,7 @@ def plain_function(value: Any, name: str, example: str = "") -> Callable[..., An
 
 
 def as_utility(value: Any) -> Utility:
-    """The value itself if it is a utility, else a plain function wrapped as one.
+    """Return a utility unchanged, or a plain function wrapped as a utility.
 
     **Raises:** `ValueError` for anything else.
     """
