@@ -49,7 +49,7 @@ def screened_poisson(cloud: PointCloud, depth: int = 8) -> TriangleMesh:
     require(finite, "the cloud has points or normals that are not finite: build it with PointCloud.from_arrays")
     meshes = pymeshlab.MeshSet(verbose=False)
     meshes.add_mesh(pymeshlab.Mesh(vertex_matrix=points, v_normals_matrix=normals))
-    # With several threads, the last bits would differ from run to run.
+    # Only one thread is used, since several threads would change the last bits from run to run.
     meshes.generate_surface_reconstruction_screened_poisson(depth=depth, threads=1)
     reconstruction = meshes.current_mesh()
     vertices, faces = reconstruction.vertex_matrix(), reconstruction.face_matrix()
