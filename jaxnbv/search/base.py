@@ -1,4 +1,4 @@
-"""Base classes of searches, and the choice of the best candidate."""
+"""Base classes of searches, and functions that choose the best candidate."""
 
 import dataclasses
 from abc import abstractmethod
@@ -17,23 +17,23 @@ from jaxnbv.search.problem import Problem
 from jaxnbv.search.proposal import Proposal
 from jaxnbv.utility import Quantity
 
-# Numbers and poses are converted on the way in, which mypy cannot see.
+# The field's converter also accepts numbers and poses, which mypy cannot see.
 if TYPE_CHECKING:
     AnyCandidates: TypeAlias = Any
 else:
     AnyCandidates = Candidates
 
 Scores: TypeAlias = Float[Array, "asked samples candidates"]
-"""Scores of each acquisition in `CandidateSearch.acquisitions`, for each posterior sample and candidate."""
+"""Scores for each acquisition of `CandidateSearch.acquisitions`, each posterior sample and each candidate."""
 
 _TIE = 1e-5
 
 
 class Search(eqx.Module):
-    """Base class of searches: methods that find the next pose.
+    """Base class of searches, which find the next pose.
 
     - `uses_samples`: whether the search needs posterior samples.
-    - `uses_cost`: whether the cost of going to a pose can count.
+    - `uses_cost`: whether the search can include the cost of the move in the value of a pose.
     """
 
     uses_samples: eqx.AbstractClassVar[bool]
@@ -44,21 +44,24 @@ class Search(eqx.Module):
         return
 
     def quantity(self, acquisition: Acquisition) -> Quantity:
-        """Quantity of the values of its proposals, by default the acquisition's."""
+        """Return the quantity of the proposals' values, by default the acquisition's quantity."""
         return acquisition.quantity
 
     def poses_around(self) -> Pose:
-        """Poses all around the object, used to compute which surface is visible. By default the paper's."""
+        """Return poses around the object, from which the visible surface is computed.
+
+        The default is the paper's candidates.
+        """
         return SphereCandidates().poses()
 
     def upper_half(self) -> "Search":
-        """A copy over the upper half of its poses if these are a whole sphere; otherwise the search itself."""
+        """Return a copy over the upper half of the candidates if they are a sphere; otherwise `self`."""
         return self
 
     def over(self, poses: Pose) -> "Search":
-        """A copy that chooses among these poses (n,).
+        """Return a copy whose candidates are these poses (n,).
 
-        **Raises:** `ValueError` if the search does not choose among poses.
+        **Raises:** `ValueError` if the search has no candidates to replace.
         """
         raise InputError(
             f"poses were given, but {type(self).__name__} is no search over candidates: use DiscreteSearch() or "
@@ -67,22 +70,23 @@ class Search(eqx.Module):
 
     @abstractmethod
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
-        """Propose the next pose. A pure function that runs under `jit`."""
+        """Propose the next pose. This must be a pure function that runs under `jit`."""
 
 
 class CandidateSearch(Search):
-    """Base class of searches over candidates, in two halves: score the candidates, then pick one.
+    """Base class of searches that score all candidates, then pick one of them.
 
-    A study computes the scores of `acquisitions` once for several searches, and lets each of them `pick`.
+    The two halves are separate methods. A study can therefore compute the scores of `acquisitions` once for several
+    searches, and call `pick` of each search with these scores.
 
-    - `candidates`: `SphereCandidates`, `GivenPoses` or others. A number becomes `SphereCandidates`, a batch of poses
-      `GivenPoses`.
+    - `candidates`: `Candidates`, for example `SphereCandidates`. A number is converted to `SphereCandidates`, and a
+      batch of poses to `GivenPoses`.
     """
 
     candidates: AnyCandidates = eqx.field(converter=as_candidates, default=SphereCandidates())
 
     def poses_around(self) -> Pose:
-        """The poses of its candidates."""
+        """Return the poses of the candidates."""
         return self.candidates.poses()
 
     def upper_half(self) -> "CandidateSearch":
@@ -92,11 +96,11 @@ class CandidateSearch(Search):
         return dataclasses.replace(self, candidates=GivenPoses(poses))
 
     def acquisitions(self, acquisition: Acquisition) -> tuple[Acquisition, ...]:
-        """The acquisitions whose scores `pick` needs; empty for a search that needs none."""
+        """Return the acquisitions whose scores `pick` needs. The tuple is empty if `pick` needs no scores."""
         return (acquisition,)
 
     def score(self, problem: Problem, candidates: Pose) -> Scores:
-        """First half: the scores of the candidates for each acquisition in `acquisitions` and each sample."""
+        """Score the candidates, for each acquisition of `acquisitions` and each posterior sample (first half)."""
         acquisitions = self.acquisitions(problem.acquisition)
         if not acquisitions:
             return jnp.zeros((0, 0, self.candidates.count))
@@ -106,30 +110,30 @@ class CandidateSearch(Search):
 
     @abstractmethod
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
-        """Second half: propose one of the candidates, given their scores."""
+        """Propose one of the candidates, given the scores of all candidates (second half)."""
 
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
-        """Score, then pick."""
+        """Score the candidates, then pick one of them."""
         candidates = self.candidates.poses()
         return self.pick(problem, candidates, self.score(problem, candidates), key)
 
 
 class Baseline(CandidateSearch):
-    """Base class of searches that value candidates without the acquisition."""
+    """Base class of searches that compute the value of a candidate without the acquisition."""
 
     uses_samples: ClassVar[bool] = False
     uses_cost: ClassVar[bool] = False
 
     def acquisitions(self, acquisition: Acquisition) -> tuple[Acquisition, ...]:
-        """No acquisitions."""
+        """Return no acquisitions."""
         return ()
 
     @abstractmethod
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
-        """Value of each candidate. The search picks the highest among those that are not excluded."""
+        """Return the value of each candidate. The search picks the highest value that is not excluded."""
 
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
-        """The argmax of `values`. The scores are empty."""
+        """Propose the candidate of the highest value in `values`. The scores are empty."""
         return best_unvisited(problem, candidates, self.values(problem, candidates, key))
 
 
@@ -140,10 +144,11 @@ def best_unvisited(
     tie: float = _TIE,
     scores: Float[Array, "samples candidates"] | None = None,
 ) -> Proposal:
-    """Propose the candidate of the highest value that is not excluded; the first one if values tie.
+    """Propose the candidate of the highest value that is not excluded. If values tie, propose the first.
 
-    - `tie`: values tie within this relative difference, by default the rounding error of sums in another order.
-    - `scores`: scores whose means are the values, for standard errors.
+    - `tie`: relative difference up to which values tie. The default exceeds the rounding error that depends on the
+      order of a sum.
+    - `scores`: scores whose means are `values`. The proposal has standard errors only if scores are passed.
     """
     values = jnp.where(problem.is_excluded(candidates), -jnp.inf, values)
     index = first_best(values, tie)
@@ -157,42 +162,46 @@ def best_unvisited(
 
 
 def best_or_farthest(problem: Problem, candidates: Pose, scores: Float[Array, "samples candidates"]) -> Proposal:
-    """Propose as `best_unvisited`, but take the farthest of the tied candidates from earlier cameras.
+    """Propose the best candidate or, among tied candidates, the one farthest from earlier cameras.
 
-    This applies if the acquisition `gains_once` and no cost counts, since a cost counts against far candidates.
+    Ties are decided by distance only if the acquisition `gains_once` and there is no cost, because a cost already
+    favours near candidates. Otherwise propose as `best_unvisited` does.
     """
     proposal = best_unvisited(problem, candidates, jnp.mean(scores, axis=0), scores=scores)
     if not problem.acquisition.gains_once or problem.cost is not None:
         return proposal
     proposal = dataclasses.replace(proposal, value_at_visited=problem.value_at_visited())
     visited = problem.observations.poses
-    # Without earlier cameras there is no distance: prefer the highest value.
+    # Without earlier cameras there is no distance, so the candidate of the highest value is preferred.
     return preferred(proposal, jnp.where(visited.count > 0, visited.distance(candidates), proposal.values))
 
 
 def preferred(proposal: Proposal, preference: Float[Array, " candidates"]) -> Proposal:
-    """Change a proposal to the most preferred candidate that is tied with its best and not excluded."""
+    """Change a proposal to the most preferred candidate among those tied with the best.
+
+    Excluded candidates are not considered.
+    """
     tied, errors = proposal.tied_with_best(), proposal.standard_errors
     assert tied is not None
     assert errors is not None
     preference = jnp.where(tied & (proposal.values > -jnp.inf), preference, -jnp.inf)
     index = first_best(preference)
-    # NaN in either propagates; the planner reports it.
+    # NaN in a preference or value propagates to the proposal, and the planner reports it.
     value = jnp.where(jnp.isnan(preference[index]), jnp.nan, proposal.values[index])
     value = jnp.where(jnp.isfinite(proposal.value), value, proposal.value)
     return dataclasses.replace(proposal, pose=proposal.candidates[index], value=value, standard_error=errors[index])
 
 
 def first_best(values: Float[Array, " candidates"], tie: float = _TIE) -> Int[Array, ""]:
-    """Index of the highest value; the first one within the relative difference `tie`."""
+    """Return the first index whose value is within the relative difference `tie` of the highest value."""
     best = jnp.max(values)
-    # Nothing ties with an infinite value, and the planner reports NaN.
+    # No value ties with an infinite value. The planner reports NaN.
     tied = values >= best - jnp.where(jnp.isfinite(best), tie * jnp.abs(best), 0.0)
     return jnp.where(jnp.isfinite(best), jnp.argmax(tied), jnp.argmax(values))
 
 
 def standard_error(scores: Float[Array, "samples *poses"]) -> Float[Array, "*poses"]:
-    """Standard error of the mean over samples; NaN for one sample."""
+    """Return the standard error of the mean over samples; NaN for one sample."""
     count = scores.shape[0]
     squares = jnp.sum((scores - jnp.mean(scores, axis=0)) ** 2, axis=0)
     return jnp.sqrt(squares / (count - 1) / count) if count > 1 else jnp.full(scores.shape[1:], jnp.nan)

@@ -1,4 +1,4 @@
-"""The paper's three baselines, over the same candidate pool as the discrete search."""
+"""The paper's three baselines, which have the same default candidates as the discrete search."""
 
 from typing import ClassVar
 
@@ -14,34 +14,35 @@ from jaxnbv.utility import Quantity
 
 
 class FarthestView(Baseline):
-    """Farthest point sampling of views: the candidate whose nearest visited camera is farthest away."""
+    """Farthest point sampling, which proposes the candidate farthest from the nearest earlier camera."""
 
     def quantity(self, acquisition: Acquisition) -> Quantity:
         meaning = "distance from a candidate to the nearest camera so far, whatever the surface."
         return Quantity("distance to the nearest camera", "", meaning, length_power=1)
 
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
-        """Distances in scene units. The key is not used."""
+        """Return the distances to the nearest earlier camera, in scene units. The key is not used."""
         return problem.observations.poses.distance(candidates)
 
 
 class RandomView(Baseline):
-    """Random view: a candidate drawn uniformly from those that are not excluded."""
+    """Baseline that proposes a candidate uniformly at random among those that are not excluded."""
 
     def quantity(self, acquisition: Acquisition) -> Quantity:
         meaning = "a random number for each open candidate, whatever the surface."
         return Quantity("lot drawn", "uniform on [0, 1)", meaning, smooth=False)
 
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
-        """Random numbers, uniform on [0, 1)."""
+        """Return random numbers, uniform on [0, 1)."""
         return jax.random.uniform(key, (self.candidates.count,))
 
 
 class UncertaintyView(Baseline):
-    """The candidate whose principal ray has the most uncertain end (Holalkere et al. 2025).
+    """Baseline that proposes the candidate with the most uncertain hit of the principal ray.
 
-    The transmittance T(t) is the share of samples whose surface the ray has not entered before t. The value is the
-    length of the ray between the first t with T(t) < 1 and the last t with T(t) > 0.05.
+    The source is Holalkere et al. (2025). The transmittance T(t) is the fraction of samples whose surface the ray has
+    not entered before distance t. The value is the length of the ray between the first t with T(t) < 1 and the last t
+    with T(t) > 0.05.
     """
 
     uses_samples: ClassVar[bool] = True
@@ -52,20 +53,20 @@ class UncertaintyView(Baseline):
         return Quantity("uncertain length of the principal ray", "", meaning, length_power=1)
 
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
-        """Lengths in scene units, given the cost. The key is not used."""
+        """Return the lengths in scene units, after the cost is applied. The key is not used."""
         return problem.apply_cost(uncertain_length(problem, candidates), candidates)
 
 
 def uncertain_length(problem: Problem, poses: Pose) -> Float[Array, " poses"]:
-    """Length between the first T < 1 and the last T > 0.05 along the principal rays, in scene units.
+    """Return the length between the first T < 1 and the last T > 0.05 along each principal ray.
 
-    T is evaluated every half cell within the samples' grid. The length is zero for a ray that hits no sample, or that
-    misses the grid.
+    The length is in scene units. T is the transmittance of `UncertaintyView`, evaluated every half cell within the
+    samples' grid. The length is zero for a ray that hits no sample or misses the grid.
     """
     surfaces = problem.surfaces
     grid = surfaces.grid
     step = 0.5 * grid.spacing
-    # The range of depths crosses the whole grid for any camera inside it, or outside it and looking at it.
+    # For a camera inside the grid, or outside and looking at the grid, these depths cross the whole grid.
     away = jnp.linalg.norm(poses.position, axis=-1, keepdims=True) - 3**0.5 * grid.half_extent
     depth = jnp.maximum(away, 0.0) + step * jnp.arange(int(2 * 3**0.5 * grid.half_extent / step) + 2)
     points = poses.position[:, None] + depth[..., None] * poses.forward[:, None]

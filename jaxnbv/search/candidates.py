@@ -1,4 +1,4 @@
-"""Candidates: the sets of poses that a search chooses among."""
+"""Candidates, which are the sets of poses among which a search chooses."""
 
 import dataclasses
 import math
@@ -29,16 +29,18 @@ class Candidates(eqx.Module):
 
     @abstractmethod
     def poses(self) -> Pose:
-        """The poses (count,), the same at each call."""
+        """Return the poses (count,). Every call returns the same poses."""
 
     def upper_half(self) -> "Candidates":
-        """The upper half of a whole sphere; other candidates unchanged."""
+        """Return the upper half if the candidates are a whole sphere; otherwise the candidates themselves."""
         return self
 
     def where(self, allowed: Callable[[Pose], Bool[AnyArray, ""] | bool]) -> "GivenPoses":
-        """The candidates that satisfy a predicate of one pose, for example that a robot can reach it.
+        """Return the candidates that satisfy a predicate, for example that a robot can reach the pose.
 
-        **Raises:** `ValueError` if it allows none, or does not return a single bool.
+        - `allowed`: function of one pose that returns a bool.
+
+        **Raises:** `ValueError` if no candidate is allowed, or if the function does not return a single bool.
         """
         require(callable(allowed), f"the predicate is {short_text(allowed)}; give a function of one pose")
         poses = self.poses()
@@ -52,12 +54,12 @@ class Candidates(eqx.Module):
 
 
 class SphereCandidates(Candidates):
-    """The paper's candidates: a Fibonacci sphere, or part of one, of cameras that look at the origin.
+    """The paper's candidates: cameras on a sphere or part of a sphere, all looking at the origin.
 
-    - `count`: number of cameras, evenly spaced on the part of the sphere above `min_elevation`.
+    - `count`: number of cameras. They form a Fibonacci sphere, evenly spaced above `min_elevation`.
     - `radius`: radius in scene units.
-    - `min_elevation`: lowest elevation in radians, above the plane through the origin normal to `up`; 0 gives a dome
-      over a table.
+    - `min_elevation`: smallest elevation in radians, above the plane through the origin that is normal to `up`. The
+      cameras are a dome over a table if it is 0.
     - `up`: upward direction in the scene and in the images.
 
     **Raises:** `ValueError` for no cameras, a radius that is not positive and finite, an elevation that is not within
@@ -85,11 +87,12 @@ class SphereCandidates(Candidates):
 
 
 class Reach(Candidates):
-    """Cameras within an arm's reach that look at the origin, between two distances and two elevations.
+    """Cameras within an arm's reach: between two distances and two elevations, all looking at the origin.
 
-    - `count`: number of cameras. Directions lie on a Fibonacci sphere, and distances are uniform in volume.
-    - `nearest`, `farthest`: distances from the origin in scene units.
-    - `min_elevation`, `max_elevation`: elevations in radians, above the plane normal to `up`.
+    - `count`: number of cameras. Their directions are a Fibonacci sphere, and their distances are uniform in volume.
+    - `nearest`, `farthest`: smallest and largest distance from the origin, in scene units.
+    - `min_elevation`, `max_elevation`: limits of the elevation in radians, above the plane through the origin that is
+      normal to `up`.
     - `up`: upward direction in the scene and in the images.
 
     **Raises:** `ValueError` for no cameras, distances or elevations in the wrong order, or a zero `up`.
@@ -116,7 +119,8 @@ class Reach(Candidates):
         low, high = math.sin(self.min_elevation), math.sin(self.max_elevation)
         y = high - (high - low) * (index + 0.5) / self.count
         ring, angle = np.sqrt(1.0 - y**2), index * math.pi * (3.0 - math.sqrt(5.0))
-        # A low-discrepancy sequence by the plastic number: directions and distances are even together (Roberts 2018).
+        # Roberts' low-discrepancy sequence (2018) of the plastic number spaces directions and distances evenly
+        # together.
         share = (0.5 + index / _PLASTIC**2) % 1.0
         distance = np.cbrt(self.nearest**3 + share * (self.farthest**3 - self.nearest**3))
         places = distance[:, None] * np.stack([ring * np.cos(angle), y, ring * np.sin(angle)], axis=1)
@@ -124,9 +128,9 @@ class Reach(Candidates):
 
 
 class GivenPoses(Candidates):
-    """Candidates that are given as poses.
+    """Candidates from a batch of poses.
 
-    - `batch`: the poses.
+    - `batch`: the poses (n,).
 
     **Raises:** `ValueError` unless the poses are a batch (n,) with n >= 1.
     """
@@ -157,7 +161,7 @@ def _check_places(number: int, nearest: float, farthest: float, up: tuple[float,
 
 
 def _looking(places: Float[Array, "n 3"], up: tuple[float, float, float]) -> Pose:
-    """Poses that look at the origin from `places`, rotated so that the y axis becomes `up`."""
+    """Return poses that look at the origin, from `places` after the rotation that takes the y axis to `up`."""
     axis = jnp.asarray(up, places.dtype)
     if up[0] or up[2] or up[1] < 0:
         turn = rotation_between(jnp.asarray([0.0, 1.0, 0.0], places.dtype), axis / jnp.linalg.norm(axis))
@@ -166,9 +170,11 @@ def _looking(places: Float[Array, "n 3"], up: tuple[float, float, float]) -> Pos
 
 
 def as_candidates(value: object) -> Candidates:
-    """Convert to candidates: a number gives `SphereCandidates`, a batch of poses `GivenPoses`.
+    """Convert a number to `SphereCandidates`, or a batch of poses to `GivenPoses`.
 
-    **Raises:** `ValueError` for anything else, and as these classes do.
+    Candidates are returned unchanged.
+
+    **Raises:** `ValueError` for any other value, and as `SphereCandidates` and `GivenPoses` do.
     """
     if isinstance(value, Candidates):
         return value
@@ -182,5 +188,5 @@ def as_candidates(value: object) -> Candidates:
 
 
 def sphere_candidates(count: int, radius: float = SENSOR_RADIUS) -> Pose:
-    """The poses of `SphereCandidates`."""
+    """Return the poses of `SphereCandidates(count, radius)`."""
     return SphereCandidates(count, radius).poses()

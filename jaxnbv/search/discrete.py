@@ -1,4 +1,4 @@
-"""Discrete candidate search (the paper's Algorithm 1), and a variant with a second acquisition."""
+"""Discrete search over candidates (the paper's Algorithm 1), and a variant with a second acquisition."""
 
 from typing import ClassVar
 
@@ -15,27 +15,31 @@ from jaxnbv.search.proposal import Proposal
 
 
 class DiscreteSearch(CandidateSearch):
-    """Search that proposes the candidate of the highest acquisition.
+    """Search that proposes the candidate of the highest value.
 
-    For an acquisition that `gains_once` (`NewSurface`), it proposes among tied candidates the farthest from the cameras
-    so far. A candidate is tied if its value is below the best by at most two standard errors of the difference plus the
-    mean value expected at visited poses. At these poses the expectation is wrong, and it may be as wrong elsewhere.
+    For an acquisition that `gains_once`, such as `NewSurface`, several candidates may be tied with the best. The search
+    then proposes the tied candidate that is farthest from the earlier cameras. A candidate is tied if its value differs
+    from the best by at most two standard errors of the difference, plus the mean value expected at visited poses. The
+    true value at visited poses is zero, so this mean is an error, and may be as large at other poses.
     """
 
     uses_samples: ClassVar[bool] = True
 
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
-        """Propose one of the candidates that are not excluded. The key is not used."""
+        """Propose one of the candidates that are not excluded. The random key is not used."""
         return best_or_farthest(problem, candidates, scores[0])
 
 
 class TieBreakSearch(CandidateSearch):
-    """Search for the highest acquisition, in which a second acquisition decides between tied candidates.
+    """Search with two acquisitions, in which the second decides between candidates that tie in the first.
 
-    Before any view shows what matters, no sample shows it either, and the argmax is a random view. Candidates are tied
-    if their values differ from the best by at most two standard errors of the difference (`Proposal.tied_with_best`).
-    So the second acquisition decides at first, and the first one as soon as its values differ. Both score the same
-    imagined scans. The proposal has the values of the first acquisition; the proposed one need not be the highest.
+    Until a view has shown the relevant part of the object, the samples do not contain it either. The values of the
+    first acquisition are then mostly noise, and their maximum is a random view. Candidates are tied if their values
+    differ from the best by at most two standard errors of the difference (`Proposal.tied_with_best`). Therefore the
+    second acquisition decides in the first steps, and the first acquisition decides as soon as its values differ.
+
+    Both acquisitions score the same simulated scans. The proposal contains the values of the first acquisition, and the
+    proposed pose need not have the highest of these values.
 
     - `second`: acquisition that decides between tied candidates, for example `Coverage()`.
     """
@@ -47,11 +51,11 @@ class TieBreakSearch(CandidateSearch):
         check_fields(self)
 
     def acquisitions(self, acquisition: Acquisition) -> tuple[Acquisition, ...]:
-        """Both acquisitions."""
+        """Return both acquisitions."""
         return acquisition, self.second
 
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
-        """Propose the argmax of the second acquisition over tied candidates. The key is not used."""
+        """Propose the tied candidate with the highest value in the second acquisition. The key is not used."""
         first, second = scores
         proposal = best_unvisited(problem, candidates, jnp.mean(first, axis=0), scores=first)
         return preferred(proposal, jnp.mean(second, axis=0))

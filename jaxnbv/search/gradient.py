@@ -1,4 +1,4 @@
-"""Gradient searches, which differentiate the acquisition with respect to the pose."""
+"""Gradient searches, which maximise the acquisition with its derivative with respect to the pose."""
 
 import dataclasses
 import math
@@ -22,31 +22,32 @@ from jaxnbv.search.pose_space import FreePoses, PoseSpace, SpherePoses
 from jaxnbv.search.problem import Problem
 from jaxnbv.search.proposal import Proposal, Trajectories
 
-# Penalty for each scene unit of violated clearance, as a multiple of the range of the candidates' values.
+# Penalty per scene unit by which a pose violates the clearance, as a multiple of the range of the candidates' values.
 _PENALTY = 10.0
 
 
 class GradientSearch(Search):
-    """Multi-start gradient ascent over 2-DOF or 6-DOF poses, with all starts in one batch, by Optimistix.
+    """Gradient ascent over 2-DOF or 6-DOF poses from several starts, which run in one batch by Optimistix.
 
     - `dof`: 2 for `SpherePoses()`, 6 for `FreePoses()`.
-    - `space`: pose space in place of `dof`, for example `ConstrainedPoses()`.
-    - `num_starts`: number of starts, the best of the candidates.
-    - `iterations`: steps from each start. Each evaluates the acquisition and its gradient once.
+    - `space`: pose space to use in place of `dof`, for example `ConstrainedPoses()`.
+    - `num_starts`: number of starts. The candidates of the highest values are the starts.
+    - `iterations`: number of steps from each start. Each step evaluates the acquisition and its gradient once.
     - `learning_rate`: learning rate of Adam, in the units of the space's parameters: about radians or scene units.
-    - `num_candidates`: number of candidates, which are spread evenly over the space, rotated at random and evaluated
-      first. If it equals `num_starts`, every candidate is a start.
-    - `solver`: Optimistix minimiser in place of Adam, for example `optimistix.BFGS(rtol=1e-4, atol=1e-4)`. Its
-      objective is of order 1.
-    - `candidates`: poses of your own in place of `num_candidates`, not rotated.
+    - `num_candidates`: number of candidates, which are evaluated first. They are spread evenly over the space, and
+      rotated at random together. If the number equals `num_starts`, every candidate is a start.
+    - `solver`: Optimistix minimiser to use in place of Adam, for example `optimistix.BFGS(rtol=1e-4, atol=1e-4)`. The
+      objective is scaled such that its differences are of order 1.
+    - `candidates`: your own candidates to use in place of `num_candidates`. These are not rotated.
 
-    The defaults of starts, steps and rate are the paper's. The paper starts from six random views without evaluating
-    others first, and returns the best final value; `num_candidates=6` is closest to this. Differentiation stores the
-    acquisition's intermediate results for all starts and samples: several gigabytes with PointNet++.
+    The default numbers of starts and steps and the default learning rate are the paper's. The paper starts from six
+    random views without evaluating other candidates first, and returns the best final value. `num_candidates=6` is
+    closest to the paper. Differentiation stores the acquisition's intermediate results for all starts and samples. This
+    needs several gigabytes with PointNet++.
 
-    **Raises:** `ValueError` for another `dof`, both `dof` and `space`, fewer candidates than starts, no starts or
-    iterations, or a learning rate that is not positive. Within a `Planner`, also for an acquisition that JAX cannot
-    differentiate, or a camera that does not fit the space.
+    **Raises:** `ValueError` for a `dof` other than 2 or 6, for both `dof` and `space`, fewer candidates than starts, no
+    starts or iterations, or a learning rate that is not positive. A `Planner` with this search also raises it for an
+    acquisition that JAX cannot differentiate, or a camera that does not fit the space.
     """
 
     space: PoseSpace
@@ -95,10 +96,10 @@ class GradientSearch(Search):
 
     @property
     def minimiser(self) -> optx.AbstractMinimiser:
-        """The solver, by default Adam."""
+        """The minimiser that is used: `solver`, or Adam if `solver` is None."""
         if self.solver is not None:
             return self.solver
-        # Zero tolerances are never met, so that all iterations run.
+        # Zero tolerances are never met, so all iterations run.
         return optx.OptaxMinimiser(optax.adam(self.learning_rate), rtol=0.0, atol=0.0)
 
     def poses_around(self) -> Pose:
@@ -115,9 +116,9 @@ class GradientSearch(Search):
         check_traceable(acquisition, capacity, camera, differentiable=True)
 
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
-        """Propose the best pose of all trajectories, or the best candidate if that is better.
+        """Propose the best pose of all trajectories, or the best candidate if its value is higher.
 
-        The key rotates the space's candidates.
+        The random key decides the rotation of the space's candidates.
         """
         if self.candidates is None:
             candidates = self.space.candidates(self.num_candidates, key if self.rotates_candidates else None)
@@ -133,7 +134,7 @@ class GradientSearch(Search):
         trajectories, errors = jax.vmap(partial(self._walk, problem, scale))(starts)
         best_candidate = best_unvisited(problem, candidates, values, tie=0.0, scores=scores)
         best_step = best_unvisited(problem, *trajectories.flat, tie=0.0)
-        # This form lets NaN through, which the planner reports.
+        # With this form of the comparison, NaN reaches the proposal, and the planner reports it.
         is_better = ~(best_step.value <= best_candidate.value)
         # `flat` swaps the axes of the trajectories, so transpose their errors too.
         best_step = dataclasses.replace(
@@ -148,9 +149,9 @@ class GradientSearch(Search):
     def _walk(
         self, problem: Problem, scale: Float[Array, ""], start: Pose
     ) -> tuple[Trajectories, Float[Array, " steps"]]:
-        """The trajectory of the solver from a start, and the standard errors of its values.
+        """Run the solver from a start, and return the trajectory and the standard errors of the trajectory's values.
 
-        It holds every evaluated pose; with a line search, every accepted one.
+        The trajectory contains every evaluated pose. For a solver with a line search, it contains accepted poses only.
         """
         solver = self.minimiser
 
@@ -158,9 +159,9 @@ class GradientSearch(Search):
             pose = self.space.retract(start, parameters)
             scores = problem.scores(pose[None])
             value, error = jnp.mean(scores, axis=0)[0], standard_error(jax.lax.stop_gradient(scores))[0]
-            # A pose may be finite although a gradient was NaN and so the parameters are.
+            # If a gradient was NaN, the parameters are NaN, but the pose may still be finite.
             value = jnp.where(jnp.isfinite(parameters).all(), value, jnp.nan)
-            # Poses that violate the clearance are never proposed. The penalty leads away from them.
+            # Poses that violate the clearance are never proposed. The penalty drives the solver away from such poses.
             return _PENALTY * problem.violation(pose[None])[0] - value / scale, (pose, value, error)
 
         parameters = jnp.zeros(self.space.num_parameters, start.position.dtype)
@@ -176,16 +177,17 @@ class GradientSearch(Search):
             after = moved, eqx.filter(whole, eqx.is_array)
             return jax.tree.map(partial(jnp.where, done), carry, after), output
 
-        # One more step evaluates the pose after the last iteration.
+        # The additional step evaluates the pose after the last iteration.
         _, (poses, values, errors) = jax.lax.scan(step, (parameters, state), length=self.iterations + 1)
         return Trajectories(poses, values), errors
 
 
 class HybridSearch(GradientSearch):
-    """Discrete search, then gradient ascent from its best: a `GradientSearch` with other defaults.
+    """Discrete search, followed by gradient ascent from the best candidates.
 
-    It takes fewer and longer steps. The candidates are not rotated. On the sphere they equal the candidates of a
-    `DiscreteSearch` of the same number, so the value is never lower than there.
+    This is a `GradientSearch` whose defaults differ: it takes fewer and longer steps from fewer starts. Its candidates
+    are not rotated. On the sphere they equal the same number of candidates of a `DiscreteSearch`. The value of the
+    proposal is therefore at least the best value of that search.
     """
 
     rotates_candidates: ClassVar[bool] = False

@@ -1,4 +1,4 @@
-"""Successive halving: discrete search that scores poor candidates on few samples."""
+"""Successive halving, a discrete search that scores poor candidates on a few samples only."""
 
 from collections.abc import Callable
 from typing import ClassVar, NamedTuple
@@ -15,7 +15,7 @@ from jaxnbv.search.base import CandidateSearch, Scores
 from jaxnbv.search.problem import Problem
 from jaxnbv.search.proposal import Proposal
 
-# Smallest number of candidates that are scored together, and the rank of empty places in a block.
+# Smallest number of candidates that are scored together, and the rank that marks an unused entry of a block.
 _LEAST = 8
 _NOBODY = np.iinfo(np.int32).max
 
@@ -23,9 +23,10 @@ _NOBODY = np.iinfo(np.int32).max
 class HalvingSearch(CandidateSearch):
     """Successive halving over candidates (Karnin et al. 2013), a faster `DiscreteSearch`.
 
-    All candidates are scored on the first few posterior samples, the better half on as many more, the better half of
-    these on twice as many more, and so on until all samples are used. For 16 samples and `num_first_samples=2`, this
-    takes 5 scores for each candidate instead of 16. The proposal may differ from that of the full search.
+    All candidates are scored on the first few posterior samples. In each later round, the better half of the remaining
+    candidates is scored on further samples, until all samples are used. Each round doubles the number of samples on
+    which the remaining candidates were scored. For 16 samples and `num_first_samples=2`, the mean number of scores for
+    a candidate is 5 instead of 16. The proposal may differ from that of `DiscreteSearch`.
 
     - `num_first_samples`: number of posterior samples on which every candidate is scored.
     """
@@ -40,7 +41,7 @@ class HalvingSearch(CandidateSearch):
         )
 
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
-        """Propose as `pick` does, but score only the candidates that are left in each round."""
+        """Propose as `pick` does, but score only the remaining candidates in each round."""
         candidates = self.candidates.poses()
 
         def score(left: Int[Array, " left"], sample: Int[Array, ""]) -> Float[Array, " left"]:
@@ -51,7 +52,8 @@ class HalvingSearch(CandidateSearch):
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
         """Propose the best candidate of the last round.
 
-        The value and standard error of a candidate that left earlier come from its scores until then.
+        For a candidate that was dropped in an earlier round, the value and standard error come from the scores before
+        that round.
         """
         return self._halved(problem, candidates, lambda left, sample: scores[0, sample][left])
 
@@ -60,7 +62,10 @@ class HalvingSearch(CandidateSearch):
         zeros = jnp.zeros(count, candidates.position.dtype)
 
         def ranked(state, left):
-            """Candidates in order of their mean scores, first those that are left; and the means."""
+            """Return the order of the candidates, and their mean scores.
+
+            The first `left` candidates of the current order come first, highest mean first.
+            """
             order, totals, scored = state
             values = jnp.where(is_excluded, -jnp.inf, totals / jnp.maximum(scored, 1))
             among = jnp.where(jnp.arange(count) < left, values[order], -jnp.inf)
@@ -90,7 +95,10 @@ class HalvingSearch(CandidateSearch):
         )
 
     def _blocks(self, num_samples: int) -> tuple["_Block", int]:
-        """All rounds as blocks of one size, so that scoring compiles once; and how many candidates are left."""
+        """Return all rounds as blocks, and the number of candidates in the last round.
+
+        All blocks have the same size, so the program that scores a block is compiled once.
+        """
         rounds: list[tuple[int, range]] = []
         left, scored = self.candidates.count, 0
         while scored < num_samples:
@@ -113,8 +121,10 @@ class HalvingSearch(CandidateSearch):
 class _Block(NamedTuple):
     """Candidates that are scored together on one sample.
 
-    - `sorts`: whether to rank the first `left` candidates before.
-    - `ranks`: ranks of the candidates to score; `_NOBODY` for an empty place.
+    - `sorts`: whether to rank the first `left` candidates before this block.
+    - `left`: number of remaining candidates before the ranking.
+    - `sample`: index of the posterior sample.
+    - `ranks`: ranks of the candidates to score; `_NOBODY` for an unused entry.
     """
 
     sorts: Bool[np.ndarray, "*blocks"]

@@ -1,7 +1,8 @@
 """Pose spaces of gradient searches: a sphere, all poses, or poses within constraints.
 
-A space moves a start pose by a vector of parameters (a *retraction* in optimisation on manifolds). Every start is the
-origin of its own chart, so that there are no poles, angles or image flips.
+A space moves a start pose by a vector of parameters (a *retraction* in optimisation on manifolds). The parameters are
+relative to the start, and zero parameters are the start itself. Therefore no start is near a singularity of the
+parameters, such as the poles of spherical coordinates.
 """
 
 import math
@@ -30,13 +31,16 @@ class PoseSpace(eqx.Module):
 
     @abstractmethod
     def candidates(self, count: int, key: PRNGKeyArray | None) -> Pose:
-        """Poses spread evenly over the space, rotated at random if there is a key."""
+        """Return `count` poses that are spread evenly over the space.
+
+        If `key` is not None, all poses are rotated by a random rotation.
+        """
 
     @abstractmethod
     def retract(self, start: Pose, parameters: Float[Array, " parameters"]) -> Pose:
-        """Move `start` by the parameters. Differentiable in them.
+        """Move `start` by the parameters. The result is differentiable in the parameters.
 
-        Zero parameters give `start`, if it is in the space.
+        Zero parameters return `start` if `start` is in the space.
         """
 
     def check_camera(self, camera: Camera) -> None:
@@ -45,10 +49,11 @@ class PoseSpace(eqx.Module):
 
 
 class SpherePoses(PoseSpace):
-    """2-DOF poses on a sphere about the origin, looking at the origin.
+    """2-DOF poses on a sphere about the origin, all looking at the origin.
 
     The parameters (3,) are added to the unit vector from the origin to the start, and the sum is normalised. The camera
-    does not roll, so that the poles are not singular. A start at another radius is moved to the sphere.
+    follows by the smallest rotation, which has no singularity at the poles. A start at a different radius is moved to
+    the sphere.
 
     - `radius`: radius of the sphere, in scene units.
 
@@ -71,10 +76,10 @@ class SpherePoses(PoseSpace):
 
 
 class FreePoses(PoseSpace):
-    """6-DOF poses of any position and rotation.
+    """6-DOF poses with any position and rotation.
 
-    The parameters (9,) are added to the first two columns of the start's rotation (Zhou et al. 2019), and to its
-    position. The camera may turn away from the object, or move into it.
+    Six parameters are added to the first two columns of the start's rotation (Zhou et al. 2019), and three parameters
+    to its position. The camera may rotate away from the object, or move into the object.
 
     - `radius`: radius of the sphere of candidates, in scene units.
 
@@ -97,16 +102,20 @@ class FreePoses(PoseSpace):
 
 
 class ConstrainedPoses(PoseSpace):
-    """6-DOF poses within constraints: a range of distances, with the object's centre in view.
+    """6-DOF poses within a range of distances from the origin, with the origin in view.
 
-    - `nearest`, `farthest`: range of distances from the origin, in scene units. The default is around the paper's
-      sphere and outside any object: corners of the scene's cube have distance 2.17.
+    - `nearest`, `farthest`: range of distances from the origin, in scene units. The default range contains the paper's
+      sphere, and is outside any object, because the corners of the scene's cube have distance 2.17.
     - `off_axis`: largest angle between the optical axis and the direction to the origin, in radians.
 
-    Poses of any parameters (8,) satisfy the constraints. Three parameters move the direction from the origin, as in
-    `SpherePoses`. One moves the distance, and two the place of the origin in the image, each mapped into its range by
-    s / sqrt(1 + s^2). Two are added to (cos, sin) = (1, 0) of the roll, which is normalised. A start that violates the
-    constraints is moved just inside them.
+    The pose satisfies the constraints for any parameters (8,):
+
+    - Three parameters move the direction from the origin, as in `SpherePoses`.
+    - One parameter moves the distance, and two move the image of the origin. The map s / sqrt(1 + s^2) keeps them in
+      their ranges.
+    - Two parameters are added to (cos, sin) = (1, 0) of the roll angle, and the sum is normalised.
+
+    A start that violates the constraints is first moved just inside the constraints.
 
     **Raises:** `ValueError` unless 0 < nearest < farthest and 0 < off_axis < pi / 2.
     """
@@ -133,7 +142,7 @@ class ConstrainedPoses(PoseSpace):
         return 0.5 * (self.nearest + self.farthest)
 
     def candidates(self, count: int, key: PRNGKeyArray | None) -> Pose:
-        """Poses on a sphere in the middle of the range of distances."""
+        """Return poses on a sphere in the middle of the range of distances."""
         return _about_origin(count, self._middle, key)
 
     def retract(self, start: Pose, parameters: Float[Array, " parameters"]) -> Pose:
@@ -156,7 +165,7 @@ class ConstrainedPoses(PoseSpace):
         return Pose(_product(_product(turned, rotation_between(target, to_origin)), about_axis), position)
 
     def check_camera(self, camera: Camera) -> None:
-        """**Raises:** `ValueError` if the image is too narrow to keep the origin in view."""
+        """Raise `ValueError` if the image is too narrow to keep the origin in view."""
         left, top, right, bottom = camera.edges
         half = math.atan(min(-left, -top, right, bottom))
         require(
@@ -167,7 +176,7 @@ class ConstrainedPoses(PoseSpace):
 
 
 def _about_origin(count: int, radius: float, key: PRNGKeyArray | None) -> Pose:
-    """A Fibonacci sphere of cameras that look at the origin, rotated at random if there is a key."""
+    """Return a Fibonacci sphere of cameras that look at the origin. If `key` is not None, rotate it at random."""
     places = fibonacci_sphere(count, radius)
     if key is not None:
         turn = rotation_from_6d(jax.random.normal(key, (6,)))
@@ -176,7 +185,7 @@ def _about_origin(count: int, radius: float, key: PRNGKeyArray | None) -> Pose:
 
 
 def _directions(start: Pose, parameters: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-    """Unit vectors from the origin to the camera, before and after the parameters move it."""
+    """Return the unit vectors from the origin to the camera, before and after the move by the parameters."""
     before = normalise(start.position, jnp.asarray([0.0, 0.0, 1.0], start.position.dtype))
     return before, normalise(before + parameters, before)
 
@@ -186,7 +195,10 @@ def _product(a: Float[Array, "3 3"], b: Float[Array, "3 3"]) -> Float[Array, "3 
 
 
 def _move(place: Float[Array, " n"], step: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Move a point of the open unit ball, in coordinates that map the ball to the whole space."""
+    """Move a point of the open unit ball by a step. The result is also in the ball, for any step.
+
+    The step is added in the coordinates p / sqrt(1 - |p|^2) of a point p, which map the ball to the whole space.
+    """
     length = jnp.linalg.norm(place)
     place = place * jnp.where(length > 0.99, 0.99 / jnp.maximum(length, 0.99), 1.0)
     far = place / jnp.sqrt(1.0 - jnp.sum(place**2)) + step

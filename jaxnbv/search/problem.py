@@ -1,4 +1,4 @@
-"""The problem that a search solves in one step."""
+"""The problem that a search solves to choose one view."""
 
 import dataclasses
 from collections.abc import Callable
@@ -19,19 +19,20 @@ from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning import GridSurface, Obstacles, barrier_of
 
 ApplyCost: TypeAlias = Callable[[Float[Array, "*samples poses"], Observations, Pose], Float[Array, "*samples poses"]]
-"""Function of values, observations and poses (n,) that returns the values, given the cost of going to the poses."""
+"""Function of values, observations and poses (n,) that applies the cost of the moves to the values, and returns
+them."""
 
 
 class Problem(eqx.Module):
-    """The problem of one step: find the next pose.
+    """The problem of finding the next pose.
 
-    - `inputs`: the observations and, if the search needs them, the posterior samples.
-    - `camera`: the camera whose scans are imagined.
-    - `acquisition`: the expected worth of a view.
-    - `obstacles`: solids around the object, which hide it and which cameras keep clear of; None if there are none.
-    - `cost`: applies the cost of going to a pose to its value; None to ignore the cost.
-    - `pending`: poses that were proposed before but not taken; None for none.
-    - `context`: the acquisition's context, computed once from the inputs; see `prepared`.
+    - `inputs`: the observations and, if the search uses samples, the posterior and its samples.
+    - `camera`: the camera whose scans are simulated.
+    - `acquisition`: the expected value of a view.
+    - `obstacles`: solids around the object, or None. Obstacles may hide the object, and cameras keep clear of them.
+    - `cost`: function that applies the cost of the move to the value of a pose; None to ignore the cost.
+    - `pending`: poses of earlier proposals without a view; None if there are none.
+    - `context`: context of the acquisition, computed once from the inputs by `prepared`.
     """
 
     inputs: StepInputs
@@ -48,24 +49,29 @@ class Problem(eqx.Module):
         return self.inputs.observations
 
     def prepared(self) -> "Problem":
-        """A copy with the acquisition's context, which searches need; without samples there is no context."""
+        """Return a copy with the acquisition's context, which is None without samples.
+
+        Call this before a search, because scores need the context.
+        """
         context = None if self.inputs.surfaces is None else context_of(self.acquisition, self.inputs)
         return dataclasses.replace(self, context=context)
 
     def with_acquisition(self, acquisition: Acquisition) -> "Problem":
-        """A copy with another acquisition."""
+        """Return a copy with a different acquisition and its context."""
         return dataclasses.replace(self, acquisition=acquisition).prepared()
 
     def values(self, poses: Pose) -> Float[Array, " poses"]:
-        """Value of each pose: the mean of its scores over all posterior samples."""
+        """Return the value of each pose, which is the mean of the pose's scores over all posterior samples."""
         return jnp.mean(self.scores(poses), axis=0)
 
     def scores(
         self, poses: Pose, samples: slice | Int[Array, " some"] = slice(None)
     ) -> Float[Array, "*scores samples poses"]:
-        """The acquisition's score for each sample and pose, with the cost of going there if it counts.
+        """Return the acquisition's score for each sample and pose, after the cost is applied.
 
-        For an `AcquisitionList`, there is a leading axis of acquisitions.
+        For an `AcquisitionList`, the result has a leading axis of acquisitions.
+
+        - `samples`: the samples to use, by default all.
         """
         surfaces = jax.tree.map(lambda leaf: leaf[samples], self.surfaces)
         barrier = barrier_of(self.obstacles, self.camera, poses)
@@ -73,14 +79,15 @@ class Problem(eqx.Module):
         return self.apply_cost(jnp.moveaxis(values, (0, 1), (-2, -1)), poses)
 
     def apply_cost(self, values: Float[Array, "*samples poses"], poses: Pose) -> Float[Array, "*samples poses"]:
-        """Values of poses, given the cost of going there from the last view."""
+        """Apply the cost of the move from the last view to the values of poses, if there is a cost."""
         return values if self.cost is None else self.cost(values, self.observations, poses)
 
     def value_at_visited(self) -> Float[Array, ""]:
-        """Mean value that the acquisition expects at the visited poses, in its own units and without cost.
+        """Return the mean value that the acquisition expects at the visited poses, without the cost.
 
-        If a second view from a pose gains nothing, this value is an error, and may be so at other poses. Zero before
-        there are two views: after one view the surface that it saw at a slant still counts, and not in vain.
+        If a second view from the same pose gains nothing, this value is an error, and the error may be as large at
+        other poses. Return zero for fewer than two views, because the value at a single visited pose is no error. There
+        it counts surface that the view saw only at a steep angle.
         """
         visited = self.observations.poses
         uncosted = dataclasses.replace(self, cost=None)
@@ -99,23 +106,26 @@ class Problem(eqx.Module):
 
     @property
     def surfaces(self) -> GridSurface:
-        """The step's posterior samples, along a leading axis.
+        """The posterior samples, along a leading axis.
 
-        **Raises:** `ValueError` if there are none.
+        **Raises:** `ValueError` if the inputs have no samples.
         """
         if self.inputs.surfaces is None:
             raise InputError("the acquisition needs posterior samples: set uses_samples = True on the search")
         return self.inputs.surfaces
 
     def is_excluded(self, poses: Pose) -> Bool[Array, " poses"]:
-        """Mask of the poses that were visited or proposed before, or violate the clearance."""
+        """Return a mask of the poses that were visited or proposed before, or that violate the clearance."""
         excluded = self.observations.poses.contains(poses)
         if self.pending is not None:
             excluded |= self.pending.contains(poses)
         return excluded | (self.violation(poses) > 0)
 
     def violation(self, poses: Pose) -> Float[Array, " poses"]:
-        """How far each camera violates the clearance, in scene units, see `Obstacles.violation`."""
+        """Return the amount by which each pose violates the clearance, see `Obstacles.violation`.
+
+        The amount is in scene units, and zero for a permitted pose.
+        """
         if self.obstacles is None:
             return jnp.zeros(poses.position.shape[:-1], poses.position.dtype)
         return self.obstacles.violation(poses, self.observations.cloud)

@@ -1,4 +1,4 @@
-"""Results of a search: proposals and the trajectories of gradient searches."""
+"""Proposals, which are the results of searches, and trajectories of gradient searches."""
 
 import equinox as eqx
 import jax
@@ -12,9 +12,9 @@ from jaxnbv.geometry.pose import Pose
 
 
 class Trajectories(eqx.Module):
-    """Poses and values of a gradient search at each step, for each of its starts.
+    """Poses and values of a gradient search, for each start and each of its `iterations` + 1 steps.
 
-    - `poses`: a batch with the axes of `values`; there are `iterations` + 1 steps.
+    - `poses`: a batch of poses with the same axes as `values`.
     """
 
     poses: Pose
@@ -22,24 +22,25 @@ class Trajectories(eqx.Module):
 
     @property
     def flat(self) -> tuple[Pose, Float[Array, " looks"]]:
-        """All poses and values along one axis: all starts, then all first steps, and so on."""
+        """All poses and values along a single axis: first those of all starts, then of all first steps, etc."""
         poses, values = jax.tree.map(lambda rows: jnp.swapaxes(rows, 0, 1), (self.poses, self.values))
         return jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), (poses, values))
 
 
 class Proposal(eqx.Module):
-    """A search's result: the next pose, and the values of all poses that were evaluated.
+    """Result of a search: the next pose, and the values of all poses that the search evaluated.
 
-    - `pose`, `value`: the proposed pose and its value, in the units of the search's quantity.
-    - `candidates`, `values`: all candidates and their values; -inf for an excluded one.
-    - `trajectories`: trajectories of a gradient search, from the best candidates; None for other searches.
-    - `standard_errors`: standard errors of the values, as means over the samples on which a candidate was scored.
-    - `difference_errors`: standard errors of the differences to the best value. They are smaller, since all poses are
-      scored on the same samples. None for a search that does not score all candidates on all samples.
-    - `standard_error`: standard error of `value`, a mean over posterior samples. NaN for one sample; None for a search
-      without scores.
-    - `value_at_visited`: mean value expected at visited poses, see `Problem.value_at_visited`; None unless the
-      acquisition `gains_once`.
+    - `pose`, `value`: the proposed pose and its value, in the unit of the search's quantity.
+    - `candidates`, `values`: all candidates and their values. The value of an excluded candidate is -inf.
+    - `trajectories`: trajectories of a gradient search from the best candidates; None for other searches.
+    - `standard_errors`: standard errors of the values as means over posterior samples; None for a search without
+      scores. If a search scores a candidate on some samples only, the standard error is for these samples.
+    - `difference_errors`: standard errors of the differences between the values and the best value. They are smaller
+      than `standard_errors`, because all candidates are scored on the same samples. None for a search that does not
+      score all candidates on all samples.
+    - `standard_error`: standard error of `value`. NaN for one sample; None for a search without scores.
+    - `value_at_visited`: mean value expected at visited poses, see `Problem.value_at_visited`. None if the acquisition
+      does not `gains_once` or ties are not decided by distance.
     """
 
     pose: Pose
@@ -53,7 +54,10 @@ class Proposal(eqx.Module):
     value_at_visited: Float[Array, ""] | None = None
 
     def in_world(self, frame: Frame, length_power: int) -> "Proposal":
-        """The proposal with values and errors in world units (powers of length). Poses stay in the scene."""
+        """Return a copy with values and errors in world units. Poses stay in scene coordinates.
+
+        - `length_power`: power of length in the unit of the values.
+        """
 
         def convert(leaf):
             return leaf if isinstance(leaf, Pose) else frame.length_to_world(leaf, length_power)
@@ -61,10 +65,10 @@ class Proposal(eqx.Module):
         return jax.tree.map(convert, self, is_leaf=lambda leaf: isinstance(leaf, Pose))
 
     def tied_with_best(self, errors: float = 2.0) -> Bool[Array, " candidates"] | None:
-        """Mask of the candidates that are tied with the best one (itself included); None without errors.
+        """Return a mask of the candidates that are tied with the best; None without `difference_errors`.
 
-        A value ties if it differs from the best by at most `errors` standard errors of the difference plus
-        `value_at_visited`.
+        A candidate is tied if its value differs from the best value by at most `errors` standard errors of the
+        difference, plus `value_at_visited`. The best candidate itself is in the mask.
         """
         if self.difference_errors is None:
             return None
@@ -72,10 +76,11 @@ class Proposal(eqx.Module):
         return (self.values == best) | (best - self.values <= errors * self.difference_errors + bias)
 
     def best(self, count: int, apart: float = 30.0) -> Pose:
-        """A batch of the best candidates from different directions, best first.
+        """Return a batch of the best candidates from different directions, best first.
 
-        Takes the candidates by falling value, and skips each that the origin sees within `apart` degrees of one that
-        was taken. The batch is shorter than `count` if no candidate is left. Excluded ones are never taken.
+        Candidates are selected in descending order of value. A candidate is skipped if the angle at the origin between
+        it and a selected candidate is less than `apart` degrees. Excluded candidates are never selected. The batch is
+        shorter than `count` if there are not enough candidates.
 
         **Raises:** `ValueError` for a count below 1, or an angle outside [0, 180].
         """
@@ -92,7 +97,7 @@ class Proposal(eqx.Module):
 
     @property
     def num_tied(self) -> int | None:
-        """Number of other candidates that are tied with the best one; None if errors are unknown."""
+        """Number of further candidates that are tied with the best; None if standard errors are unknown."""
         tied = self.tied_with_best()
         if tied is None or bool(jnp.isnan(jnp.asarray(self.difference_errors)).any()):
             return None

@@ -1,4 +1,4 @@
-"""Tasks, one file each: the utility or acquisition, and the answer."""
+"""Tasks. Each file has a task's utility or acquisition, and the task's answer."""
 
 from jaxnbv.tasks.classification import ClassAcquisition as ClassAcquisition
 from jaxnbv.tasks.classification import Classifier as Classifier

@@ -1,7 +1,7 @@
-"""Classification: which class is the object of?
+"""Classification: to which class does the object belong?
 
-A classifier is any function from a `PointCloud` (masked rows) to log-probabilities, log p = classifier(cloud): a
-network of `jaxnbv.networks`, one of your own, or a `HostClassifier`. A `Classifier` may also name its classes.
+A classifier is any function from a `PointCloud` (masked rows) to log-probabilities, log p = classifier(cloud). It may
+be a network of `jaxnbv.networks`, your own network, or a `HostClassifier`. A `Classifier` may also name its classes.
 """
 
 from abc import abstractmethod
@@ -26,14 +26,14 @@ Context: TypeAlias = tuple[PointCloud, Array]
 
 
 class Classifier(eqx.Module):
-    """Base class of classifiers of clouds. Subclasses must define `__call__` only.
+    """Base class of classifiers of clouds. Subclasses must define only `__call__`.
 
-    - `classes`: names of the classes, or None.
+    - `classes`: names of the classes; None for no names.
     """
 
     @abstractmethod
     def __call__(self, cloud: PointCloud) -> Float[Array, " classes"]:
-        """log p of one cloud (masked rows)."""
+        """Return log p of one cloud (masked rows)."""
 
     @property
     def classes(self) -> tuple[str, ...] | None:
@@ -46,7 +46,7 @@ class Classifier(eqx.Module):
 
 
 class FunctionClassifier(Classifier):
-    """A classifier from a plain function of a cloud."""
+    """A classifier that calls a plain function of a cloud."""
 
     function: Callable[[PointCloud], Float[Array, " classes"]]
 
@@ -56,7 +56,7 @@ class FunctionClassifier(Classifier):
 
 
 def as_classifier(value: Any) -> Classifier:
-    """The value itself if it is a classifier, else a plain function wrapped as one.
+    """Wrap a plain function as a classifier, or return a classifier unchanged.
 
     **Raises:** `ValueError` for anything else.
     """
@@ -71,26 +71,27 @@ else:
 
 
 def entropy(log_p: Float[Array, "*batch classes"]) -> Float[Array, "*batch"]:
-    """-sum_c p_c log p_c in nats, from log-probabilities. A class of probability zero adds nothing."""
+    """Return the entropy -sum_c p_c log p_c in nats. A class of probability zero contributes zero."""
     return cross_entropy(log_p, log_p)
 
 
 def cross_entropy(
     log_p: Float[Array, "*batch classes"], log_q: Float[Array, "*batch classes"]
 ) -> Float[Array, "*batch"]:
-    """-sum_c p_c log q_c in nats, from log-probabilities.
+    """Return the cross-entropy -sum_c p_c log q_c in nats, from log-probabilities.
 
-    Finite, since log q_c counts as no less than the logarithm of the smallest float.
+    The result is finite, because log q_c is clipped from below at the logarithm of the smallest positive float.
     """
     least = jnp.log(jnp.finfo(log_p.dtype).tiny)
     return -jnp.sum(jnp.exp(log_p) * jnp.maximum(log_q, least), axis=-1)
 
 
 class ClassAcquisition(Acquisition):
-    """Base class of acquisitions that compare a classifier's results on D and on D u scan.
+    """Base class of acquisitions that compare a classifier's results before and after a simulated scan.
 
     - `classifier`: a `Classifier`, or a function from a cloud to log-probabilities.
-    - `num_points`: D is thinned to this number by farthest point sampling, once a step, before scans are added.
+    - `num_points`: number of points to which D is thinned by farthest point sampling. This happens once for each
+      proposal, before scans are added.
     """
 
     cloud_only: ClassVar[bool] = True
@@ -98,7 +99,7 @@ class ClassAcquisition(Acquisition):
     num_points: int = eqx.field(static=True, default=1024)
 
     def context(self, step: StepInputs) -> Context:
-        """D, thinned to `num_points`, and log p^(t)."""
+        """Return D, thinned to `num_points`, and the log-probabilities log p^(t) given D."""
         thinned = limit_capacity(step.observations.cloud, self.num_points)
         return thinned, self._log_p(thinned)
 
@@ -107,30 +108,34 @@ class ClassAcquisition(Acquisition):
 
     @abstractmethod
     def compare(self, log_p: Float[Array, " classes"], log_q: Float[Array, " classes"]) -> Float[Array, "*values"]:
-        """Value in nats of a scan that takes the classifier's result from log p^(t) to `log_q`, log p^(t+1)."""
+        """Return the value of a scan in nats.
+
+        - `log_p`: log p^(t), the classifier's result for D.
+        - `log_q`: log p^(t+1), the classifier's result for D with the scan.
+        """
 
     def score(self, context: Context, view: ImaginedView) -> Float[Array, "*values"]:
-        """`compare` on D and D u scan. Zero for an empty scan."""
+        """Return the result of `compare` for D and D with the scan. An empty scan has the score zero."""
         cloud, log_p = context
         return zero_if_empty(view.scan, self.compare(log_p, self._log_p(concatenate(cloud, view.scan))))
 
     @property
     def batch_size(self) -> int:
-        """The classifier's batch size."""
+        """Batch size of the classifier."""
         return self.classifier.batch_size
 
     def answer(self, cloud: PointCloud) -> "ClassAnswer":
-        """The probabilities of the classes given D."""
+        """Return the probabilities of the classes given D."""
         p = np.asarray(self.answer_values(cloud), np.float64)
         names = self.classifier.classes or tuple(f"class {index}" for index in range(len(p)))
         return ClassAnswer(tuple(names), p)
 
     def answer_values(self, cloud: PointCloud) -> Float[Array, " classes"]:
-        """The probabilities of the classes given D."""
+        """Return the probabilities of the classes given D."""
         return jnp.exp(context_of(self, cloud)[1])
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> "ClassAnswer | None":
-        """The scene's class label, or None if it has none or the classifier has no such class."""
+        """Return the scene's class as an answer; None without a label, or if the classifier lacks the class."""
         label = scene.class_label
         if label is None:
             return None
@@ -138,7 +143,7 @@ class ClassAcquisition(Acquisition):
         return ClassAnswer(names, np.eye(len(names))[int(label)]) if 0 <= int(label) < len(names) else None
 
     def check(self, cloud: PointCloud) -> None:
-        """**Raises:** `ValueError` unless the classifier returns a log-probability for each of its classes."""
+        """Raise `ValueError` unless the classifier returns a log-probability for each of its classes."""
         log_p = context_of(self, cloud)[1]
         require(len(log_p) >= 2, f"the classifier's answer has shape {jnp.shape(log_p)}: {_LOG_P}")
         total = float(jnp.sum(jnp.exp(log_p)))
@@ -155,16 +160,16 @@ class ClassAcquisition(Acquisition):
 
 
 class CrossEntropy(ClassAcquisition):
-    """Cross-entropy of the class probabilities given D and given D u scan, -sum_c p_c^(t) log p_c^(t+1).
+    """Cross-entropy -sum_c p_c^(t) log p_c^(t+1) of the class probabilities before and after a scan.
 
-    The paper's alpha^(CE).
+    This is the paper's alpha^(CE). p^(t) is given D, and p^(t+1) is given D with a simulated scan.
 
     - `classifier`: a function from a cloud to log-probabilities.
-    - `num_points`: D is thinned to this number by farthest point sampling, once a step.
+    - `num_points`: number of points to which D is thinned by farthest point sampling, once for each proposal.
     """
 
     def compare(self, log_p: Float[Array, " classes"], log_q: Float[Array, " classes"]) -> Float[Array, ""]:
-        """Cross-entropy in nats, at least zero."""
+        """Return the cross-entropy in nats, at least zero."""
         return cross_entropy(log_p, log_q)
 
     @property
@@ -174,15 +179,15 @@ class CrossEntropy(ClassAcquisition):
 
 
 class EntropyReduction(ClassAcquisition):
-    """Reduction of the entropy of the class probabilities, max(0, H(p^(t)) - H(p^(t+1))).
+    """Reduction of the entropy of the class probabilities by a scan, max(0, H(p^(t)) - H(p^(t+1))).
 
-    It is the improvement of the paper's u_E(D) = sum_c p_c log p_c.
+    This is the improvement of the paper's utility u_E(D) = sum_c p_c log p_c. For p^(t) and p^(t+1) see `CrossEntropy`.
 
     - `classifier`, `num_points`: see `CrossEntropy`.
     """
 
     def compare(self, log_p: Float[Array, " classes"], log_q: Float[Array, " classes"]) -> Float[Array, ""]:
-        """Reduction of entropy in nats, at least zero."""
+        """Return the reduction of entropy in nats, at least zero."""
         return jnp.maximum(0.0, entropy(log_p) - entropy(log_q))
 
     @property
@@ -192,11 +197,11 @@ class EntropyReduction(ClassAcquisition):
 
 
 class MixedEntropy(ClassAcquisition):
-    """Cross-entropy while the class is uncertain, then reduction of entropy (the authors' code).
-
-    `CrossEntropy` if the entropy of p^(t) is above `threshold` (nats), else `EntropyReduction`.
+    """Cross-entropy while the class is uncertain, then reduction of entropy, as in the authors' code.
 
     - `classifier`, `num_points`: see `CrossEntropy`.
+    - `threshold`: entropy in nats. If the entropy of p^(t) is above it, the value is that of `CrossEntropy`, otherwise
+      that of `EntropyReduction`.
     """
 
     threshold: float = eqx.field(static=True, default=0.75)
@@ -206,7 +211,7 @@ class MixedEntropy(ClassAcquisition):
         require(self.threshold >= 0, f"the entropy's threshold is {self.threshold}; it must not be negative")
 
     def compare(self, log_p: Float[Array, " classes"], log_q: Float[Array, " classes"]) -> Float[Array, ""]:
-        """Cross-entropy or reduction of entropy, in nats."""
+        """Return the cross-entropy or the reduction of entropy, in nats."""
         before = entropy(log_p)
         reduction = jnp.maximum(0.0, before - entropy(log_q))
         return jnp.where(before > self.threshold, cross_entropy(log_p, log_q), reduction)

@@ -1,4 +1,4 @@
-"""Coverage: acquisitions for new surface, and the share of the surface that has been seen."""
+"""Coverage: acquisitions for new surface, and the fraction of the surface that has been seen."""
 
 from typing import ClassVar
 
@@ -21,29 +21,29 @@ from jaxnbv.scanning.visibility import is_visible, spread_points
 from jaxnbv.sharding import on_cpu, shared_map
 from jaxnbv.utility import Quantity
 
-# Default s without looks, in scene units.
+# Default size s of `NewSurface` in scene units, for observations without looks.
 _SIZE = 0.05
-# Points on each sample for the seen share, which is then accurate to a percent.
+# Number of points on each sample for `seen_share`. The result is then accurate to a percent.
 _POINTS = 1024
 
 
 def _many() -> int:
-    """Batch size of scans with a cheap score."""
+    """Return the batch size for scores that are cheap to compute."""
     return 128 if on_cpu() else 2048
 
 
 class Coverage(Acquisition):
-    """Chamfer distance from scan to D, sum_{x in scan} min_{y in D} |x - y|^2, in squared scene units.
+    """Chamfer distance from a simulated scan to D, sum_{x in scan} min_{y in D} |x - y|^2.
 
-    The paper's alpha^(CD).
+    This is the paper's alpha^(CD), in squared scene units.
     """
 
     def context(self, step: StepInputs) -> PointCloud:
-        """D itself."""
+        """Return D."""
         return step.observations.cloud
 
     def score(self, context: PointCloud, view: ImaginedView) -> Float[Array, ""]:
-        """Unidirectional Chamfer distance from the scan to D. Zero for an empty scan."""
+        """Return the unidirectional Chamfer distance from the scan to D. It is zero for an empty scan."""
         return jnp.sum(jnp.where(view.scan.mask, nearest_squared_distance(view.scan.points, context), 0.0))
 
     @property
@@ -53,14 +53,14 @@ class Coverage(Acquisition):
 
     @property
     def batch_size(self) -> int:
-        """Many scans at once, since a single loop over D serves all of them."""
+        """Number of scans to score together: large, because one loop over D computes the scores of all scans."""
         return _many()
 
 
 class Newness(eqx.Module):
-    """How new a point on a surface is, given the observations.
+    """Function that returns the newness of surface at a point, given the observations.
 
-    - `distances`: distance field to all hits of earlier views, or to D if the observations keep no looks.
+    - `distances`: distance field to all hits of earlier views, or to D for observations without looks.
     - `size`: see `NewSurface`.
     """
 
@@ -68,27 +68,31 @@ class Newness(eqx.Module):
     size: Float[Array, ""]
 
     def __call__(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
-        """Newness of surface at each point, from 0 to 1."""
+        """Return the newness of the surface at each point, from 0 (seen) to 1 (new)."""
         return jnp.clip(self.distances(points) / self.size - 1.0, 0.0, 1.0)
 
 
 class NewSurface(Acquisition):
-    """Area in an imagined scan that no view has measured yet, in squared scene units.
+    """Area in a simulated scan that no view has measured yet, in squared scene units.
 
-        alpha(D, scan) = sum_x a(x) clip(d(x) / s - 1, 0, 1)
+        alpha(D, scan) = sum_x a(x) clip(d(x) / s - 1, 0, 1),   a(x) = r^2 omega / cos
 
-    over the hits x of the scan. d is the distance to the nearest pixel footprint of any earlier view (`Looks`), and
-    a(x) = r^2 omega / cos is the pixel's area on the surface: omega its solid angle, r the distance, and cos the cosine
-    of the angle of incidence, at least 0.5. Rays of one scan do not overlap, so no surface counts twice. In the paper's
-    `Coverage` near surfaces, which fill more pixels, or a single far point can outweigh the rest. Here they cannot. It
-    is differentiable in the pose wherever `Coverage` is, but most of a gain comes from jumps, which the derivative
-    misses: search over candidates.
+    The sum is over the hits x of the scan. d(x) is the distance from x to the nearest surface that any earlier view
+    measured, see `Looks`. a(x) is the area of the pixel on the surface: omega is the pixel's solid angle, r the
+    distance, and cos the cosine of the angle of incidence, clipped to at least 0.5. Rays of one scan do not overlap, so
+    no surface counts twice. In the paper's `Coverage`, near surfaces dominate because they fill more pixels, and a
+    single far point may also dominate. `NewSurface` has neither problem.
 
-    - `size`: s. Surface within s of a hit has been seen, and surface farther than 2 s is new. In scene units, also in
-      sessions. The spacing of the grid of `Looks` is both the default and the minimum.
+    Use a search over candidates. `NewSurface` is differentiable in the pose wherever `Coverage` is, but most of the
+    gain comes from jumps of rays, which the derivative leaves out.
 
-    Observations without looks, such as a cloud alone, use D in place of all hits. Then s is 0.05 by default, and at
-    least the median distance from points of D to their nearest neighbours.
+    - `size`: the length s, in scene units also in sessions. Surface within s of a hit has been seen, and surface
+      farther than 2 s is new. The default is the spacing of the grid of `Looks`. A smaller size is raised to this
+      spacing.
+
+    For observations without looks, such as a single cloud, or if 2 s exceeds `Looks.reach`, d(x) is the distance to the
+    nearest point of D. The default of s is then 0.05. A size below the median distance between nearest neighbours in D
+    is raised to this distance.
 
     **Raises:** `ValueError` if the size is not positive.
     """
@@ -102,7 +106,7 @@ class NewSurface(Acquisition):
         require(self.size is None or self.size > 0, f"the size is {self.size}; it must be positive, in scene units")
 
     def context(self, step: StepInputs) -> Newness:
-        """The newness of points, from the looks or from D."""
+        """Return the newness function, from the looks of the observations or from D."""
         cloud, looks = step.observations.cloud, step.observations.looks
         if looks is not None and 2.0 * (self.size or 0.0) <= looks.reach:
             return Newness(looks, jnp.asarray(max(looks.grid.spacing, self.size or 0.0), cloud.points.dtype))
@@ -110,7 +114,7 @@ class NewSurface(Acquisition):
         return Newness(DistanceField.of(cloud, 2.0 * size), size)
 
     def score(self, context: Newness, view: ImaginedView) -> Float[Array, ""]:
-        """New area of one scan. Zero for an empty scan."""
+        """Return the new area in one scan. It is zero for an empty scan."""
         return jnp.sum(pixel_area(view.scan, view.camera, view.pose, STEEP) * context(view.scan.points))
 
     @property
@@ -120,12 +124,12 @@ class NewSurface(Acquisition):
 
     @property
     def batch_size(self) -> int:
-        """Many scans at once, since the score is cheap."""
+        """Number of scans to score together: large, because a score is cheap to compute."""
         return _many()
 
 
 def new_surface_of(acquisition: Acquisition) -> NewSurface:
-    """The acquisition itself if it is a `NewSurface`, else the default one."""
+    """Return the acquisition itself if it is a `NewSurface`, otherwise `NewSurface()`."""
     return acquisition if isinstance(acquisition, NewSurface) else NewSurface()
 
 
@@ -138,11 +142,14 @@ def seen_share(
     views: PoseList,
     barrier: Float[Array, "poses rays"] | None = None,
 ) -> Float[Array, ""]:
-    """Share of the area visible from `poses` on the sampled surfaces that earlier views have seen.
+    """Return the fraction of the visible area that earlier views have seen.
 
-    A point has been seen if it is not new and, if the observations keep looks, is visible from the pose of a view. A
-    point near to a measured one may still be hidden behind an edge.
+    The visible area is the area of the sampled surfaces that is visible from `poses`. A point has been seen if its
+    newness is zero. For observations with looks, it must also be visible from an earlier view, because a point near a
+    measured point may still be hidden behind an edge.
 
+    - `newness`: newness function of the observations.
+    - `surfaces`: posterior samples, along a leading axis.
     - `views`: poses of the views so far.
     - `barrier`: distances to obstacles from `poses`, see `scan`.
     """
@@ -159,7 +166,7 @@ def _areas_shown(
     views: PoseList,
     barrier: Float[Array, "poses rays"] | None,
 ) -> Float[Array, "2"]:
-    """Two areas of one sample: visible from the poses and already seen, and visible from the poses."""
+    """Return two areas of one sample: the visible area that has been seen, and the whole visible area."""
     points = spread_points(surface, _POINTS)
     tolerance = surface.grid.spacing
     is_shown = jnp.any(is_visible(surface, camera, poses, points, tolerance, barrier), axis=0)

@@ -2,8 +2,9 @@
 
     du/dt = Delta u + f,     (M + h L) u_{k+1} = M (u_k + h f)
 
-with the Laplacian of Sharp and Crane (2020, "A Laplacian for Nonmanifold Triangle Meshes"). It is built on the tufted
-cover of the triangles. Point clouds use a local triangulation of each point's neighbours. No heat crosses open edges.
+The Laplacian is that of Sharp and Crane (2020, "A Laplacian for Nonmanifold Triangle Meshes"), which is built on the
+tufted cover of the triangles. For point clouds, the triangles come from a local triangulation of each point's
+neighbours. No heat flows across open edges.
 """
 
 from collections.abc import Callable
@@ -20,25 +21,29 @@ from scipy.sparse.linalg import splu
 from jaxnbv.checks import AnyArray, as_numbers, check_fields, is_traced, require
 from jaxnbv.errors import optional
 
-# Neighbours of a point in its local triangulation, as many as Sharp and Crane use.
+# Number of neighbours in the local triangulation of a point, as in Sharp and Crane.
 _NEIGHBOURS = 30
 
 
 def _array(source) -> AnyArray:
-    # Other arrays become NumPy's, off JAX's devices, since worker processes do not use these.
+    # Arrays other than JAX's are converted to NumPy, because worker processes cannot use JAX's devices.
     return source if isinstance(source, Array) else as_numbers(source, "the heat source")
 
 
 class HeatProblem(eqx.Module):
-    """A body of uniform temperature, heated near a point: the paper's du/dt = Delta u + f, u(0) = u0.
+    """A body of uniform temperature that is heated near a point.
 
-    - `source`: point in scene coordinates. f is `power` within `radius` of it and zero elsewhere, smoothed at the rim
-      according to the area of each point (`heating`). A body without a point there is not heated.
-    - `radius`: in scene units.
-    - `power`: f in degrees per unit of time. Time has the unit in which the factor of Delta, in scene units, is one.
-    - `duration`: T, the time of heating.
-    - `steps`: number of steps of implicit Euler, h = T / steps.
-    - `initial`: u0, in degrees.
+    The temperature u follows the paper's equation du/dt = Delta u + f, u(0) = u0.
+
+    - `source`: centre of the heated ball, in scene coordinates. The heating f is `power` within `radius` of the source
+      and zero elsewhere. At the rim it is smoothed according to the area of each point, see `heating`. A body without a
+      point in the ball is not heated.
+    - `radius`: radius of the ball, in scene units.
+    - `power`: value of f, in degrees per unit of time. The unit of time is the one in which the diffusivity is one
+      squared scene unit per unit of time.
+    - `duration`: time of heating, T.
+    - `steps`: number of steps of implicit Euler, each of length h = T / steps.
+    - `initial`: initial temperature u0, in degrees.
 
     **Raises:** `ValueError` for a source that is not one finite point, a radius or duration that is not positive, less
     than one step, or a power or initial temperature that is not finite.
@@ -64,16 +69,17 @@ class HeatProblem(eqx.Module):
 
     @property
     def highest(self) -> float:
-        """Upper bound of the temperature, u0 + T max(0, power), by the maximum principle."""
+        """Upper bound of the temperature by the maximum principle, u0 + T max(0, power)."""
         return self.initial + self.duration * max(0.0, self.power)
 
     def heating(self, points: Float[np.ndarray, "n 3"], areas: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """f at points: `power` times the share of a point's disc within `radius` of the source.
+        """Return the heating f at points.
 
-        The share is approximated by 1/2 + (radius - d) / (2 rho), clipped to [0, 1], for the distance d and the disc's
-        radius rho. In the authors' code a point is within or not, which is the same for dense points. For 1,024 points
-        on an object, the lowest temperatures of two samplings then differed by a third, and differ by a tenth with
-        shares.
+        f is `power` times the fraction of a point's disc that is within `radius` of the source. The disc has the area
+        of the point. The fraction is approximated by 1/2 + (radius - d) / (2 rho), clipped to [0, 1], where d is the
+        distance from the source and rho the radius of the disc. In the authors' code this fraction is 0 or 1, which
+        makes no difference for dense points. With 1,024 points on an object, the lowest temperatures of two random
+        samplings differ by a third with the authors' code, and by a tenth with fractions.
         """
         distance = np.linalg.norm(points - np.asarray(self.source, np.float64), axis=1)
         return self.power * np.clip(0.5 + 0.5 * (self.radius - distance) / np.sqrt(areas / np.pi), 0.0, 1.0)
@@ -82,8 +88,8 @@ class HeatProblem(eqx.Module):
 class Laplacian(NamedTuple):
     """The weak Laplacian of n points: Delta u = -u @ weak / mass.
 
-    - `weak`: L, (n, n), symmetric and positive semidefinite; its rows sum to zero, so that heat is conserved.
-    - `mass`: the diagonal of M, the positive area that belongs to each point.
+    - `weak`: the matrix L, (n, n), symmetric and positive semidefinite. Its rows sum to zero, so heat is conserved.
+    - `mass`: diagonal of the matrix M, which is the positive area of each point.
     """
 
     weak: sparse.csc_matrix
@@ -93,25 +99,28 @@ class Laplacian(NamedTuple):
 class Temperature(NamedTuple):
     """The solution of a `HeatProblem` at time T.
 
-    - `values`: u in degrees.
-    - `reached`: whether each point is connected to a heated point. Other points stay at the initial temperature.
+    - `values`: temperature u of each point, in degrees.
+    - `reached`: mask of the points that are connected to a heated point. All others keep the initial temperature.
     """
 
     values: Float[np.ndarray, " n"]
     reached: Bool[np.ndarray, " n"]
 
     def coldest(self, reached_only: bool) -> int | None:
-        """Index of the coldest point, the first of equals, or None if there is no point to choose from."""
+        """Return the index of the coldest point, the first if several are equal; None if there is no point.
+
+        - `reached_only`: consider only the points that are connected to a heated point.
+        """
         candidates = np.flatnonzero(self.reached) if reached_only else np.arange(len(self.values))
         return int(candidates[np.argmin(self.values[candidates])]) if len(candidates) else None
 
 
 def cloud_laplacian(points: Float[np.ndarray, "n 3"]) -> Laplacian:
-    """Laplacian of a point cloud without coincident points.
+    """Return the Laplacian of a point cloud without coincident points.
 
-    A point is connected to some of its 30 nearest neighbours (to all others, if they are fewer), at any distance. So
-    pieces of more points than that are separate once they are far apart. Points without a triangle, such as points on
-    a lone line, conduct no heat.
+    A point is connected to some of its 30 nearest neighbours, or of all other points if there are fewer, at any
+    distance. Therefore two groups of points are disconnected only if they are far apart and each has more than 30
+    points. Points without a triangle, such as points on a single line, conduct no heat.
     """
     if len(points) == 3:
         # The library reads uninitialised memory if there are only two neighbours.
@@ -123,12 +132,12 @@ def cloud_laplacian(points: Float[np.ndarray, "n 3"]) -> Laplacian:
 
 
 def mesh_laplacian(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Laplacian:
-    """Laplacian of triangles, manifold or not. Heat flows where they share vertices."""
+    """Return the Laplacian of triangles, manifold or not. Heat flows across shared vertices."""
     return _assemble(lambda: optional("robust_laplacian").mesh_laplacian(vertices, faces), len(vertices))
 
 
 def _nothing(count: int) -> Laplacian:
-    """Laplacian of points that conduct no heat."""
+    """Return the Laplacian of points that conduct no heat."""
     return Laplacian(sparse.csc_matrix((count, count)), np.ones(count))
 
 
@@ -138,11 +147,11 @@ def _assemble(build: Callable, count: int) -> Laplacian:
     try:
         weak, mass = build()
     except RuntimeError as error:
-        # The library raises this if there is no triangle at all.
+        # The library raises this error if there is no triangle at all.
         if "unreferenced vertex" not in str(error):
             raise
         return _nothing(count)
-    # The library couples a point without triangles to zero degrees. Rows that sum to zero leave it alone.
+    # The library couples a point without triangles to zero degrees. With rows that sum to zero, the point is isolated.
     flow = weak - sparse.diags(weak.diagonal())
     flow.eliminate_zeros()
     return Laplacian((flow - sparse.diags(np.asarray(flow.sum(axis=1)).ravel())).tocsc(), mass.diagonal())
@@ -155,12 +164,16 @@ def diffuse(
     duration: float,
     steps: int,
 ) -> Float[np.ndarray, " n"]:
-    """u after `duration`, by implicit Euler: (M + h L) u_{k+1} = M (u_k + h f), factorised once.
+    """Return u after `duration`, by implicit Euler: (M + h L) u_{k+1} = M (u_k + h f).
 
-    It is stable for any h, with an error of order h. The heat, mass @ u, grows by h mass @ f each step.
+    The matrix is factorised once. The method is stable for any step length h, and its error is of order h. The total
+    heat, mass @ u, grows by h mass @ f in each step.
+
+    - `initial`: temperature at the start, u_0.
+    - `heating`: f at each point.
     """
     step = duration / steps
-    # The system is symmetric positive definite, so it needs no pivoting and the order can keep the factors sparse.
+    # The matrix is symmetric positive definite, so no pivoting is needed, and a fill-reducing order can be used.
     system = sparse.diags(laplacian.mass) + step * laplacian.weak
     factors = splu(system.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     u = initial
@@ -170,7 +183,7 @@ def diffuse(
 
 
 def cloud_temperature(points: Float[np.ndarray, "n 3"], heat: HeatProblem) -> Temperature:
-    """Temperature of a point cloud in scene coordinates. Coincident points count as one.
+    """Return the temperature of a point cloud in scene coordinates. Coincident points count as one.
 
     **Raises:** `ValueError` for points that are not finite.
     """
@@ -181,10 +194,10 @@ def cloud_temperature(points: Float[np.ndarray, "n 3"], heat: HeatProblem) -> Te
 def mesh_temperature(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], heat: HeatProblem
 ) -> Temperature:
-    """Temperature at the vertices of a mesh in scene coordinates.
+    """Return the temperature at the vertices of a mesh in scene coordinates.
 
-    It is linear between vertices: see `refine`. Coincident vertices count as one, so that heat crosses the seams of a
-    triangle soup.
+    The temperature is linear between vertices, so a coarse mesh should be refined first, see `refine`. Coincident
+    vertices count as one, so heat also flows between the triangles of a triangle soup.
 
     **Raises:** `ValueError` for vertices that are not finite.
     """
@@ -195,7 +208,7 @@ def mesh_temperature(
 
 
 def _merge(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The distinct points, sorted, and the row of each point among them."""
+    """Return the distinct points, sorted, and the row of each point among the distinct points."""
     bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
     require(bad.size == 0, f"{bad.size} points are not finite, the first at row {bad[:1]}: drop these rows")
     distinct, place = np.unique(np.asarray(points, np.float64), axis=0, return_inverse=True)
@@ -204,13 +217,13 @@ def _merge(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _solve(laplacian: Laplacian, points: np.ndarray, place: np.ndarray, heat: HeatProblem) -> Temperature:
     heating = heat.heating(points, laplacian.mass)
-    # No heat flows between connected pieces.
+    # No heat flows between different connected components.
     _, pieces = connected_components(laplacian.weak, directed=False)
     reached = np.isin(pieces, pieces[heating != 0.0])
     values = np.full(len(points), float(heat.initial))
     if reached.any():
         values = diffuse(laplacian, values, heating, heat.duration, heat.steps)
-        # The solver rounds, and these must be exact.
+        # The solver makes rounding errors, but the initial temperature must be exact.
         values[~reached] = heat.initial
     return Temperature(values[place], reached[place])
 
@@ -218,10 +231,10 @@ def _solve(laplacian: Laplacian, points: np.ndarray, place: np.ndarray, heat: He
 def refine(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], longest: float
 ) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]:
-    """The same surface in triangles with edges no longer than `longest`, by bisection of longer edges.
+    """Bisect edges until all are at most `longest` long, and return the new vertices and faces.
 
-    Each edge is halved in all its triangles at once. The original vertices come first. Triangles may become slivers,
-    which this Laplacian tolerates.
+    An edge is bisected in all its triangles at once. The original vertices come first in the result. Triangles may
+    become slivers, but this does not harm the Laplacian of Sharp and Crane.
 
     **Raises:** `ValueError` if `longest` is not positive.
     """
@@ -239,9 +252,9 @@ def refine(
 
 
 def _split_faces(faces: np.ndarray, halves: np.ndarray) -> np.ndarray:
-    """Triangles, cut at the midpoints of their edges.
+    """Split triangles at the midpoints of their edges.
 
-    - `halves`: index of the midpoint's vertex on each edge (i, i + 1), or -1 for an edge that stays whole.
+    - `halves`: index of the vertex at the midpoint of each edge (i, i + 1); -1 for an edge that is not bisected.
     """
     count = (halves >= 0).sum(axis=1)
     # Rotate each triangle: one midpoint is then on the first edge, and two are on the first and second edges.

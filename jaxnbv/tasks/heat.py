@@ -1,4 +1,4 @@
-"""Heat diffusion: the coldest point of a body that is heated at one place."""
+"""Heat diffusion: the coldest point of a body that is heated near one point."""
 
 import math
 import multiprocessing
@@ -21,31 +21,32 @@ from jaxnbv.tasks.diffusion import HeatProblem, Temperature, cloud_temperature, 
 from jaxnbv.tasks.host import call_on_host
 from jaxnbv.utility import Answer, Quantity, Utility
 
-# Longest edge, in scene units, of the triangles for the true temperature. At the default radius it is within 2 % of the
-# limit of finer triangles, and takes seconds.
+# Longest edge of the triangles for the true temperature, in scene units. At the default radius, the temperature is
+# within 2 % of its limit for fine triangles, and the computation takes seconds.
 _LONGEST_EDGE = 0.025
-# Workers stay alive this long between calls, while the rest of a step is computed.
+# Idle time after which a worker exits. Workers should survive between two calls, while other results are computed.
 _IDLE_SECONDS = 120
-# Workers import JAX, but must not take the accelerator or each other's cores.
+# Workers import JAX, but must not occupy the accelerator or use more than one core each.
 _WORKER_ENVIRONMENT = {"JAX_PLATFORMS": "cpu", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
 
 class ColdestPoint(Utility):
     """Negative lowest temperature, u_H(D) = -min u^(T), a utility for `ExpectedUtilityImprovement`.
 
-    The paper's u_H. The Laplacian runs on the host, so there is no gradient: search over candidates, as in the paper.
-    The order of the points and the number of workers do not change a bit of the values.
+    This is the paper's u_H. The heat equation is solved outside JAX, so there is no gradient. Use a search over
+    candidates, as in the paper. The values do not depend on the order of the points or the number of workers, not even
+    in the last bit.
 
-    - `heat`: the `HeatProblem`, or its source alone, (3,) in scene coordinates, with the authors' values for the rest.
-      Scenes that differ in the source alone share one compilation.
-    - `reached_only`: take the minimum over the points that the source can warm. The paper takes it over all points.
-      Once D or an imagined scan has a piece that is not connected to the source, that minimum stays at u0, and no view
-      improves on it.
-    - `workers`: number of processes that share the candidates, by default one for each core. For 1, this process does
-      the work.
+    - `heat`: a `HeatProblem`, or only the source (3,) in scene coordinates. The other values are then the authors'.
+      Problems that differ only in the source share the same compiled program.
+    - `reached_only`: take the minimum only over points that are connected to a heated point. The paper takes the
+      minimum over all points. If D or a simulated scan has points that are not connected to the source, that minimum is
+      u0, and no view can improve it.
+    - `workers`: number of processes that share the clouds, by default one for each core. With 1, the current process
+      does the work.
 
-    **Raises:** `ValueError` for fewer than one worker, for a source that `HeatProblem` refuses, and when it is
-    differentiated.
+    **Raises:** `ValueError` for fewer than one worker, for a source that `HeatProblem` does not accept, and for an
+    attempt to differentiate the utility.
     """
 
     heat: HeatProblem
@@ -67,12 +68,13 @@ class ColdestPoint(Utility):
         self.reached_only, self.workers = reached_only, workers
 
     def __call__(self, cloud: PointCloud) -> Float[Array, ""]:
-        """u_H of one cloud in degrees. Under `vmap` all clouds are computed in one call.
+        """Return u_H of one cloud in degrees. Under `vmap`, all clouds are computed in one call.
 
-        Without a point to take the minimum over, it is the lower bound -(u0 + T power), and any point improves on it.
+        If there is no point for the minimum, return the lower bound -(u0 + T max(0, power)). Any point then is an
+        improvement.
         """
         source = jnp.asarray(self.heat.source, cloud.points.dtype)
-        # The source may be traced, so it is passed as an array with each cloud.
+        # The source may be traced, so it is passed as an array together with the cloud.
         heat = replace(self.heat, source=np.zeros(3))
         values = partial(_values, heat=heat, reached_only=self.reached_only, workers=self.workers)
         return call_on_host(values, (), "ColdestPoint", cloud.points, cloud.mask, source)
@@ -84,7 +86,7 @@ class ColdestPoint(Utility):
         return Quantity("expected fall of the least temperature", "degrees", meaning)
 
     def answer(self, cloud: PointCloud) -> "Coldest":
-        """The coldest point of the cloud and its temperature."""
+        """Return the coldest point of the cloud and its temperature."""
         return coldest_point(cloud, self.heat, self.reached_only)
 
 
@@ -103,7 +105,7 @@ def _value(points: np.ndarray, heat: HeatProblem, reached_only: bool) -> float:
 
 
 def _map(function: Callable, clouds: list, problems: list, workers: int) -> list[float]:
-    # A Dask worker is a daemon, and Python does not let daemons start processes.
+    # Python does not let daemon processes, such as Dask workers, start processes.
     if workers == 1 or len(clouds) == 1 or multiprocessing.current_process().daemon:
         return list(map(function, clouds, problems))
     executor = optional("loky").get_reusable_executor(workers, timeout=_IDLE_SECONDS, env=_WORKER_ENVIRONMENT)
@@ -113,10 +115,11 @@ def _map(function: Callable, clouds: list, problems: list, workers: int) -> list
 def body_temperature(
     body: PointCloud | TriangleMesh, heat: HeatProblem
 ) -> tuple[Float[np.ndarray, "n 3"], Temperature]:
-    """Points of a body, in scene coordinates, and their temperature.
+    """Return points of a body, in scene coordinates, and the temperature at these points.
 
-    They are the points of a cloud, or the vertices of a mesh after refinement to resolve the heat. Heat does not cross
-    between parts of a mesh that touch but share no vertices: if it should, give a dense cloud of the mesh.
+    For a mesh, the points are the vertices after refinement, which is fine enough for the default heat problem. Heat
+    does not flow between components of a mesh that touch but share no vertices. If it should, pass a dense cloud of the
+    mesh.
     """
     if isinstance(body, PointCloud):
         points = np.asarray(body.to_numpy()[0], np.float64)
@@ -126,9 +129,10 @@ def body_temperature(
 
 
 class Coldest(Answer):
-    """The coldest point, in scene coordinates. Its temperature in degrees is the answer's only value.
+    """The coldest point of a body. The answer's only value is the temperature there, in degrees.
 
-    - `frame`: frame of the world for the point's coordinates in words.
+    - `point`: the coldest point, in scene coordinates.
+    - `frame`: frame of the world. A text of the answer shows the point in coordinates of this world.
     """
 
     point: Float[np.ndarray, "3"] = eqx.field(default_factory=lambda: np.zeros(3))
@@ -145,12 +149,14 @@ class Coldest(Answer):
 
 @checked
 def coldest_point(body: PointCloud | TriangleMesh, heat: HeatProblem, reached_only: bool = False) -> Coldest:
-    """The coldest point of a cloud (the estimate) or of a mesh (the truth), the first of equals.
+    """Return the coldest point of a cloud (the estimate) or of a mesh (the truth).
 
-    - `reached_only`: see `ColdestPoint`. If False, and some points are not connected to the source, the result is one
-      of these.
+    If several points are equally cold, the first is returned.
 
-    **Raises:** `ValueError` if there is no point, or for `reached_only` none that the source can warm.
+    - `reached_only`: see `ColdestPoint`. If False and some points are not connected to the source, the result is one of
+      these unheated points.
+
+    **Raises:** `ValueError` if there is no point or, with `reached_only`, no point that is connected to the source.
     """
     points, temperature = body_temperature(body, heat)
     coldest = temperature.coldest(reached_only)

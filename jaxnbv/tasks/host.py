@@ -1,6 +1,6 @@
-"""Functions that run outside JAX, on the host: a PyTorch model or a solver, say.
+"""Functions that run outside JAX on the host, for example a PyTorch model or a solver.
 
-They have no derivative, so only searches over candidates can use them.
+Such functions have no derivative, so gradient searches cannot use them.
 """
 
 from collections.abc import Callable
@@ -19,16 +19,17 @@ from jaxnbv.tasks.segmentation import Segmenter
 
 
 class HostClassifier(Classifier):
-    """A classifier that runs outside JAX, a PyTorch model say, for searches over candidates only.
+    """A classifier that runs outside JAX, for example a PyTorch model. Gradient searches cannot use it.
 
-    - `function`: from points (b, n, 3), unit normals (b, n, 3) and mask (b, n), as NumPy arrays, to log-probabilities
-      (b, num_classes). It is called with up to 128 scans at once.
+    - `function`: function of points (b, n, 3), unit normals (b, n, 3) and mask (b, n) as NumPy arrays that returns
+      log-probabilities (b, num_classes). It is called with up to 128 clouds at once.
     - `num_classes`: number of classes.
-    - `version`: a text or number, such as "2026-11", that you change whenever the function changes. Stored runs need it
-      unless the function's source and all that it reads can be described. PyTorch weights cannot.
+    - `version`: a text or number, such as "2026-11", that you change whenever the function changes. A stored run needs
+      a version unless the function's source code and all variables that it reads can be described. The weights of a
+      PyTorch model cannot be described.
 
-    **Raises:** `ValueError` when it is differentiated. If the function fails or returns another shape, JAX raises its
-    own `RuntimeError`, whose text has the message.
+    **Raises:** `ValueError` for an attempt to differentiate the classifier. If the function fails or returns an array
+    of the wrong shape, JAX raises a `RuntimeError` whose text contains the original message.
     """
 
     function: Callable = eqx.field(static=True)
@@ -41,15 +42,15 @@ class HostClassifier(Classifier):
         require(self.num_classes >= 2, f"num_classes is {self.num_classes}; it must be at least 2")
 
     def __call__(self, cloud: PointCloud) -> Float[Array, " classes"]:
-        """Log-probabilities of one cloud. Under `vmap` the function gets all clouds in one call."""
+        """Return the log-probabilities of one cloud. Under `vmap`, the function gets all clouds in one call."""
         return _of_cloud(self.function, (self.num_classes,), "HostClassifier", cloud)
 
 
 class HostSegmenter(Segmenter):
-    """A segmenter that runs outside JAX, a PyTorch model say, for searches over candidates only.
+    """A segmenter that runs outside JAX, for example a PyTorch model. Gradient searches cannot use it.
 
-    - `function`: from the arrays of `HostClassifier` to probabilities of the parts (b, n, num_parts). Masked rows of
-      its result are ignored.
+    - `function`: function of the same arrays as in `HostClassifier` that returns part probabilities (b, n, num_parts).
+      Rows of the result for which the mask is False are ignored.
     - `num_parts`: number of parts.
     - `version`: see `HostClassifier`.
 
@@ -66,7 +67,10 @@ class HostSegmenter(Segmenter):
         require(self.num_parts >= 1, f"num_parts is {self.num_parts}; it must be at least 1")
 
     def __call__(self, cloud: PointCloud) -> Float[Array, "points parts"]:
-        """Part probabilities of one cloud's points. Under `vmap` the function gets all clouds in one call."""
+        """Return the part probabilities of a cloud's points.
+
+        Under `vmap`, the function gets all clouds in one call.
+        """
         p = _of_cloud(self.function, (cloud.capacity, self.num_parts), "HostSegmenter", cloud)
         return jnp.where(cloud.mask[:, None], p, 0.0)
 
@@ -78,14 +82,15 @@ def _of_cloud(function: Callable, shape: tuple[int, ...], name: str, cloud: Poin
 def call_on_host(
     function: Callable, shape: tuple[int, ...], name: str, *arrays: Shaped[Array, "..."]
 ) -> Float[Array, "..."]:
-    """The result of a NumPy function for these arrays.
+    """Call a NumPy function with JAX arrays, also under `jit` and `vmap`, and return the result.
 
-    The function gets the arrays with an extra leading axis, of length one or, under `vmap`, the number of entries.
+    The function gets the arrays with an additional leading axis. The length of this axis is the number of entries of a
+    `vmap`, or one outside `vmap`.
 
-    - `shape`: shape of the result for one entry. Its type is that of the first array.
-    - `name`: name of the caller, for errors.
+    - `shape`: shape of the result for one entry. The result has the dtype of the first array.
+    - `name`: name of the caller for error messages.
 
-    **Raises:** `ValueError` when it is differentiated.
+    **Raises:** `ValueError` for an attempt to differentiate the result.
     """
     return _call(arrays, function, shape, name)
 

@@ -1,4 +1,4 @@
-"""Identification: an acquisition to find out which known part an object is and how it lies."""
+"""Identification: which known part is the object, and what is its pose?"""
 
 from collections.abc import Sequence
 from typing import Any, ClassVar, TypeAlias
@@ -22,22 +22,22 @@ from jaxnbv.surfaces.part_hypotheses import NONE, PartHypotheses, hypotheses_of
 from jaxnbv.surfaces.shape_bank import ShapeBank
 from jaxnbv.utility import Answer, Quantity
 
-# Nodes along each axis of the grid for the hypotheses' surfaces.
+# Number of nodes along each axis of the grid for the surfaces of the hypotheses.
 _RESOLUTION = 64
-# Weight of the information about how a part lies, relative to that about which part it is.
+# Weight of the information about the part's pose, relative to the information about its name.
 _POSE_WEIGHT = 0.1
-# For each ray: distance to the part, cosine of the angle of incidence, and whether it hits the part.
+# Three values for each ray: distance to the part, cosine of the angle of incidence, and whether the ray hits the part.
 _Image: TypeAlias = tuple[Float[Array, "..."], Float[Array, "..."], Bool[Array, "..."]]
 
 
 class ImaginedParts(eqx.Module):
-    """The context of `Identify`.
+    """Context of the acquisition `Identify`.
 
-    - `surfaces`: surfaces of the likeliest hypotheses, along a leading axis.
-    - `weights`: their probabilities, which sum to one.
-    - `classes`: class c of each hypothesis h, one-hot.
-    - `tau`: how far a measured point may lie from the surface, in scene units, see `part_evidence`.
-    - `pose_weight`: weight of the information about how a part lies, or zero.
+    - `surfaces`: surfaces of the hypotheses, along a leading axis.
+    - `weights`: probabilities of the hypotheses, which sum to one without "none of these".
+    - `classes`: class c of each hypothesis h, as one-hot rows.
+    - `tau`: scale of the distance between a measured point and the surface, in scene units, see `part_evidence`.
+    - `pose_weight`: weight of the information about the part's pose, or zero.
     """
 
     surfaces: GridSurface
@@ -48,20 +48,22 @@ class ImaginedParts(eqx.Module):
 
 
 class Identify(Acquisition):
-    """Expected information in nats about which part the object is and, with less weight, how it lies:
+    """Expected information in nats about the name of the part and, with less weight, about its pose:
 
         alpha(theta) = I(c) + 0.1 I(h | c),   I(c) = H(c) - sum_h w_h H(c | z_h),
         w_h' | z_h  proportional to  w_h' exp(-L(z_h, z_h'))
 
-    over the hypotheses h of a model with known parts (`KnownShapes` with a bank at true size). c is the name of h, and
-    I(h | c) the information about h beyond c. z_h is the depth image of h from theta, and L the misfit of two images,
-    the same as in the weights of the hypotheses (`part_evidence`). Every hypothesis is rendered once for each pose, and
-    images are compared in pairs. It needs no posterior. The name has the larger weight, since views that first settle
-    how the object lies delay finding its name.
+    The sum is over the hypotheses h of a model with known parts (`KnownShapes` with a bank at true size). A hypothesis
+    is a part with a pose, and w_h is its probability. c is the name of the part, and I(h | c) is the information about
+    h that c does not contain. z_h is the depth image of h from the pose theta. L is the misfit of two images, which the
+    probabilities of the hypotheses also use, see `part_evidence`. Every hypothesis is rendered once for each candidate,
+    and the images are compared in pairs. No posterior of the surface is needed. The name has the larger weight, because
+    a search that first determines the pose needs more views to find the name.
 
-    - `pose`: whether information about how the object lies counts at all.
-    - `group`: a class name for each part of the bank, to ask for the class ("left" or "right", say) instead of the
-      part: `[name.split("-")[0] for name in bank.names]`. How the object lies then does not count.
+    - `pose`: whether to include the information about the pose.
+    - `group`: a class name for each part of the bank. Then c is the class, for example "left" or "right", instead of
+      the part, and the information about the pose is left out. An example is
+      `[name.split("-")[0] for name in bank.names]`.
 
     **Raises:** `ValueError` for a group that is not a list of names.
     """
@@ -74,7 +76,7 @@ class Identify(Acquisition):
         check_fields(self)
 
     def context(self, step: StepInputs) -> ImaginedParts:
-        """Surfaces, weights and classes of the hypotheses."""
+        """Return the surfaces, weights and classes of the hypotheses."""
         observations, hypotheses = step.observations, hypotheses_of(step.observations)
         grid = Grid() if observations.grid is None else observations.grid
         grid = Grid(min(_RESOLUTION, grid.resolution), grid.half_extent)
@@ -94,7 +96,7 @@ class Identify(Acquisition):
         return jax.nn.one_hot(jnp.asarray(numbers)[shapes], int(numbers.max()) + 1)
 
     def score(self, context: Any, view: ImaginedView) -> Float[Array, ""]:
-        """**Raises:** `ValueError` always. The value of a view needs the scans of all hypotheses."""
+        """Raise `ValueError`, because the value of a view needs the scans of all hypotheses."""
         raise InputError("Identify cannot score a single scan: use its sample_scores")
 
     def sample_scores(
@@ -105,7 +107,10 @@ class Identify(Acquisition):
         poses: Pose,
         barrier: Float[Array, "poses rays"] | None = None,
     ) -> Float[Array, "1 poses"]:
-        """Expected information of each pose, from the surfaces in the context. `surfaces` is not used."""
+        """Return the expected information of each pose, from the surfaces in the context.
+
+        The argument `surfaces` is not used.
+        """
         at_once = samples_at_once(camera, poses)
         images = shared_map(_image, context.surfaces, camera, poses, barrier, at_once=at_once)
         by_pose = jax.tree.map(lambda rows: jnp.moveaxis(rows, 1, 0), images)
@@ -118,13 +123,13 @@ class Identify(Acquisition):
 
 
 class IdentityAnswer(Answer):
-    """The probability of each part of a bank, or of each group of parts, and last of "none of these"."""
+    """Probability of each part of a bank, or of each group of parts. The last entry is "none of these"."""
 
     form: str = "{:.2f}"
 
 
 def identity_answer(hypotheses: PartHypotheses, acquisition: Acquisition) -> IdentityAnswer:
-    """Probabilities of the parts, or of the groups of parts for `Identify(group=...)`."""
+    """Return the probabilities of the parts, or of the groups of parts for `Identify(group=...)`."""
     names, values = weights_by_name(hypotheses.bank, np.asarray(hypotheses.part_weights), acquisition)
     return IdentityAnswer((*names, NONE), values)
 
@@ -132,9 +137,10 @@ def identity_answer(hypotheses: PartHypotheses, acquisition: Acquisition) -> Ide
 def weights_by_name(
     bank: ShapeBank, weights: Float[np.ndarray, "*batch k_and_none"], acquisition: Acquisition
 ) -> tuple[list[str], Float[np.ndarray, "*batch n"]]:
-    """Names of a bank's parts in alphabetical order, and the weight of each and last of "none of these".
+    """Return the names of a bank's parts in alphabetical order, and the weights in this order.
 
-    For `Identify(group=...)` the names are those of the groups.
+    The last weight is that of "none of these", which has no entry in the names. For `Identify(group=...)`, the names
+    are those of the groups.
 
     - `weights`: `PartHypotheses.part_weights`, with any leading axes.
     """
@@ -146,7 +152,7 @@ def weights_by_name(
 
 
 def _image(surface: GridSurface, camera: Camera, poses: Pose, barrier: Float[Array, "poses rays"] | None) -> _Image:
-    """Image of a part from each pose of a batch."""
+    """Render a part from each pose of a batch."""
     scans = scan(surface, camera, poses, barrier)
     offset = scans.points - poses.position[:, None]
     away = jnp.linalg.norm(offset, axis=-1)
@@ -155,7 +161,7 @@ def _image(surface: GridSurface, camera: Camera, poses: Pose, barrier: Float[Arr
 
 
 def _information(images: _Image, context: ImaginedParts, camera: Camera) -> Float[Array, ""]:
-    """alpha of one pose, from the images of all hypotheses from there."""
+    """Return alpha of one pose, given the images of all hypotheses from this pose."""
     (reach, _, hits), weights = images, context.weights
     weight = weight_of(jnp.sum(jnp.where(hits, reach, 0.0)) / jnp.maximum(jnp.sum(hits), 1), camera)
 
@@ -174,9 +180,10 @@ def _information(images: _Image, context: ImaginedParts, camera: Camera) -> Floa
 
 
 def _misfits(image: _Image, others: _Image, tau: Float[Array, ""]) -> Float[Array, "h rays"]:
-    """Misfit of each ray between the image of one part and those of others.
+    """Return, for each ray, the misfit between the image of one hypothesis and the images of all hypotheses.
 
-    It grows with the distance between the surfaces, and is C (`MOST`) where the ray hits only one of the two parts.
+    The misfit grows with the distance between the surfaces. It is `MOST`, the bound C of `part_evidence`, if the ray
+    hits only one of the two surfaces.
     """
     (reach, _, hits), (expected, cosine, are_expected) = image, others
     both = hits & are_expected
@@ -185,7 +192,7 @@ def _misfits(image: _Image, others: _Image, tau: Float[Array, ""]) -> Float[Arra
 
 
 def entropy(weights: Float[Array, "*n c"]) -> Float[Array, "*n"]:
-    """-sum_c w_c log w_c in nats, over the last axis."""
+    """Return the entropy -sum_c w_c log w_c in nats, over the last axis."""
     return -jnp.sum(jax.scipy.special.xlogy(weights, jnp.maximum(weights, 1e-30)), axis=-1)
 
 

@@ -1,9 +1,9 @@
 """Semantic parts: have all parts of the object been found?
 
-A segmenter is any function p = segmenter(cloud) from a `PointCloud` (masked rows) to an array (points, parts): p_ic is
-the probability that point i belongs to part c. Rows without a point hold zeros. There may be fewer rows than in the
-cloud, if the segmenter thins it. `jaxnbv.networks.CloudSegmenter` wraps a network, and `HostSegmenter` a function
-outside JAX. A `Segmenter` may also name its parts.
+A segmenter is any function p = segmenter(cloud) from a `PointCloud` (masked rows) to an array (points, parts). p_ic is
+the probability that point i belongs to part c. Rows without a point contain zeros. The array has fewer rows than the
+cloud if the segmenter thins the cloud. `jaxnbv.networks.CloudSegmenter` wraps a network, and `HostSegmenter` wraps a
+function that runs outside JAX. A `Segmenter` may also name its parts.
 """
 
 import dataclasses
@@ -23,19 +23,21 @@ from jaxnbv.programs import program
 from jaxnbv.scanning import Surface
 from jaxnbv.utility import Answer, Quantity, Utility, default_batch_size, plain_function
 
-# Tolerance for the sums of probabilities in 32 bits or fewer.
+# Tolerance for sums of probabilities that have 32 bits or fewer.
 _SLACK = 1e-2
 
 
 class Segmenter(eqx.Module):
-    """Base class of segmenters: part probabilities of each point. Subclasses must define `__call__` only.
+    """Base class of segmenters, which return part probabilities for each point of a cloud.
 
-    - `part_names`: names of the parts to find, by index, or None.
+    Subclasses must define only `__call__`.
+
+    - `part_names`: dictionary from the index of a part to its name, for all parts to find; None for no names.
     """
 
     @abstractmethod
     def __call__(self, cloud: PointCloud) -> Float[Array, "points parts"]:
-        """p of one cloud (masked rows). Zeros in rows without a point."""
+        """Return the probabilities p for one cloud (masked rows), with zeros in rows without a point."""
 
     @property
     def part_names(self) -> Mapping[int, str] | None:
@@ -48,7 +50,7 @@ class Segmenter(eqx.Module):
 
 
 class FunctionSegmenter(Segmenter):
-    """A segmenter from a plain function of a cloud."""
+    """A segmenter that calls a plain function of a cloud."""
 
     function: Callable[[PointCloud], Float[Array, "points parts"]]
 
@@ -58,7 +60,7 @@ class FunctionSegmenter(Segmenter):
 
 
 def as_segmenter(value: Any) -> Segmenter:
-    """The value itself if it is a segmenter, else a plain function wrapped as one.
+    """Wrap a plain function as a segmenter, or return a segmenter unchanged.
 
     **Raises:** `ValueError` for anything else.
     """
@@ -73,13 +75,13 @@ else:
 
 
 class SoftPartCount(Utility):
-    """Soft number of parts found, u_S(D) = sum_c tanh(sum_i p_ic / N_target).
+    """Soft number of detected parts, u_S(D) = sum_c tanh(sum_i p_ic / N_target).
 
-    The paper's u_S, a utility for `ExpectedUtilityImprovement`. A part saturates once far more than N_target of its
-    points are seen, so a view gains by showing parts that have not been found yet.
+    This is the paper's u_S, a utility for `ExpectedUtilityImprovement`. The term of a part saturates once D has many
+    more than N_target points of this part. Therefore the utility improves most with views that show new parts.
 
     - `segmenter`: a `Segmenter`, or a function from a cloud to part probabilities of each point.
-    - `target`: N_target, in points that the segmenter gets. The default is the authors'.
+    - `target`: N_target, a number of points after the segmenter's own thinning. The default is the authors' value.
     """
 
     segmenter: AnySegmenter = eqx.field(converter=as_segmenter)
@@ -90,15 +92,15 @@ class SoftPartCount(Utility):
         require(self.target > 0, f"N_target is {self.target}; it must be positive")
 
     def __call__(self, cloud: PointCloud) -> Float[Array, ""]:
-        """u_S(D), between zero and the number of parts."""
+        """Return u_S(D), which is between zero and the number of parts."""
         return jnp.sum(jnp.tanh(jnp.sum(_probabilities(self.segmenter, cloud), axis=0) / self.target))
 
     def check(self, cloud: PointCloud) -> None:
-        """**Raises:** `ValueError` unless the segmenter returns probabilities, one row for each point."""
+        """Raise `ValueError` unless the segmenter returns a row of probabilities for each point."""
         with functions_of_users():
             p = _probabilities(self.segmenter, cloud)
         total = jnp.sum(p, axis=1)
-        # Rows without a point hold zeros.
+        # Rows without a point contain zeros.
         proper = jnp.all(p >= -_SLACK) & jnp.all((jnp.abs(total - 1.0) < _SLACK) | (jnp.abs(total) < _SLACK))
         require(
             bool(proper),
@@ -109,7 +111,7 @@ class SoftPartCount(Utility):
 
     @property
     def batch_size(self) -> int:
-        """The segmenter's batch size."""
+        """Batch size of the segmenter."""
         return self.segmenter.batch_size
 
     @property
@@ -119,7 +121,10 @@ class SoftPartCount(Utility):
         return Quantity("expected gain in parts", "parts", meaning)
 
     def answer(self, cloud: PointCloud) -> "PartAnswer":
-        """Number of points predicted for each part. Shows the segmenter's named parts, or else those found."""
+        """Return the number of points that are predicted for each part.
+
+        The parts to show are the segmenter's named parts. Without names, they are all parts with a predicted point.
+        """
         counts = np.asarray(self.answer_values(cloud), np.float64)
         part_names = self.segmenter.part_names
         names = tuple((part_names or {}).get(index, f"part {index}") for index in range(len(counts)))
@@ -127,13 +132,16 @@ class SoftPartCount(Utility):
         return PartAnswer(names, counts, parts=parts, target=self.target)
 
     def answer_values(self, cloud: PointCloud) -> Float[Array, " parts"]:
-        """Number of points predicted for each part."""
+        """Return the number of points that are predicted for each part."""
         return _counts(self.segmenter, cloud).astype(cloud.points.dtype)
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> "PartAnswer":
-        """Number of surface points of each part by the scene's labels.
+        """Return the true number of surface points of each part, from the scene's labels.
 
-        Without labels it is the answer on all of the surface. A part is present if it has at least one point.
+        If the scene has no labels, return the segmenter's answer for the whole surface. The answer's `target` is 1,
+        because a part with at least one point is present.
+
+        - `cloud`: points on the whole surface.
         """
         answer = dataclasses.replace(self.answer(cloud), target=1.0)
         labels = scene.part_labels(cloud.points)
@@ -144,10 +152,10 @@ class SoftPartCount(Utility):
 
 
 class PartAnswer(Answer):
-    """Number of points predicted for each part.
+    """Number of points that are predicted for each part.
 
     - `parts`: indices of the parts to show.
-    - `target`: N_target.
+    - `target`: N_target of `SoftPartCount`.
     """
 
     form: str = "{:.0f}"
@@ -166,6 +174,9 @@ def _counts(segmenter: Segmenter, cloud: PointCloud) -> Int[Array, " parts"]:
 
 
 def part_counts(p: Float[Array, "points parts"]) -> Int[Array, " parts"]:
-    """N_c = sum_i 1[argmax_c' p_ic' = c], points predicted for each part. Zero rows do not count."""
+    """Return the number of points predicted for each part, N_c = sum_i 1[argmax_c' p_ic' = c].
+
+    Rows of zeros do not count.
+    """
     predicted = jax.nn.one_hot(jnp.argmax(p, axis=1), p.shape[1], dtype=jnp.int32)
     return jnp.sum(jnp.where(jnp.any(p > 0, axis=1)[:, None], predicted, 0), axis=0)
