@@ -1,6 +1,6 @@
 """Categories and parts of ShapeNet-part (Yi et al. 2016), in the order of the published networks.
 
-The data set's files number the fifty parts without naming them. The names here are descriptions.
+The files of the data set only number the fifty parts. We chose the names of the parts here to describe them.
 """
 
 from typing import NamedTuple
@@ -12,7 +12,7 @@ from jaxnbv.checks import require
 
 
 class Category(NamedTuple):
-    """A category: its name, its folder in the data set, names of its parts, label of the first part."""
+    """A category: its name, its folder in the data set, the names of its parts, and the label of the first part."""
 
     name: str
     synset: str
@@ -21,7 +21,7 @@ class Category(NamedTuple):
 
     @property
     def labels(self) -> range:
-        """The labels of the parts, one for each name."""
+        """The labels of the parts, one for each name in `parts`."""
         return range(self.first_label, self.first_label + len(self.parts))
 
 
@@ -47,7 +47,7 @@ NUM_PARTS = 50
 
 
 def category_index(name: str) -> int:
-    """Index of a category in `CATEGORIES` and in the networks' one-hot input, by its name.
+    """Return the index of a category in `CATEGORIES` and in the networks' one-hot input, given its name.
 
     **Raises:** `ValueError` for an unknown name.
     """
@@ -57,5 +57,5 @@ def category_index(name: str) -> int:
 
 
 def part_mask() -> Bool[np.ndarray, "categories parts"]:
-    """Mask of the parts, out of fifty, that belong to each of the sixteen categories."""
+    """Return a mask: for each of the sixteen categories, the parts (out of fifty) that belong to the category."""
     return np.array([[label in category.labels for label in range(NUM_PARTS)] for category in CATEGORIES])

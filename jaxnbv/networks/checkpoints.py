@@ -1,7 +1,7 @@
-"""Networks in files: published PointNet++ checkpoints, and the files of jaxnbv's own networks.
+"""Files of networks: published PointNet++ checkpoints, and the files of jaxnbv's own networks.
 
-A file of a network of jaxnbv holds the arrays by attribute paths such as `pattern.pair.weight`. Its metadata hold the
-class of the network and the arguments of its constructor.
+A file of a network of jaxnbv holds the network's arrays. Their keys are attribute paths such as `pattern.pair.weight`.
+The metadata of the file hold the class of the network and the arguments of its constructor.
 """
 
 import functools
@@ -32,13 +32,14 @@ _KINDS: dict[str, type] = {kind.__name__: kind for kind in (InvariantClassifier,
 
 
 def load_checkpoint(path: str | Path) -> Network:
-    """The network in a PyTorch (.pth, .pt) or .safetensors file.
+    """Load the network in a PyTorch (.pth, .pt) or .safetensors file.
 
-    It is a classifier or a part segmenter: PointNet++ as published, or a network of jaxnbv from `save_checkpoint`.
-    Nothing in the file is run, and PyTorch is not needed. Wrap the network in `CloudClassifier` or `CloudSegmenter`.
+    The network is a classifier or a part segmenter: PointNet++ as published, or a network of jaxnbv that
+    `save_checkpoint` wrote. No code in the file is run, and PyTorch is not needed. Wrap the network in
+    `CloudClassifier` or `CloudSegmenter`.
 
-    **Raises:** `ValueError` for another suffix, for a file that is missing or damaged, and for tensors that do not fit
-    any of these networks.
+    **Raises:** `ValueError` if the file has a different suffix, is missing or damaged, or if its tensors fit none of
+    these networks.
     """
     tensors, metadata = _read(path)
     try:
@@ -53,7 +54,7 @@ def load_checkpoint(path: str | Path) -> Network:
 def save_checkpoint(network: OwnNetwork, path: str | Path) -> None:
     """Write a network of jaxnbv as a safetensors file.
 
-    **Raises:** `ValueError` for another network, or for a file that cannot be written.
+    **Raises:** `ValueError` if the network is not one of jaxnbv's own, or if the file cannot be written.
     """
     settings = network.settings if isinstance(network, InvariantClassifier) else {}
     metadata = {"network": json.dumps({"kind": type(network).__name__, **settings})}
@@ -62,7 +63,7 @@ def save_checkpoint(network: OwnNetwork, path: str | Path) -> None:
 
 
 def _read(path: str | Path) -> tuple[_Tensors, Mapping[str, str]]:
-    """Tensors by name, and metadata."""
+    """Read the tensors of a file, keyed by name, and its metadata."""
     suffix = Path(path).suffix
     require(
         suffix in (".pth", ".pt", ".safetensors"),
@@ -79,7 +80,7 @@ def _read(path: str | Path) -> tuple[_Tensors, Mapping[str, str]]:
 
 
 def _blank(text: str) -> Any:
-    """A network of jaxnbv with shapes in place of arrays, from the text in a file's metadata."""
+    """Make a network of jaxnbv with shapes in place of arrays, given the text in a file's metadata."""
     try:
         arguments = json.loads(text)
         kind = _KINDS[arguments.pop("kind")]
@@ -90,7 +91,7 @@ def _blank(text: str) -> Any:
 
 
 def _filled(blank: Any, arrays: _Tensors) -> Any:
-    """The network `blank` with these arrays in place of its shapes."""
+    """Return a copy of the network `blank` with these arrays in place of its shapes."""
     expected = {name: leaf.shape for name, leaf in _named(blank)}
     leaves: dict[str, np.ndarray] = {}
     for name in sorted(expected.keys() | arrays.keys()):

@@ -1,4 +1,4 @@
-"""Classifiers and segmenters of clouds from networks on arrays."""
+"""Classifiers and segmenters of clouds, made from networks on arrays."""
 
 from collections.abc import Callable
 
@@ -17,15 +17,15 @@ from jaxnbv.tasks.segmentation import Segmenter
 
 
 class CloudClassifier(Classifier):
-    """A classifier from a network: maps a `PointCloud` to log-probabilities.
+    """A classifier made from a network. It maps a `PointCloud` to log-probabilities.
 
     - `network`: called as `network(points, normals, mask)`.
-    - `num_points`: number of points of the network's input, by farthest point sampling. A smaller cloud is padded with
-      masked rows.
+    - `num_points`: number of points that the network gets, selected by farthest point sampling. A smaller cloud is padded
+      with masked rows.
     - `scale`: network units per scene unit.
-    - `classes`: names of the classes, by default the network's own, or None.
+    - `classes`: names of the classes, or None. By default the names that the network has, if any.
 
-    **Raises:** `ValueError` if `num_points` or `scale` is not positive, or for a network that segments parts.
+    **Raises:** `ValueError` if `num_points` or `scale` is not positive, or if the network segments parts.
     """
 
     network: Callable[..., Float[Array, " classes"]]
@@ -48,25 +48,25 @@ class CloudClassifier(Classifier):
         require(self.scale > 0, f"the scale is {self.scale}; it must be positive")
 
     def __call__(self, cloud: PointCloud) -> Float[Array, " classes"]:
-        """Log-probabilities of the classes of one cloud in scene coordinates."""
+        """Compute the log-probabilities of the classes of one cloud in scene coordinates."""
         inputs = farthest_point_subsample(cloud, self.num_points)
         return self.network(self.scale * inputs.points, inputs.normals, inputs.mask)
 
 
 class CloudSegmenter(Segmenter):
-    """A segmenter from a network: maps a `PointCloud` to probabilities of a category's parts by row.
+    """A segmenter made from a network. It maps a `PointCloud` to the part probabilities of each point.
 
-    Category and scale are arrays, so objects that differ in them share one compilation.
+    Category and scale are arrays, so objects of different category or scale use the same compiled program.
 
     - `network`: called as `network(points, normals, category, mask)`. It returns log-probabilities of the fifty parts
       of ShapeNet-part.
-    - `category`: category of the object, by its name or index in `CATEGORIES`.
-    - `num_points`: number of points of the network's input, by farthest point sampling. A smaller cloud is padded with
-      masked rows.
+    - `category`: category of the object, given as its name or as its index in `CATEGORIES`.
+    - `num_points`: number of points that the network gets, selected by farthest point sampling. A smaller cloud is padded
+      with masked rows.
     - `scale`: network units per scene unit.
 
-    **Raises:** `ValueError` for an unknown category, if `num_points` or `scale` is not positive, or for a network that
-    classifies.
+    **Raises:** `ValueError` for an unknown category, if `num_points` or `scale` is not positive, or if the network
+    classifies whole clouds.
     """
 
     network: Callable[..., Float[Array, "n parts"]]
@@ -99,19 +99,20 @@ class CloudSegmenter(Segmenter):
 
     @property
     def part_names(self) -> dict[int, str]:
-        """Names of the category's parts, by their index among the fifty."""
+        """Names of the category's parts, keyed by their index among the fifty parts."""
         category = CATEGORIES[int(self.category)]
         return dict(zip(category.labels, category.parts, strict=True))
 
     def __call__(self, cloud: PointCloud) -> Float[Array, "num_points parts"]:
-        """p(part) at the network's input points. Zero for parts of other categories and in masked rows.
+        """Compute p(part) at the network's input points.
 
-        These are the network's probabilities, conditioned on the parts of the category.
+        These are the network's probabilities, conditioned on the parts of the category. They are zero for parts of
+        other categories and in masked rows.
         """
         return self._probabilities(farthest_point_subsample(cloud, self.num_points))
 
     def predict(self, cloud: PointCloud) -> tuple[PointCloud, Int[Array, " num_points"]]:
-        """The network's input points in scene coordinates, and the likeliest part of each (-1 in masked rows)."""
+        """Return the network's input points in scene coordinates, and the most likely part of each."""
         inputs = farthest_point_subsample(cloud, self.num_points)
         labels = jnp.argmax(self._probabilities(inputs), axis=-1).astype(jnp.int32)
         return inputs, jnp.where(inputs.mask, labels, -1)

@@ -1,4 +1,4 @@
-"""Small rotation-invariant classifiers, on features of pairs of oriented points."""
+"""Small rotation-invariant classifiers, whose inputs are features of pairs of oriented points."""
 
 from typing import Any
 
@@ -17,15 +17,15 @@ _CENTERS, _CHOSEN = 384, 320
 
 
 class PairLevel(eqx.Module):
-    """One level of grouping: a perceptron of pair and neighbour features, then the maximum.
+    """One level of grouping: a perceptron on features of pairs and neighbours, then a maximum.
 
-    The maximum is over the neighbours in a group. The features of a pair of oriented points are
-    (|d|^2, n_i . d, n_j . d, n_i . n_j) with d = (x_j - x_i) / radius: the point-pair features of Drost et al. (2010)
-    without square root and arc cosines, so that derivatives exist everywhere.
+    The maximum is over the neighbours in the group of a centre. The features of a pair of oriented points are
+    (|d|^2, n_i . d, n_j . d, n_i . n_j) with d = (x_j - x_i) / radius. These are the point-pair features of Drost et
+    al. (2010) without the square root and the arc cosines, so derivatives exist everywhere.
 
     - `radius`: radius of a group, in the units of the points.
     - `groups`: intended number of centres, which the caller chooses.
-    - `neighbours`: maximum size of a group, the first rows within its radius.
+    - `neighbours`: maximum number of points in a group. If more are within the radius, the first rows are used.
     """
 
     pair: eqx.nn.Linear
@@ -50,9 +50,9 @@ class PairLevel(eqx.Module):
         neighbourhood: tuple[Float[Array, "n 3"], Float[Array, "n 3"], Float[Array, "n inputs"] | None],
         mask: Bool[Array, " n"],
     ) -> Float[Array, "m outputs"]:
-        """Features of each centre.
+        """Compute the features of each centre.
 
-        - `centers`: points and normals of the centres.
+        - `centers`: positions and normals of the centres.
         - `neighbourhood`: points, normals and features of all rows.
         """
         points, normals, features = neighbourhood
@@ -62,23 +62,23 @@ class PairLevel(eqx.Module):
         pairs = jnp.stack([jnp.sum(a * b, axis=-1) for a, b in ((d, d), (here, d), (there, d), (here, there))], axis=-1)
         hidden = _affine(self.pair, pairs.reshape(-1, 4))
         if self.feature is not None and features is not None:
-            # The map is linear, so it is computed once for each point and not for each pair.
+            # The map is linear, so compute it once per point and not once per pair.
             hidden = hidden + product(features, self.feature.weight.T)[index].reshape(hidden.shape)
         output = _affine(self.output, jax.nn.relu(hidden))
         return jax.nn.relu(jnp.max(output.reshape(*index.shape, -1), axis=1))
 
 
 def _affine(layer: Any, rows: Float[Array, "*rows inputs"]) -> Float[Array, "*rows outputs"]:
-    """A linear layer, applied to all rows."""
+    """Apply a linear layer to all rows."""
     return product(rows, layer.weight.T) + layer.bias
 
 
 class Focus(eqx.Module):
-    """Network that tells which points are on the cue of the class.
+    """A network that finds the cue: the points of an object that determine its class, such as a truck's cargo.
 
-    It is invariant under rotations and translations. It computes features of each point's edges, groups them around
-    farthest point samples, interpolates these back to the points, and applies a perceptron to both. It has about 12,000
-    parameters.
+    The network is invariant under rotations and translations. It computes features of each point's neighbourhood and
+    groups them around farthest point samples. It interpolates the features of the groups back to the points, and
+    applies a perceptron to both kinds of features. It has about 12,000 parameters.
     """
 
     edge: PairLevel
@@ -94,7 +94,7 @@ class Focus(eqx.Module):
     def __call__(
         self, points: Float[Array, "n 3"], normals: Float[Array, "n 3"], mask: Bool[Array, " n"]
     ) -> Float[Array, " n"]:
-        """Log-odds that each point is on the cue. Meaningless in masked rows."""
+        """Compute the log-odds that each point is on the cue. The values of masked rows have no meaning."""
         edges = self.edge((points, normals), (points, normals, None), mask)
         order = farthest_point_indices(points, mask, self.around.groups)
         around = self.around((points[order], normals[order]), (points, normals, edges), mask)
@@ -105,9 +105,10 @@ class Focus(eqx.Module):
     def select(
         self, points: Float[Array, "n 3"], normals: Float[Array, "n 3"], mask: Bool[Array, " n"]
     ) -> tuple[Float[Array, "few 3"], Float[Array, "few 3"], Bool[Array, " few"]]:
-        """The first 320 points that are on the cue by better than even odds, with their normals and mask.
+        """Select the first 320 points with a probability above 0.5 to be on the cue.
 
-        Points in farthest point order give farthest point samples of the cue.
+        Returns the points, their normals and their mask. If the points are in farthest point order, the selected points
+        are farthest point samples of the cue.
         """
         on_cue = mask & (self(points, normals, mask) > 0.0)
         index = jnp.argsort(~on_cue, stable=True)[:_CHOSEN]
@@ -117,17 +118,18 @@ class Focus(eqx.Module):
 class InvariantClassifier(eqx.Module):
     """PointNet++ on point-pair features, which are invariant under rotations and translations.
 
-    It has two levels of grouping, at the scale of an edge and of a pattern, a maximum over all groups, and about 75,000
-    parameters.
+    The network has two levels of grouping (the first at the scale of an edge, the second at the scale of a pattern), a
+    maximum over all groups, and about 75,000 parameters.
 
     - `num_classes`: number of classes.
     - `radii`: radii of the two levels, in the units of the points.
     - `classes`: names of the classes, or None.
-    - `groups`: number of groups of each level. More groups show smaller details.
-    - `focused`: whether it only gets the points that its `focus` chooses.
-    - `temperature`: divides the logits. Above 1 it makes an over-confident network more careful (Guo et al. 2017).
+    - `groups`: number of groups of each level. With more groups the network can use smaller details.
+    - `focused`: whether a `Focus` first selects the points that the classifier gets.
+    - `temperature`: number that divides the logits. A value above 1 makes an overconfident network less confident (Guo
+      et al. 2017).
 
-    **Raises:** `ValueError` if the number of names is not that of the classes, a radius is not positive, or the second
+    **Raises:** `ValueError` if the number of names is not `num_classes`, if a radius is not positive, or if the second
     level has more groups than the first.
     """
 
@@ -176,11 +178,11 @@ class InvariantClassifier(eqx.Module):
     def __call__(
         self, points: Float[Array, "n 3"], normals: Float[Array, "n 3"], mask: Bool[Array, " n"] | None = None
     ) -> Float[Array, " classes"]:
-        """Log-probabilities of the classes. Normals must have length one. Masked rows are ignored."""
+        """Compute the log-probabilities of the classes. Normals must have length one. Masked rows are ignored."""
         mask = jnp.ones(len(points), bool) if mask is None else mask
         if self.focus is not None:
             points, normals, mask = self.focus.select(points, normals, mask)
-        # The first rows in farthest point order are farthest point samples themselves.
+        # The first rows in farthest point order are themselves farthest point samples, so use them as coarse centres.
         order = farthest_point_indices(points, mask, self.edge.groups)
         centers = points[order], normals[order]
         edges = self.edge(centers, (points, normals, None), mask)

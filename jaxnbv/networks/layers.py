@@ -4,11 +4,11 @@ Set abstraction maps points with features to fewer points,
 
     g_i = max over j in the ball of c_i of MLP(x_j - c_i, f_j),   c_i by farthest point sampling,
 
-with one MLP for each radius and their outputs concatenated. Feature propagation maps back to more points,
+with one MLP per radius. The outputs of these MLPs are concatenated. Feature propagation maps back to more points,
 
     f(x) = sum_j w_j f_j / sum_j w_j,   w_j = 1 / (|x - y_j|^2 + 1e-8),   over the three nearest y_j.
 
-Weights are for inference: batch normalisation is then a fixed affine map, and is folded into the layer before it.
+Weights are for inference: batch normalisation is then a fixed affine map, and is merged into the layer before it.
 """
 
 import functools
@@ -23,60 +23,61 @@ from jaxnbv.geometry.farthest_points import farthest_point_indices
 
 _WORD = 32
 _NEIGHBOURS = 3
-# Keeps the weight finite if a point and a coarse point coincide. The published number, in squared units of the points.
+# Keeps the weight finite if a point and a coarse point coincide. In squared units of the points, as published.
 _SOFTENING = 1e-8
 
 
 def product(x: Float[Array, "*rows inputs"], weight: Float[Array, "inputs outputs"]) -> Float[Array, "*rows outputs"]:
-    """x W in full precision, as one matrix product for all rows."""
+    """Return x W in full precision, computed as one matrix product for all rows."""
     flat = jnp.matmul(x.reshape(-1, x.shape[-1]), weight, precision="highest")
     return flat.reshape(*x.shape[:-1], weight.shape[1])
 
 
 class Linear(eqx.Module):
-    """x W + b in full precision.
+    """A linear layer, x W + b, in full precision.
 
-    - `weight`: W, inputs by outputs.
-    - `bias`: b.
+    - `weight`: the matrix W.
+    - `bias`: the vector b.
     """
 
     weight: Float[Array, "inputs outputs"]
     bias: Float[Array, " outputs"]
 
     def __call__(self, x: Float[Array, "*rows inputs"]) -> Float[Array, "*rows outputs"]:
-        """x W + b, row by row."""
+        """Return x W + b for each row of `x`."""
         return product(x, self.weight) + self.bias
 
 
 class PooledMLP(eqx.Module):
-    """PointNet: a perceptron shared by all members of a group, then the maximum over the group.
+    """PointNet: applies the same perceptron to all members of a group, then takes the maximum over the group.
 
-    - `layers`: two or more, each followed by a rectifier. The first three inputs of the first layer are coordinates.
+    - `layers`: two or more layers, each followed by a rectifier. The first three inputs of the first layer are
+      coordinates.
     """
 
     layers: tuple[Linear, ...]
 
     def lift(self, points: Float[Array, "n 3"], features: Float[Array, "n inputs"] | None) -> Float[Array, "n outputs"]:
-        """[x, f] W of the first layer without bias. It is linear, so it is computed once for all groups."""
+        """Return [x, f] W of the first layer, without bias. Computed once, as it is the same for all groups."""
         inputs = points if features is None else jnp.concatenate([points, features], axis=-1)
         return product(inputs, self.layers[0].weight)
 
     def pool(self, lifted: Float[Array, "*groups members inputs"]) -> Float[Array, "*groups outputs"]:
-        """The rest after the first product: rectifiers, the other layers and the maximum over the members."""
+        """Apply everything after `lift`: first bias and rectifier, the other layers, maximum over the members."""
         hidden = jax.nn.relu(lifted + self.layers[0].bias)
         for layer in self.layers[1:-1]:
             hidden = jax.nn.relu(layer(hidden))
-        # max relu(x + b) = relu(max x + b): apply the last bias and rectifier once for each group.
+        # max relu(x + b) = relu(max x + b), so apply the last bias and rectifier once per group.
         last = self.layers[-1]
         return jax.nn.relu(jnp.max(product(hidden, last.weight), axis=-2) + last.bias)
 
 
 class SetAbstraction(eqx.Module):
-    """One level of PointNet++, with a perceptron for each radius.
+    """One level of PointNet++, with one perceptron per radius.
 
     - `branches`: the perceptron of each radius.
     - `radii`: radii of the balls, in units of the points.
-    - `members`: number of rows in each ball's group.
+    - `members`: for each radius, the number of points in a group.
     - `centers`: number of centres.
     """
 
@@ -88,7 +89,7 @@ class SetAbstraction(eqx.Module):
     def __call__(
         self, points: Float[Array, "n 3"], features: Float[Array, "n inputs"] | None, mask: Bool[Array, " n"]
     ) -> tuple[Float[Array, "centers 3"], Float[Array, "centers outputs"]]:
-        """The centres, repeated if there are fewer points, and the features around each."""
+        """Return the centres and the features around each centre. Centres repeat if the cloud has fewer points."""
         centers = points[farthest_point_indices(points, mask, self.centers)]
         outputs = []
         for branch, radius, members in zip(self.branches, self.radii, self.members, strict=True):
@@ -100,10 +101,10 @@ class SetAbstraction(eqx.Module):
 
 
 class FeaturePropagation(eqx.Module):
-    """One level of feature propagation: interpolation, then a perceptron shared by all points.
+    """One level of feature propagation: interpolation, then the same perceptron for all points.
 
-    - `layers`: each followed by a rectifier. Inputs of the first layer are the point's own features, then the
-      interpolated ones.
+    - `layers`: the layers, each followed by a rectifier. Inputs of the first layer are the point's own features, then
+      the interpolated features.
     """
 
     layers: tuple[Linear, ...]
@@ -115,9 +116,9 @@ class FeaturePropagation(eqx.Module):
         own: Float[Array, "n inputs"],
         features: Float[Array, "m f"],
     ) -> Float[Array, "n outputs"]:
-        """Features of the points, from their own features and those of the coarse points."""
+        """Compute new features of the points, given their own features and the features of the coarse points."""
         first = self.layers[0]
-        # Interpolation is linear, so take the first product at the coarse points, which are fewer.
+        # Interpolation is linear, so compute the first product at the coarse points. There are fewer coarse points.
         lifted = interpolate(points, coarse, product(features, first.weight[own.shape[1] :]))
         x = jax.nn.relu(product(own, first.weight[: own.shape[1]]) + lifted + first.bias)
         for layer in self.layers[1:]:
@@ -133,10 +134,11 @@ def ball_query(
     radius: float | Float[Array, ""],
     count: int,
 ) -> Int[Array, "m count"]:
-    """Indices of the first `count` rows within `radius` of each centre, padded by the first of them.
+    """Return the indices of the first `count` rows within `radius` of each centre.
 
-    A point at exactly `radius` counts. A centre without any point gets the first filled row. Indices carry no
-    derivative, but `points[index]` does.
+    If a ball has fewer points, the first index is repeated. A point at exactly `radius` is in the ball. If a ball has
+    no point, all of its indices are those of the first valid row. Indices have no derivative, but `points[index]` is
+    differentiable.
 
     **Raises:** `ValueError` if `count` < 1.
     """
@@ -149,10 +151,11 @@ def ball_query(
 
 
 def _positions_of_true(flags: Bool[Array, "m n"], count: int) -> Int[Array, "m count"]:
-    """Columns of the first `count` true entries of each row, padded by values of at least n.
+    """Return the columns of the first `count` true entries of each row.
 
-    The row is packed into words of 32 bits. Bit counts of the words give the word of the k-th entry, and five halvings
-    of the word give its bit. This takes one pass over the flags, while sorting the columns takes many.
+    If a row has fewer true entries, the remaining columns are at least n. Each row is packed into words of 32 bits. Bit
+    counts of the words determine the word that holds the k-th true entry, and five bisections of this word determine
+    the bit. This takes one pass over the flags. Sorting the columns would take many passes.
     """
     flags = jnp.pad(flags, ((0, 0), (0, -flags.shape[1] % _WORD))).reshape(len(flags), -1, _WORD)
     bit = jnp.left_shift(jnp.uint32(1), jnp.arange(_WORD, dtype=jnp.uint32))
@@ -180,10 +183,10 @@ def _bit_count(words):
 def interpolate(
     points: Float[Array, "n 3"], coarse: Float[Array, "m 3"], features: Float[Array, "m f"]
 ) -> Float[Array, "n f"]:
-    """Features at each point, interpolated from the three nearest coarse points (or all, if fewer).
+    """Interpolate features at each point from the three nearest coarse points (or all, if there are fewer).
 
-    Weights are inverse squared distances. Differentiable in features, points and coarse points, with the choice of
-    neighbours held fixed.
+    Weights are inverse squared distances. The result is differentiable in features, points and coarse points. The
+    derivative ignores changes of the nearest points.
     """
     index, is_valid = _nearest(points, coarse)
     squared = jnp.sum((points[:, None] - coarse[index]) ** 2, axis=-1)
@@ -193,9 +196,9 @@ def interpolate(
 
 
 def _nearest(points: Float[Array, "n 3"], coarse: Float[Array, "m 3"]) -> tuple[Int[Array, "n 3"], Bool[Array, "n 3"]]:
-    """Rows of the three nearest coarse points, and whether each of the three exists.
+    """Return the rows of the three nearest coarse points of each point, and whether each of the three exists.
 
-    It loops over the coarse points and keeps the three best. On a CPU this is two to three times as fast as
+    Loops over the coarse points and keeps the three nearest. On a CPU this is two to three times as fast as
     `jax.lax.top_k`.
     """
     points, coarse = jax.lax.stop_gradient((points, coarse))

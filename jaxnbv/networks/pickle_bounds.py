@@ -1,4 +1,4 @@
-"""Checks of a pickle before it is read: bounds on its memory and on its nesting."""
+"""Checks the memory and the nesting depth of a pickle before the pickle is loaded."""
 
 import mmap
 import pickletools
@@ -9,22 +9,22 @@ from typing import Any
 from jaxnbv.checks import require
 
 _PUTS, _GETS = ("PUT", "BINPUT", "LONG_BINPUT"), ("GET", "BINGET", "LONG_BINGET")
-# Operations that change the first object that they take off the stack.
+# Operations that modify the first object that they take from the stack and put this object back.
 _CHANGES = ("APPEND", "APPENDS", "SETITEM", "SETITEMS", "ADDITEMS", "BUILD")
-# Python hashes nested tuples by recursion without a limit.
+# Python hashes nested tuples by recursion without a depth limit, which could overflow the C stack.
 _DEEPEST = 500
 
 
 def skip_pickle(file: BytesIO | mmap.mmap, size: int) -> None:
-    """Move a file past its next pickle without creating the objects.
+    """Check the next pickle in a file and move the file past it, without creating the pickle's objects.
 
     - `size`: size of the file in bytes.
 
-    **Raises:** `ValueError` for a pickle that is damaged, asks for more memory than a file of this size can fill, or
-    nests too deep.
+    **Raises:** `ValueError` if the pickle is damaged, needs more memory than a file of this size can fill, or is nested
+    too deeply.
     """
     start = file.tell()
-    # Nesting depth of each object on the stack.
+    # Nesting depth of each object on the unpickler's stack.
     stack: list[int] = []
     marks: list[int] = []
     memo: dict[int, int] = {}

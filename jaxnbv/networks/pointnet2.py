@@ -1,7 +1,7 @@
 """PointNet++ classifier and part segmenter (Qi et al. 2017), and a small part segmenter.
 
-PointNet++ is in inference mode. The small segmenter has similar layers, and is fast enough for hundreds of imagined
-scans in each step.
+The PointNet++ networks are for inference only. The small segmenter has similar layers, and is fast enough for hundreds
+of imagined scans in each step.
 """
 
 import itertools
@@ -18,7 +18,7 @@ from jaxnbv.networks.layers import FeaturePropagation, Linear, PooledMLP, SetAbs
 
 
 class Level(NamedTuple):
-    """Sizes of a set abstraction: number of centres, radii of balls, number of rows in each group."""
+    """Sizes of a set abstraction: number of centres, radii of the balls, and, for each radius, the group size."""
 
     centers: int
     radii: tuple[float, ...]
@@ -35,7 +35,7 @@ PARTS_SCALES = SINGLE_SCALE, (Level(512, (0.1, 0.2, 0.4), (32, 64, 128)), Level(
 def _filled(
     points: Float[Array, "n 3"], normals: Float[Array, "n 3"], mask: Bool[Array, " n"] | None
 ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Bool[Array, " n"]]:
-    """Points and normals with zeros in masked rows, and the mask."""
+    """Return points and normals with zeros in masked rows, and the mask."""
     require(
         points.ndim == 2 and points.shape[1] == 3 and points.shape[0] > 0 and normals.shape == points.shape,
         f"points and normals must both be (n, 3) with n > 0, got {points.shape} and {normals.shape}: "
@@ -46,7 +46,7 @@ def _filled(
 
 
 def _down(network: Any, rows: Any, mask: Bool[Array, " n"]) -> tuple[list[Any], Float[Array, " outputs"]]:
-    """Centres and features of each level of a network, and the features of the whole cloud.
+    """Compute the centres and features of each level of a network, and the features of the whole cloud.
 
     - `rows`: points and their features.
     """
@@ -61,14 +61,15 @@ def _down(network: Any, rows: Any, mask: Bool[Array, " n"]) -> tuple[list[Any], 
 class PointNet2Classifier(eqx.Module):
     """Classifier of a cloud: set abstractions, a PointNet over the last centres, and a perceptron.
 
-    Expects the object centred and inside the unit sphere, as in training. For many clouds use `vmap` or `lax.map`. On
-    a CPU the latter is two to three times as fast, since the features of one cloud stay in the cache. Reverse-mode
-    differentiable in points and normals, with the sampling and grouping of points held fixed.
+    The object must be centred and inside the unit sphere, as in training. For many clouds use `vmap` or `lax.map`. On a
+    CPU `lax.map` is two to three times as fast, since the features of one cloud stay in the cache. The result is
+    reverse-mode differentiable in points and normals. The derivative ignores changes in the sampling and grouping of
+    points.
 
     - `levels`: the set abstractions.
     - `whole`: the PointNet over the last level's centres, coordinates and features.
     - `hidden`: layers of the perceptron, each followed by a rectifier.
-    - `last`: its last layer, with one output for each class.
+    - `last`: last layer of the perceptron, with one output for each class.
     """
 
     levels: tuple[SetAbstraction, ...]
@@ -84,10 +85,11 @@ class PointNet2Classifier(eqx.Module):
     def __call__(
         self, points: Float[Array, "n 3"], normals: Float[Array, "n 3"], mask: Bool[Array, " n"] | None = None
     ) -> Float[Array, " classes"]:
-        """log p(class) of one cloud. All rows are points if `mask` is None.
+        """Compute log p(class) of one cloud. All rows are points if `mask` is None.
 
-        Masked rows have no influence. The order of the others has: the first row is the first centre, and crowded balls
-        keep their first rows only. A cloud without points is treated as one point at the origin.
+        Masked rows do not affect the result. The order of the other rows does: the first row is the first centre, and a
+        ball with too many points keeps only its first rows. A cloud without points is treated as one point at the
+        origin.
 
         **Raises:** `ValueError` if points and normals are not both (n, 3), or there are no rows.
         """
@@ -101,15 +103,16 @@ class PointNet2Classifier(eqx.Module):
 class PointNet2PartSegmenter(eqx.Module):
     """Part segmenter of a cloud for an object of known category.
 
-    Set abstractions reduce the cloud to one vector, feature propagations lead back to the points, and a perceptron
-    follows. Expects the object centred and inside the unit sphere, as in training. Reverse-mode differentiable in
-    points and normals, with the sampling, grouping and neighbours of points held fixed.
+    Set abstractions reduce the cloud to one vector, feature propagations interpolate back to the points, and a
+    perceptron follows. The object must be centred and inside the unit sphere, as in training. The result is
+    reverse-mode differentiable in points and normals. The derivative ignores changes in the sampling, grouping and
+    neighbours of points.
 
     - `levels`: the set abstractions.
     - `whole`: the PointNet over the last level's centres, coordinates and features.
     - `propagations`: the feature propagations, the coarsest level first.
-    - `hidden`: the perceptron's first layer, followed by a rectifier.
-    - `last`: its last layer, with one output for each part.
+    - `hidden`: first layer of the perceptron, followed by a rectifier.
+    - `last`: last layer of the perceptron, with one output for each part.
     """
 
     levels: tuple[SetAbstraction, ...]
@@ -137,10 +140,11 @@ class PointNet2PartSegmenter(eqx.Module):
         category: int | Int[AnyArray, ""],
         mask: Bool[Array, " n"] | None = None,
     ) -> Float[Array, "n parts"]:
-        """log p(part) at each point, over the parts of all categories. The values of masked rows mean nothing.
+        """Compute log p(part) at each point, over the parts of all categories.
 
-        Masked rows have no influence on the others. The order of the others has: the first row is the first centre, and
-        crowded balls keep their first rows only.
+        Masked rows do not affect the other rows, and the values of masked rows have no meaning. The order of the other
+        rows affects the result: the first row is the first centre, and a ball with too many points keeps only its first
+        rows.
 
         - `category`: index of the category, which may be traced.
 
@@ -153,7 +157,8 @@ class PointNet2PartSegmenter(eqx.Module):
             is_traced(category) or 0 <= int(category) < count,
             f"the category is {category}; the network has 0 to {count - 1}",
         )
-        # The published network also has the coordinates as features, in addition to those relative to a ball's centre.
+        # The published network has the coordinates as features, in addition to the coordinates relative to a ball's
+        # centre.
         features = jnp.concatenate([points, normals], axis=-1) if self.uses_normals else points
         one_hot = jnp.broadcast_to(jax.nn.one_hot(category, count, dtype=points.dtype), (len(points), count))
         levels, x = _down(self, (points, features), mask)
@@ -165,11 +170,11 @@ class PointNet2PartSegmenter(eqx.Module):
 
 
 class CompactPartSegmenter(eqx.Module):
-    """Small part segmenter: two set abstractions, a maximum over all points, three propagations.
+    """Small part segmenter: two set abstractions, a PointNet over all centres, and three propagations.
 
-    It has about 100,000 parameters. It expects oriented points of upright objects that face one way, as in ShapeNet,
-    since absolute coordinates are features too. Reverse-mode differentiable in points and normals, with the sampling
-    and grouping of points held fixed.
+    The segmenter has about 100,000 parameters. Absolute coordinates are features too, so all objects must be upright
+    and face the direction of ShapeNet's objects. Points need normals. The result is reverse-mode differentiable in
+    points and normals. The derivative ignores changes in the sampling and grouping of points.
     """
 
     fine: SetAbstraction
@@ -197,12 +202,12 @@ class CompactPartSegmenter(eqx.Module):
         category: Int[Array, ""] | int,
         mask: Bool[Array, " n"] | None = None,
     ) -> Float[Array, "n parts"]:
-        """Log-probabilities of the fifty parts at each point.
+        """Compute the log-probabilities of the fifty parts at each point.
 
-        - `points`: in units in which the object's longest side is 2.
-        - `normals`: of length one.
+        - `points`: points in units in which the object's longest side is 2.
+        - `normals`: normals of length one.
         - `category`: index of the object's category in `CATEGORIES`.
-        - `mask`: masked rows have no influence, and their values mean nothing.
+        - `mask`: False for rows to ignore. The values of these rows have no meaning.
         """
         mask = jnp.ones(len(points), bool) if mask is None else mask
         own = jnp.where(mask[:, None], jnp.concatenate([points, normals], axis=-1), 0.0)
@@ -218,6 +223,6 @@ class CompactPartSegmenter(eqx.Module):
 
 
 def _layers(keys: Any, *widths: int) -> tuple[Linear, ...]:
-    """Layers of these widths with initial weights by He et al. (2015)."""
+    """Make layers of these widths with random initial weights, as in He et al. (2015)."""
     normal = jax.nn.initializers.he_normal()
     return tuple(Linear(normal(next(keys), pair), jnp.zeros(pair[1])) for pair in itertools.pairwise(widths))

@@ -1,4 +1,4 @@
-"""Shipped networks. `scripts/train_classifier.py` and `scripts/train_parts.py` make their weights."""
+"""The shipped networks. `scripts/train_classifier.py` and `scripts/train_parts.py` train them."""
 
 from importlib import resources
 
@@ -9,21 +9,22 @@ from jaxnbv.networks.invariant import InvariantClassifier
 
 # Longest side of the box of a training object, in scene units.
 TRAINED_SIDE = 2.5
-# Number of points of a cloud in the training of each classifier.
+# Number of points of each training cloud, for each classifier.
 TRAINED_POINTS = {"pyramid": 1024, "truck": 2048, "household": 1024}
 
 
 def pretrained_classifier(
     name: str, longest_side: float = TRAINED_SIDE, num_points: int | None = None
 ) -> CloudClassifier:
-    """The shipped classifier for a kind of procedural scenes.
+    """Load the shipped classifier for one kind of procedural scenes.
 
     - `name`: "pyramid", "truck" or "household".
     - `longest_side`: longest side of the object's box, in scene units.
-    - `num_points`: number of its input points, by default that of its training. Half as many make it twice as fast and
-      a little less accurate.
+    - `num_points`: number of input points, by default the number used in training. With half as many points the
+      classifier is twice as fast and a little less accurate.
 
-    **Raises:** `ValueError` for another name, or if `longest_side` or `num_points` is not positive.
+    **Raises:** `ValueError` if there is no classifier with this name, or if `longest_side` or `num_points` is not
+    positive.
     """
     names = ", ".join(TRAINED_POINTS)
     require(name in TRAINED_POINTS, f"there is no shipped classifier {name!r}: choose from {names}, or load your own")
@@ -33,10 +34,11 @@ def pretrained_classifier(
 
 
 def part_segmenter(category: str | int, num_points: int = 2048, longest_side: float = TRAINED_SIDE) -> CloudSegmenter:
-    """The shipped part segmenter for a category of procedural objects.
+    """Load the shipped part segmenter for a category of procedural objects.
 
-    It was trained on partial views of upright objects that face one way, with a longest side of 2.5. The categories
-    cap, car and knife were not in its training, so do not rely on its results for them.
+    The segmenter was trained on partial views of upright objects with a longest side of 2.5. All objects of a category
+    faced the same direction. The categories cap, car and knife were not in the training set, so results for these
+    categories are not reliable.
 
     - `longest_side`: longest side of the object's box, in scene units.
 
@@ -47,10 +49,12 @@ def part_segmenter(category: str | int, num_points: int = 2048, longest_side: fl
 
 
 def network_scale(network: Network, longest_side: float = TRAINED_SIDE) -> float:
-    """Network units per scene unit, for an object with a box of this longest side in scene units.
+    """Return the number of network units per scene unit.
 
-    `InvariantClassifier` expects objects of longest side 2.5. The other networks expect objects that fill the unit
-    sphere or its box.
+    `InvariantClassifier` expects objects with a longest side of 2.5. The other networks expect objects that fill the
+    unit sphere or its bounding box.
+
+    - `longest_side`: longest side of the object's box, in scene units.
 
     **Raises:** `ValueError` if `longest_side` is not positive.
     """

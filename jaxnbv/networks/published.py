@@ -1,4 +1,4 @@
-"""Networks from the tensors of the widely used PyTorch PointNet++. The names of these are:
+"""Makes networks from the tensors of the widely used PyTorch code of PointNet++. The names of the tensors are:
 
     sa1, sa2     mlp_convs.<layer>, mlp_bns.<layer>              one radius
                  conv_blocks.<radius>.<layer>, bn_blocks. ...    several radii
@@ -7,9 +7,9 @@
     fp3, fp2, fp1    mlp_convs.<layer>, mlp_bns.<layer>          the part segmenter's feature propagations
     conv1, bn1, conv2                                            its perceptron
 
-Channels, layers, classes, parts and the use of normals follow from the shapes. The radii are those published for one
-radius or for several. Weights have inference form, W' = W g / sqrt(v + eps), b' = (b - m) g / sqrt(v + eps) + h, with
-scale g, shift h, running mean m and running variance v of the batch normalisation.
+The shapes of the tensors determine the channels, layers, classes, parts and the use of normals. The radii are the
+published ones, for networks with one radius per level or with several. Batch normalisation is merged into the weights,
+W' = W g / sqrt(v + eps), b' = (b - m) g / sqrt(v + eps) + h, with scale g, shift h, running mean m, running variance v.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,9 +27,10 @@ _EPSILON = 1e-5
 
 
 def published_network(tensors: Tensors) -> PointNet2Classifier | PointNet2PartSegmenter:
-    """The network with these tensors: a part segmenter if there are propagations, else a classifier.
+    """Make the network of these tensors: a part segmenter if there are propagations, else a classifier.
 
-    **Raises:** `ValueError` with the name of a tensor that is missing, unexpected or not finite, or has a wrong shape.
+    **Raises:** `ValueError` if a tensor is missing, unexpected or not finite, or has a wrong shape. The error names the
+    tensor.
     """
     state = _State(tensors)
     segments = any(name.startswith("fp") for name in tensors)
@@ -49,7 +50,8 @@ def _part_segmenter(state: "_State") -> PointNet2PartSegmenter:
     levels, whole, widths = _encoder(state, PARTS_SCALES, {6: "points", 9: "with normals"})
     width = _width(whole.layers)
     propagations = []
-    # The last one's own inputs: one for each category, the coordinates, and the points' features.
+    # The point's own inputs of the last propagation are one input per category, the coordinates, and the point's
+    # features.
     for number, own in ((3, widths[2]), (2, widths[1]), (1, None)):
         layers = state.layers(f"fp{number}.mlp_convs", None if own is None else own + width)
         propagations.append(FeaturePropagation(layers))
@@ -65,9 +67,11 @@ def _part_segmenter(state: "_State") -> PointNet2PartSegmenter:
 def _encoder(
     state: "_State", scales: tuple[tuple[Level, ...], tuple[Level, ...]], kinds: dict[int, str]
 ) -> tuple[tuple[SetAbstraction, ...], PooledMLP, list[int]]:
-    """The set abstractions, the PointNet over all points, and numbers of features of the points and of each level.
+    """Make the set abstractions and the PointNet over all points, and return the numbers of features too.
 
-    - `kinds`: allowed numbers of inputs, each with its meaning.
+    The numbers of features are those of the points, then of each level.
+
+    - `kinds`: allowed numbers of inputs, and the meaning of each.
     """
     multi = "sa1.conv_blocks.0.0.weight" in state.tensors
     first = "sa1.conv_blocks.0.0.weight" if multi else "sa1.mlp_convs.0.weight"
@@ -84,14 +88,14 @@ def _encoder(
 
 
 class _State:
-    """Tensors by name, with checks of their shapes. `left` has the names of the tensors that have not been used."""
+    """Tensors keyed by name, with checks of their shapes. `left` has the names of the tensors not used so far."""
 
     def __init__(self, tensors: Tensors):
         self.tensors = {name: array for name, array in tensors.items() if not name.endswith("num_batches_tracked")}
         self.left = set(self.tensors)
 
     def take(self, name: str, *shape: int | None) -> np.ndarray:
-        """The tensor as float64. Its shape must be `shape`, where None is any length, possibly followed by 1s."""
+        """Return a tensor as float64. Its shape must be `shape`, where None is any length, possibly followed by 1s."""
         require(name in self.tensors, f"the tensor {name} is missing")
         actual = self.tensors[name].shape
         fits = len(actual) >= len(shape) and all(a in (None, b) for a, b in zip(shape, actual, strict=False))
@@ -103,9 +107,9 @@ class _State:
         return np.asarray(self.tensors[name], dtype=np.float64).reshape(actual[: len(shape)])
 
     def linear(self, name: str, inputs: int | None, norm: str | None = None, roll: bool = False) -> Linear:
-        """A layer, with the batch normalisation `norm` after it folded in.
+        """Make a layer and merge the batch normalisation `norm` that follows it into the layer.
 
-        - `roll`: move the coordinates from the last inputs to the first.
+        - `roll`: whether to move the coordinates from the last inputs to the first.
         """
         weight = self.take(f"{name}.weight", None, inputs).T
         outputs = weight.shape[1]
@@ -124,7 +128,7 @@ class _State:
         return Linear(*map(jnp.asarray, arrays))
 
     def layers(self, name: str, inputs: int | None, roll: bool = False) -> tuple[Linear, ...]:
-        """The layers <name>.0, <name>.1, ..., each with its batch normalisation folded in."""
+        """Make the layers <name>.0, <name>.1, ..., with the batch normalisation after each layer merged into it."""
         norm = name.replace("mlp_convs", "mlp_bns").replace("conv_blocks", "bn_blocks")
         layers: list[Linear] = []
         while not layers or f"{name}.{len(layers)}.weight" in self.tensors:
@@ -134,7 +138,7 @@ class _State:
         return tuple(layers)
 
     def pooled(self, name: str, inputs: int, roll: bool = False) -> PooledMLP:
-        """The layers of `layers` as a PointNet."""
+        """Make a PointNet of the layers that `layers` returns."""
         layers = self.layers(name, inputs, roll)
         require(len(layers) > 1, f"{name} has one layer only; two or more are needed")
         return PooledMLP(layers)

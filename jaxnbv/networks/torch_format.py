@@ -1,7 +1,7 @@
 """Reads the tensors of a PyTorch file, without PyTorch and without running code from the file.
 
-A `.pth` file is a pickle, which is a program, together with the raw bytes of its arrays. Only the pickle's names of
-tensors and dictionaries have a meaning here. Any other name resolves to an object that does nothing, and nothing is
+A `.pth` file holds a pickle, which is a program, and the raw bytes of the arrays. This reader knows only the names that
+a pickle needs for tensors and dictionaries. Any other name resolves to an object that does nothing, and nothing is
 imported. Two layouts are supported: the zip archive since PyTorch 1.6 (`data.pkl`, `data/0`, `data/1`, ...), and the
 older stream of pickles followed by the arrays.
 """
@@ -24,7 +24,7 @@ import numpy as np
 from jaxnbv.checks import InputError, require
 from jaxnbv.networks.pickle_bounds import skip_pickle
 
-# Names and not types, since a pickle could modify the objects that it gets, but not text.
+# Values are names of types, not types, since a pickle could modify a type, but cannot modify a string.
 _TYPES = {
     "DoubleStorage": "float64",
     "FloatStorage": "float32",
@@ -39,17 +39,17 @@ _TYPES = {
 }
 _STREAM_MAGIC = 0x1950A86A20F9469CFC6C
 _STATE_NAMES = ("model_state_dict", "state_dict")
-# Loads a storage by its key, type and number of entries.
+# Loads a storage, given its key, type and number of entries.
 _Load = Callable[[str, str, int], np.ndarray]
 
 
 def read_torch_tensors(path: str | Path) -> dict[str, np.ndarray]:
-    """The model's tensors by name, from a file of `torch.save`.
+    """Read the tensors of a model, keyed by name, from a file that `torch.save` wrote.
 
-    The file holds a state dictionary, or a training checkpoint with one under `model_state_dict` or `state_dict`. The
-    prefix `module.` of models trained on several devices is dropped.
+    The file holds a state dictionary, or a training checkpoint with a state dictionary under `model_state_dict` or
+    `state_dict`. Names in models that were trained on several devices have the prefix `module.`, which is removed.
 
-    **Raises:** `ValueError` for a file that is missing, damaged, not from PyTorch, or without a state dictionary.
+    **Raises:** `ValueError` if the file is missing, damaged, not from PyTorch, or has no state dictionary.
     """
     path = Path(path)
     require(os.path.isfile(path), f"there is no file {path}: give the path of a PyTorch checkpoint")
@@ -80,7 +80,7 @@ def _state_dictionary(content: Any) -> dict[str, np.ndarray]:
 
 
 def _read_archive(file: BufferedIOBase, size: int) -> Any:
-    """Read a zip archive: one folder with data.pkl, the arrays as data/<key>, and the byte order."""
+    """Read a zip archive. It has one folder with data.pkl, the arrays as data/<key>, and the byte order."""
     with zipfile.ZipFile(file) as archive:
         unpacked = sum(entry.file_size for entry in archive.infolist())
         require(unpacked <= size, f"unpacks to {unpacked} bytes from {size}, which torch.save does not: save it again")
@@ -99,8 +99,8 @@ def _read_archive(file: BufferedIOBase, size: int) -> Any:
 def _read_stream(file: BufferedIOBase, size: int) -> Any:
     """Read the layout before PyTorch 1.6.
 
-    It has magic number, protocol, system, content, keys, and then each array's count and bytes. The arrays come last,
-    so the tensors are views of arrays that are filled afterwards.
+    The file has a magic number, the protocol, the system, the content, the keys, and then the count and the bytes of
+    each array. The arrays come last, so the tensors are first made as views of empty arrays, which are then filled.
     """
     storages: dict[str, np.ndarray] = {}
 
@@ -127,7 +127,7 @@ def _read_stream(file: BufferedIOBase, size: int) -> Any:
 
 
 def _unpickled(file: BytesIO | mmap.mmap, size: int, load: _Load) -> Any:
-    """The object in the next pickle of a file."""
+    """Load the object in the next pickle of a file."""
     start = file.tell()
     skip_pickle(file, size)
     end = file.tell()
@@ -144,7 +144,7 @@ class _Tensors(pickle.Unpickler):
         self._items = len(file.getbuffer())
 
     def find_class(self, module: str, name: str) -> Any:
-        """The replacement for a name in the pickle."""
+        """Return the replacement for a name in the pickle."""
         if module in ("torch", "torch.cuda") and name in _TYPES:
             return _TYPES[name]
         if (module, name) == ("collections", "OrderedDict"):
@@ -152,26 +152,26 @@ class _Tensors(pickle.Unpickler):
         return _KNOWN.get((module, name), _Nothing)
 
     def persistent_load(self, identifier: Any) -> np.ndarray:
-        """The storage with identifier ('storage', type, key, device, count). Older files append a view, always None."""
+        """Return the storage with identifier ('storage', type, key, device, count). Older files append None."""
         _, kind, key, _, count, *_ = identifier
         return self._storage(key, kind, count)
 
     def _dictionary(self, items: Any = ()) -> "_Dictionary":
-        """A copy of these items. Refuses a file that copies more items than it has bytes."""
+        """Copy items into a dictionary. Raises an error if all copies have more items than the file has bytes."""
         self._items -= len(items)
         require(self._items >= 0, "copies the same dictionary over and over: it is damaged")
         return _Dictionary(items)
 
 
 class _Dictionary(OrderedDict):
-    """A dictionary that ignores the state of a model besides its tensors."""
+    """A dictionary that ignores attributes, since a model's state dictionary may have some besides its tensors."""
 
     def __setstate__(self, _: Any) -> None:
         pass
 
 
 class _Nothing:
-    """Replacement for all other names in a file. It accepts any arguments and does nothing."""
+    """The replacement for all unknown names in a file. It accepts any arguments and does nothing."""
 
     def __new__(cls, *_: Any) -> "_Nothing":
         return super().__new__(cls)
@@ -184,7 +184,7 @@ class _Nothing:
 
 
 def _tensor(storage: np.ndarray, offset: int, shape: tuple[int, ...], strides: tuple[int, ...], *_: Any) -> np.ndarray:
-    """A view of a storage. NumPy refuses a view beyond its end."""
+    """Return a view of a storage. NumPy raises an error for a view beyond the end of the storage."""
     size = storage.itemsize
     tensor = np.ndarray(shape, storage.dtype, storage, offset * size, tuple(stride * size for stride in strides))
     require(tensor.size <= storage.size, f"stretches {storage.size} numbers to a tensor of shape {shape}: save a copy")
