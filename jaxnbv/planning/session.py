@@ -83,8 +83,8 @@ class Session:
     - `obstacles`: solids around the object, in world units, for example `Obstacles((table,), margin=0.005)`. Pass
       `Obstacles()` if there are no obstacles. By default the session detects obstacles:
 
-      - A plane under the object in the first image counts as a table. Its points are removed, and cameras keep clear
-        of it. A warning names the plane. If there is no such plane, the warning names other values of `up` with which a
+      - A plane under the object in the first image counts as a table. Its points are removed, and cameras keep clear of
+        it. A warning names the plane. If there is no such plane, the warning names other values of `up` with which a
         plane would be detected.
       - Surfaces outside the box become coarse obstacles. They may hide the object, and cameras keep clear of them.
 
