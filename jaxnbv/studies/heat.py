@@ -78,7 +78,7 @@ class Truth(NamedTuple):
 def _saturated(record: Record, method: str) -> dict[int, float]:
     """Return, for each view after the first, 1.0 if the chosen view has value zero, else 0.0.
 
-    If the chosen view has value zero, then all candidates have. The result is empty for methods not in `HEAT_METHODS`.
+    If the chosen view has value zero, all candidates have value zero. Methods not in `HEAT_METHODS` have no values.
     """
     steps = record["methods"][method]["steps"] if method in HEAT_METHODS else []
     return {view: float(step["value"] == 0.0) for view, step in enumerate(steps, start=2)}

@@ -78,7 +78,8 @@ class IdentificationStudy(Study):
     - `meshes`: mesh files of the parts at true size. Without mesh files, the study uses sets of eight parts that look
       alike.
 
-    All methods use the same bank and the same weights of hypotheses. They differ only in the views that they choose.
+    All methods use the same bank and compute the weights of hypotheses in the same way. They differ only in the views
+    that they choose.
     """
 
     title: ClassVar[str] = "Which part it is, and how it lies"

@@ -96,7 +96,7 @@ class ReconstructionStudy(Study):
         return NewSurface() if method == "new-surface" else Coverage()
 
     def mesher(self, scene: Scene) -> Planner:
-        """Return the planner whose sampler reconstructs the surface for all methods, also the user's."""
+        """Return the planner whose sampler reconstructs the surface for all methods, including the user's."""
         return self.planner("farthest", scene)
 
     def truth(self, scene: Scene) -> Float[np.ndarray, "n 3"]:

@@ -108,9 +108,9 @@ class MostNewVoxels(Baseline):
 
 
 def _gains(record: Record, method: str) -> dict[int, float | None]:
-    """Return, for each view after the first, the voxels that a method has added, relative to the oracle's.
+    """Return the number of voxels that a method has added by each later view, as a fraction of the oracle's number.
 
-    Both numbers count all voxels added since the first view. The value is None if the oracle has added none.
+    Both numbers count all voxels added since the first view. The fraction is None if the oracle has added no voxels.
     """
     if ORACLE not in record["methods"]:
         return {}
@@ -120,7 +120,7 @@ def _gains(record: Record, method: str) -> dict[int, float | None]:
 
 
 class RecordedStudy(Study):
-    """Measures how much of a box the frames of a recording show that a method chooses.
+    """Measures how much of a box is shown by the frames that a method chooses from a recording.
 
     The candidates are the recorded poses, and the scan of a candidate is its recorded scan. The first view is a random
     frame that shows at least 5 % of the box's voxels. Scenes differ only in their first view.
@@ -131,8 +131,8 @@ class RecordedStudy(Study):
     - `box`: the region of interest, in the recording's units.
     - `voxel`: side of the counted voxels, in the recording's units.
 
-    **Raises:** `ValueError` as `RecordedFrames` does, or if the box holds no voxel that three frames show. Both are
-    raised when the recording is first read.
+    **Raises:** `ValueError` as `RecordedFrames` does, or if the box holds no voxel that three frames show. These errors
+    are raised when `recording` is first read.
     """
 
     title: ClassVar[str] = "Voxels of a recorded place that were seen"

@@ -73,7 +73,7 @@ class PyramidStudy(ClassificationStudy):
     def first_view(self, scene: Scene) -> int:
         """Return the index of a random candidate that hides the pattern but shows enough, see `shows_enough`.
 
-        **Raises:** `ValueError` if no candidate shows enough.
+        **Raises:** `ValueError` if no candidate shows enough, or if none that shows enough hides the pattern.
         """
         scans = scene.task.scans
         enough = [self.shows_enough(scene, scans[index]) for index in range(self.num_candidates)]

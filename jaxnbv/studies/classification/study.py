@@ -277,11 +277,11 @@ class ClassificationStudy(Study):
         return runs[0] | {name: [row for run in runs for row in run[name]] for name in ("log_p", "pixels")}
 
     def follow(self, scene: Scene, truth: Truth, planner: Planner, episode: Iterator[Step]) -> Record:
-        """Record the log probabilities of the classes after each view, and measures of each view.
+        """Record the classifier's predictions after each view, and measures of each view.
 
-        These are the number of the view's rays that hit the cue and, for each view that a method chose, the roughness
-        of the samples and the rank correlation between the candidates' values and the numbers of their rays that hit
-        the cue.
+        - Each view: the log probabilities of the classes, and the number of the view's rays that hit the cue.
+        - Each proposed view: the roughness of the samples, and the rank correlation between the values of the
+          candidates and the numbers of their rays that hit the cue.
         """
         lists: dict[str, list] = {name: [] for name in ("log_p", "pixels", "rank_correlation", "roughness")}
         for view, _, inputs, _ in episode:

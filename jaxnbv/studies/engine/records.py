@@ -26,7 +26,7 @@ _NONE: Mapping[str, np.ndarray] = MappingProxyType({})
 
 
 class RecordFolder(ResultFolder):
-    """A folder of records of one configuration, which the file study.json stores.
+    """A folder of records that share one configuration. The file study.json stores the configuration.
 
     - `executor`: an executor with the interface of `concurrent.futures` that runs the scenes without a record, such as
       `Processes(8)` or a `Cluster`; default: this process runs the scenes. In both cases, this process writes the
@@ -49,7 +49,7 @@ class RecordFolder(ResultFolder):
         super().__init__(path, config, arrays)
 
     def collect(self, scenes: Sequence[int], run: Trial, progress: bool = True) -> list[Record]:
-        """Run the scenes that have no record yet, and return all records in order of their indices.
+        """Run the scenes that have no record yet, and return the records of all `scenes` in order.
 
         Each record is written as soon as its scene is done. If `run` fails for a scene, the scene has no record.
         `failures` then returns the error, and the next call of `collect` runs the scene again.

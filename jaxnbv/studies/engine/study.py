@@ -198,7 +198,7 @@ class Study(eqx.Module):
         """Run an episode and return its record, which must be JSON-serialisable.
 
         - `truth`: the result of `truth` for the scene.
-        - `episode`: iterator that runs one step at a time. The method may stop before the iterator ends.
+        - `episode`: iterator that runs one step at a time. `follow` may stop before the iterator ends.
         """
 
     def scene_record(self, scene: Scene, truth: Any, first: int) -> Record:

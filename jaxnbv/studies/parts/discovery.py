@@ -52,7 +52,7 @@ class NearestPart(Segmenter):
 
         p_ic proportional to exp(-d_ic^2 / 2 w^2),   w = 0.02 scene units,
 
-    where d_ic is the distance of point i from the true part c. Oracles with the same number of parts, padding included,
+    where d_ic is the distance of point i from the true part c. Oracles that have the same number of parts after padding
     share one compilation.
 
     - `distances`: distance of each node of `grid` from each part. Values between nodes are interpolated linearly.
@@ -131,8 +131,8 @@ class PartDiscoveryStudy(Study):
     It has the settings of `Study`, and:
 
     - `imagined_rays`: rays along each side of an imagined scan. True scans have 64 x 64 rays.
-    - `num_points`: number of points of D and an imagined scan that the segmenter gets. The utility's N_target is scaled
-      in proportion to this number.
+    - `num_points`: number of points that the segmenter gets of D and an imagined scan together. The utility's N_target
+      is scaled in proportion to this number.
     """
 
     title: ClassVar[str] = "Views until all parts are found"

@@ -38,7 +38,7 @@ class PartMesh(eqx.Module):
 
 
 class MeshPartStudy(PartDiscoveryStudy):
-    """Part discovery on mesh files with the oracle `NearestPart`, which excludes a network's errors.
+    """Part discovery on mesh files, segmented by the oracle `NearestPart` in place of a network.
 
     It has the settings of `PartDiscoveryStudy`, and:
 
@@ -50,8 +50,8 @@ class MeshPartStudy(PartDiscoveryStudy):
     """
 
     explanation: ClassVar[str] = (
-        f"{PartDiscoveryStudy.explanation}\nAn oracle assigns each point to the nearest part. A part counts only if the "
-        f"oracle assigns {max(TARGETS)}\nof {NETWORK_POINTS} points to it in the scans from all candidates together."
+        f"{PartDiscoveryStudy.explanation}\nAn oracle assigns each point to the nearest part. A part counts only if "
+        f"the oracle assigns\n{max(TARGETS)} of {NETWORK_POINTS} points of the scans from all candidates to the part."
     )
     seed: ClassVar[int] = 12
 
@@ -66,7 +66,7 @@ class MeshPartStudy(PartDiscoveryStudy):
     def files_in(cls, folder: str | Path) -> tuple[MeshFile, ...]:
         """Return the meshes that have at least two nodes.
 
-        The order takes one mesh from each subfolder in turn. The names of the meshes include the name of the subfolder.
+        The result takes one mesh from each subfolder in turn. The name of a mesh includes the name of its subfolder.
 
         **Raises:** `ValueError` if there is no such mesh, or if a mesh cannot be read.
         """

@@ -14,7 +14,7 @@ from jaxnbv.studies.scenes.splits import Split, scene_key
 
 
 class Pyramid(ClassObject):
-    """A pyramid with a pattern imprinted on its base, which tells its class.
+    """A pyramid. The pattern imprinted on its base tells its class.
 
     - `solid`: the pyramid in scene coordinates.
     - `label`: index of the pattern in `PATTERNS`.
