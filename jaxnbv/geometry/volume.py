@@ -120,7 +120,7 @@ def boundary_points(volume: Volume, count: int, beyond: float = 0.0) -> Float[Ar
     about the origin, a ray may have several crossings, and any one of the crossings is returned.
 
     - `beyond`: value of the volume's function at the returned points, in scene units. The default gives points on the
-      boundary, a positive value points outside it.
+      boundary. A positive value gives points outside the volume.
     """
     directions = fibonacci_sphere(count)
 

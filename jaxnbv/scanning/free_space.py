@@ -1,7 +1,7 @@
 """Space that a sensor has seen to be empty, and carving: removal of sampled surface from this space.
 
 A ray that hits shows that space is empty up to its hit. A ray that misses shows that space is empty along all of its
-length. An invalid ray shows nothing. A node of the grid is *seen empty* if all rays near it went past it.
+length. An invalid ray shows nothing. A node of the grid is *seen empty* if all rays near the node went past the node.
 """
 
 import functools
@@ -125,7 +125,7 @@ class Carving(eqx.Module):
 
 @jax.jit
 def carve(values: Float[Array, "*s g g g"], empty: Bool[Array, "g g g"]) -> Float[Array, "*s g g g"]:
-    """Return the node values with positive values, which mean outside, at the empty nodes.
+    """Return node values in which all empty nodes are positive, that is, outside the surface.
 
     - `values`: f minus its level at the nodes.
 

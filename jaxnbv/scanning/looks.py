@@ -42,7 +42,7 @@ class Looks(eqx.Module):
       most `reach`.
     - `sight`: how far each view saw along the rays of `camera` (see `PointCloud`); zero for a ray outside the image of
       the view.
-    - `camera`: the sensor with fewer rows and columns.
+    - `camera`: a copy of the sensor that keeps every few rows and columns, to limit the number of rays.
     """
 
     distance: Float[Array, "g g g"]
@@ -129,7 +129,7 @@ class Looks(eqx.Module):
         return surfaces.without_cells(shared_map(_unmeasured_by_any, surfaces, self, poses))
 
     def unmeasured_cells(self, surface: Surface, index: Int[Array, ""] | int, pose: Pose) -> Int[Array, "rays 3"]:
-        """Return the cell of each ray's hit on a surface that the view should have measured but did not.
+        """Return the cells of hits on a surface that the view should have measured but did not, one per ray.
 
         The view should have measured the hit if the surface faces the camera and the ray saw as far as the hit, or if
         the ray passed the hit and went on to something deeper. The view did not measure the hit if no stored hit lies

@@ -170,7 +170,7 @@ class TriangleMesh(Surface):
 def level_triangles(
     values: Float[np.ndarray, "g g g"], grid: Grid
 ) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"], Float[np.ndarray, "v 3"]] | None:
-    """Return vertices, faces and vertex normals of the zero set of `values`; None if it is empty.
+    """Return vertices, faces and vertex normals of the zero set of `values`; None if the set is empty.
 
     The triangles come from marching cubes. Values are positive outside. Faces are wound outward, and normals have unit
     length and point outward.

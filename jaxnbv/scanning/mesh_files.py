@@ -26,7 +26,7 @@ from jaxnbv.scanning.sphere_tracing import SDFSurface
 def load_mesh(path: str | Path | trimesh.Trimesh | trimesh.Scene, up: str = "y") -> TriangleMesh:
     """Load a mesh from a file in any format that trimesh reads, or convert a trimesh mesh or scene.
 
-    If the file or scene has several geometries, they are placed as it says and joined into one mesh.
+    If the file or scene has several geometries, their transforms are applied and they are joined into one mesh.
 
     - `up`: the file's axis that is upward, see `Frame`.
 

@@ -79,7 +79,7 @@ class Surface(eqx.Module):
 
     @property
     def world_frame(self) -> Frame | None:
-        """The frame that maps the surface's world to the scene. None if they are the same."""
+        """The frame that maps the surface's world to the scene. None if the world is the scene."""
         return None
 
 
@@ -307,7 +307,7 @@ def _implicit_depth_jvp(primals, tangents):
 
 
 def pixel_area(scan: PointCloud, camera: Camera, pose: Pose, steepest: float) -> Float[Array, " rays"]:
-    """Surface area that each pixel shows, in squared scene units.
+    """Return the surface area that each pixel shows, in squared scene units.
 
     It is zero for pixels without a point. Otherwise the area is r^2 omega / cos = z^3 / (r fx fy cos), with focal
     lengths fx and fy, depth z, distance r, the pixel's solid angle omega and the cosine of incidence cos.

@@ -74,7 +74,7 @@ def is_visible(
     tolerance: float,
     barrier: Float[Array, "poses rays"] | None = None,
 ) -> Bool[Array, "poses n"]:
-    """Whether a camera sees each point of a surface, for each pose of a batch.
+    """Return, for each pose of a batch and each point of a surface, whether a camera sees the point.
 
     A camera sees a point if the point lies in its image and range, is not at a grazing angle, and nothing hides it.
 
