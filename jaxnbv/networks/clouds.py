@@ -20,8 +20,8 @@ class CloudClassifier(Classifier):
     """A classifier made from a network. It maps a `PointCloud` to log-probabilities.
 
     - `network`: called as `network(points, normals, mask)`.
-    - `num_points`: number of points that the network gets, selected by farthest point sampling. A smaller cloud is padded
-      with masked rows.
+    - `num_points`: number of points that the network gets, selected by farthest point sampling. A smaller cloud is
+      padded with masked rows.
     - `scale`: network units per scene unit.
     - `classes`: names of the classes, or None. By default the names that the network has, if any.
 
@@ -61,8 +61,8 @@ class CloudSegmenter(Segmenter):
     - `network`: called as `network(points, normals, category, mask)`. It returns log-probabilities of the fifty parts
       of ShapeNet-part.
     - `category`: category of the object, given as its name or as its index in `CATEGORIES`.
-    - `num_points`: number of points that the network gets, selected by farthest point sampling. A smaller cloud is padded
-      with masked rows.
+    - `num_points`: number of points that the network gets, selected by farthest point sampling. A smaller cloud is
+      padded with masked rows.
     - `scale`: network units per scene unit.
 
     **Raises:** `ValueError` for an unknown category, if `num_points` or `scale` is not positive, or if the network

@@ -1,4 +1,4 @@
-"""Inspection of code: names and sources of functions, and the globals that they read."""
+"""Inspects code: the names and sources of functions, and the globals that functions read."""
 
 import contextlib
 import dis
@@ -19,46 +19,46 @@ _STANDARD = sysconfig.get_path("stdlib")
 _GENERATED = {"__init__", "__repr__", "__eq__", "__lt__", "__le__", "__gt__", "__ge__", "__hash__", "__new__"} | {
     f"__{name}__" for name in ("setattr", "delattr", "replace")
 }
-# Flag in a class's `__flags__`: made by a class statement, or by a C library in the same way.
+# Flag in the `__flags__` of a class: a class statement made it, or a C library that makes classes in the same way.
 _HEAP_TYPE = 1 << 9
 _SLOTS = MemberDescriptorType | GetSetDescriptorType | type(NamedTuple("_", [("a", int)]).a)  # type: ignore[attr-defined]
 
 
 def lookup(name: str) -> Any:
-    """The object with this name, "module:qualified.name", in an imported module, or None."""
+    """Look up an object of an imported module by its name, "module:qualified.name". Returns None if there is none."""
     module, _, path = name.partition(":")
     value: Any = sys.modules.get(module)
     for part in path.split("."):
-        # getattr could run code.
+        # Read `__dict__`, because getattr could run code.
         value = getattr(value, "__dict__", {}).get(part)
         value = value.__func__ if isinstance(value, classmethod | staticmethod) else value
     return value
 
 
 def name_of(thing: Any) -> str:
-    """Module and qualified name of a class or function, for `lookup`. Empty for other objects."""
+    """Return the module and qualified name of a class or function, for `lookup`; "" for other objects."""
     own = getattr(thing, "__qualname__", None) or getattr(thing, "__name__", None)
     module = getattr(thing, "__module__", None) or getattr(getattr(thing, "__objclass__", None), "__module__", None)
     if not isinstance(own, str) or not isinstance(module, str):
         return ""
     if lookup(f"{module}:{own}") is not thing:
-        # Name a lambda, or a function that another one returned, by a global variable that holds it.
+        # A lambda, or a function that was made inside a function, gets the name of a global variable that holds it.
         names = vars(sys.modules.get(module, object))
         own = next((name for name in list(names) if names[name] is thing), own)
     return f"{module}:{own}"
 
 
 def is_installed(module: str | None) -> bool:
-    """Whether a module belongs to jaxnbv, Python or an installed package.
+    """Return whether a module belongs to jaxnbv, Python or an installed package.
 
-    The code of these changes only with their version.
+    The code of such a module changes only with the version of its package.
     """
     package = str(module).partition(".")[0]
     if package == "jaxnbv":
         return True
     try:
         spec = importlib.util.find_spec(package)
-    # Modules without a file, such as __main__.
+    # Raised for modules without a file, such as __main__.
     except (ValueError, ImportError):
         return False
     places = [] if spec is None else [spec.origin, *(spec.submodule_search_locations or ())]
@@ -76,7 +76,7 @@ class _Plain:
 
 
 def is_plain(thing: Any) -> bool:
-    """Whether an object's whole state is in its `__dict__`, not in slots or in memory of a C library."""
+    """Return whether the whole state of an object is in its `__dict__`, not in slots or in memory of a C library."""
     kind = type(thing)
     slots = any(isinstance(member, MemberDescriptorType) for base in kind.__mro__ for member in vars(base).values())
     made_by_python = bool(kind.__flags__ & _HEAP_TYPE) and kind.__basicsize__ == _Plain.__basicsize__
@@ -84,7 +84,7 @@ def is_plain(thing: Any) -> bool:
 
 
 def closure(function: FunctionType) -> dict[str, Any]:
-    """Variables of the enclosing functions, by name, that have a value."""
+    """Return the variables of a function's enclosing functions that have a value, keyed by name."""
     values = {}
     for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
         with contextlib.suppress(ValueError):
@@ -93,9 +93,14 @@ def closure(function: FunctionType) -> dict[str, Any]:
 
 
 def reads_of(code: CodeType, names: dict[str, Any], way: str) -> Iterator[tuple[str, Any]]:
-    """Names and values of globals that code reads, and of attributes that it reads from a user's module.
+    """Yield names and values of the globals that code reads.
 
-    **Raises:** `ValueError` for code that imports a user's module.
+    If the code reads an attribute of a user's module, yields this attribute instead of the module.
+
+    - `names`: the globals, keyed by name.
+    - `way`: path to the code, for errors.
+
+    **Raises:** `ValueError` if the code imports a user's module.
     """
     steps = [step for step in dis.get_instructions(code) if step.opname != "EXTENDED_ARG"]
     for index, step in enumerate(steps):
@@ -117,7 +122,7 @@ def reads_of(code: CodeType, names: dict[str, Any], way: str) -> Iterator[tuple[
 
 
 def is_written(name: str, member: Any) -> bool:
-    """Whether a member of a class is written by its author and not generated by Python."""
+    """Return whether a member of a class is written by its author and not generated by Python."""
     function = getattr(member, "__func__", member)
     if isinstance(function, FunctionType):
         by_python = name in _GENERATED and function.__code__.co_filename == "<string>"
@@ -126,7 +131,7 @@ def is_written(name: str, member: Any) -> bool:
 
 
 def source_of(function: FunctionType, way: str) -> str:
-    """The source of a function. For a lambda only its body, since a line may have several lambdas.
+    """Read the source of a function. For a lambda it is only the body, since a line may have several lambdas.
 
     **Raises:** `ValueError` if the source cannot be read.
     """
@@ -141,7 +146,7 @@ def source_of(function: FunctionType, way: str) -> str:
     if function.__name__ != "<lambda>":
         return text
     lines, _ = inspect.findsource(code)
-    # An instruction of zero width belongs to no expression.
+    # Skip instructions of zero width, because they belong to no expression.
     spans = [(a, b, c, d) for a, b, c, d in code.co_positions() if a and b and c is not None and d]
     (first, start), (last, end) = min((a, c) for a, _, c, _ in spans), max((b, d) for _, b, _, d in spans)
     body = [line.encode() for line in lines[first - 1 : last]]

@@ -1,4 +1,4 @@
-"""JSON descriptions of configurations. `jaxnbv.storage.rebuilding` is the inverse."""
+"""Describes configurations as JSON. `jaxnbv.storage.rebuilding` is the inverse."""
 
 import dataclasses
 import enum
@@ -28,34 +28,35 @@ _FUNCTIONS = ("__func__", "fget", "func", "fun", "jvp", "fwd", "bwd", "__wrapped
 
 
 def describe(thing: Any, arrays: dict[str, np.ndarray] | None = None, way: str = "") -> Any:
-    """A JSON description that differs between different configurations. `rebuild` is the inverse.
+    """Describe a configuration as JSON. Different configurations have different descriptions.
 
-    Modules, dataclasses and named tuples become their classes and fields. Small arrays become their values, and large
-    ones a hash of their bytes. A function becomes its source, defaults, closure and all globals that its code reads,
-    and so does each method of a user's class. Definitions of installed packages become their names. An object with a
-    `version`, a text or a number, becomes its class and version.
+    `rebuild` is the inverse. Equinox modules, dataclasses and named tuples are described by their classes and fields,
+    small arrays by their values, and large arrays by a hash of their bytes. A function is described by its source,
+    defaults, closure and all globals that its code reads. The same holds for each method of a user's class. Definitions
+    of installed packages are described by their names, and objects with a `version` (a text or a number) by their class
+    and version.
 
-    - `arrays`: a dictionary to fill with the contents of the large arrays, by their hashes.
+    - `arrays`: a dictionary to fill with the contents of the large arrays, keyed by hash.
     - `way`: path to `thing`, for errors.
 
-    **Raises:** `ValueError` with the path to an object whose state cannot be described, or to a function whose source
-    cannot be read, unless it has a `version`.
+    **Raises:** `ValueError` if the state of an object cannot be described, or the source of a function cannot be read,
+    and the object or function has no `version`. The error names its path.
     """
     return _Describer({} if arrays is None else arrays).describe(thing, way)
 
 
 def is_record(kind: type) -> bool:
-    """Whether a class is a dataclass (as are modules) or a named tuple."""
+    """Return whether a class is a dataclass (Equinox modules are dataclasses) or a named tuple."""
     return dataclasses.is_dataclass(kind) or (issubclass(kind, tuple) and hasattr(kind, "_fields"))
 
 
 def fields_of(kind: type) -> Sequence[str]:
-    """Names of the fields of a dataclass or a named tuple."""
+    """Return the names of the fields of a dataclass or a named tuple."""
     return [field.name for field in dataclasses.fields(kind)] if dataclasses.is_dataclass(kind) else kind._fields  # type: ignore[attr-defined]
 
 
 class _Describer:
-    """State of one description. Objects that refer to themselves end in a reference to the first visit."""
+    """State of one call of `describe`. If an object refers to itself, the second visit is described as a reference."""
 
     def __init__(self, arrays: dict[str, np.ndarray]):
         self.arrays = arrays
@@ -84,7 +85,8 @@ class _Describer:
         try:
             return self._object(thing, kind, way)
         finally:
-            # Only code is described once. Containers with equal contents are described alike, the same object or not.
+            # Only code is described once per call. Equal containers are described alike, whether or not they are the
+            # same object.
             if not isinstance(thing, FunctionType | type):
                 del self.visited[id(thing)]
 
@@ -95,7 +97,7 @@ class _Describer:
         if is_record(kind) and not wraps:
             code = {} if is_installed(kind.__module__) else {"class": self.describe(kind, f"{way}.class")}
             values = {name: getattr(thing, name) for name in fields_of(kind)}
-            # The version stands for functions.
+            # The version is described instead of fields that are functions.
             state = {name: value for name, value in values.items() if not (versioned and callable(value))}
             return {"type": name_of(kind), **code, **self._named(state, way)}
         if versioned:
@@ -148,7 +150,7 @@ class _Describer:
         array = np.ascontiguousarray(thing).reshape(np.shape(thing))
         if array.dtype.hasobject:
             raise InputError(f"{way or 'this'} is an array of Python objects: give numbers")
-        # "weak" is a JAX scalar from a Python number, which does not promote types.
+        # A "weak" JAX scalar was made from a Python number, and does not promote the types of other arrays.
         kind = f"{'weak' if array.ndim == 0 and getattr(thing, 'weak_type', False) else origin} {array.dtype}"
         if 0 < array.size <= _LARGEST_LISTED and array.dtype.kind in "biuf" and np.isfinite(array).all():
             return {"type": kind, "values": array.tolist()}
@@ -160,7 +162,7 @@ class _Describer:
         return {name: self.describe(value, f"{way}.{name}".lstrip(".")) for name, value in values.items()}
 
     def _function(self, function: FunctionType, way: str) -> dict[str, Any]:
-        """Everything that the result of a function depends on, except definitions of installed packages."""
+        """Describe everything that the result of a function depends on, except definitions of installed packages."""
         own = not is_installed(function.__globals__.get("__name__"))
         parts = {"defaults": (function.__defaults__, function.__kwdefaults__), "closure": closure(function)}
         if own:
@@ -170,7 +172,7 @@ class _Describer:
         return source | self._beside(parts, way)
 
     def _beside(self, parts: dict[str, Any], way: str) -> dict[str, Any]:
-        """Descriptions of parts that are looked up by name, not rebuilt, so that their arrays need not be stored."""
+        """Describe parts of code without storing their arrays, since `rebuild` looks up code by name."""
         arrays, self.arrays = self.arrays, {}
         try:
             return self._named(parts, way)

@@ -13,13 +13,13 @@ PARTS = "." + 16 * "[0-9a-f]" + ".partial"
 
 
 def write_whole(path: Path, write: Callable[[Any], Any]) -> None:
-    """Write a file completely or not at all: a reader finds the old file or the whole new one.
+    """Write a file completely or not at all: a reader finds the old file or the complete new file.
 
-    It writes a partial file in the same folder and renames it.
+    Writes a partial file in the same folder, then renames this file.
 
     **Raises:** `ValueError` if the disk is full, the folder is missing or may not be written, or the name is too long.
     """
-    # A random name, so that two processes that write the same file use different partial files.
+    # The name is random, so two processes that write the same file use different partial files.
     partial = path.with_name(f".{secrets.token_hex(8)}.partial")
     try:
         try:
@@ -49,9 +49,9 @@ def write_text(path: Path, text: str) -> None:
 
 
 def make_folder(path: str | Path) -> Path:
-    """Create a folder and its parents if it is missing, and return it.
+    """Create a folder and its parents if the folder is missing, and return its path.
 
-    **Raises:** `ValueError` if there is a file in its place, or it cannot be created.
+    **Raises:** `ValueError` if there is a file at this path, or if the folder cannot be created.
     """
     try:
         Path(path).mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Folders of results of one configuration, written by one process at a time."""
+"""Folders of results. All results in a folder have the same configuration, and one process at a time writes there."""
 
 import importlib.metadata
 import json
@@ -19,33 +19,33 @@ from jaxnbv.scanning.triangle_rays import tracer
 from jaxnbv.storage.files import PARTS, make_folder, write_text, write_whole
 
 _LOCK = ".lock"
-# The large arrays of the record.
+# File of the large arrays of the configuration.
 ARRAYS = "arrays.npz"
-# Bytes after unpacking: sixteen million rays, far more than a camera has.
+# Largest size of a file of arrays after unpacking, in bytes. It holds sixteen million rays, far more than a camera has.
 LARGEST = 2**29
 _LONGEST_SHOWN = 60
 
 
 def software() -> dict[str, str]:
-    """Versions of the packages that the numbers depend on."""
+    """Return the versions of the packages that can change the numbers of results."""
     names = ("jaxnbv", "jax", "jaxlib", "equinox", "optax", "optimistix", "numpy", "trimesh", tracer())
     return {name: importlib.metadata.version(name) for name in names}
 
 
 def num_threads() -> int:
-    """Number of threads for a sum of XLA on a CPU: NPROC, or else the cores that this process may use."""
+    """Return the number of CPU threads that XLA uses for a sum: NPROC, or the number of cores of this process."""
     if threads := os.environ.get("NPROC"):
         return int(threads)
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def versions() -> dict[str, Any]:
-    """Software, device and threads of this process, on which the last bits of its numbers depend."""
+    """Return the software, device and threads of this process. The last bits of its results depend on them."""
     return software() | {"device": jax.devices()[0].device_kind, "cores": num_threads()}
 
 
 def differences(stored: Any, current: Any, name: str = "") -> list[str]:
-    """The differences between two descriptions, in words: `stored` in the folder, `current` now."""
+    """List the differences between two descriptions in words: `stored` in the folder, and `current` in this process."""
     if isinstance(stored, dict) and isinstance(current, dict):
         keys = list(dict.fromkeys([*stored, *current]))
         nested = (differences(stored.get(key), current.get(key), f"{name}.{key}".lstrip(".")) for key in keys)
@@ -54,13 +54,13 @@ def differences(stored: Any, current: Any, name: str = "") -> list[str]:
 
 
 def _short(value: Any) -> str:
-    """The beginning of a value's text, which may be the source of a function."""
+    """Return the beginning of the text of a value. The value may be the whole source of a function."""
     text = str(value)
     return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}..."
 
 
 def check_format(format: Any, supported: int, file: Path) -> None:
-    """**Raises:** `ValueError` for a file of a format other than `supported`."""
+    """Check the format of a file. **Raises:** `ValueError` if `format` is not `supported`."""
     require(
         format == supported,
         f"{file} is of format {str(format)[:20]}; this version of jaxnbv reads format {supported}: install a newer "
@@ -69,11 +69,11 @@ def check_format(format: Any, supported: int, file: Path) -> None:
 
 
 def read_json(file: Path, problem: str, remedy: str) -> dict[str, Any]:
-    """The object in a JSON file.
+    """Read the object in a JSON file.
 
-    **Raises:** `ValueError` with `problem` and `remedy`, if the file cannot be read or holds something else.
+    **Raises:** `ValueError` with `problem` and `remedy`, if the file cannot be read or holds no JSON object.
     """
-    # Reading something that is not a file, such as a pipe, may never end.
+    # Check this first, because reading from something that is not a file, such as a pipe, may never end.
     require(os.path.isfile(file) or not os.path.lexists(file), f"{file} {problem} (it is no file): {remedy}")
     try:
         content = json.loads(file.read_bytes())
@@ -95,9 +95,9 @@ def write_arrays(file: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def read_arrays(file: Path, remedy: str, check: Callable[[dict[str, np.ndarray]], None]) -> dict[str, np.ndarray]:
-    """The arrays of a .npz file.
+    """Read the arrays of a .npz file, keyed by name.
 
-    - `check`: raises any error if the arrays are not those that were written.
+    - `check`: a function that raises any error if the arrays differ from those that were written.
 
     **Raises:** `ValueError` with `remedy` if the file is damaged.
     """
@@ -112,15 +112,15 @@ def read_arrays(file: Path, remedy: str, check: Callable[[dict[str, np.ndarray]]
             arrays = {key: saved[key] for key in saved.files}
         check(arrays)
         return arrays
-    # On flipped bits NumPy and zipfile raise some twenty kinds of errors.
+    # If bits of the file are flipped, NumPy and zipfile raise some twenty kinds of errors.
     except Exception as error:
         raise InputError(f"{file} is damaged ({error}): {remedy}") from error
 
 
 def read_record(folder: Path, kind: str, remedy: str) -> dict[str, Any]:
-    """The record of a folder, with its `config`.
+    """Read the record of a folder. It has a `config`.
 
-    **Raises:** `ValueError` with `remedy` if there is no record, or it has no configuration.
+    **Raises:** `ValueError` with `remedy` if there is no record, or if the record has no configuration.
     """
     file, problem = folder / f"{kind}.json", f"is no {kind} record"
     record = read_json(file, problem, remedy)
@@ -141,7 +141,7 @@ def writing_in(path: Path) -> Iterator[None]:
         raise InputError(
             f"{path} is being written by another process: wait until it ends, or choose another folder"
         ) from error
-    # filelock (3.16 and later) raises these if the file system has no locks.
+    # filelock (3.16 and later) raises these errors if the file system has no locks.
     except (OSError, NotImplementedError) as error:
         raise InputError(f"cannot write in {path} ({error}): make room or choose another place") from error
     try:
@@ -153,15 +153,16 @@ def writing_in(path: Path) -> Iterator[None]:
 
 
 class ResultFolder:
-    """A folder of results with one configuration. Its record is written with the first result.
+    """A folder of results with the same configuration. The record is written before the first result.
 
     - `config`: the configuration as JSON, see `jaxnbv.storage.describe`.
-    - `arrays`: contents of its large arrays by their hashes, stored in arrays.npz.
+    - `arrays`: contents of the configuration's large arrays, keyed by hash. They are stored in arrays.npz.
 
-    Subclasses define the `kind` of results, which names the record, the `pattern` of the files' names, and the number
-    of the `format`.
+    Subclasses define the `kind` of results (the record is the file `kind`.json), the `pattern` of the names of result
+    files, and the number of the `format`.
 
-    **Raises:** `ValueError` if the folder cannot be created, or holds results of another configuration or other files.
+    **Raises:** `ValueError` if the folder cannot be created, holds results of a different configuration, or holds other
+    files.
     """
 
     kind: str
@@ -189,7 +190,7 @@ class ResultFolder:
             yield
 
     def set_versions(self, there: dict[str, Any]) -> None:
-        """Set the `versions` of the process that computes new results. Warns if the folder has others."""
+        """Set the `versions` of the process that computes new results. Warns if the folder has different ones."""
         self.versions = there
         if not self.bound:
             return
@@ -202,10 +203,10 @@ class ResultFolder:
             )
 
     def bind(self) -> None:
-        """Write the record and its arrays before the first result, if they are not there."""
+        """Write the record and its arrays, if they are not there yet. Called before the first result."""
         if not self.bound:
             record = {"format": self.format, "config": self.config, "versions": self.versions}
-            # The record comes first, since arrays without a record would belong to no configuration.
+            # Write the record first, since arrays without a record would belong to no configuration.
             write_text(self.path / f"{self.kind}.json", json.dumps(record, indent=2))
             if self.arrays:
                 write_arrays(self.path / ARRAYS, self.arrays)
@@ -223,7 +224,7 @@ class ResultFolder:
             return
         written = read_record(self.path, self.kind, "choose another output folder")
         check_format(written.get("format"), self.format, file)
-        # A record without results is of a run that ended before its first result, and may be overwritten.
+        # If there is a record but no result, the run ended before its first result, and the record may be overwritten.
         if not any(self.path.glob(self.pattern)):
             return
         changed = differences(written["config"], self.config)

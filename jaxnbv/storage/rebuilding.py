@@ -18,7 +18,7 @@ from jaxnbv.checks import InputError, require
 from jaxnbv.storage.description import describe, fields_of, is_installed, is_record, lookup, name_of
 from jaxnbv.storage.folders import ARRAYS, check_format, differences, read_arrays, read_record
 
-# Modules of installed packages whose functions only compute. Functions of other packages might do anything.
+# Modules of installed packages whose functions have no side effects. Functions of other packages might do anything.
 _HARMLESS = ("jaxnbv", "jax.nn", "jax._src.nn", "jax.lax", "equinox.nn", "optimistix", "math")
 _TEXTS: dict[str, Callable[[Any], Any]] = {
     "float": float,
@@ -30,15 +30,17 @@ _TEXTS: dict[str, Callable[[Any], Any]] = {
 
 
 def rebuild(description: Any, arrays: Mapping[str, np.ndarray], way: str) -> Any:
-    """The configuration with this description by `describe`.
+    """Rebuild a configuration from the description that `describe` returned.
 
-    Classes and functions are looked up in jaxnbv and in modules that are already imported. None of them is called, not
-    even a constructor.
+    Classes and functions are looked up in jaxnbv and in modules that are already imported. No function and no
+    constructor is called.
 
-    - `arrays`: contents of the large arrays by their hashes, from `describe`.
-    - `way`: path to the configuration, for errors. Its first name is the argument that can replace it.
+    - `arrays`: contents of the large arrays, keyed by hash, from `describe`.
+    - `way`: path to the configuration, for errors. The first name in this path is the argument of `load` that can
+      replace the configuration.
 
-    **Raises:** `ValueError` with the path to a part that cannot be rebuilt, or has changed.
+    **Raises:** `ValueError` if a part cannot be rebuilt, or has changed since it was described. The error names the
+    part's path.
     """
     remedy = f"import its module first, or give it again: load(..., {way.partition('.')[0] or 'planner'}=...)"
     try:
@@ -54,15 +56,15 @@ def rebuild(description: Any, arrays: Mapping[str, np.ndarray], way: str) -> Any
 
 
 def read_config(path: str | Path, kind: str, format: int, replacements: Mapping[str, Any]) -> dict[str, Any]:
-    """The configuration of an existing folder, rebuilt from its record.
+    """Rebuild the configuration of an existing folder from the folder's record.
 
     - `kind`: kind of the folder, such as "episode".
-    - `format`: number of the format of its record.
-    - `replacements`: parts by name that replace those of the record. Opening the folder with them checks that they
-      agree.
+    - `format`: number of the record's format.
+    - `replacements`: parts that replace those of the record, keyed by name. When `RunFolder` then opens the folder with
+      these parts, it checks that they agree with the record.
 
-    **Raises:** `ValueError` if the folder holds no record, or a damaged one, or has a part that cannot be rebuilt and
-    is not given.
+    **Raises:** `ValueError` if the folder holds no record or a damaged record, or if a part cannot be rebuilt and has
+    no replacement.
     """
     folder, remedy = Path(path), "give the folder of a run"
     record = read_record(folder, kind, remedy)
@@ -144,14 +146,14 @@ class _Rebuilder:
         thing: Any = object.__new__(kind)  # type: ignore[arg-type]
         for field, value in values.items():
             object.__setattr__(thing, field, value)
-        # Equinox's wrappers take the names of the functions that they wrap.
+        # Wrappers of Equinox have the name and docstring of the function that they wrap.
         if is_installed(kind.__module__) and (wrapped := getattr(thing, "__wrapped__", None)) is not None:
             for attribute in functools.WRAPPER_ASSIGNMENTS:
                 object.__setattr__(thing, attribute, getattr(wrapped, attribute))
         return thing
 
     def _code(self, name: str, way: str) -> Any:
-        """A function, or the class of a record or of a NumPy scalar, by its name."""
+        """Look up a function, or the class of a record or of a NumPy scalar, by its name."""
         thing = self._lookup(name, way)
         module = name.partition(":")[0]
         harmless = (
@@ -159,7 +161,7 @@ class _Rebuilder:
             if isinstance(thing, type)
             else not is_installed(module)
             or any(module == own or module.startswith(f"{own}.") for own in _HARMLESS)
-            # Ufuncs of NumPy, and the functions of jax.numpy with the same names.
+            # These are the ufuncs of NumPy, and the functions of jax.numpy with the same names.
             or (module in ("numpy", "jax.numpy") and isinstance(getattr(np, name.partition(":")[2], None), np.ufunc))
         )
         require(harmless, f"{way} is {name}, which no configuration that is read from a file may call: {self.remedy}")

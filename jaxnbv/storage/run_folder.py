@@ -33,7 +33,7 @@ from jaxnbv.storage.files import write_whole
 from jaxnbv.storage.folders import ResultFolder, read_arrays, versions, write_arrays
 from jaxnbv.storage.rebuilding import read_config
 
-# Parts that are stored as several arrays.
+# Classes of the parts that are stored as several arrays, keyed by the part's name.
 _MODULES = {
     "pose": Pose,
     "scan": PointCloud,
@@ -45,17 +45,17 @@ _MODULES = {
 
 
 class RunFolder(ResultFolder):
-    """The folder of an episode or a session with one configuration: numbered files of arrays.
+    """The folder of an episode or a session: a record of the configuration, and numbered files of arrays.
 
-    Files are checked when they are read.
+    The checksum of each file is checked when the file is read.
 
     - `kind`: "episode" or "session".
-    - `config`: parts of the configuration by name. `RunFolder` makes their descriptions.
+    - `config`: parts of the configuration, keyed by name. `RunFolder` describes them as JSON.
 
-    **Raises:** `ValueError` if the folder holds results of another configuration, or other files.
+    **Raises:** `ValueError` if the folder holds results of a different configuration, or other files.
     """
 
-    # The pattern leaves out arrays.npz, which belongs to the record.
+    # The pattern does not match arrays.npz, which belongs to the record.
     pattern, format = "*_*.npz", 4
 
     def __init__(self, path: str | Path, kind: str, config: dict[str, Any]):
@@ -67,15 +67,16 @@ class RunFolder(ResultFolder):
 
     @classmethod
     def config_of(cls, path: str | Path, kind: str, **given: Any) -> dict[str, Any]:
-        """The configuration of an existing folder, see `read_config`."""
+        """Rebuild the configuration of an existing folder, see `read_config`."""
         return read_config(path, kind, cls.format, given)
 
     def count(self, name: str) -> int:
-        """Number of files of a name, such as "view" for view_00.npz, view_01.npz and so on.
+        """Count the files with a name, such as "view" for view_00.npz, view_01.npz and so on.
 
-        **Raises:** `ValueError` if one before the last is missing.
+        **Raises:** `ValueError` if a file before the last one is missing.
         """
-        # By name, so that a broken link counts as an image that cannot be read.
+        # List names and do not check files, so a broken link counts as a file, and reading this file then raises an
+        # error.
         names = {file for file in os.listdir(self.path) if re.fullmatch(rf"{name}_\d{{2,}}\.npz", file)}
         for index in range(len(names)):
             file = self.file(name, index).name
@@ -87,13 +88,13 @@ class RunFolder(ResultFolder):
         return len(names)
 
     def file(self, name: str, index: int) -> Path:
-        """The path of the file with a name and an index."""
+        """Return the path of the file with a name and an index."""
         return self.path / f"{name}_{index:02d}.npz"
 
     def write(self, name: str, index: int, **parts: Any) -> None:
-        """Write a file, completely or not at all. The first file binds the folder to its configuration.
+        """Write a file, completely or not at all. The first call also writes the record of the folder.
 
-        - `parts`: modules, arrays or None, by name.
+        - `parts`: Equinox modules, arrays or None, keyed by name.
 
         **Raises:** `ValueError` if `write_whole` does.
         """
@@ -105,9 +106,9 @@ class RunFolder(ResultFolder):
         write_arrays(self.file(name, index), sealed)
 
     def read(self, name: str, index: int) -> dict[str, Any]:
-        """The parts in a file, except those that were None.
+        """Read the parts in a file, keyed by name. Parts that were None are absent.
 
-        **Raises:** `ValueError` if the file is damaged, or has another index inside.
+        **Raises:** `ValueError` if the file is damaged, or if the index stored in it differs from `index`.
         """
 
         def check(arrays: dict[str, np.ndarray]) -> None:
@@ -122,9 +123,9 @@ class RunFolder(ResultFolder):
         return _parts(arrays)
 
     def write_cloud(self, cloud: PointCloud) -> None:
-        """Write points and normals as a binary PLY file, without a change of coordinates."""
+        """Write points and normals to cloud.ply, a binary PLY file, in the coordinates of `cloud`."""
         points, normals = cloud.to_numpy()
-        # A mesh without faces, since trimesh's point clouds have no normals.
+        # Use a mesh without faces, since trimesh's point clouds have no normals.
         bare = trimesh.Trimesh(points, vertex_normals=normals, process=False)
         content = trimesh.exchange.ply.export_ply(bare, vertex_normal=True)
         write_whole(self.path / "cloud.ply", lambda file: file.write(content))
@@ -138,7 +139,7 @@ def _checksum(arrays: dict[str, np.ndarray]) -> str:
 
 
 def _parts(arrays: dict[str, Any]) -> dict[str, Any]:
-    """Modules and arrays by name. Names of a module's arrays are paths such as "scan.points"."""
+    """Make modules and arrays, keyed by name. Keys of a module's arrays are paths such as "scan.points"."""
     parts: dict[str, Any] = {}
     for name, array in arrays.items():
         part, _, rest = name.partition(".")
