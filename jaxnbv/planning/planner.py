@@ -64,11 +64,12 @@ class Planner(eqx.Module):
     No method changes the planner or the observations, and all methods run under `jit`. Programs are compiled at the
     first two views only. For a cloud without a pose, use `planner.init(None, cloud)`.
 
-    **Raises:** `ValueError` in three cases:
+    **Raises:** `ValueError` in the following cases:
 
     - `capacity` or `max_views` is below one.
     - The search cannot work with the acquisition, the camera or the cost. For example, a gradient search needs an
       acquisition that JAX can differentiate.
+    - The acquisition needs known parts, but the sampler's model has none.
     - JAX cannot trace a utility, classifier or segmenter, or it returns an array of the wrong shape.
     """
 
@@ -133,8 +134,8 @@ class Planner(eqx.Module):
 
         **Raises:** `ValueError` if the cloud is empty, if a point is not finite or outside the scene's grid, if more
         than a few stray points are outside the carving's volume, if a normal's length differs from 1 by more than 1 %,
-        or if the scan does not have one row for each ray of the camera. Also raises what the acquisition's `check`
-        raises.
+        or if a sensor's scan does not have one row for each ray of the camera. Also raises what the acquisition's
+        `check` raises.
         """
         camera = camera or self.camera
         self._check(pose, scan, camera, first=True)
@@ -203,7 +204,7 @@ class Planner(eqx.Module):
     def propose(self, observations: Observations, key: PRNGKeyArray, pending: PoseList | None = None) -> Proposal:
         """Propose the next pose.
 
-        - `pending`: poses of earlier proposals without a view. These poses are not proposed again.
+        - `pending`: poses that were proposed earlier but not visited. They are not proposed again.
 
         **Raises:** `ValueError` if every candidate has been visited, or if the observations were started on a different
         grid than the sampler's.

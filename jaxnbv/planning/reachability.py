@@ -105,8 +105,8 @@ class _Checks:
         return [self._option(turned[index], float(values[index]), score) for index, score in scores.items()]
 
     def _option(self, pose: Pose, value: float, score: float) -> _Option:
-        # Among tied poses, the search need not propose the one of the highest value. So no value counts more than that
-        # of the proposed pose.
+        # The search may have proposed a tied pose whose value is not the highest. Therefore values are capped at the
+        # value of the proposed pose.
         least = min(value, float(self.values[0]))
         return _Option(pose, value, least * score if least > 0 else least)
 

@@ -89,8 +89,9 @@ class Session:
       - Surfaces outside the box become coarse obstacles. They may hide the object, and cameras keep clear of them.
 
     - `poses`: (n, 4, 4), poses at which the sensor can be held. The default is the candidates of the planner's search,
-      in scene units around the centre of the box. If these are a whole sphere, only the upper half is used, because a
-      table may be below. Give poses to scan a room from inside, because the default poses are outside the box.
+      in scene units around the centre of the box. If the candidates are a whole sphere, only the upper half is used,
+      because a table may be below. Give poses to scan a room from inside, because the default poses are outside the
+      box.
     - `folder`: folder in which images and proposals are stored before they are used. If the process is killed, the
       session continues from this folder.
     - `convention`: axes of the matrices, see `Pose.from_matrix`.
@@ -171,8 +172,8 @@ class Session:
     ) -> "Session":
         """Load a session from its folder, to continue after its last image.
 
-        - `planner`: planner to use in place of the stored one. It is needed if the stored planner contains a function
-          or network that cannot be restored. It must have the same description as the stored planner.
+        - `planner`: planner to use in place of the stored planner. Pass a planner if the stored planner contains a
+          function or network that cannot be restored. Both planners must have the same description.
         - `until`, `progress`, `reachable`, `ignore`: as for a new session. A session's folder does not store them.
 
         **Raises:** `ValueError` if the folder holds no session, or if the stored planner cannot be restored.
@@ -376,9 +377,9 @@ class Session:
         """Refuse the pose of `next`, because the camera cannot be held there.
 
         The pose is not proposed again, and does not count as visited. `next` then returns the best remaining pose
-        without delay, because it uses the same values again.
+        without a new search.
 
-        - `reason`: reason for `NextView.refusals` of the following proposals.
+        - `reason`: text under which `NextView.refusals` counts this pose from now on.
 
         **Raises:** `ValueError` if `next` was not called since the last image.
         """
@@ -413,7 +414,7 @@ class Session:
             self._add(image)
 
     def _read(self, folder: SessionFolder) -> None:
-        """Restore the images of the folder, the proposal before each, and the proposal after the last one."""
+        """Restore the images of the folder, the proposal before each image, and the proposal after the last image."""
         self._refused, count = folder.refused(), folder.num_images
         for index in range(count + 1):
             if index and (proposal := folder.proposal(index)) is not None:

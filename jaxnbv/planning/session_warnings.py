@@ -21,7 +21,7 @@ _CALLER, _CALLER_OF_ADD = 3, 4
 def warn_of_cut(box: Box, points: Float[np.ndarray, "n 3"], voxel: float, faces: frozenset[str]) -> frozenset[str]:
     """Warn about faces beyond which the object seems to extend. Return the faces of all warnings so far.
 
-    - `box`, `points`: box and points in world units. The points must include those within about a voxel beyond a face.
+    - `box`, `points`: box and points in world units. They must include points within about a voxel beyond a face.
     - `voxel`: side of a cell of the planner's grid, in world units.
     - `faces`: faces of earlier warnings, which are not repeated.
     """

@@ -105,7 +105,7 @@ def _points_about(cloud: PointCloud, low: Float[np.ndarray, "3"], high: Float[np
 def _plane_of_most(image: _Points, lowest: float, highest: float) -> tuple[Float[np.ndarray, "3"], float] | None:
     """Return the normal n and offset d of the table plane n . x = d; None if no plane can be a table.
 
-    Among the planes that can be a table, it is the one with the most points outside the box.
+    Among the planes that can be a table, the plane with the most points outside the box is returned.
 
     - `lowest`, `highest`: limits of the plane's height at the middle of the box.
     """

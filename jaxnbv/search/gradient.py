@@ -1,4 +1,4 @@
-"""Gradient searches, which maximise the acquisition with its derivative with respect to the pose."""
+"""Gradient searches, which maximise the acquisition by gradient ascent in the pose."""
 
 import dataclasses
 import math
@@ -134,7 +134,7 @@ class GradientSearch(Search):
         trajectories, errors = jax.vmap(partial(self._walk, problem, scale))(starts)
         best_candidate = best_unvisited(problem, candidates, values, tie=0.0, scores=scores)
         best_step = best_unvisited(problem, *trajectories.flat, tie=0.0)
-        # With this form of the comparison, NaN reaches the proposal, and the planner reports it.
+        # A comparison with NaN is False, so `is_better` is True and NaN reaches the planner, which reports it.
         is_better = ~(best_step.value <= best_candidate.value)
         # `flat` swaps the axes of the trajectories, so transpose their errors too.
         best_step = dataclasses.replace(

@@ -50,7 +50,7 @@ class FunctionClassifier(Classifier):
 
     function: Callable[[PointCloud], Float[Array, " classes"]]
 
-    # `Acquisition.check` checks the result, since it can name the function in the error.
+    # The result is checked in `Acquisition.check`, whose error can name the function.
     def __call__(self, cloud: PointCloud) -> Any:
         return self.function(cloud)
 
