@@ -135,9 +135,10 @@ class Acquisition(eqx.Module):
         return self.answer(cloud)
 
     def check(self, cloud: PointCloud) -> None:
-        """Raise `ValueError` if a network or function of the acquisition has an impossible result.
+        """Raise `ValueError` if a network or function of the acquisition returns an invalid result.
 
-        Called on the first D, and on D together with a scan if the score of that scan is not finite.
+        This method is called with the first D. It is also called with D and a scan together, if the score of this scan
+        is not finite.
         """
         return
 
@@ -195,7 +196,7 @@ class ExpectedUtilityImprovement(Acquisition):
         return own
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> Answer:
-        """Return the utility's own true answer, or the answer that points on the whole surface give."""
+        """Return the utility's own true answer, or else the answer from points on the whole surface."""
         own = self.utility.true_answer(scene, cloud)
         return self.answer(cloud) if own is None else own
 
@@ -222,8 +223,8 @@ def as_acquisition(value: Any) -> Acquisition:
 class AcquisitionList(Acquisition):
     """Several acquisitions on the same samples and the same scans. Each pose is scanned only once.
 
-    The value is a vector: the members' values, concatenated in order. A member's value may itself be a vector.
-    Use an `AcquisitionList` with `expected_value` and `Problem.scores`, not in a planner.
+    The value is a vector: the members' values, concatenated in order. The value of a member may itself be a vector. Use
+    an `AcquisitionList` with `expected_value` and `Problem.scores`, not in a planner.
     """
 
     members: tuple[Acquisition, ...]
@@ -261,7 +262,10 @@ class AcquisitionList(Acquisition):
 
 
 def inputs_of(observations: StepInputs | Observations | PointCloud) -> StepInputs:
-    """Return step inputs unchanged, or wrap observations or a cloud as inputs without posterior and samples."""
+    """Return step inputs unchanged, or make them from observations or a cloud.
+
+    Step inputs made in this way have no posterior and no samples.
+    """
     return observations if isinstance(observations, StepInputs) else StepInputs(as_observations(observations))
 
 
@@ -308,7 +312,7 @@ def check_traceable(
     differentiate it (host code).
     """
     if acquisition.needs_posterior or acquisition.needs_hypotheses:
-        # There is no posterior and there are no hypotheses yet.
+        # This acquisition cannot be tested, because there are no posterior and no hypotheses yet.
         return
 
     def cloud(rows: int) -> PointCloud:

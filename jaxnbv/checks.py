@@ -60,7 +60,7 @@ def check_device() -> None:
     except Exception as error:
         raise InputError(
             f"JAX_PLATFORMS is {os.environ.get('JAX_PLATFORMS', '')!r}, but JAX finds no such device here: leave it "
-            f"out, or see to the device's driver and {install('cuda')}"
+            f"out, or check the device's driver and run {install('cuda')}"
         ) from error
 
 

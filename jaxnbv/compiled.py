@@ -10,7 +10,7 @@ import platformdirs
 
 from jaxnbv.errors import InputError
 
-# The variable that names the folder of the package's own programs.
+# Name of the environment variable that contains the folder of the package's own programs.
 PROGRAMS = "JAXNBV_PROGRAMS"
 _FOLDER = "jax_compilation_cache_dir"
 # By default JAX does not store programs that compile within a second. Most programs of a step compile that fast.

@@ -42,7 +42,8 @@ class Observations(eqx.Module):
     - `looks`: the measured surface and the measured ray lengths of each view, see `Looks`.
     - `empty_nodes`: mask of the nodes that some scan showed to be empty.
     - `obstacle_nodes`: mask of the nodes inside known obstacles, where the object cannot be.
-    - `hypotheses`: the state that a model carries from view to view, see `SurfaceModel.add_state`; None without one.
+    - `hypotheses`: the state that a model carries from view to view, see `SurfaceModel.add_state`; None if the model
+      carries no state.
     """
 
     cloud: PointCloud

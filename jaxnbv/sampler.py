@@ -123,7 +123,7 @@ class SurfaceSampler(eqx.Module):
         scale, usual = longest_side / 2.5, ScreenedSPSR()
         room, volume = (0.0, Box.cube(longest_side)) if volume is None else (scale * _ROOM, volume)
         lengthscales = scale * (usual.base.lengthscale + (jnp.array([0.005, 0.0]) if quick else 0.0))
-        # Shorter scales need more frequencies, but time and memory grow with their cube.
+        # Shorter lengthscales need more frequencies, but time and memory grow with the cube of the truncation.
         truncation = min(round((20 if quick else usual.base.truncation) / scale), 30 if quick else 48)
         base = GeometricSPSR(lengthscales, usual.base.variance, truncation)
         values = (OutsideBoundary(volume, room=room), OnSurface(), *(() if solid else (EmptySpace(),)))
@@ -246,7 +246,7 @@ class SurfaceSampler(eqx.Module):
     def probability_inside(self, observations: Observations | PointCloud) -> Float[Array, "g g g"]:
         """Return P(f < level | observations) at the grid's nodes.
 
-        The estimate is the fraction of S carved samples, drawn with a fixed key, that are below the level. It exists
+        The estimate is the fraction of S carved samples that are below the level, drawn with a fixed key. This works
         for any model.
 
         **Raises:** `ValueError` if `sample` does.
@@ -269,7 +269,7 @@ class SurfaceSampler(eqx.Module):
         if triangles is None:
             half = self.grid.half_extent
             raise InputError(
-                f"the posterior mean less its level runs from {values.min():.4g} to {values.max():.4g} on the grid, so "
+                f"the posterior mean minus its level is from {values.min():.4g} to {values.max():.4g} on the grid, so "
                 f"no surface lies within [-{half}, {half}]^3: give a finer Grid, or one whose half extent holds the "
                 "cloud"
             )

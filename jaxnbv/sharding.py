@@ -19,7 +19,9 @@ from jax.sharding import AxisType, PartitionSpec, get_abstract_mesh
 
 
 def shared_map(function: Callable[..., Any], rows: Any, *common: Any, at_once: int = 1) -> Any:
-    """Map `function(row, *common)` over the rows of a tree by `jax.lax.map`, with rows divided among devices.
+    """Map `function(row, *common)` over the rows of a tree, with the rows divided among devices.
+
+    Each device maps its rows by `jax.lax.map`.
 
     - `at_once`: number of rows that a device computes together.
     """

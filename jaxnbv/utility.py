@@ -52,7 +52,10 @@ class Answer(eqx.Module):
     form: str = "{:.4g}"
 
     def in_world(self, frame: Frame) -> "Answer":
-        """Return a copy whose text gives points and lengths in the frame's world. By default unchanged."""
+        """Return a copy whose text gives points and lengths in the frame's world.
+
+        The default is for answers without points and lengths, and returns the answer unchanged.
+        """
         return self
 
 

@@ -51,8 +51,8 @@ class _Grid:
 def _difference(one: _Grid, other: _Grid, ratio: float) -> float:
     """Return the largest difference between the signed distances to two centred shapes, near the surface of `one`.
 
-    `other` is rotated by right angles such that the result is smallest. The result is infinite if the side lengths
-    differ in every rotation.
+    The result is the smallest over rotations of `other` by right angles. It is infinite if the side lengths differ in
+    every rotation.
 
     - `ratio`: factor that scales `other` to the units of `one`.
     """

@@ -23,7 +23,7 @@ from jaxnbv.scanning.mesh import TriangleMesh
 from jaxnbv.scanning.mesh_files import load_mesh
 from jaxnbv.scanning.sdf import Sampled, solid_of_mesh
 
-# Increase this when the code changes that computes the cached arrays.
+# Increase this number when the code that computes the cached arrays changes.
 _VERSION = 3
 _ARRAYS = ("values", "low", "spacing", "padding", "extremes", "from_mesh")
 _T = TypeVar("_T")
@@ -134,7 +134,7 @@ def _sampled(mesh: TriangleMesh, resolution: int, sheet: float, num_extremes: in
 
 
 def _read(file: Path) -> dict[str, np.ndarray] | None:
-    """Read cached arrays; None if there is no file or it is damaged."""
+    """Read cached arrays, or return None if the file is missing or damaged."""
     try:
         with np.load(file) as stored:
             return {name: stored[name] for name in _ARRAYS}
@@ -143,7 +143,7 @@ def _read(file: Path) -> dict[str, np.ndarray] | None:
 
 
 def _keep(file: Path, arrays: dict[str, Any]) -> None:
-    """Write arrays to the cache; warn if that fails, for example on a full disk."""
+    """Write arrays to the cache, or warn if writing fails, for example on a full disk."""
     partial = file.with_suffix(f".{secrets.token_hex(8)}.npz")
     try:
         file.parent.mkdir(parents=True, exist_ok=True)

@@ -39,12 +39,12 @@ from jaxnbv.surfaces.shape_bank import ShapeBank
 # Smallest tau in scene units, tau in standard deviations of the noise, and the residual with misfit C, in tau.
 LEAST_TAU, _TAU_OF_NOISE, _FAR = 0.03, 2.0, 4.0
 MOST = math.log1p(_FAR**2 / 2.0)
-# Standard deviation of a normal distribution divided by the lower quartile of its absolute value. A median would not do
-# for a thin object: more than half of the differences cross the object's edges, and would count as noise.
+# Standard deviation of a normal distribution divided by the lower quartile of its absolute value. A median would
+# overestimate the noise on a thin object, where more than half of the differences cross the object's edges.
 _BY_QUARTILE = 1.0 / 0.31864
 # Smallest stride along a ray in scene units, and number of strides.
 _STRIDE, _NUM_STRIDES = 0.04, 40
-# Most rays used from all views together.
+# Largest number of rays used from all views together.
 _NUM_RAYS = 4096
 # Rays closer together than this on the object have dependent errors; scene units.
 _APART = 0.12

@@ -28,8 +28,8 @@ class PartHypotheses(eqx.Module):
     """Parts of a bank, each with a placement, the most likely first.
 
     - `bank`: the parts at true size, in scene units.
-    - `placed`: part and placement of each hypothesis. A part may have several placements. Of placements with equal
-      surfaces, only one counts.
+    - `placed`: part and placement of each hypothesis. A part may have several placements. If several placements of a
+      part have equal surfaces, only one has a weight above zero.
     - `weights`: probability of each hypothesis, followed by the probability of "none of these".
     - `tau`: scale of the distance between measured points and the surface, in scene units, see `part_evidence`.
     """

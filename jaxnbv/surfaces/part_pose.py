@@ -91,8 +91,8 @@ def distances_to(hypotheses: PartHypotheses, points: Float[Array, "p 3"]) -> Flo
 def symmetries(shape: Shape) -> Float[np.ndarray, "n 3 3"]:
     """Return the rotations about a shape's centre that leave the shape unchanged, the identity first.
 
-    Tested are rotations by multiples of five degrees about each axis, and the rotations of a cube onto itself. The
-    result also contains products of a symmetry of the first kind and a symmetry of the second kind.
+    The function tests rotations by multiples of five degrees about each axis, and the rotations of a cube onto itself.
+    The result contains all products of a symmetry of the first kind and a symmetry of the second kind.
     """
     vectors = [angle * axis for axis in np.eye(3) for angle in np.arange(0.0, 2.0 * np.pi, _STEP)]
     about_axes, of_cube = Rotation.from_rotvec(vectors).as_matrix(), Rotation.create_group("O").as_matrix()

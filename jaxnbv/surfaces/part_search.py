@@ -49,7 +49,8 @@ _NUM_PROBES, _FEW_RAYS = 4096, 1024
 def placeholder_hypotheses(dtype: Any) -> Hypotheses:
     """Return placeholders for the hypotheses of the view before the first.
 
-    They are the first part at the identity placement with infinite misfit, which are harmless extra starts.
+    Each placeholder is the first part at the identity placement with infinite misfit. As an extra start of the search,
+    it does no harm.
     """
     still = Placement(jnp.eye(3, dtype=dtype), jnp.zeros(3, dtype), jnp.ones(3, dtype))
     one = Hypotheses(jnp.zeros((), int), still, jnp.asarray(jnp.inf, dtype), jnp.asarray(False))

@@ -74,7 +74,7 @@ class ShapePoses(eqx.Module):
     def __check_init__(self):
         check_fields(self)
         least, most = self.scale
-        require(0 < least <= most, f"the scales are {self.scale}; give the least, positive, and the greatest")
+        require(0 < least <= most, f"the scales are {self.scale}; give the smallest (above 0) and the largest")
 
     @abstractmethod
     def rotations(self, count: int) -> Float[AnyArray, "m 3 3"]:
@@ -125,7 +125,7 @@ class Upright(ShapePoses):
     - `axis`: the vertical direction, which is the same in the frames of the shapes and in the scene.
     - `within`: the search starts at angles between -`within` and `within`, in radians. Refined angles may lie outside.
 
-    **Raises:** `ValueError` as `ShapePoses` does, and for a zero axis or an angle `within` outside (0, pi].
+    **Raises:** `ValueError` if `ShapePoses` does, for a zero axis, or for an angle `within` outside (0, pi].
     """
 
     axis: tuple[float, float, float] = eqx.field(static=True, default=(0.0, 1.0, 0.0))

@@ -266,7 +266,7 @@ def _mean(values: Float[Array, " n"], mask: Bool[Array, " n"]) -> Float[Array, "
 def _misfit(
     shape: Shape, prior: Prior, placement: Placement, targets: FitTargets, tau: Float[Array, ""] | float
 ) -> Float[Array, ""]:
-    """Return E of a placement. `jax.jvp` computes n_j . grad d."""
+    """Return E of a placement of a shape. `jax.jvp` computes n_j . grad d in one pass."""
     distance, slope = jax.jvp(lambda x: placement.distance(shape.solid, x), (targets.points,), (targets.normals,))
     empty = placement.distance(shape.solid, targets.empty)
     return _summed(distance, slope, empty, prior.deviation(shape, placement), targets, tau)
@@ -294,9 +294,9 @@ def _newton_step(
     tau: Float[Array, ""],
     basis: Float[Array, "9 k"],
 ) -> tuple[Float[Array, "9"], Float[Array, ""]]:
-    """Return a damped Gauss-Newton step on E, limited in size, and E before the step at the last tau.
+    """Return a damped Gauss-Newton step on E, limited in size, and E of `placement` at the last tau.
 
-    In the step, the normals contribute the term (n - grad d)^2 / 4.
+    The step is for the given `tau`. In the step, the normals contribute the term (n - grad d)^2 / 4.
     """
     points = jnp.concatenate([targets.points, targets.empty])
     distance, gradient = values_and_gradients(lambda x: placement.distance(shape.solid, x), points)

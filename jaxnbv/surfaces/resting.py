@@ -41,7 +41,7 @@ class Resting(ShapePoses):
         require(len(bank) > 0, "the bank is empty: give one with parts")
         each = [_stable_poses(bank, index) for index in range(len(bank))]
         most = max(len(poses) for poses in each)
-        # Parts with fewer poses repeat them.
+        # If a part has fewer poses than other parts, repeat its poses.
         rows = [poses[np.arange(most) % len(poses)] for poses in each]
         return cls(jnp.asarray(np.stack(rows), jnp.result_type(float)))
 

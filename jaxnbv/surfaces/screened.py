@@ -46,7 +46,7 @@ class ScreenedSPSR(SurfaceModel):
     The defaults were the best over validation objects in `benchmarks/imagination.py`.
 
     - `base`: the prior, and the noise of the normals. The default has a short lengthscale for detail, and a long
-      lengthscale for the overall shape, over which values can act.
+      lengthscale for the overall shape, which lets values affect f far from their points.
     - `values`: sources of values, see `jaxnbv.surfaces.values`.
     - `level_deviation`: tau, the prior standard deviation of the level, which is broad compared with the values of f.
     - `offset`: distance from the data, to both sides, at which h is measured, in scene units. h is half the median over
@@ -83,8 +83,8 @@ class ScreenedSPSR(SurfaceModel):
 
         The cost is that of the base, plus M triangular solves with the base's factor.
 
-        **Raises:** `ValueError` as `GeometricSPSR.condition` does, for a capacity above 16,384, for values that are not
-        finite or at points outside [-pi/2, pi/2]^3, and if S is singular in the dtype's precision. Under `jit` values
+        **Raises:** `ValueError` if `GeometricSPSR.condition` does, for a capacity above 16,384, for values that are not
+        finite or at points outside [-pi/2, pi/2]^3, or if S is singular in the dtype's precision. Under `jit` values
         cannot be checked, and the posterior is NaN instead.
         """
         observations = as_observations(observations)
@@ -186,7 +186,7 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
         prior = function_variance(spectrum) + self.model.level_deviation**2
 
         def at_point(point):
-            # Whitened covariances of g with the normals, and with the values given the normals.
+            # `normals`: whitened covariances of g with the normals. `values`: with the values, given the normals.
             normals = self.base.solver.whitened_cross(point[None])
             cross = function_covariance(self.rows.points, point[None], spectrum) + self.model.level_deviation**2
             cross = cross - jnp.einsum("dnm,dnx->mx", self.whitened, normals, precision="highest")

@@ -78,7 +78,10 @@ class Solver(eqx.Module):
         return _of_columns(self.factor.unwhiten, blocks)
 
     def whitened_cross(self, x: Float[Array, "n 3"]) -> Float[Array, "3 capacity n"]:
-        """Return C^-1 cov(v_d(X), f(x)). The sum of squares over d and X is the variance that the data explain."""
+        """Return C^-1 cov(v_d(X), f(x)).
+
+        The sum of its squares over d and the data is the part of Var f(x) that the data explain.
+        """
         capacity, factor = self.cloud.capacity, self.factor
 
         def leading(size: int):
@@ -141,7 +144,7 @@ class ConjugateGradientSolver(Solver):
 
     @property
     def factor(self) -> CholeskyFactor:
-        """**Raises:** `ValueError`, since this solver has no factor."""
+        """**Raises:** `ValueError`, because this solver does not factorise A."""
         raise InputError(
             f"covariances and likelihoods need a factorisation, which is done for at most {MOST_FACTORISED} points: "
             "keep fewer points"
@@ -201,6 +204,6 @@ def _on_filled_rows(cloud: PointCloud, leading: Callable[[int], Float[Array, "*o
 
 
 def _of_columns(function: Callable[[Array], Array], blocks: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
-    """Apply a function of columns to the columns of all blocks at once."""
+    """Apply a function, which maps each column of a matrix, to the columns of all blocks at once."""
     columns = jnp.moveaxis(blocks, 0, 1)
     return jnp.moveaxis(function(columns.reshape(len(columns), -1)).reshape(columns.shape), 1, 0)

@@ -31,7 +31,10 @@ def circle_basis(x: Float[Array, "*n"], truncation: int) -> Float[Array, "*n a"]
 
 
 def basis_variance(spectrum: Float[Array, "l_plus_1"]) -> Float[Array, " a"]:
-    """Return variances of the coefficients of phi_a for the kernel sum_n s1(n) cos(n t) (n in Z) on the circle."""
+    """Return the variances of the coefficients of phi_a for a kernel on the circle.
+
+    The kernel is sum_{n in Z} s1(n) cos(n t), and `spectrum` is s1(0), ..., s1(L).
+    """
     positive = 2.0 * spectrum[1:]
     return jnp.concatenate([positive[::-1], spectrum[:1], positive])
 

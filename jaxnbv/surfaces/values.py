@@ -134,7 +134,7 @@ class OutsideBoundary(ValueSource):
 
 
 class OnSurface(ValueSource):
-    """f(x_j) - c ~ N(0, s_f^2) at some of the data: the "screening" of Kazhdan and Hoppe (2013).
+    """f(x_j) - c ~ N(0, s_f^2) at some points x_j of D: the "screening" of Kazhdan and Hoppe (2013).
 
     - `num_points`: number of points, chosen by farthest point sampling. If D has fewer points, all are used.
     - `noise`: standard deviation s_f, in units of h.
