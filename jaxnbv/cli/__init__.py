@@ -1,4 +1,4 @@
-"""The command line. Commands are typer functions or apps, the entry points of the group `jaxnbv.commands`."""
+"""The command line. Its commands are the entry points of the group `jaxnbv.commands`: typer functions or apps."""
 
 import sys
 from importlib.metadata import EntryPoint, entry_points
@@ -55,9 +55,10 @@ def _is_own(point: EntryPoint) -> bool:
 
 
 def _add_commands() -> None:
-    """Add the commands of this package, then those of other packages under names that are free.
+    """Add the commands of this package, then the commands of other packages.
 
-    An entry point names a function, or a `typer.Typer` for a command with commands of its own.
+    A command of a different package is skipped if this package has a command of the same name. An entry point names a
+    function, or a `typer.Typer` for a command that has subcommands.
     """
     named = {point.name: point for point in sorted(entry_points(group="jaxnbv.commands"), key=_is_own)}
     for point in sorted(named.values(), key=lambda point: (not _is_own(point), point.name)):
@@ -67,7 +68,7 @@ def _add_commands() -> None:
                 app.add_typer(loaded, name=point.name)
             else:
                 app.command(point.name, cls=Command)(loaded)
-        # Modules of other packages can fail in any way at import.
+        # The module of another package can raise any error when it is imported.
         except (Exception, SystemExit) as error:
             package = point.dist.name if point.dist else point.module
             reason = " ".join(f"{type(error).__name__}: {error}".split())
@@ -78,7 +79,7 @@ _add_commands()
 
 
 def answer() -> None:
-    """Run the command line of this process. An `InputError` prints one line, without a traceback.
+    """Run the command line with the arguments of this process. Prints an `InputError` as one line, without a traceback.
 
     **Raises:** `SystemExit` with the exit code.
     """
@@ -92,7 +93,7 @@ def answer() -> None:
 
 
 def main() -> None:
-    """Entry point: run the command line, then end the process even if background work still runs."""
+    """Entry point: run the command line, then end the process even if a background thread still runs."""
     try:
         answer()
     except SystemExit as end:

@@ -11,7 +11,7 @@ _NAME = "jaxnbv-background"
 
 
 def in_background(function: Callable[..., Any], *arguments: Any, **settings: Any) -> "Future[Any]":
-    """Start a call in its own thread and return its future. The arguments are freed when it ends."""
+    """Start a call in a new thread and return its future. The arguments are freed when the call ends."""
     future: Future[Any] = Future()
 
     def call() -> None:
@@ -20,13 +20,13 @@ def in_background(function: Callable[..., Any], *arguments: Any, **settings: Any
         except BaseException as error:
             future.set_exception(error)
 
-    # The process joins an executor's threads at its end, but not daemon threads.
+    # Use a daemon thread: at its end a process waits for the threads of an executor, but not for daemon threads.
     threading.Thread(target=call, name=_NAME, daemon=True).start()
     return future
 
 
 def is_working() -> bool:
-    """Whether a background call still runs."""
+    """Return whether a call of `in_background` still runs."""
     return any(thread.name == _NAME for thread in threading.enumerate())
 
 

@@ -1,4 +1,4 @@
-"""`jaxnbv demo`: an episode on a built-in object."""
+"""`jaxnbv demo`: simulates an episode on a built-in object."""
 
 from dataclasses import dataclass
 from typing import Annotated

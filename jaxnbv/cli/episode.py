@@ -31,7 +31,7 @@ KnownOption = Annotated[
 
 
 def by_task(of: Callable[[type[Task]], T]) -> dict[T, str]:
-    """The values of a function of the tasks, each with the names of the tasks that have it."""
+    """Group the names of tasks by the value of a function: maps each value to the names joined by "/"."""
     names: dict[T, list[str]] = {}
     for name, task in TASKS.items():
         names.setdefault(of(task), []).append(name)

@@ -1,4 +1,4 @@
-"""`jaxnbv identify RECORDING`: names and poses of known parts in a recording."""
+"""`jaxnbv identify RECORDING`: finds names and poses of known parts in a recording."""
 
 import dataclasses
 import json
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from jaxnbv.surfaces.part_pose import ObjectPose
 
 _NAMES_SAID, _BAR = 4, 24
-# A frame with fewer pixels than this in the box shows no object.
+# A frame with fewer points than this in the box shows no object.
 _FEWEST = 20
 _NO_FOLDER = (
     "is a file: identify needs depth images with the poses of the camera, since the empty space along rays also tells "
@@ -130,7 +130,7 @@ def identify(options: IdentifyOptions, box: Any, intrinsics: Any, depth_scale: A
             f"none of the {len(indices)} frames of {options.recording} shows an object in the box: give --box, or more "
             "--views"
         )
-    # Named units imply a world in metres.
+    # If the parts have a named unit, the world is in metres.
     unit = "m" if isinstance(as_unit(options.parts_scale), str) else None
     answers = {}
     for name, session in _objects(sessions, names).items():
@@ -144,7 +144,7 @@ def identify(options: IdentifyOptions, box: Any, intrinsics: Any, depth_scale: A
 
 
 def _shows(frames: "RecordedFrames", index: int, corners: "np.ndarray") -> bool:
-    """Whether a frame shows at least `_FEWEST` points in a box."""
+    """Return whether a frame shows at least `_FEWEST` points in a box."""
     import numpy as np
 
     from jaxnbv.geometry.pose import Pose
@@ -157,7 +157,7 @@ def _shows(frames: "RecordedFrames", index: int, corners: "np.ndarray") -> bool:
 
 
 def _objects(sessions: Any, names: dict[int, str]) -> "dict[str, Session]":
-    """The session of each object by its name, which is "" for a single object."""
+    """Return the session of each object, keyed by the object's name. The name of a single object is ""."""
     objects = getattr(sessions, "objects", None)
     if objects is None:
         return {"": sessions}
@@ -169,7 +169,7 @@ def _likely(session: "Session") -> list[tuple[str, float]]:
 
 
 def _say(name: str, session: "Session", unit: str | None) -> dict[str, Any]:
-    """Print which part an object is and where it lies, and return it as JSON."""
+    """Print which part an object is and where it lies, and return both for a JSON file."""
     from jaxnbv.surfaces.part_hypotheses import NONE
 
     if name:
@@ -183,7 +183,7 @@ def _say(name: str, session: "Session", unit: str | None) -> dict[str, Any]:
 
 
 def pose_text(pose: "ObjectPose", unit: str) -> str:
-    """Lines of text with the pose of a part and its standard deviations.
+    """Return lines of text with the pose of a part and the standard deviations of the pose.
 
     - `unit`: unit of the world.
     """

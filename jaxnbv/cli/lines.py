@@ -1,4 +1,4 @@
-"""Lines on the terminal about each finished view of an episode."""
+"""Prints lines on the terminal about each finished view of an episode."""
 
 import sys
 
@@ -12,7 +12,7 @@ from jaxnbv.viz.answers import label_of, number, words_of
 
 
 class Lines:
-    """Prints two lines for each view, within 100 columns: position and choice, then the answer."""
+    """Prints two lines of at most 100 columns for each view: position and choice, then the answer."""
 
     def __init__(self, planner: Planner):
         self.planner, self.count = planner, 0
@@ -36,7 +36,7 @@ def _print(line: str) -> None:
 
 
 def _why(planner: Planner, view: View) -> str:
-    """The value of the chosen view and its rank among the candidates."""
+    """Return the value of the chosen view and the rank of this value among the candidates, as text."""
     if view.proposal is None:
         return "given"
     value, values = float(view.proposal.value), np.asarray(view.proposal.values, np.float64)

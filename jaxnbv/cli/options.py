@@ -15,7 +15,7 @@ from jaxnbv.errors import suggestion
 Position: TypeAlias = tuple[float, float, float]
 T = TypeVar("T")
 
-# One kind of option for each group of the help.
+# A kind of option for each group of options in the help.
 asking = partial(typer.Option, rich_help_panel="Task")
 seeing = partial(typer.Option, rich_help_panel="Sensor")
 imagining = partial(typer.Option, rich_help_panel="Imagined surfaces")
@@ -25,12 +25,12 @@ planning = partial(typer.Option, rich_help_panel="Planner")
 
 
 def listed(choices: Iterable[tuple[str, str]]) -> str:
-    """Names and their meanings as one sentence of the help."""
+    """Join names and their meanings to one sentence for the help."""
     return "; ".join(f"{name}: {about}" for name, about in choices) + "."
 
 
 def one_of(names: Collection[str]) -> Callable[[str], str]:
-    """A parser of an option that takes one of some names. Its error suggests the nearest one."""
+    """Make the parser of an option that takes one of these names. Its error suggests the most similar name."""
 
     def parse(text: str) -> str:
         if text not in names:
@@ -41,9 +41,11 @@ def one_of(names: Collection[str]) -> Callable[[str], str]:
 
 
 def command(options: type[T], more: Mapping[str, Any] = {}) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Decorator: make a typer command from a function that takes a dataclass of options.
+    """Decorator: make a typer command from a function whose first argument is a dataclass of options.
 
-    - `more`: annotations of further options by name. They are passed by keyword, None for those that are not given. A
+    - `options`: the dataclass. Its fields become options of the command.
+    - `more`: annotations of further options, keyed by name. Their values are passed as keyword arguments, with None for
+      an option without a value. A
       `typer.Argument` is required.
     """
 
@@ -71,11 +73,11 @@ def command(options: type[T], more: Mapping[str, Any] = {}) -> Callable[[Callabl
 class Command(TyperCommand):
     """A command that reads `--option A B` as `--option A --option B` if the option's metavar ends in dots.
 
-    A shell expands a pattern of files to several words.
+    So the option also takes a pattern of files, which a shell expands to several words.
     """
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the words and return those that are left over, as in click."""
+        """Parse the words of a command and return the remaining words, as in click."""
         repeated = {flag for one in self.params if str(one.metavar).endswith("...") for flag in one.opts}
         words: list[str] = []
         flag = None

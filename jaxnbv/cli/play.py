@@ -1,4 +1,4 @@
-"""Simulation of an episode by a command: its planner, the race with a baseline, output and drawings."""
+"""Simulates the episode of a command: makes the planner, runs a baseline to compare, writes results and drawings."""
 
 import dataclasses
 import functools
@@ -46,10 +46,10 @@ class Sizes(NamedTuple):
     """Sizes of a planner.
 
     - `samples`: number of posterior samples.
-    - `candidates`: number of candidates, or None for that of the sensor's setting.
+    - `candidates`: number of candidates, or None for the number in the sensor's setting.
     - `capacity`: number of points to keep in D.
-    - `grid`: grid of the samples, or None for the task's.
-    - `rays`: rays along each side of an image, or None for the sensor's.
+    - `grid`: grid of the samples, or None for the grid of the task.
+    - `rays`: number of rays along each side of an image, or None for the sensor's own numbers.
     """
 
     samples: int
@@ -66,9 +66,9 @@ _RACE_VIEWS = 10
 
 
 def rule(texts: Sequence[str]) -> StopRule | None:
-    """The rule that stops once any of some rules such as "sure=0.95" does, or None for "never".
+    """Make one stop rule from texts such as "sure=0.95". It holds when one of them holds; None for "never".
 
-    **Raises:** `ValueError` for an unknown name, or a value that is not a number or out of range.
+    **Raises:** `ValueError` if a name is unknown, or if a value is not a number or out of range.
     """
     if not texts or list(texts) == ["never"]:
         return None
@@ -84,7 +84,7 @@ def rule(texts: Sequence[str]) -> StopRule | None:
 
 
 def search_of(name: str, radius: float, count: int) -> Search:
-    """The search with a name of `SEARCHES`.
+    """Make the search with this name, one of `SEARCHES`.
 
     - `radius`: distance of the candidates in scene units.
     - `count`: number of candidates.
@@ -96,10 +96,10 @@ def search_of(name: str, radius: float, count: int) -> Search:
 
 
 def imagined(model: str, quick: bool, known: str | ShapeBank | None) -> SurfaceSampler:
-    """The sampler of a model with a name of `MODELS`, with a bank of known shapes if there is one.
+    """Make the sampler of the model with this name, one of `MODELS`, with a bank of known shapes if given.
 
-    - `known`: a shipped bank, a folder of upright meshes, or a bank of parts in any rotation. None or "none" for no
-      bank.
+    - `known`: name of a shipped bank, a folder of upright meshes, or a bank of parts in any rotation. None or "none"
+      for no bank.
 
     **Raises:** `ValueError` if there is no such bank or folder, or if no mesh in the folder can be used.
     """
@@ -120,7 +120,7 @@ def imagined(model: str, quick: bool, known: str | ShapeBank | None) -> SurfaceS
 def planner_of(
     setting: Setting, acquisition: Acquisition, search: str, sampler: SurfaceSampler, sizes: Sizes
 ) -> Planner:
-    """A planner for a task."""
+    """Make the planner of a task."""
     grid = sizes.grid or sampler.grid
     sampler = dataclasses.replace(sampler, grid=grid, num_samples=sizes.samples)
     searcher = search_of(search, setting.radius, sizes.candidates or setting.num_candidates)
@@ -129,7 +129,7 @@ def planner_of(
 
 
 def first_pose(place: Position, surface: Surface) -> Pose:
-    """Pose of the first view at a position, looking at the origin.
+    """Return the pose of a first view at a position. The camera looks at the origin.
 
     **Raises:** `ValueError` for a position inside the object.
     """
@@ -139,9 +139,9 @@ def first_pose(place: Position, surface: Surface) -> Pose:
 
 
 def play(options: EpisodeOptions, subject: Subject, setting: Setting, sizes: Sizes, until: Sequence[str] = ()) -> None:
-    """Simulate an episode into a folder, print each view when it is done, and write the report.
+    """Simulate an episode, write it to a folder, print each view when it is finished, and write the report.
 
-    - `until`: default of `--until`. If it is not empty, a baseline, farthest view, runs from the same first view.
+    - `until`: default of `--until`. If it is not empty, the baseline farthest view also runs from the same first view.
     """
     began = time.perf_counter()
     if options.quick:
@@ -175,11 +175,11 @@ def play(options: EpisodeOptions, subject: Subject, setting: Setting, sizes: Siz
         nonlocal race, drawing
         lines(step.view)
         if sketches is not None:
-            # Draw one step at a time, since each waiting step would keep its posterior in memory.
+            # Draw only one step at a time, because each step that waits to be drawn keeps its posterior in memory.
             if drawing is not None:
                 drawing.result()
             drawing = in_background(sketches.add, step)
-        # Start the baseline after the first view. Earlier, both would compile the same programs.
+        # Start the baseline only after the first view. Before, both threads would compile the same programs.
         if race is None and races:
             start = subject.surface, subject.first, _RACE_VIEWS, key, noise, folder / "farthest"
             race = in_background(simulate, rival, *start, progress=False, until=enough)

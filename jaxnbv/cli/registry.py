@@ -1,10 +1,10 @@
-"""Names of models, searches and stop rules on the command line. Imports nothing heavy."""
+"""Names of models, searches and stop rules on the command line. This module does not import JAX."""
 
 import importlib
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-# Lazy: the modules of its names are imported when these are used.
+# The package is lazy: it imports a module only when a name of this module is used.
 import jaxnbv as nbv
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ STUDY_SETTINGS = {
 }
 
 BANKS = ("pyramid", "truck", "household", "parts", "heat", "household-real")
-"""The banks of known shapes that ship."""
+"""The shipped banks of known shapes."""
 
 SEARCHES = {
     "discrete": "the best of all candidates",
@@ -42,8 +42,8 @@ SEARCHES = {
 class Stop(NamedTuple):
     """A rule of `--until`.
 
-    - `about`: meaning of its number, for the help.
-    - `rule`: makes the rule from the number.
+    - `about`: meaning of the rule's number, for the help.
+    - `rule`: function that makes the rule from the number.
     """
 
     about: str
@@ -63,6 +63,6 @@ STOPS = {
 
 
 def resolve(text: str) -> Any:
-    """Import an object by its text "module:name"."""
+    """Import the object that a text "module:name" names."""
     module, _, name = text.partition(":")
     return getattr(importlib.import_module(module), name)

@@ -1,4 +1,4 @@
-"""`jaxnbv report DIR`: results of studies on one page."""
+"""`jaxnbv report DIR`: writes one page with the results of studies."""
 
 from pathlib import Path
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""`jaxnbv run MESH`: an episode on a mesh of the user's."""
+"""`jaxnbv run MESH`: simulates an episode on a user's mesh."""
 
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
@@ -38,7 +38,7 @@ _OF_TASKS = {
     for name, hint in get_type_hints(task, include_extras=True).items()
     if name in {field.name for field in fields(task)}
 }
-"""Annotations of the tasks' own options."""
+"""Annotations of the options that belong to single tasks, keyed by option."""
 
 
 @command(RunOptions, _OF_TASKS)
@@ -46,7 +46,7 @@ def run(options: RunOptions, **of_tasks: Any) -> None:
     """Choose views of a mesh, scanned by a simulated depth camera.
 
     The mesh may be open, a soup of triangles or inconsistently wound. It is scaled and centred so that its longest side
-    is 2.5 scene units. Cameras stand far enough from its centre to see all of it.
+    is 2.5 scene units. Without --paper, cameras stand far enough from the centre to see the whole mesh.
     """
     task = _task(options.task, {name: value for name, value in of_tasks.items() if value is not None})
 
@@ -68,9 +68,9 @@ def run(options: RunOptions, **of_tasks: Any) -> None:
 
 
 def _task(name: str, settings: dict[str, Any]) -> Task:
-    """The task with this name and its own options.
+    """Make the task with this name, with the values of the task's own options.
 
-    **Raises:** `ValueError` for an option of another task, or for a required option that is missing.
+    **Raises:** `ValueError` if an option belongs to a different task, or if a required option is missing.
     """
     declared = {field.name: field for field in fields(TASKS[name])}
     for option in settings.keys() - declared.keys():

@@ -1,4 +1,4 @@
-"""Body of `jaxnbv study`: runs the scenes and writes tables, a chart and pictures."""
+"""Runs the scenes of `jaxnbv study` and writes tables, a chart and pictures."""
 
 import functools
 import os
@@ -30,12 +30,12 @@ from jaxnbv.studies.registry import studies
 
 
 def run_study(name: str, options: StudyOptions, **settings: Any) -> None:
-    """Run all parts of a study and write the results.
+    """Run all parts of a study and write the results of each part.
 
-    - `settings`: values of the study's own options, None for those that are not given.
+    - `settings`: values of the study's own options, None for options without a value.
 
-    **Raises:** `ValueError` for no scenes, unknown methods, options that exclude each other, or a user's method that
-    cannot be imported. Also if scenes failed, after all results are written.
+    **Raises:** `ValueError` if there are no scenes, a method is unknown, options exclude each other, or a user's method
+    cannot be imported. If scenes failed, raises `ValueError` after all results are written.
     """
     entry = studies()[name]
     kind: type[Study] = entry.load()
@@ -88,7 +88,7 @@ def run_study(name: str, options: StudyOptions, **settings: Any) -> None:
 
 
 def _executor(options: StudyOptions) -> AbstractContextManager[Executor | None]:
-    """The executor that runs the scenes, or None for this process."""
+    """Make the executor that runs the scenes, or None to run them in this process."""
     require(
         options.cluster is None or options.workers == 1,
         f"--workers {options.workers} and --cluster {options.cluster} exclude each other: leave one out",
@@ -99,7 +99,7 @@ def _executor(options: StudyOptions) -> AbstractContextManager[Executor | None]:
 
 
 def _sources(folders: Iterable[Path], parts: Iterable[str]) -> dict[str, list[Path]]:
-    """The folders of records to join, for each part of the study."""
+    """Return the folders of records to join, keyed by part of the study."""
     sources = {part: [folder / part for folder in folders if (folder / part / "study.json").exists()] for part in parts}
     for folder in folders:
         require(
@@ -110,9 +110,9 @@ def _sources(folders: Iterable[Path], parts: Iterable[str]) -> dict[str, list[Pa
 
 
 def _planned(kind: type[Study], options: StudyOptions) -> dict[str, Any]:
-    """Settings of the study that replace its own: those of `--settings`, and then single ones.
+    """Return settings that replace those of the study: first from `--settings`, then from single options.
 
-    **Raises:** `ValueError` for the paper's settings in a quick run.
+    **Raises:** `ValueError` if a quick run has the paper's settings.
     """
     is_paper = options.settings == "paper"
     require(not (is_paper and options.quick), "--quick and --settings paper exclude each other: leave one out")
@@ -126,7 +126,7 @@ def _planned(kind: type[Study], options: StudyOptions) -> dict[str, Any]:
 
 
 def _scenes(text: str) -> Sequence[int]:
-    """Indices of scenes: the first N for "N", or A to B - 1 for "A:B"."""
+    """Return the indices of scenes: the first N for the text "N", or A to B - 1 for "A:B"."""
     match = re.fullmatch(r"(?:(\d{1,9}):)?(\d{1,9})", text.strip())
     scenes = range(int(match[1] or 0), int(match[2])) if match else range(0)
     if not scenes:
@@ -135,12 +135,12 @@ def _scenes(text: str) -> Sequence[int]:
 
 
 def _own(text: str) -> Factory:
-    """A user's function by its text "module:function". The module may be in the current folder."""
+    """Import the function of a user that a text "module:function" names. It may be in the current folder."""
     if (here := os.getcwd()) not in sys.path:
         sys.path.insert(0, here)
     try:
         factory = resolve(text)
-    # A module of the user's can fail in any way at import.
+    # A user's module can raise any error when it is imported.
     except (Exception, SystemExit) as error:
         raise InputError(
             f"--method {text} cannot be found ({type(error).__name__}: {error}): write module:function, such as "

@@ -1,4 +1,4 @@
-"""Output for any encoding, since the system's encoding of redirected output may lack characters; and warnings."""
+"""Output of the command line: text for encodings that lack characters, and warnings without repetition."""
 
 import codecs
 import io
@@ -38,7 +38,7 @@ _READABLE = str.maketrans(
 
 
 def _readable(error: UnicodeError) -> tuple[str, int]:
-    """Replacement for characters that an encoding lacks: a similar text, or else their code."""
+    """Return a replacement for characters that an encoding lacks: a similar text, or else their codes."""
     assert isinstance(error, UnicodeEncodeError)
     text = error.object[error.start : error.end].translate(_READABLE)
     return text.encode("ascii", "backslashreplace").decode("ascii"), error.end
@@ -48,18 +48,18 @@ codecs.register_error("readable", _readable)
 
 
 def write_readable() -> None:
-    """Make the standard streams replace characters that their encoding lacks, such as "m2" for "m²"."""
+    """Make the standard streams replace characters that their encoding lacks, for example "m²" by "m2"."""
     for stream in (sys.stdout, sys.stderr):
-        # Streams of tests and notebooks have another type, and take all characters.
+        # Streams of tests and notebooks are not of this type, and can print all characters.
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="readable")
 
 
 @contextmanager
 def each_warning_once() -> Iterator[None]:
-    """Context manager: print each different warning once, and at the end the counts of repeated ones.
+    """Context manager: print each different warning once, and at the end how often repeated warnings occurred.
 
-    Python's own filter forgets what was printed whenever a library changes the filters.
+    Python's own filter is not enough: whenever a library changes the filters, Python forgets which warnings it printed.
     """
     counts: Counter[str] = Counter()
     usual = warnings.showwarning

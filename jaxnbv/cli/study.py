@@ -1,4 +1,4 @@
-"""`jaxnbv study NAME`: the runs behind the paper's tables and figures, and studies of the user's."""
+"""`jaxnbv study NAME`: runs studies of the paper's claims, and the studies of users."""
 
 import dataclasses
 from typing import Any
@@ -23,7 +23,7 @@ study = typer.Typer(
 
 
 def _add(name: str, entry: Entry) -> None:
-    """Add the command of a study."""
+    """Add the command of a study to `jaxnbv study`."""
     common = {field.name for field in dataclasses.fields(StudyOptions)}
     own = {option: hint for option, hint in entry.options.items() if option not in common}
 

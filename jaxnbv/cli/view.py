@@ -1,4 +1,4 @@
-"""`jaxnbv view RUN`: an episode or a session in the browser."""
+"""`jaxnbv view RUN`: shows an episode or a session in the browser."""
 
 import time
 from dataclasses import dataclass

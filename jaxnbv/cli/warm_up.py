@@ -29,9 +29,10 @@ class WarmUpOptions:
 
 @command(WarmUpOptions)
 def warm_up(options: WarmUpOptions) -> None:
-    """Compile and keep the programs of a session with this camera, so that its first view comes at once.
+    """Compile and keep the programs of a session with this camera, so the session's first proposal takes seconds.
 
-    A session of your program uses them after nbv.keep_compiled(). For another planner, call session.rehearse() there.
+    Call nbv.keep_compiled() in your own program to load them there. If you use a different planner than the default,
+    call session.rehearse() in your program instead of this command.
     """
     import jaxnbv as nbv
 

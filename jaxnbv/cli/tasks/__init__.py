@@ -1,4 +1,4 @@
-"""The tasks of `jaxnbv demo` and `jaxnbv run`: all named `Task` classes in the files of this folder."""
+"""The tasks of `jaxnbv demo` and `jaxnbv run`: all classes of `Task` in this folder that have a `name`."""
 
 import importlib
 import pkgutil

@@ -1,4 +1,4 @@
-"""Base class of tasks of the command line. A task imports JAX only once it is chosen."""
+"""Base class of the tasks of the command line. Methods import JAX, so that a task is listed without importing JAX."""
 
 import math
 from abc import ABC, abstractmethod
@@ -21,10 +21,10 @@ network_option = asking(
 
 
 class Subject(NamedTuple):
-    """The object of an episode.
+    """The object of an episode, with its acquisition and first pose.
 
-    - `bank`: known shapes as in `--known`, or a bank of parts at their size in the scene.
-    - `grid`: grid of the imagined surfaces, or None for the usual one.
+    - `bank`: known shapes as in `--known`, or a bank of parts with sizes in scene units.
+    - `grid`: grid of the imagined surfaces, or None for the default grid.
     - `note`: text to print before the first view.
     - `question`: question at the head of the report, or None for the task's.
     """
@@ -41,14 +41,14 @@ class Subject(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Task(ABC):
-    """A task of `jaxnbv run` and `jaxnbv demo`. Its fields are options of `run`.
+    """A task of `jaxnbv run` and `jaxnbv demo`. The fields of a task are options of `run`.
 
-    Options without a default are required.
+    Fields without a default are required options.
 
-    - `name`: name in `--task`.
-    - `about`: the question, a clause for the help.
-    - `example`: the object of the demo, a clause for the help.
-    - `until`: default of `--until` in the demo. If it is not empty, farthest view runs too, for comparison.
+    - `name`: name of the task in `--task`.
+    - `about`: the question of the task, as a phrase for the help.
+    - `example`: the object of the demo, as a phrase for the help.
+    - `until`: default of `--until` in the demo. If it is not empty, the demo also runs farthest view for comparison.
     """
 
     name: ClassVar[str]
@@ -58,34 +58,34 @@ class Task(ABC):
 
     @classmethod
     def setting(cls) -> "Setting":
-        """The sensor's setting."""
+        """Return the camera, the candidates' distance and the number of candidates."""
         from jaxnbv.scanning.sensors import USUAL_SETTING
 
         return USUAL_SETTING
 
     @abstractmethod
     def acquisition(self, mesh: "TriangleMesh", camera: "Camera", first: "Pose") -> "Acquisition":
-        """The acquisition for views of a user's mesh.
+        """Make the acquisition for views of a user's mesh.
 
         - `first`: pose of the first view.
         """
 
     def bank(self, mesh: "TriangleMesh") -> "str | ShapeBank":
-        """Known shapes for a user's mesh, see `Subject`."""
+        """Return the known shapes for a user's mesh, see `Subject`."""
         return "none"
 
     @classmethod
     @abstractmethod
     def demo(cls, scene: int, seed: int) -> Subject:
-        """A built-in object.
+        """Return the object of the demo.
 
         - `scene`: number that selects the object.
-        - `seed`: seed of the first view.
+        - `seed`: seed for the choice of the first view.
         """
 
 
 def usual_first(radius: float | None = None) -> "Pose":
-    """Default pose of a first view, from (0.8, 0.9, 2.2), or in this direction at distance `radius`."""
+    """Return the default first pose: at (0.8, 0.9, 2.2), or in this direction at distance `radius`."""
     from jaxnbv.geometry.pose import look_at
 
     usual = (0.8, 0.9, 2.2)

@@ -1,4 +1,4 @@
-"""Tasks about the object's class."""
+"""The tasks that ask for the object's class."""
 
 from abc import abstractmethod
 from dataclasses import dataclass
@@ -14,13 +14,13 @@ if TYPE_CHECKING:
     from jaxnbv.scanning import TriangleMesh
     from jaxnbv.tasks.classification import Classifier
 
-# Number of points that the demo's classifier gets.
+# Number of input points of the demo's classifier.
 _NUM_POINTS = 512
 
 
 @dataclass(frozen=True, kw_only=True)
 class ClassTask(Task):
-    """A task with an acquisition that compares the results of a classifier."""
+    """Base class of tasks whose acquisition compares a classifier's probabilities before and after a scan."""
 
     example = "a truck, whose cargo the first view does not show"
     until = ("sure=0.95",)
@@ -29,7 +29,7 @@ class ClassTask(Task):
     @classmethod
     @abstractmethod
     def compared(cls, classifier: "Classifier") -> "Acquisition":
-        """The acquisition with this classifier."""
+        """Make the acquisition from a classifier."""
 
     def acquisition(self, mesh: "TriangleMesh", camera: "Camera", first: "Pose") -> "Acquisition":
         from jaxnbv.networks import CloudClassifier, load_checkpoint, network_scale
@@ -39,9 +39,9 @@ class ClassTask(Task):
 
     @classmethod
     def demo(cls, scene: int, seed: int) -> Subject:
-        """A truck. Its class is its cargo, which the first view, from above the ground, does not show.
+        """Return a truck, whose class is its cargo, and a first view from above that does not show the cargo.
 
-        The grid is that of the surfaces in the classifier's training.
+        The grid is the one on which surfaces were sampled for the training of the classifier.
         """
         import jax
         import numpy as np

@@ -1,4 +1,4 @@
-"""Task about the object's shape."""
+"""The task that asks for the object's shape."""
 
 from typing import TYPE_CHECKING
 
@@ -23,7 +23,7 @@ class CoverageTask(Task):
 
     @classmethod
     def demo(cls, scene: int, seed: int) -> Subject:
-        """A mug, the same for all numbers."""
+        """Return a mug, whatever `scene` and `seed` are."""
         from jaxnbv.studies.scenes import demo_object
         from jaxnbv.tasks import NewSurface
 

@@ -1,4 +1,4 @@
-"""Task about the coldest point of an object that is heated at one place."""
+"""The task that asks for the coldest point of an object that is heated at one position."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
@@ -62,7 +62,7 @@ def _heated_at(source: "Float[np.ndarray, '3']") -> "Acquisition":
 
 
 def _source(place: Position | None, mesh: "TriangleMesh", camera: "Camera", first: "Pose") -> "Float[np.ndarray, '3']":
-    """The object's point nearest to a position, or else the point in the middle of the first view."""
+    """Return the object's point nearest to `place`, or by default the point in the middle of the first view."""
     import jax
     import numpy as np
 

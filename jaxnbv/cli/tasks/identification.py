@@ -1,4 +1,4 @@
-"""Task to find out which known part the object is."""
+"""The task that asks which known part the object is."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from jaxnbv.scanning.sensors import Setting
     from jaxnbv.surfaces import ShapeBank
 
-# Parts that are this many times smaller or larger than the object have another unit.
+# If all parts are this many times smaller or larger than the object, their unit must be wrong.
 _OTHER_UNIT = 20.0
-# Distance in scene units from which nearly all of a housing is seen, and direction of the first view.
+# Distance in scene units from which a view shows nearly the whole housing, and direction of the first view.
 _RADIUS, _FIRST = 5.5, (-0.75, -0.42, 0.5)
 
 
@@ -53,7 +53,7 @@ class IdentifyTask(Task):
         return Identify()
 
     def bank(self, mesh: "TriangleMesh") -> "ShapeBank":
-        """The parts of the folder."""
+        """Return the parts of the folder, in scene units."""
         import numpy as np
 
         frame = mesh.world_frame
@@ -61,7 +61,7 @@ class IdentifyTask(Task):
 
     @classmethod
     def demo(cls, scene: int, seed: int) -> Subject:
-        """One of the housings in a random rotation, first seen from a side that does not show the difference."""
+        """Return a housing in a random rotation, and a first view that does not show how housings differ."""
         import numpy as np
         from scipy.spatial.transform import Rotation
 
@@ -85,13 +85,13 @@ class IdentifyTask(Task):
 
 
 def bank_of(folder: Path, scale: str, size: float, up: str = "y") -> "ShapeBank":
-    """The parts of a folder, in units of a world.
+    """Read the parts of a folder, and convert them to the units of a world.
 
     - `scale`: unit of the parts, as in `--parts-scale`.
     - `size`: approximate size of the object in the world.
-    - `up`: upward axis of the parts.
+    - `up`: up axis in the files of the parts.
 
-    **Raises:** `ValueError` if `ShapeBank.from_meshes` does, or if no part is about as large as the object.
+    **Raises:** `ValueError` if `ShapeBank.from_meshes` does, or if all parts are far smaller or larger than the object.
     """
     import numpy as np
 
@@ -109,7 +109,7 @@ def bank_of(folder: Path, scale: str, size: float, up: str = "y") -> "ShapeBank"
 
 
 def as_unit(text: str) -> float | str:
-    """A number, or the name of a unit."""
+    """Return the number that a text states, or the text itself if it is the name of a unit."""
     try:
         return float(text)
     except ValueError:
@@ -117,7 +117,10 @@ def as_unit(text: str) -> float | str:
 
 
 def _housings() -> "dict[str, SignedDistance]":
-    """Housings with longest side 2.5 and a pocket that opens upward, by the bosses at the bottom of the pocket."""
+    """Return housings with longest side 2.5, keyed by a description of the bosses in their pocket.
+
+    The pocket opens upward, and the bosses are at its bottom.
+    """
     from jaxnbv.scanning.sdf import Cuboid, Cylinder
 
     body = Cuboid([1.0, 1.25, 0.9], 0.05) - Cuboid([0.8, 0.6, 0.7]).translate([0.0, 0.85, 0.0])

@@ -1,4 +1,4 @@
-"""Task about the object's parts."""
+"""The task that asks for the object's parts."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from jaxnbv.scanning import TriangleMesh
     from jaxnbv.scanning.sensors import Setting
 
-# Categories that the shipped segmenter was not trained on.
+# Categories that were not in the training set of the shipped segmenter.
 _UNKNOWN_TO_SEGMENTER = ("cap", "car", "knife")
 
 
