@@ -395,7 +395,7 @@ REFUSED = {
         ),
         "k1, k2, p1, p2",
     ),
-    "a frame of before the move": (stale_frame, "bit for bit image 1"),
+    "a frame of before the move": (stale_frame, "bit for bit equal to image 1"),
     "an inverse of intrinsics": (
         lambda: nbv.Camera.from_intrinsics(np.linalg.inv([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]]), 480, 640),
         "intrinsic matrix",

@@ -120,8 +120,8 @@ class Image(NamedTuple):
             is_same = np.array_equal(image.depth, self.depth, equal_nan=self.depth.dtype.kind == "f")
             require(
                 not is_same or bool(np.abs(image.matrix - self.matrix).max() <= _SAME_PLACE),
-                f"the image is bit for bit image {number}, which was taken from another pose, so it is older than its "
-                "pose. Discard the frames that the driver still holds after a move",
+                f"the image is bit for bit equal to image {number}, which has a different pose, so the driver returned "
+                "an old frame. Discard the frames that the driver still holds after a move",
             )
 
 

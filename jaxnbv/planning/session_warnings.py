@@ -79,12 +79,12 @@ def warn_of_mount(alignment: Alignment) -> None:
     off = f"off by {shifts.max():.2g} and {np.degrees(turns.max()):.2g} degrees"
     use = "Session(correct_mount=True) uses the correction"
     if not alignment.is_corrected:
-        cause = f"they cannot tell whether the camera's mount is off; {alignment.motion} would"
+        cause = f"these views do not determine the error of the camera's mount, but {alignment.motion} would"
     elif alignment.is_mount:
-        more = "" if alignment.is_determined else f", and {alignment.motion} would tell it better"
+        more = "" if alignment.is_determined else f", and {alignment.motion} would determine the error better"
         cause = f"the camera's mount seems {off}{more}; {use}"
     else:
-        cause = f"poses seem {off} at most, each in its own way; {use}"
+        cause = f"single poses seem {off} at most; {use}"
     warnings.warn(
         f"the views disagree by {alignment.disagreement[worst]:.2g}, where a single view's points scatter by "
         f"{alignment.noise:.2g}: {cause}",

@@ -196,7 +196,9 @@ def test_an_image_of_an_earlier_moment_than_its_pose_is_refused(unit, tmp_path):
     stale = shot(FIRST, unit)
     session_of(tmp_path).add(stale, FIRST, depth_scale=1.0 / unit)
     session = session_of(tmp_path)
-    with pytest.raises(InputError, match=r"bit for bit image 1, which was taken from another pose.*Discard the frames"):
+    with pytest.raises(
+        InputError, match=r"bit for bit equal to image 1, which has a different pose.*Discard the frames"
+    ):
         session.add(stale.copy(), POSES[0], depth_scale=1.0 / unit)
     session.add(stale, FIRST.astype(np.float32), depth_scale=1.0 / unit)
     stale[20, 20] += 1
