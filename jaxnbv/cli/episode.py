@@ -46,14 +46,14 @@ class EpisodeOptions:
     """Options of a command that simulates an episode."""
 
     task: TaskOption
-    views: Annotated[int, asking(metavar="N", help="Views in all, the first one included.")] = 5
+    views: Annotated[int, asking(metavar="N", help="Number of views, including the first.")] = 5
     until: Annotated[
         list[str] | None,
         asking(
             metavar="RULE=N",
-            help="End once a rule holds. Can be repeated. "
+            help="End when a rule holds. Can be repeated. "
             + listed((name, stop.about) for name, stop in STOPS.items())
-            + " Or never.",
+            + " Give never for no rule.",
             show_default=f"never; demo: {', '.join(_ENOUGH)}",
         ),
     ] = None
@@ -61,8 +61,8 @@ class EpisodeOptions:
         Position | None,
         seeing(
             metavar="X Y Z",
-            help="Where the first camera stands, in scene units; it looks at the origin.",
-            show_default="towards 0.8 0.9 2.2, at the distance of the candidates; demo: a view that hides the answer",
+            help="Position of the first camera, in scene units. The camera looks at the origin.",
+            show_default="in direction 0.8 0.9 2.2, at the candidates' distance; demo: a view that hides the answer",
         ),
     ] = None
     noise: Annotated[float, seeing(metavar="X", help="Standard deviation of points and normals.")] = 0.01
@@ -73,5 +73,5 @@ class EpisodeOptions:
     out: Annotated[
         Path | None, running(metavar="DIR", help="Output folder.", show_default="runs/NAME-TASK-SEARCH[-MODEL]-seedN")
     ] = None
-    quick: Annotated[bool, running("--quick", help="Small settings for a first look, not the paper's.")] = False
+    quick: Annotated[bool, running("--quick", help="Small and fast settings for a first try, not the paper's.")] = False
     report: Annotated[bool, running("--report/--no-report", help="Write report.html.")] = True

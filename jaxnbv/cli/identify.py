@@ -46,7 +46,7 @@ class IdentifyOptions:
         list[str] | None,
         asking(
             metavar="RULE=N",
-            help=f"End once a rule holds: identified={STOPS['identified'].about}, placed={STOPS['placed'].about}.",
+            help=f"End when a rule holds: identified={STOPS['identified'].about}, placed={STOPS['placed'].about}.",
             show_default="never",
         ),
     ] = None
@@ -78,8 +78,8 @@ def identify(options: IdentifyOptions, box: Any, intrinsics: Any, depth_scale: A
     """Find out which part of a folder was recorded, and where it lies.
 
     Prints the parts' names with probabilities after each frame, then the pose in the recording's world. With --several
-    or --masks it does so for each object. Nothing is trained. A part is a mesh at its true size, and "none of these"
-    is one of the answers.
+    or --masks it prints both for each object. Nothing is trained. A part is a mesh at its true size. The answer can
+    be "none of these", which means that the object is not in the folder.
     """
     if options.recording.is_file():
         raise InputError(f"{options.recording} {_NO_FOLDER}")

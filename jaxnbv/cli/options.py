@@ -45,8 +45,7 @@ def command(options: type[T], more: Mapping[str, Any] = {}) -> Callable[[Callabl
 
     - `options`: the dataclass. Its fields become options of the command.
     - `more`: annotations of further options, keyed by name. Their values are passed as keyword arguments, with None for
-      an option without a value. A
-      `typer.Argument` is required.
+      an option without a value. A `typer.Argument` is required.
     """
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:

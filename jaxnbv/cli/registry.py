@@ -12,15 +12,15 @@ if TYPE_CHECKING:
 
 
 MODELS = {
-    "screened": "also uses space that was seen empty",
+    "screened": "uses scanned points and normals, and space that was seen to be empty",
     "paper": "uses only the scanned normals",
 }
 
-STUDY_MODELS = {"known": "screened, with a bank of other objects of the kind", **MODELS}
+STUDY_MODELS = {"known": "screened, with a bank of similar objects as known shapes", **MODELS}
 
 STUDY_SETTINGS = {
-    "usual": "the study's own, smaller than the paper's",
-    "paper": "those of the paper, with its model, which take hours",
+    "usual": "the study's own settings, smaller than the paper's",
+    "paper": "the paper's settings and model, with which a study takes hours",
 }
 
 BANKS = ("pyramid", "truck", "household", "parts", "heat", "household-real")
@@ -28,13 +28,13 @@ BANKS = ("pyramid", "truck", "household", "parts", "heat", "household-real")
 
 SEARCHES = {
     "discrete": "the best of all candidates",
-    "halving": "the same, faster: drops the worse half repeatedly",
-    "tie-break": "coverage decides between tied candidates",
+    "halving": "like discrete, but faster, because it repeatedly drops the worse half of the candidates",
+    "tie-break": "like discrete, but coverage decides between tied candidates",
     "gradient-2dof": "gradient ascent on the sphere",
     "gradient-constrained": "gradient ascent over positions and rotations",
     "hybrid": "gradient ascent from the best candidates",
-    "farthest": "a baseline, far from all views",
-    "random": "a baseline",
+    "farthest": "a baseline, the candidate farthest from all views",
+    "random": "a baseline, a random candidate",
     "uncertainty": "a baseline, where the surface is least certain",
 }
 
@@ -52,8 +52,8 @@ class Stop(NamedTuple):
 
 STOPS = {
     "sure": Stop("probability of the class", lambda probability: nbv.Sure(probability)),
-    "parts-found": Stop("points of every part", lambda points: nbv.PartsFound(int(points))),
-    "covered": Stop("share of the visible surface that was seen", lambda share: nbv.Covered(share)),
+    "parts-found": Stop("number of points of every part", lambda points: nbv.PartsFound(int(points))),
+    "covered": Stop("fraction of the visible surface that was seen", lambda share: nbv.Covered(share)),
     "identified": Stop("probability of the part", lambda probability: nbv.Identified(probability)),
     "placed": Stop("root mean square error of the part's surface", lambda length: nbv.Placed(length)),
     "value-below": Stop("value of the best view", lambda value: nbv.ValueBelow(value)),

@@ -27,7 +27,7 @@ class RunOptions(EpisodeOptions):
         bool,
         seeing(
             "--paper",
-            help="The paper's close-up: 30 degrees wide, from 2 to 3 scene units away, depending on the task.",
+            help="The paper's camera, which sees a patch of the mesh: 30 degrees wide, 2 to 3 scene units away.",
         ),
     ] = False
 

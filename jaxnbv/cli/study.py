@@ -13,9 +13,9 @@ study = typer.Typer(
     help="""Measure a claim of the paper on many scenes.
 
     All methods have the same scenes, first views and noise. A study writes a record of each scene, tables, a chart and
-    pictures. Repeat the command of an interrupted study, and it continues.
+    pictures. To continue an interrupted study, repeat its command.
     """,
-    epilog="`jaxnbv study NAME --help` lists the options of a study. `jaxnbv report` makes one page of all that ran.",
+    epilog="`jaxnbv study NAME --help` lists the options of a study. `jaxnbv report` makes one page of all studies.",
     no_args_is_help=True,
     rich_markup_mode="markdown",
     subcommand_metavar="NAME [OPTIONS]",

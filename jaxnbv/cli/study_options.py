@@ -21,10 +21,11 @@ class StudyOptions:
         ),
     ] = None
     views: Annotated[
-        int | None, typer.Option(min=2, help="Views in all, the first one included.", show_default="the study's")
+        int | None, typer.Option(min=2, help="Number of views, including the first.", show_default="the study's")
     ] = None
     methods: Annotated[
-        str | None, typer.Option(help="Methods to run, separated by commas.", show_default="those of the table")
+        str | None,
+        typer.Option(help="Methods to run, separated by commas.", show_default="the methods of the study's tables"),
     ] = None
     own: Annotated[
         list[str] | None,

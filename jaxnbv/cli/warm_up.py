@@ -16,9 +16,11 @@ class WarmUpOptions:
     intrinsics: Annotated[
         tuple[float, float, float, float], seeing(metavar="FX FY CX CY", help="Intrinsics of the camera, in pixels.")
     ]
-    size: Annotated[tuple[int, int], seeing(metavar="HEIGHT WIDTH", help="Numbers of rows and columns of its images.")]
-    nearest: Annotated[float, seeing(min=0.0, help="Least depth that it measures, in world units.")] = 0.0
-    farthest: Annotated[float | None, seeing(help="Largest depth that it measures.", show_default="no limit")] = None
+    size: Annotated[tuple[int, int], seeing(metavar="HEIGHT WIDTH", help="Number of rows and columns of an image.")]
+    nearest: Annotated[float, seeing(min=0.0, help="Least depth that the camera measures, in world units.")] = 0.0
+    farthest: Annotated[
+        float | None, seeing(help="Largest depth that the camera measures.", show_default="no limit")
+    ] = None
     box: Annotated[
         tuple[float, float, float, float, float, float],
         seeing(

@@ -26,7 +26,7 @@ class Subject(NamedTuple):
     - `bank`: known shapes as in `--known`, or a bank of parts with sizes in scene units.
     - `grid`: grid of the imagined surfaces, or None for the default grid.
     - `note`: text to print before the first view.
-    - `question`: question at the head of the report, or None for the task's.
+    - `question`: question at the head of the report, or None for the default question of the task.
     """
 
     name: str
