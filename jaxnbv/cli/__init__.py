@@ -79,7 +79,9 @@ _add_commands()
 
 
 def answer() -> None:
-    """Run the command line with the arguments of this process. Prints an `InputError` as one line, without a traceback.
+    """Run the command line with the arguments of this process.
+
+    Prints an `InputError` as one line, without a traceback.
 
     **Raises:** `SystemExit` with the exit code.
     """

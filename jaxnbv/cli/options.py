@@ -30,7 +30,7 @@ def listed(choices: Iterable[tuple[str, str]]) -> str:
 
 
 def one_of(names: Collection[str]) -> Callable[[str], str]:
-    """Make the parser of an option that takes one of these names. Its error suggests the most similar name."""
+    """Make the parser of an option that takes one of these names. Its error suggests a similar name."""
 
     def parse(text: str) -> str:
         if text not in names:

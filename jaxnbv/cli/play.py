@@ -66,7 +66,9 @@ _RACE_VIEWS = 10
 
 
 def rule(texts: Sequence[str]) -> StopRule | None:
-    """Make one stop rule from texts such as "sure=0.95". It holds when one of them holds; None for "never".
+    """Make a stop rule from texts such as "sure=0.95", or None for "never".
+
+    The rule holds when one of the rules in the texts holds.
 
     **Raises:** `ValueError` if a name is unknown, or if a value is not a number or out of range.
     """
@@ -139,7 +141,7 @@ def first_pose(place: Position, surface: Surface) -> Pose:
 
 
 def play(options: EpisodeOptions, subject: Subject, setting: Setting, sizes: Sizes, until: Sequence[str] = ()) -> None:
-    """Simulate an episode, write it to a folder, print each view when it is finished, and write the report.
+    """Simulate an episode into a folder, print each view when it is finished, and write the report.
 
     - `until`: default of `--until`. If it is not empty, the baseline farthest view also runs from the same first view.
     """

@@ -27,7 +27,8 @@ class RunOptions(EpisodeOptions):
         bool,
         seeing(
             "--paper",
-            help="The paper's camera, which sees a patch of the mesh: 30 degrees wide, 2 to 3 scene units away.",
+            help="The paper's camera, which sees a patch of the mesh: 30 degrees wide, and 2 to 3 scene units away, "
+            "depending on the task.",
         ),
     ] = False
 

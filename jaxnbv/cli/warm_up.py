@@ -31,10 +31,11 @@ class WarmUpOptions:
 
 @command(WarmUpOptions)
 def warm_up(options: WarmUpOptions) -> None:
-    """Compile and keep the programs of a session with this camera, so the session's first proposal takes seconds.
+    """Compile and keep the programs of a session with this camera.
 
-    Call nbv.keep_compiled() in your own program to load them there. If you use a different planner than the default,
-    call session.rehearse() in your program instead of this command.
+    The first proposal of the session then takes seconds. Call nbv.keep_compiled() in your own program to load them
+    there. If you use a different planner than the default, call session.rehearse() in your program instead of this
+    command.
     """
     import jaxnbv as nbv
 

@@ -12,7 +12,7 @@ from jaxnbv.checks import require
 
 
 class Category(NamedTuple):
-    """A category: its name, its folder in the data set, the names of its parts, and the label of the first part."""
+    """A category: name, folder in the data set, names of the parts, and label of the first part."""
 
     name: str
     synset: str
@@ -57,5 +57,5 @@ def category_index(name: str) -> int:
 
 
 def part_mask() -> Bool[np.ndarray, "categories parts"]:
-    """Return a mask: for each of the sixteen categories, the parts (out of fifty) that belong to the category."""
+    """Return a mask of the parts (out of fifty) that belong to each of the sixteen categories."""
     return np.array([[label in category.labels for label in range(NUM_PARTS)] for category in CATEGORIES])

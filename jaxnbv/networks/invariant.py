@@ -74,11 +74,12 @@ def _affine(layer: Any, rows: Float[Array, "*rows inputs"]) -> Float[Array, "*ro
 
 
 class Focus(eqx.Module):
-    """A network that finds the cue: the points of an object that determine its class, such as a truck's cargo.
+    """A network that finds the cue: the points of an object that determine its class.
 
-    The network is invariant under rotations and translations. It computes features of each point's neighbourhood and
-    groups them around farthest point samples. It interpolates the features of the groups back to the points, and
-    applies a perceptron to both kinds of features. It has about 12,000 parameters.
+    For example, the cargo is the cue for the class of a truck. The network is invariant under rotations and
+    translations. It computes features of each point's neighbourhood and groups them around farthest point samples. It
+    interpolates the features of the groups back to the points, and applies a perceptron to both kinds of features. It
+    has about 12,000 parameters.
     """
 
     edge: PairLevel

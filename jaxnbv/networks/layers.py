@@ -49,7 +49,7 @@ class Linear(eqx.Module):
 
 
 class PooledMLP(eqx.Module):
-    """PointNet: applies the same perceptron to all members of a group, then takes the maximum over the group.
+    """PointNet: the same perceptron for all members of a group, then the maximum over the group.
 
     - `layers`: two or more layers, each followed by a rectifier. The first three inputs of the first layer are
       coordinates.
@@ -89,7 +89,7 @@ class SetAbstraction(eqx.Module):
     def __call__(
         self, points: Float[Array, "n 3"], features: Float[Array, "n inputs"] | None, mask: Bool[Array, " n"]
     ) -> tuple[Float[Array, "centers 3"], Float[Array, "centers outputs"]]:
-        """Return the centres and the features around each centre. Centres repeat if the cloud has fewer points."""
+        """Return the centres and the features around each. Centres repeat if the cloud has fewer points."""
         centers = points[farthest_point_indices(points, mask, self.centers)]
         outputs = []
         for branch, radius, members in zip(self.branches, self.radii, self.members, strict=True):
@@ -183,10 +183,10 @@ def _bit_count(words):
 def interpolate(
     points: Float[Array, "n 3"], coarse: Float[Array, "m 3"], features: Float[Array, "m f"]
 ) -> Float[Array, "n f"]:
-    """Interpolate features at each point from the three nearest coarse points (or all, if there are fewer).
+    """Interpolate features at each point from the three nearest coarse points.
 
-    Weights are inverse squared distances. The result is differentiable in features, points and coarse points. The
-    derivative ignores changes of the nearest points.
+    If there are fewer than three coarse points, all of them are used. Weights are inverse squared distances. The result
+    is differentiable in features, points and coarse points. The derivative ignores changes of the nearest points.
     """
     index, is_valid = _nearest(points, coarse)
     squared = jnp.sum((points[:, None] - coarse[index]) ** 2, axis=-1)

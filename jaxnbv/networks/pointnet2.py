@@ -18,7 +18,7 @@ from jaxnbv.networks.layers import FeaturePropagation, Linear, PooledMLP, SetAbs
 
 
 class Level(NamedTuple):
-    """Sizes of a set abstraction: number of centres, radii of the balls, and, for each radius, the group size."""
+    """Sizes of a set abstraction: number of centres, radii of the balls, group size for each radius."""
 
     centers: int
     radii: tuple[float, ...]

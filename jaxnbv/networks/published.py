@@ -95,7 +95,10 @@ class _State:
         self.left = set(self.tensors)
 
     def take(self, name: str, *shape: int | None) -> np.ndarray:
-        """Return a tensor as float64. Its shape must be `shape`, where None is any length, possibly followed by 1s."""
+        """Return a tensor as float64, after a check of its shape.
+
+        The shape must be `shape`, where None is any length, possibly followed by 1s.
+        """
         require(name in self.tensors, f"the tensor {name} is missing")
         actual = self.tensors[name].shape
         fits = len(actual) >= len(shape) and all(a in (None, b) for a, b in zip(shape, actual, strict=False))
@@ -128,7 +131,7 @@ class _State:
         return Linear(*map(jnp.asarray, arrays))
 
     def layers(self, name: str, inputs: int | None, roll: bool = False) -> tuple[Linear, ...]:
-        """Make the layers <name>.0, <name>.1, ..., with the batch normalisation after each layer merged into it."""
+        """Make the layers <name>.0, <name>.1, ..., and merge the batch normalisations into them."""
         norm = name.replace("mlp_convs", "mlp_bns").replace("conv_blocks", "bn_blocks")
         layers: list[Linear] = []
         while not layers or f"{name}.{len(layers)}.weight" in self.tensors:

@@ -27,7 +27,9 @@ _SYNSETS = {category.name: category.synset for category in CATEGORIES}
 
 
 class MeshFile(NamedTuple):
-    """A mesh file with the class, the name and the up axis of its object. The file is read only on request.
+    """A mesh file with the class, the name and the up axis of its object.
+
+    The file is read only on request.
 
     - `label`: index of the object's class.
     - `name`: name of the object.
@@ -49,7 +51,7 @@ class MeshFile(NamedTuple):
 
 
 def interleave(groups: Iterable[Sequence[_T]]) -> list[_T]:
-    """List the first item of each group, then the second item of each group that has a second item, and so on."""
+    """List the first item of each group, then the second item of each group, and so on."""
     turns = itertools.chain.from_iterable(itertools.zip_longest(*groups))
     return [item for item in turns if item is not None]
 

@@ -25,7 +25,7 @@ _SLOTS = MemberDescriptorType | GetSetDescriptorType | type(NamedTuple("_", [("a
 
 
 def lookup(name: str) -> Any:
-    """Look up an object of an imported module by its name, "module:qualified.name". Returns None if there is none."""
+    """Look up an object of an imported module by its name, "module:qualified.name"; None if absent."""
     module, _, path = name.partition(":")
     value: Any = sys.modules.get(module)
     for part in path.split("."):
@@ -76,7 +76,10 @@ class _Plain:
 
 
 def is_plain(thing: Any) -> bool:
-    """Return whether the whole state of an object is in its `__dict__`, not in slots or in memory of a C library."""
+    """Return whether the whole state of an object is in its `__dict__`.
+
+    The state of other objects is also in slots or in memory of a C library.
+    """
     kind = type(thing)
     slots = any(isinstance(member, MemberDescriptorType) for base in kind.__mro__ for member in vars(base).values())
     made_by_python = bool(kind.__flags__ & _HEAP_TYPE) and kind.__basicsize__ == _Plain.__basicsize__
@@ -131,7 +134,9 @@ def is_written(name: str, member: Any) -> bool:
 
 
 def source_of(function: FunctionType, way: str) -> str:
-    """Read the source of a function. For a lambda it is only the body, since a line may have several lambdas.
+    """Read the source of a function, for a lambda only its body.
+
+    A line may have several lambdas, so the line does not identify a lambda.
 
     **Raises:** `ValueError` if the source cannot be read.
     """

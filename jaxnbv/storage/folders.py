@@ -33,19 +33,19 @@ def software() -> dict[str, str]:
 
 
 def num_threads() -> int:
-    """Return the number of CPU threads that XLA uses for a sum: NPROC, or the number of cores of this process."""
+    """Return the number of CPU threads that XLA uses for a sum: NPROC, or the cores of this process."""
     if threads := os.environ.get("NPROC"):
         return int(threads)
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def versions() -> dict[str, Any]:
-    """Return the software, device and threads of this process. The last bits of its results depend on them."""
+    """Return the software, device and threads of this process, which change the last bits of results."""
     return software() | {"device": jax.devices()[0].device_kind, "cores": num_threads()}
 
 
 def differences(stored: Any, current: Any, name: str = "") -> list[str]:
-    """List the differences between two descriptions in words: `stored` in the folder, and `current` in this process."""
+    """List the differences in words between a `stored` and the `current` description."""
     if isinstance(stored, dict) and isinstance(current, dict):
         keys = list(dict.fromkeys([*stored, *current]))
         nested = (differences(stored.get(key), current.get(key), f"{name}.{key}".lstrip(".")) for key in keys)
