@@ -96,7 +96,7 @@ def _filled(blank: Any, arrays: _Tensors) -> Any:
     leaves: dict[str, np.ndarray] = {}
     for name in sorted(expected.keys() | arrays.keys()):
         require(name in arrays, f"the array {name} is missing")
-        require(name in expected, f"the array {name} has no place in it")
+        require(name in expected, f"the array {name} is not part of such a network")
         shape = arrays[name].shape
         require(shape == expected[name], f"the array {name} has shape {shape}; expected {expected[name]}")
         # 64-bit numbers may overflow in JAX's default type.

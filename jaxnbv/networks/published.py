@@ -35,7 +35,9 @@ def published_network(tensors: Tensors) -> PointNet2Classifier | PointNet2PartSe
     state = _State(tensors)
     segments = any(name.startswith("fp") for name in tensors)
     network = _part_segmenter(state) if segments else _classifier(state)
-    require(not state.left, f"{len(state.left)} tensors have no place in it, such as {sorted(state.left)[:1]}")
+    require(
+        not state.left, f"{len(state.left)} tensors are not part of such a network, such as {sorted(state.left)[:1]}"
+    )
     return network
 
 

@@ -114,7 +114,7 @@ class RecordedFrames:
         scale = layout.depth_scale if depth_scale is None else depth_scale
         scale = depth_unit(self._stored, self.matrices, self.camera) if scale is None else scale
         if scale is None:
-            raise InputError(f"the frames of {folder} cannot tell the unit of their depths: {_ASK_UNIT}")
+            raise InputError(f"the frames of {folder} do not determine the unit of their depths: {_ASK_UNIT}")
         require(0 < scale < 100, f"the depth scale is {short_text(scale)}, which is no length of a unit: {_ASK_UNIT}")
         self.depth_scale = float(scale)
 

@@ -51,7 +51,7 @@ def rebuild(description: Any, arrays: Mapping[str, np.ndarray], way: str) -> Any
     except Exception as error:
         raise InputError(f"{way} cannot be made again from its description ({error}): {remedy}") from error
     changed = differences(description, describe(thing, way=way), way)
-    require(not changed, f"{'; '.join(changed[:3])}: what it was made of has changed; {remedy}")
+    require(not changed, f"{'; '.join(changed[:3])}: the code or a value behind it has changed; {remedy}")
     return thing
 
 
@@ -116,7 +116,9 @@ class _Rebuilder:
             own = any(member is function for base in type(bound).__mro__ for member in vars(base).values())
             require(own, f"{way} is a method that {type(bound).__name__} does not have: {self.remedy}")
             return getattr(bound, function.__name__)
-        require(" " in kind, f"{way} is a {node.get('name', kind)}, of which only its {kind} is stored: {self.remedy}")
+        require(
+            " " in kind, f"{way} is a {node.get('name', kind)}, and the folder stores only its {kind}: {self.remedy}"
+        )
         origin, dtype = kind.split(" ")
         if origin == "key":
             return jax.random.wrap_key_data(jnp.array(node["data"], jnp.uint32), impl=dtype)

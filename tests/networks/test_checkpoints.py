@@ -54,7 +54,7 @@ def test_tensors_that_make_no_classifier_are_named(tmp_path, state):
     assert "sa3.mlp_bns.0.bias has shape (4, 9)" in problem({"sa3.mlp_bns.0.bias": ones})
     assert "negative" in problem({"bn1.running_var": -state["bn1.running_var"]})
     assert "not finite" in problem({"bn1.bias": np.full_like(state["bn1.bias"], np.nan)})
-    assert "no place in it, such as ['fc1.extra']" in problem({"fc1.extra": ones})
+    assert "not part of such a network, such as ['fc1.extra']" in problem({"fc1.extra": ones})
 
 
 def test_safetensors_files_that_are_damaged_or_missing(tmp_path, state):
@@ -110,7 +110,7 @@ def test_files_that_hold_no_whole_network_of_our_own_are_refused(own, tmp_path):
 
     assert f"{name} has shape" in problem({name: np.ascontiguousarray(whole[name][:, :-1])})
     assert f"{name} is missing" in problem({}, [name])
-    assert "more has no place" in problem({"more": np.zeros(3, np.float32)})
+    assert "more is not part of" in problem({"more": np.zeros(3, np.float32)})
     assert f"{name} has entries that are not finite" in problem({name: np.full_like(whole[name], np.inf)})
     for nonsense in ("", "[]", "{}", '{"kind": "Perceptron"}', said.replace('"kind"', '"more": 1, "kind"')):
         assert "makes no network" in problem({}, said=nonsense)

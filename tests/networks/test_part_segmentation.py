@@ -157,7 +157,7 @@ def test_tensors_that_make_no_segmenter_are_named(tmp_path):
     assert "fp1.mlp_convs.0.weight has no inputs for categories" in problem({"fp1.mlp_convs.0.weight": few})
     assert "takes 5 inputs; expected 6 (points) or 9" in problem({"sa1.conv_blocks.0.0.weight": ones})
     assert "conv2 has entries that are not finite" in problem({"conv2.bias": np.full(50, np.inf)})
-    assert "no place in it, such as ['fc3.weight']" in problem({"fc3.weight": ones})
+    assert "not part of such a network, such as ['fc3.weight']" in problem({"fc3.weight": ones})
 
 
 def test_the_parts_of_all_categories_make_up_the_fifty():
