@@ -124,7 +124,8 @@ class _Program:
             return outputs
 
         of_arrays.__name__ = of_arrays.__qualname__ = self._function.__name__
-        lowered = jax.jit(of_arrays).lower(leaves)
+        # Unused arguments stay in the code. Without them, programs of different arguments could have the same code.
+        lowered = jax.jit(of_arrays, keep_unused=True).lower(leaves)
         code = lowered.as_text()
         # A program with a callback to Python cannot be stored, because it contains an address of this process.
         if "callback" in code:

@@ -109,6 +109,23 @@ def test_another_kind_of_argument_is_another_program(folder):
     assert len(calls) == 6
 
 
+def test_an_unused_argument_is_part_of_a_program(folder):
+    """JAX drops unused arguments from lowered code, which is then the same for all of these."""
+    x = jnp.ones(2)
+    for function, arguments in (
+        (lambda x, y: x + 1, (x, jnp.zeros(2))),
+        (lambda x, y: y + 1, (jnp.zeros(2), x)),
+        (lambda x, y: x + 1, (x, jnp.zeros(3))),
+        (lambda x, y, z: x + 1, (x, jnp.zeros(2), jnp.zeros(2))),
+    ):
+        for _ in range(2):
+            # The name of each is its own, since two functions of one name would be one entry.
+            kept, calls = counted(function)
+            kept._function.__qualname__ = str((id(function), len(arguments)))
+            np.testing.assert_array_equal(kept(*arguments), [2.0, 2.0])
+        assert len(calls) == 0
+
+
 def test_settings_are_part_of_a_program(folder):
     stored, _ = counted(lambda x: x + jnp.asarray(0.1))
     assert stored(jnp.ones(2)).dtype == jnp.float32
