@@ -94,6 +94,13 @@ def computes():
 
 
 @pytest.fixture(autouse=True)
+def kept_programs():
+    """A command that runs within the process keeps programs. The next test compiles its own again."""
+    yield
+    os.environ.pop("JAXNBV_PROGRAMS", None)
+
+
+@pytest.fixture(autouse=True)
 def random_numbers_of_its_own(request):
     """Reseed the module's generator, so that a test draws the same numbers whichever tests ran before it."""
     if hasattr(request.module, "RNG"):
