@@ -17,6 +17,7 @@ import threading
 import time
 import types
 import uuid
+import warnings
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -291,9 +292,19 @@ def _read(path: Path) -> bytes | None:
 
 
 def _write(path: Path, data: bytes) -> None:
-    """Write a file atomically, so that other processes never read a part of it."""
+    """Write a file atomically, so that other processes never read a part of it.
+
+    Warns if it cannot be written, on a full disk for example: the program itself is compiled and works.
+    """
     packed = zlib.compress(data, 1)
-    path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f"{path.name}.{uuid.uuid4().hex}")
-    part.write_bytes(hashlib.sha256(packed).digest() + packed)
-    part.replace(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.write_bytes(hashlib.sha256(packed).digest() + packed)
+        part.replace(path)
+    except OSError as error:
+        warnings.warn(
+            f"a compiled program cannot be kept in {path.parent} ({error}): the next process compiles it again, unless "
+            "you make room there or give keep_compiled another folder",
+            stacklevel=2,
+        )

@@ -174,6 +174,13 @@ def test_a_damaged_file_is_made_again(folder):
     assert len(calls) == 0
 
 
+def test_a_program_that_cannot_be_written_works(folder, monkeypatch):
+    (folder / "file").write_text("")
+    monkeypatch.setenv(PROGRAMS, str(folder / "file"))
+    with pytest.warns(UserWarning, match="cannot be kept in .*file .*give keep_compiled another folder"):
+        np.testing.assert_array_equal(counted(lambda x: x + 1)[0](jnp.ones(2)), [2.0, 2.0])
+
+
 def test_after_an_edit_the_same_code_is_not_compiled_again(folder, monkeypatch):
     counted(lambda x: x + 1)[0](jnp.ones(2))
     monkeypatch.setattr(programs, "_source", lambda: "edited")
