@@ -261,7 +261,7 @@ REFUSED = {
         "(2, 3)",
     ),
     "rays that differ in number": (lambda: nbv.PointCloud(SCAN.points, SCAN.normals, SCAN.mask, SCAN.mask[:5]), "(5,)"),
-    "a mask of numbers": (lambda: nbv.PointCloud(CLOUD.points, CLOUD.normals, jnp.ones(60)), "truths"),
+    "a mask of numbers": (lambda: nbv.PointCloud(CLOUD.points, CLOUD.normals, jnp.ones(60)), "boolean"),
     "a batch to measure": (
         lambda: nbv.scanning.metrics.coverage([nbv.View(POSE, SCANS, CLOUD, None, SMALL)], D),
         "rows of shape",
@@ -463,7 +463,7 @@ REFUSED = {
     "no such category": (lambda: CloudSegmenter(SEGMENTER, "sofa"), "no category 'sofa'"),
     "a segmenter of seven parts": (
         lambda: CloudSegmenter(lambda *_: jnp.zeros((60, 7)), 3, num_points=60)(CLOUD),
-        "knows 7 parts",
+        "has 7 parts",
     ),
     **{
         f"levels of {levels}": (

@@ -214,7 +214,7 @@ def test_tables_claims_and_pictures_are_made_of_a_record(record, folder, tmp_pat
     for measure in IdentificationStudy.measures[:-1]:
         assert measure.title in text
     (verdict,) = verdicts(table, IdentificationStudy)
-    assert verdict.methods == 1
+    assert verdict.num_methods == 1
     (picture,) = write_pictures([record], small_study(folder, Setup.HIDDEN), tmp_path, pixels=80)
     image = np.asarray(Image.open(picture).convert("L"))
     # The truth and two views of two methods.

@@ -398,7 +398,7 @@ def test_first_views_differ_and_show_enough(study):
 
 def test_what_the_study_cannot_use_is_named(study, sequence, tmp_path):
     known_sensor(plain, tmp_path, sequence)
-    with pytest.raises(ValueError, match="give a model of screened, paper"):
+    with pytest.raises(ValueError, match="give one of the models screened, paper"):
         RecordedStudy.configured("known", VIEWS, quick=True, folder=tmp_path)
     away = RecordedStudy.configured("screened", VIEWS, quick=True, folder=tmp_path, box=(9, 9, 9, 10, 10, 10))[""]
     with pytest.raises(ValueError, match="no voxel"):
