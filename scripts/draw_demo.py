@@ -79,7 +79,7 @@ class Film:
         axes.axhline(chart.goal, color=GREY, lw=0.8, ls=":")
         axes.set(ylim=(0.0, 1.06))
         over_views(axes, max(len(chart.values), len(other.values)))
-        axes.legend(loc="lower right", frameon=False, fontsize=9)
+        axes.legend(loc="lower center", bbox_to_anchor=(0.5, 0.98), ncols=2, frameon=False, fontsize=9)
 
     def save(self, path: Path) -> None:
         """Write the film with one palette, on a white background: Pillow looks colours up by their leading bits."""

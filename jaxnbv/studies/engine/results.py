@@ -113,7 +113,7 @@ def _means(rows: pd.DataFrame, measure: Measure, best: pd.Series) -> list[str]:
         else:
             error = "" if pd.isna(row.standard_error) else f" +- {row.standard_error:.{measure.digits}f}"
             text = f"{row.mean:.{measure.digits}f}{error}"
-        texts.append(text + "*" * star)
+        texts.append(text + _star(star))
     return texts
 
 
@@ -121,9 +121,14 @@ def _leads(rows: pd.DataFrame, measure: Measure) -> list[str]:
     """Format leads and their intervals as text. A star marks a lead whose interval excludes zero."""
     form, scale = ("+.0f", 100) if measure.unit == "%" else (f"+.{measure.digits}f", 1)
     return [
-        f"{scale * lead:{form}} [{scale * low:{form}}, {scale * high:{form}}]" + "*" * (low > 0 or high < 0)
+        f"{scale * lead:{form}} [{scale * low:{form}}, {scale * high:{form}}]{_star(low > 0 or high < 0)}"
         for lead, low, high in zip(rows["lead"], rows["lead_low"], rows["lead_high"], strict=True)
     ]
+
+
+def _star(is_marked: bool) -> str:
+    """Return a star, or a space that keeps the digits of right-aligned cells below one another."""
+    return "*" if is_marked else " "
 
 
 def summary(table: pd.DataFrame, study: type[Study]) -> str:
@@ -172,7 +177,7 @@ def verdicts(table: pd.DataFrame, study: type[Study]) -> list[Verdict]:
         for row, text in zip(rows.itertuples(), _leads(rows, measure), strict=True):
             level = row.lead_low <= 0 <= row.lead_high
             better = (row.lead < 0) == measure.less
-            by_place[_WHERE[1 if level else 0 if better else 2]].append(f"{row.method} ({text.rstrip('*')})")
+            by_place[_WHERE[1 if level else 0 if better else 2]].append(f"{row.method} ({text.rstrip('* ')})")
         if len(rows):
             num_held = sum(len(by_place[place]) for place in _WHERE[: 1 if claim.must_be_better else 2])
             parts = "; ".join(f"{place} {', '.join(methods)}" for place, methods in by_place.items() if methods)

@@ -1,6 +1,7 @@
 """Numbers from hand-made records: means, errors, intervals and leads, and their tables, charts and verdicts."""
 
 import io
+import re
 
 import numpy as np
 import pandas as pd
@@ -79,7 +80,11 @@ def test_scenes_without_a_value_are_left_out_of_a_number():
 
 def test_tables_show_shares_errors_and_leads():
     table = results(RECORDS, ToyStudy)
-    lines = [" ".join(line.split()) for line in summary(table, ToyStudy).splitlines()]
+    text = summary(table, ToyStudy)
+    # A star moves no digit out of its column.
+    signs = [[match.start() for match in re.finditer(r"\+-", line)] for line in text.splitlines() if " +- " in line]
+    assert signs[-2] == signs[-1]
+    lines = [" ".join(line.split()) for line in text.splitlines()]
     assert "Points of a ball: 2 scenes" in lines
     assert "farthest 900.0 +- 100.0* 3300.0 +- 200.0* 4500.0 +- 500.0*" in lines
     assert "random 900.0 +- 100.0* 2300.0 +- 300.0 2800.0 +- 300.0" in lines
