@@ -1,6 +1,6 @@
-"""Studies that compare methods, their scenes, and the engine that runs them.
+"""Studies that compare methods of choosing views, with their scenes and the engine that runs them.
 
-Only the command line imports this package. The rest of the library does not.
+Within the library, only the command line imports this package.
 """
 
 import lazy_loader

@@ -21,10 +21,10 @@ class Entry(NamedTuple):
     - `study`: class of the study as "module:class". It is imported when the study runs.
     - `question`: the question that the study answers, shown in the help.
     - `scenes`, `views`: default numbers of scenes and views.
-    - `model`: default surface model. It is "known" for a study that has a `bank` or is about known parts.
-    - `options`: maps names of the study's settings to typer annotations, for options that only this study has. The
-      default of each option is None, and a `typer.Argument` is required. Options of all studies, such as `capacity`,
-      are not listed here.
+    - `model`: default surface model: "known" (with known shapes), or the name of a model without known shapes.
+    - `options`: maps names of the study's settings to typer annotations, for options that only this study has. A
+      setting annotated by a `typer.Argument` must be given. All others default to None. Options of all studies, such as
+      `capacity`, are not listed here.
     """
 
     study: str

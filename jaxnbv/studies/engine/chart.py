@@ -52,9 +52,9 @@ _OTHERS = (("#8c564b", "-", "p"), ("#7f3fbf", "-", "h"), ("#b8860b", "--", "d"))
 
 
 def chart(table: pd.DataFrame, study: type[Study]) -> bytes:
-    """A PNG file of the results over all scenes, one panel per measure.
+    """Draw a table of `results` over all scenes, one panel per measure, and return the content of a PNG file.
 
-    Error bars are bootstrap intervals. Bands would overlap with this many methods.
+    Error bars show the bootstrap intervals, because bands of this many methods would overlap.
     """
     (group, scenes), *_ = groups_of(table).items()
     rows = table[table["group"] == group]
@@ -66,7 +66,7 @@ def chart(table: pd.DataFrame, study: type[Study]) -> bytes:
         panels = figure.subplots(tall, wide, squeeze=False).ravel()
         for axes, measure in zip(panels, shown, strict=False):
             _draw(axes, rows[rows["quantity"] == measure.name], measure, rows["method"].unique().tolist())
-            # A share may be of scenes or of surface, which the title says.
+            # The label does not say what the percentage is of, because the title does.
             unit = f"%, mean of {scenes} scenes" if measure.unit == "%" else measure.unit
             axes.set(title=measure.title, xlabel=measure.by, ylabel=unit)
         for axes in panels[len(shown) :]:
@@ -97,7 +97,7 @@ def _draw(axes: Axes, rows: pd.DataFrame, measure: Measure, methods: list[str]) 
 
 
 def _look(method: str, index: int) -> dict[str, Any]:
-    """Arguments of `Axes.errorbar` for the line, markers and bars of a method. The main new methods are thicker."""
+    """Return the arguments of `Axes.errorbar` for a method. The lines of the main new methods are thicker."""
     colour, line, marker = LOOKS.get(method) or _OTHERS[index % len(_OTHERS)]
     width, size = (2.0, 5.5) if (colour, line, marker) == _OURS else (1.2, 4.4)
     bars = {"ecolor": mpl.colors.to_rgba(colour, 0.35), "elinewidth": 2.4}

@@ -1,4 +1,4 @@
-"""Executor that runs the trials of a study on the workers of a Dask cluster."""
+"""Executor that runs the scenes of a study on the workers of a Dask cluster."""
 
 import concurrent.futures
 import contextlib
@@ -57,7 +57,7 @@ class Cluster(Executor):
         self._running: set[Future] = set()
         pools = optional("threadpoolctl").threadpool_info()
         threads = [pool["num_threads"] for pool in pools if pool["user_api"] == "blas"]
-        # Dask sets one thread for linear algebra in its workers. Give them as many as this process has, at most NPROC.
+        # Dask gives its workers one thread for linear algebra. Give them as many as this process has, at most NPROC.
         self._blas_threads = min([*threads, num_threads()])
         self._versions = versions()
         del self._versions["device"]
@@ -143,7 +143,15 @@ class Cluster(Executor):
 def _call(
     content: bytes, client_versions: dict[str, Any], blas_threads: int, args: tuple[Any, ...], kwargs: dict[str, Any]
 ) -> Any:
-    """Compare the versions of this worker with the client's, then call the pickled function."""
+    """Call a pickled function on this worker, and return its result.
+
+    - `content`: the function, pickled; `args`, `kwargs`: its arguments.
+    - `client_versions`: software, threads and (except in the first call) device that this worker must have.
+    - `blas_threads`: number of threads for linear algebra.
+
+    **Raises:** `ValueError` if the worker differs from the client or runs several calls at a time; `ImportError` if
+    the function cannot be unpickled.
+    """
     worker = optional("distributed").get_worker()
     require(
         worker.state.nthreads == 1,

@@ -1,4 +1,4 @@
-"""Measures and claims of a study. A measure is computed from a record, for each method and each view or other key."""
+"""Measures and claims of a study. A measure has one value per scene, method, and view or other key."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -16,8 +16,8 @@ class Measure(NamedTuple):
     """One quantity of a study, shown as a table and as a panel of the chart.
 
     - `name`: name in files; `title`: name in tables and charts.
-    - `of`: function that computes the values of a method from a record. It returns either a sequence with one value per
-      view, starting at the first view, or a mapping from keys to values. An undefined value is None or NaN.
+    - `of`: function that takes the record of a scene and the name of a method, and returns the method's values: either
+      a sequence, one per view from the first view on, or a mapping from keys. An undefined value is None or NaN.
     - `by`: name of the keys, such as "view".
     - `unit`: unit of the values; "%" for fractions in [0, 1], which are shown in percent.
     - `digits`: decimal places in tables.
@@ -34,10 +34,10 @@ class Measure(NamedTuple):
 
 
 class Claim(NamedTuple):
-    """A claim of the paper that the study's reference method is better, or not worse, than others.
+    """A claim that the study's reference method is better than other methods, or not worse.
 
     - `text`: the claim in words.
-    - `measure`: name of the measure that decides the claim; `at`: the view or other key at which it is compared.
+    - `measure`: name of the measure that decides the claim; `at`: the view or other key whose values are compared.
     - `others`: the methods with which the reference is compared.
     - `must_be_better`: True if the reference must be better, False if it must not be worse.
     """
@@ -50,7 +50,10 @@ class Claim(NamedTuple):
 
 
 def _seconds(record: Record, method: str) -> dict[str, float]:
-    """Return the median time of a scene's steps. The first step is left out, because it may include compilation."""
+    """Return the median time of a method's proposals in a scene (seconds), under the key "median".
+
+    The first proposal is left out, because its time may include compilation.
+    """
     seconds = [step["seconds"] for step in record["methods"][method].get("steps", [])][1:]
     return {"median": float(np.median(seconds))} if seconds else {}
 

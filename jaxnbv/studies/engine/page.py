@@ -21,13 +21,13 @@ _REMEDY = "give a folder that `jaxnbv study` has written"
 
 
 class Chapter(NamedTuple):
-    """The section of the page about one study.
+    """The section about one study on the HTML page.
 
     - `title`: title of the section; `verdicts`: checks of the study's claims.
     - `scenes`: number of scenes; `facts`: sentences on times and versions.
     - `explanation`: text that explains the measures and the cells of the tables.
     - `tables`: titles and HTML of the tables, for each group of scenes.
-    - `images`: names and PNG content of the chart and of the pictures in the study's folder. The chart is drawn again.
+    - `images`: names and PNG content of the pictures in the study's folder, and of the chart, drawn from the records.
     - `settings`: settings of the study as JSON.
     """
 

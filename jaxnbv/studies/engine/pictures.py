@@ -1,4 +1,4 @@
-"""Pictures of a study: a grid of tiles for each scene, one row per method and one column per view."""
+"""Pictures of a study. The picture of a scene has one small image (tile) per method and view."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +18,7 @@ from jaxnbv.viz.style import LINE, framed, save_figure
 
 # Inches: size of a tile, and the margins beside and above the grid.
 _TILE, _BESIDE, _ABOVE = (1.75, 1.95), 0.35, 0.75
-# Tiles in a row if there is one column, and the least width of such a picture, in tiles.
+# Largest number of tiles in a row if there is one tile per method, and the least width of such a picture, in tiles.
 _MOST_A_ROW, _FEWEST_WIDE = 5, 3
 
 
@@ -27,7 +27,10 @@ def write_pictures(
 ) -> list[Path]:
     """Write pictures `scene_<number>.png` of the first scenes into a folder, and return their paths.
 
-    Shows the `pictured` methods of the study, or all methods of the records. Writes none if the study draws none.
+    The pictures show the methods `study.pictured`, or all methods of a record that has none of these. No picture is
+    written if `study.tiles` returns None.
+
+    - `scenes`: number of pictures; `pixels`: width and height of each small image in a picture.
     """
     folder, paths = make_folder(folder), []
     for record in sorted(records, key=lambda record: record["scene"])[:scenes]:
@@ -70,7 +73,7 @@ def _drawn(tiles: Tiles, record: Record, methods: Sequence[str]) -> Figure:
 
 
 def _of_one_column(tiles: Tiles, record: Record, methods: Sequence[str], column: str) -> Figure:
-    """The tiles of a column side by side, several methods to a row."""
+    """Draw a picture with one tile per method, several tiles to a row. The title names their only `column`."""
     cells = ([("truth", None)] if tiles.truth is not None else []) + [(method, method) for method in methods]
     wide = min(len(cells), _MOST_A_ROW)
     tall = -(-len(cells) // wide)

@@ -1,4 +1,4 @@
-"""Executor that runs the trials of a study in processes on this machine."""
+"""Executor that runs the scenes of a study in processes on this machine."""
 
 import os
 import queue
@@ -91,7 +91,7 @@ class Processes(Executor):
 
 
 def _end_with(parent: int) -> None:
-    """Start a thread that ends this process when its parent is gone, because a killed parent cannot end it."""
+    """Start a thread that ends this process once its parent (a process id) is gone, since a killed parent cannot."""
 
     def watch() -> None:
         while os.getppid() == parent:

@@ -26,12 +26,11 @@ _NONE: Mapping[str, np.ndarray] = MappingProxyType({})
 
 
 class RecordFolder(ResultFolder):
-    """A folder of records that share one configuration. The file study.json stores the configuration.
+    """A folder with one record per scene, all of one configuration, which is stored in study.json.
 
-    - `executor`: an executor with the interface of `concurrent.futures` that runs the scenes without a record, such as
-      `Processes(8)` or a `Cluster`; default: this process runs the scenes. In both cases, this process writes the
-      records.
-    - `arrays`: the large arrays of the configuration, see `describe`.
+    - `config`, `arrays`: the configuration as JSON, and its large arrays, see `jaxnbv.storage.describe`.
+    - `executor`: an executor with the interface of `concurrent.futures`, such as `Processes(8)` or a `Cluster`, that
+      runs the scenes; default: this process runs them. In both cases, this process writes the records.
 
     **Raises:** `ValueError` if the folder cannot be made, or if it holds records of a different configuration.
     """
@@ -50,6 +49,8 @@ class RecordFolder(ResultFolder):
 
     def collect(self, scenes: Sequence[int], run: Trial, progress: bool = True) -> list[Record]:
         """Run the scenes that have no record yet, and return the records of all `scenes` in order.
+
+        - `run`: function that takes the index of a scene and returns its record.
 
         Each record is written as soon as its scene is done. If `run` fails for a scene, the scene has no record.
         `failures` then returns the error, and the next call of `collect` runs the scene again.
@@ -103,7 +104,7 @@ class RecordFolder(ResultFolder):
                 raise InputError(f"{file} and {own} differ in {'; '.join(changes[:3])}: delete the one that is wrong")
 
     def failures(self, scenes: Sequence[int]) -> dict[int, str]:
-        """Return the error of each failed scene as one line. The files scene_*.failed hold the tracebacks."""
+        """Return the error of each failed scene (one line) by scene index. Files scene_*.failed hold the tracebacks."""
         files = {index: self._file(index).with_suffix(_FAILED) for index in scenes}
         return {index: file.read_text().partition("\n")[0] for index, file in files.items() if os.path.isfile(file)}
 
@@ -115,7 +116,7 @@ class RecordFolder(ResultFolder):
 
     def _write(self, index: int, record: Record) -> Record:
         """Write a record, and return the record as `_read` would return it."""
-        # JSON turns number keys into text, which changes the order of sorted keys and so the checksum.
+        # Turn number keys into text, as the file does, because the checksum depends on the order of sorted keys.
         record = json.loads(json.dumps(record))
         self.bind()
         sealed = {"format": _FORMAT, "index": index, "sha256": _checksum(index, record), "record": record}

@@ -1,4 +1,4 @@
-"""Statistics over the records of a study, their tables, and verdicts on the paper's claims."""
+"""Statistics over the records of a study, tables of the statistics, and checks of the study's claims."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -18,12 +18,13 @@ _WHERE = ("ahead of", "level with", "behind")
 
 
 def results(records: Sequence[Record], study: type[Study]) -> pd.DataFrame:
-    """Compute the statistics of all measures, one row per group of scenes, measure, key (`at`) and method.
+    """Compute the statistics of all measures, one row per group of scenes, measure, key and method.
 
-    Each row holds the method's mean over the scenes, the standard error of the mean, and the bootstrap interval of the
-    mean (`low`, `high`). The `lead` is the mean over the scenes of the reference's value minus the method's value, and
-    `lead_low` and `lead_high` are its interval. A method without values has no row. The statistics use only scenes in
-    which all other methods have a value.
+    The column `at` holds the key: the view, or what else the measure's values belong to. Each row holds the method's
+    mean over the scenes, the standard error of the mean, and the bootstrap interval of the mean (`low`, `high`). The
+    `lead` is the mean over the scenes of the reference method's value minus this method's value, and `lead_low` and
+    `lead_high` are its bootstrap interval. A method without values has no row. The statistics use only scenes in which
+    all other methods have a value.
 
     **Raises:** `ValueError` if there are no records.
     """
@@ -46,7 +47,7 @@ def results(records: Sequence[Record], study: type[Study]) -> pd.DataFrame:
 
 
 def _compared(part: pd.DataFrame, reference: str) -> pd.DataFrame:
-    """Return the rows of one measure at one key, one row per method."""
+    """Return the rows of `results` for one measure at one key, from its values (column `value` of `part`)."""
     values = part.pivot(index="scene", columns="method", values="value")[part["method"].unique()]
     values = values.dropna(axis="columns", how="all").dropna()
     values = values if len(values) else values[[]]
@@ -74,14 +75,14 @@ def interval(values: Float[np.ndarray, "scenes columns"]) -> Float[np.ndarray, "
 
 
 def groups_of(table: pd.DataFrame) -> dict[str, int]:
-    """Return the number of scenes in each group. The first group, "all", holds all scenes."""
+    """Return the number of scenes in each group of a table of `results`. The first group, "all", holds all scenes."""
     return table.groupby("group", sort=False)["scenes"].max().to_dict()
 
 
 def tables(table: pd.DataFrame, study: type[Study], group: str = _ALL) -> list[tuple[str, pd.DataFrame]]:
-    """Return the titles and text cells of two tables per measure.
+    """Return the titles and text cells of two tables per measure, made from a table of `results`.
 
-    The first table shows the means of the methods, and the second the leads of the reference.
+    The first shows the means of the methods, and the second the leads: the reference's mean minus another method's.
     """
     texts = []
     for measure in study.measures:
@@ -102,7 +103,7 @@ def tables(table: pd.DataFrame, study: type[Study], group: str = _ALL) -> list[t
 
 
 def _means(rows: pd.DataFrame, measure: Measure, best: pd.Series) -> list[str]:
-    """Format means as text. A star marks the best mean.
+    """Format means as text, with a star where `best` is True.
 
     Means in percent are shown with their interval, and all other means with their standard error.
     """
@@ -118,7 +119,7 @@ def _means(rows: pd.DataFrame, measure: Measure, best: pd.Series) -> list[str]:
 
 
 def _leads(rows: pd.DataFrame, measure: Measure) -> list[str]:
-    """Format leads and their intervals as text. A star marks a lead whose interval excludes zero."""
+    """Format the leads of the reference over other methods as text, with a star if the interval excludes zero."""
     form, scale = ("+.0f", 100) if measure.unit == "%" else (f"+.{measure.digits}f", 1)
     return [
         f"{scale * lead:{form}} [{scale * low:{form}}, {scale * high:{form}}]{_star(low > 0 or high < 0)}"
@@ -153,7 +154,7 @@ class Verdict(NamedTuple):
 
     - `claim`: text of the claim.
     - `num_held`: number of compared methods for which the claim holds; `num_methods`: number of compared methods.
-    - `sentence`: sentence that lists all compared methods.
+    - `sentence`: text that lists the methods that the reference is ahead of, level with or behind.
     """
 
     claim: str
@@ -165,8 +166,8 @@ class Verdict(NamedTuple):
 def verdicts(table: pd.DataFrame, study: type[Study]) -> list[Verdict]:
     """Check each claim over all scenes by comparing the reference with the claim's methods.
 
-    The comparison includes the runs of these methods without known shapes. The sentence calls the reference "level
-    with" a method if the interval of the lead includes zero. A claim is left out if none of its methods was run.
+    The comparison includes the runs of these methods without known shapes. The reference is "level with" a method if
+    the interval of its lead over the method includes zero. A claim is left out if none of its methods was run.
     """
     judged = []
     for claim in study.claims:

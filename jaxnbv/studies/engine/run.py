@@ -59,7 +59,7 @@ def load_study(folder: str | Path) -> tuple[Study, list[Record]]:
 
     **Raises:** `ValueError` if the folder holds no study, or if the study or a record is damaged.
     """
-    # The names of methods in the file are settings of the run, not of the study.
+    # Replace the names of methods in the file by None, because they are settings of the run and not of the study.
     config = read_config(folder, "study", RecordFolder.format, {"methods": None, "own": None})
     return config["study"], read_records(folder)
 
@@ -99,7 +99,7 @@ def _own_planner(study: Study, scene: Scene, name: str, make: Factory) -> Planne
 
 
 def replay(study: Study, scene: Scene, run: Record) -> list[tuple[PointCloud, Observations]]:
-    """Recompute each scan and the observations after each scan from the poses in a method's record."""
+    """Recompute each scan and the observations after each scan from the poses in `run`, a method's record."""
     planner, sensor, key = (
         study.planner(study.methods[0], scene),
         study.sensor(scene),

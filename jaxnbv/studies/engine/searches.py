@@ -46,8 +46,8 @@ def search_of(
 ) -> Search:
     """Return the search named by a method, such as `RandomView` for "random".
 
-    Any other name gives `DiscreteSearch` over all candidates. A gradient search scores half of `num_candidates` poses
-    and then climbs from the best `num_starts` of them.
+    Any other name gives `DiscreteSearch` over all candidates. A gradient search scores half of `num_candidates` poses,
+    and then follows the gradient from the best `num_starts` of them.
 
     - `radius`: distance of the cameras from the scene's origin, in scene units.
     """

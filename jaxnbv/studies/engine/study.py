@@ -49,12 +49,13 @@ class Study(eqx.Module):
     A new study defines the abstract members. Settings:
 
     - `views`: number of views, including the first.
-    - `num_candidates`: number of candidates on the sphere of `radius` (scene units). Gradient searches score half of
-      this number before they climb.
-    - `sampler`, `capacity`: as in `Planner`.
-    - `num_samples`, `grid_resolution`: number of samples and resolution of the grid, which replace the sampler's.
+    - `num_candidates`: number of candidate poses on the sphere of `radius` (scene units). Gradient searches score half
+      of this number before they follow the gradient.
+    - `sampler`, `capacity`: sampler of surfaces, and largest number of points of the cloud, as in `Planner`.
+    - `num_samples`, `grid_resolution`: number of samples, and nodes of the grid along each axis, in place of the
+      sampler's own.
     - `camera`: camera of the sensor. Imagined scans may have fewer rays, see `imagined_camera`.
-    - `num_starts`, `iterations`, `learning_rate`: settings of gradient searches.
+    - `num_starts`, `iterations`, `learning_rate`: starting poses, steps and learning rate of gradient searches.
     - `meshes`: mesh files, one per scene. Without mesh files, the scenes are procedural.
 
     Class attributes:
@@ -63,7 +64,7 @@ class Study(eqx.Module):
     - `methods`: names of the methods, in order; `reference`: the method with which the others are compared.
     - `extra_methods`: methods that run only if a command names them.
     - `pictured`: methods in pictures; if empty, all methods.
-    - `measures`: quantities in the tables and the chart; `claims`: the paper's claims about the study.
+    - `measures`: quantities in the tables and the chart; `claims`: claims to check, such as the paper's.
     - `quick`: settings of a quick run; `quick_scenes`: number of scenes of a quick run.
     - `paper`: settings of the paper and its code, which may include `views`.
     - `seed`: seed of first views, noise and samples.
@@ -124,7 +125,7 @@ class Study(eqx.Module):
 
     @classmethod
     def configured(cls, model: str, views: int, quick: bool, **options: Any) -> "dict[str, Study]":
-        """Return the studies of one command by the names of their folders. The name of a single study is "".
+        """Return the studies that one command runs, by the names of their subfolders ("" for a single study).
 
         - `model`: name of the surface model. With the model `known` and `meshes`, the bank of each scene holds all
           meshes except the scene's own.
@@ -173,7 +174,7 @@ class Study(eqx.Module):
     def acquisition(self, method: str, scene: Scene) -> Acquisition:
         """Return the acquisition of a method.
 
-        Its pytree structure should be the same in all scenes, because they then share one compilation.
+        It should have the same pytree structure in all scenes, so that they share one compilation.
         """
 
     def search(self, method: str, scene: Scene) -> Search:
@@ -190,7 +191,7 @@ class Study(eqx.Module):
         return dataclasses.replace(planner, sampler=planner.sampler.without_bank)
 
     def truth(self, scene: Scene) -> Any:
-        """Return the ground truth of a scene, by default its task. All methods share the result."""
+        """Return the ground truth of a scene, by default `scene.task`. It is computed once for all methods."""
         return scene.task
 
     @abstractmethod
@@ -206,7 +207,10 @@ class Study(eqx.Module):
         return {"name": scene.name}
 
     def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles | None:
-        """Return the picture of a scene in tiles of `pixels` x `pixels`; None if the study draws none."""
+        """Return the picture of a scene as a grid of small images; None if the study has no pictures.
+
+        - `methods`: methods to show, one row each; `pixels`: width and height of each image.
+        """
         return None
 
     def sensor(self, scene: Scene) -> Sensor:
@@ -237,7 +241,7 @@ class Study(eqx.Module):
 
     @property
     def imagined_camera(self) -> Camera:
-        """The camera of imagined scans."""
+        """The camera of imagined scans, by default the sensor's."""
         return self.camera
 
     def sampler_of(self, scene: Scene) -> SurfaceSampler:
@@ -264,7 +268,7 @@ class Study(eqx.Module):
     def episode_keys(self, method: str, scene: Scene) -> list[PRNGKeyArray]:
         """Return one random key per episode of a method.
 
-        By default there is one episode, and all methods share its key. `merge_runs` merges several episodes.
+        By default there is one episode, and all methods share its key. `merge_runs` merges the records of several.
         """
         return [self.key(scene.index, "episode")]
 

@@ -1,4 +1,4 @@
-"""Tiles, the small images of which a study composes the picture of a scene, and functions that draw them."""
+"""Picture of a scene as a grid of small images (tiles), and functions that draw the tiles."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -17,13 +17,13 @@ from jaxnbv.viz.render import Still
 from jaxnbv.viz.style import GREY
 
 _RIGHT = "#00734f"
-# Longest edge of a still's triangles, which is short because colours are set at vertices, and radius of the still's
-# content, both in scene units.
+# Longest edge of the triangles in a rendered image, which is short because colours are set at vertices, and radius of
+# the ball that the image shows, both in scene units.
 _EDGE, _REACH = 0.05, 1.6
 
 
 class Tiles(NamedTuple):
-    """The picture of a scene, with one row of tiles per method.
+    """The picture of a scene: a grid of small images (tiles), with one row per method.
 
     - `caption`: text below the picture.
     - `tile`: function that draws the tile of a method (name) and a column (index) on the given axes.
@@ -42,15 +42,15 @@ class Tiles(NamedTuple):
 
 
 def caption_tile(axes: Axes, text: str, right: bool = False) -> None:
-    """Write a line of text below a tile. If `right`, the text is bold and green and starts with a tick."""
+    """Write a line of text below an image. If `right` (correct), the text is bold and green and starts with a tick."""
     colour, weight = (_RIGHT, "bold") if right else (GREY, "normal")
     axes.set_xlabel(f"{'✓ ' if right else ''}{text}", fontsize=9, color=colour, fontweight=weight)
 
 
 def opposite_direction(record: Record) -> Float[np.ndarray, "3"]:
-    """Return a direction from which pictures show the side that the shared first view hides.
+    """Return a direction from which pictures show the side of the object that the first view does not show.
 
-    The direction is opposite the first view and slopes upwards.
+    The direction is opposite the first view, which all methods share, and slopes upwards.
     """
     run = next(iter(record["methods"].values()))
     position = np.asarray(run["views"][0]["position"])
@@ -67,9 +67,10 @@ def still_of(
     value: Callable[[np.ndarray], Float[np.ndarray, " n"]] | None = None,
     norm: LogNorm | None = None,
 ) -> Still:
-    """Render a mesh from the direction `eye` in an image of `size` x `size` pixels.
+    """Render a mesh, seen from the direction `eye`, in an image of `size` x `size` pixels.
 
-    - `value`: function of points whose positive values colour the surface; default: one colour.
+    - `value`: function that returns a value for each point. The values, at least 1e-6, colour the surface; default: one
+      colour.
     - `norm`: colour scale of the values.
     """
     vertices, faces = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, _EDGE, max_iter=12)
@@ -85,7 +86,7 @@ def draw_on(
     points: Float[np.ndarray, "n 3"],
     colours: Float[np.ndarray, "n channels"],
 ) -> None:
-    """Draw a still, and over it the points that its surface does not hide. Near points cover far points."""
+    """Draw a rendered image, and over it the points that its surface does not hide. Near points cover far points."""
     axes.imshow(still.image, interpolation="antialiased", zorder=1)
     pixels, in_front = still.project(points)
     depth = (points - np.asarray(still.pose.position)) @ np.asarray(still.pose.forward)

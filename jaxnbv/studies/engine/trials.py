@@ -31,8 +31,9 @@ def outcomes(trial: Trial, indices: Sequence[int], executor: Executor | None = N
     - `indices`: indices of the scenes.
     - `executor`: an executor of `concurrent.futures`; default: this process runs the trials one after the other.
 
-    If a trial's process dies, the executor raises `BrokenExecutor`, and the outcome of the trial is a `Failure`. Other
-    errors of the executor are raised. Closing the generator cancels the trials that have not started.
+    The outcome is the trial's record, or a `Failure` if the trial raises an error or its process dies (the executor
+    raises `BrokenExecutor`). Other errors of the executor are raised. Closing the generator cancels the trials that
+    have not started.
     """
     attempt = functools.partial(_attempt, trial)
     if executor is None:
