@@ -1,4 +1,4 @@
-"""Disagreement of overlapping views, and the pose error that explains it.
+"""Compares the points of overlapping views, and estimates pose errors that explain the differences.
 
 The pose that the robot reports for view i is T_i, and the true pose of the camera is T_i X_i. If the mount of the
 camera is off, X_i = X is the same for all views. If single poses are off, each view has its own X_i, and X_0 = I. The
@@ -6,11 +6,11 @@ X_i are estimated by minimising the disagreement of overlapping views,
 
     the sum over points p of view i and the nearest point q of view j  of  rho(n_q . (T_i X_i p - T_j X_j q)),
 
-with rho(r) = c^2 log(1 + r^2 / c^2). The points p and q are in the coordinates of cameras i and j, and the normal n_q
-is in world coordinates. A prior keeps the components small that no view determines. The nearest points are searched
-again in each round, within a distance that decreases (point-to-plane iterative closest points, Chen and Medioni 1992).
-If the views do not determine all of X, the smallest eigenvalue of J^T J is small, where J is the derivative of the
-residuals.
+with the robust loss rho(r) = c^2 log(1 + r^2 / c^2), whose width c is twice the median disagreement. The points p and q
+are in the coordinates of cameras i and j, and the normal n_q at q is in world coordinates. A Gaussian prior keeps
+components that no view determines close to zero. The nearest points are searched again in each round, within a distance
+that decreases (point-to-plane iterative closest points, Chen and Medioni 1992). The views determine all of X if the
+smallest eigenvalue of J^T J is large enough, where J is the derivative of the arguments of rho with respect to X.
 """
 
 from collections.abc import Sequence
@@ -27,33 +27,33 @@ from jaxnbv.checks import checked, require
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 
-# Number of points of a view that are compared, and number of views with the nearest directions to compare it with.
+# Largest number of points of a view that are compared, and of other views with which a view is compared.
 _POINTS, _OTHERS = 800, 4
-# Largest angle between the directions of a pair of views, and fewest neighbours of a pair that count as overlap.
+# Largest angle between the directions of two views that are compared, and fewest matched points that count as overlap.
 _WIDEST, _FEWEST = np.radians(70.0), 20
-# Rounding error of points, as a fraction of the distance from the cameras.
+# Rounding error of points, as a fraction of the points' median distance from the cameras.
 _ROUNDING = 1e-6
 # Smallest cosine of the angle between the normals of two matched points.
 _ALIKE = 0.7
 # Largest distance between matched points in each round, as a fraction of the distance from the cameras.
 _REACHES = (0.08, 0.08, 0.08, 0.04, 0.04, 0.04, 0.02, 0.02, 0.01, 0.01)
-# Ratio of c to the median disagreement, and number of least-squares steps in a round.
+# Ratio of the width c of rho to the median disagreement, and number of least-squares steps in a round.
 _SCALE, _STEPS = 2.0, 3
-# Prior standard deviation of an error, in radians and as a fraction of the distance from the cameras. The errors of
-# neighbouring points are correlated. Therefore _TOGETHER points count as one independent point.
+# Prior standard deviation of a pose error: in radians, and of its shift as a fraction of the distance from the cameras.
+# The errors of neighbouring points are correlated. Therefore _TOGETHER points count as one independent point.
 _ERROR, _TOGETHER = 0.03, 50
 # The views determine all of X if the smallest eigenvalue of J^T J exceeds this fraction of the largest. The ratio is
 # 4e-6 for three views of a shelf from one side, and 1e-3 or more for views that determine X.
 _TOLD = 3e-4
 # A correction is rejected if it moves points by more than this fraction of their distance from the cameras.
 _MOST = 0.15
-# Views disagree if they differ by more than _OFF times the noise. A correction must divide the difference by _LESS.
+# Views that differ by more than _OFF times the noise disagree. A correction must divide their difference by _LESS.
 _OFF, _LESS = 3.0, 1.5
 _Corrections: TypeAlias = Float[np.ndarray, "views 4 4"]
 
 
 class Alignment(eqx.Module):
-    """Disagreement of overlapping views, and the pose error that explains it.
+    """How much overlapping views disagree, and the pose error that explains it.
 
     Lengths are in the units of the poses.
 
@@ -62,8 +62,8 @@ class Alignment(eqx.Module):
     - `angle`: median angle between the normals of these pairs of points, in radians.
     - `noise`: median point-to-plane distance between neighbouring points of the same view.
     - `corrected`: `disagreement` with corrected poses.
-    - `corrections`: (views, 4, 4), the correction X of each view. The true pose of the camera is `matrix @ X`. All X
-      are identities if corrected poses do not agree much better.
+    - `corrections`: (views, 4, 4), the correction X of each view. The true pose of the camera is `matrix @ X`, where
+      `matrix` is the reported pose. All X are identities if corrected poses do not agree much better.
     - `is_mount`: whether all views have the same X, which is then an error of the mount.
     - `covariance`: covariance of the mount's error: a rotation vector (radians), then a shift, in the camera's axes.
     - `is_determined`: whether the views determine all components of the mount's error. Undetermined components stay
@@ -71,7 +71,7 @@ class Alignment(eqx.Module):
     - `weakest`: direction of the mount's error that the views determine least: a rotation vector, then a shift.
     - `num_pairs`: number of pairs of views that were compared. Each view is compared with up to four other views of
       similar direction.
-    - `distance`: median distance of points from the cameras.
+    - `distance`: median distance of points from the camera that measured them.
     """
 
     disagreement: Float[np.ndarray, " views"]
@@ -103,15 +103,15 @@ class Alignment(eqx.Module):
 
     @property
     def errors(self) -> tuple[Float[np.ndarray, " views"], Float[np.ndarray, " views"]]:
-        """Angle in radians and length of each view's correction."""
+        """Rotation angle (radians) and length of the shift of each view's correction."""
         return errors_of(self.corrections)
 
     @property
     def motion(self) -> str:
-        """Description of the view that would best determine the weakest component of the mount's error.
+        """Text that names the further view that would best determine the `weakest` error of the mount.
 
-        If all motions between the views keep the direction of an axis, a shift along this axis or a rotation about it
-        looks the same in all views.
+        A shift along an axis, or a rotation about it, looks the same in all views if all motions between the views keep
+        the direction of the axis. The named view changes this direction.
         """
         axis = self.weakest[3:] if np.linalg.norm(self.weakest[3:]) > 0 else self.weakest[:3]
         is_ahead = abs(axis[2]) > 0.8 * np.linalg.norm(axis)
@@ -133,7 +133,7 @@ class _View(NamedTuple):
 class _Matches(NamedTuple):
     """Matched points of pairs of views, each in the coordinates of its own camera.
 
-    - `views`: indices of the two views.
+    - `views`: for each match, the indices of the two views.
     - `first`, `own_normals`: point and normal in the first view.
     - `second`, `normals`: point and normal in the second view.
     """
@@ -202,7 +202,7 @@ def align_views(clouds: Sequence[PointCloud], poses: Sequence[Pose]) -> Alignmen
 
 
 def _in_camera(cloud: PointCloud, pose: Pose) -> _View:
-    """Convert a view to its camera's coordinates, with a random subset of the points."""
+    """Return a view with a random subset of a cloud's points, in the coordinates of the camera."""
     points, normals = (rows.astype(np.float64) for rows in cloud.to_numpy())
     rows = np.random.default_rng(0).permutation(len(points))[:_POINTS]
     matrix = np.asarray(pose.to_matrix(), np.float64)
@@ -210,7 +210,7 @@ def _in_camera(cloud: PointCloud, pose: Pose) -> _View:
 
 
 def _pairs(views: Sequence[_View]) -> list[tuple[int, int]]:
-    """Pair each view with the few other views of the most similar direction, which may show the same surface."""
+    """Return pairs of views that may show the same surface: each view with a few of similar direction."""
     ahead = np.stack([view.matrix[:3, 2] for view in views])
     angles = np.arccos(np.clip(ahead @ ahead.T, -1.0, 1.0))
     np.fill_diagonal(angles, np.inf)
@@ -223,7 +223,7 @@ def _matched(
 ) -> _Matches:
     """Match each point of a pair's first view with the nearest point of the second view.
 
-    A match needs a distance of at most `reach` and similar normals. Pairs of views with few matches are left out.
+    Matches are at most `reach` apart and have similar normals. Pairs of views with few matches are left out.
     """
     placed = [view.placed(correction) for view, correction in zip(views, corrections, strict=True)]
     trees = [cKDTree(points) for points, _ in placed]
@@ -241,20 +241,27 @@ def _matched(
 
 
 def _is_plausible(corrections: _Corrections, away: float) -> bool:
-    """Return whether the corrections are small enough to be errors of poses."""
+    """Return whether the corrections are small enough to be errors of poses.
+
+    They must move points by less than 15 % of `away`, the median distance of points from the cameras.
+    """
     turn, shift = errors_of(corrections)
     return bool(np.max(away * turn + shift) < _MOST * away)
 
 
 def errors_of(corrections: _Corrections) -> tuple[Float[np.ndarray, " views"], Float[np.ndarray, " views"]]:
-    """Return the angle in radians and the length of each correction."""
+    """Return the rotation angle in radians and the length of the shift of each correction."""
     return Rotation.from_matrix(corrections[:, :3, :3]).magnitude(), np.linalg.norm(corrections[:, :3, 3], axis=1)
 
 
 def _solved(
     views: Sequence[_View], pairs: Sequence[tuple[int, int]], start: _Corrections, away: float, is_mount: bool
 ) -> _Corrections:
-    """Return the corrections that minimise the disagreement of the views."""
+    """Return the corrections that minimise the disagreement of the views, starting from `start`.
+
+    If `is_mount`, all views get the same correction. Otherwise each view but the first gets its own. `away` is the
+    median distance of points from the cameras.
+    """
     corrections, num_steps = start, 1 if is_mount else len(views) - 1
     for reach in _REACHES:
         matches = _matched(views, pairs, corrections, reach * away)
@@ -277,9 +284,13 @@ def _robust(
     errors: Float[np.ndarray, " steps"],
     prior: Float[np.ndarray, " steps"],
 ) -> Float[np.ndarray, " steps"]:
-    """Return the step that minimises the sum of rho(off + rows @ step) and prior (errors + step)^2.
+    """Return the `step` that minimises sum rho(off + rows @ step) + sum prior (errors + step)^2.
 
-    The method is iteratively reweighted least squares.
+    The method is iteratively reweighted least squares. rho is the robust loss of the module's docstring.
+
+    - `off`, `rows`: point-to-plane distances and their derivative, from `_linearised`.
+    - `scale`: width c of rho.
+    - `errors`, `prior`: the corrections so far, and the weights that pull them towards zero.
     """
     step = np.zeros(rows.shape[1])
     for _ in range(_STEPS):
@@ -292,10 +303,11 @@ def _robust(
 def _linearised(
     views: Sequence[_View], matches: _Matches, corrections: _Corrections, is_mount: bool
 ) -> tuple[Float[np.ndarray, " n"], csr_array]:
-    """Return n_q . (T_i X_i p - T_j X_j q), and its derivative with respect to steps X <- X exp(step).
+    """Return the signed point-to-plane distance of each match, and its derivative.
 
-    There is one step for the mount, or one step for each view but the first. The entries of a row for one view are
-    (p x m, m), where p is the point and m the normal in the coordinates of this view's camera.
+    The distance is n_q . (T_i X_i p - T_j X_j q), see the module's docstring. The derivative is with respect to steps
+    X <- X exp(step): one step for the mount, or one for each view but the first. Its six entries for a view are, up to
+    sign, (p x m, m) with the point p and the normal m = n_q in the coordinates of this view's camera.
     """
     true = np.stack([view.matrix for view in views]) @ corrections
     (first, second), count = matches.views.T, len(matches.views)
@@ -322,7 +334,7 @@ def _placed(matrices: Float[np.ndarray, "n 4 4"], points: Float[np.ndarray, "n 3
 
 
 def _exponential(step: Float[np.ndarray, "6"]) -> Float[np.ndarray, "4 4"]:
-    """Return the rigid motion, as a matrix, of a rotation vector and a shift."""
+    """Return the 4 x 4 matrix of a rigid motion, given as a rotation vector followed by a shift."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = Rotation.from_rotvec(step[:3]).as_matrix(), step[3:]
     return matrix
@@ -335,7 +347,12 @@ def _logarithm(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6"]:
 def _compared(
     views: Sequence[_View], pairs: Sequence[tuple[int, int]], corrections: _Corrections, away: float
 ) -> tuple[Float[np.ndarray, " views"], Float[np.ndarray, " views"]]:
-    """Return the median point-to-plane distance and the median angle between normals for each view."""
+    """Return, for each view, how much it disagrees with the views that `pairs` compares it with.
+
+    Points of two views are matched. The results are two medians over a view's matches: of the point-to-plane distance
+    between the two points, and of the angle between their normals (radians). NaN for a view without matches. `away` is
+    the median distance of points from the cameras.
+    """
     matches = _matched(views, pairs, corrections, _REACHES[0] * away)
     off, _ = _linearised(views, matches, corrections, is_mount=True)
     turns = np.stack([view.matrix for view in views])[:, :3, :3] @ corrections[:, :3, :3]
@@ -359,7 +376,7 @@ def _median(values: Float[np.ndarray, " n"]) -> float:
 
 
 def _noise(views: Sequence[_View]) -> float:
-    """Return the median distance of a point from the tangent plane at its nearest neighbour in the same view."""
+    """Return the median distance of points from the tangent plane at the nearest point of the same view."""
     off = [np.zeros(0)]
     for points, normals, _ in views:
         if len(points) < 2:

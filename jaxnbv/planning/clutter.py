@@ -15,9 +15,9 @@ from jaxnbv.planning.images import Image
 from jaxnbv.scanning import Obstacles
 from jaxnbv.scanning.sdf import Sampled
 
-# Number of cells along a side of the cube. A cell is then about 1.5 cm wide for an object of 20 cm.
+# Number of cells along a side of the cube of cells. A cell is then about 1.5 cm wide for an object of 20 cm.
 _CELLS = 48
-# Smallest number of an image's pixels in an occupied cell. Fewer pixels may be flying pixels at a depth edge.
+# Smallest number of an image's points in an occupied cell. Fewer points may be flying pixels at a depth edge.
 _FEWEST = 5
 
 
@@ -93,7 +93,7 @@ class Clutter(NamedTuple):
     def _is_seen_through(
         self, depth: Float[np.ndarray, "height width"], camera: Camera, pose: Pose, frame: Frame
     ) -> Bool[np.ndarray, "n n n"]:
-        """Return a mask of the cells that lie in front of the measured depth by more than a cell."""
+        """Return a mask of the cells that are more than a cell nearer than the depth measured at their pixel."""
         cell = frame.length_to_world(self.spacing)
         centers = np.asarray(frame.to_world(self._centers().reshape(-1, 3)), np.float64)
         local = (centers - np.asarray(pose.position, np.float64)) @ np.asarray(pose.rotation, np.float64)

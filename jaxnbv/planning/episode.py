@@ -31,11 +31,11 @@ def _score(acquisition: Acquisition, context: Any, view: ImaginedView) -> Float[
 
 
 class Episode(eqx.Module):
-    """The views that a planner chose of a scene, in scene coordinates, and all inputs that they depend on.
+    """The views that a planner chose for a scene, in scene coordinates, and everything they depend on.
 
     - `scene`, `noise`: true surface and sensor noise; None if a real sensor took the views.
     - `first`: pose of the first view.
-    - `stop_reason`: reason of the stop rule that ended the episode; None if no rule did.
+    - `stop_reason`: reason that the stop rule gave for ending the episode; None if no rule ended it.
     - `frame`: frame of the user's world, in which the episode is shown and its cloud is saved.
     """
 
@@ -55,7 +55,7 @@ class Episode(eqx.Module):
 
     @property
     def cloud(self) -> PointCloud:
-        """D after the last view, in scene coordinates."""
+        """The cloud D, the points kept from all views, in scene coordinates."""
         return self.views[-1].cloud
 
     def observations(self) -> Iterator[Observations]:
@@ -63,7 +63,7 @@ class Episode(eqx.Module):
         return self.planner.replay(((view.pose, view.scan) for view in self.views), self.sensor)
 
     def observations_after(self, views: int) -> Observations:
-        """The planner's observations after the first `views` views.
+        """Return the planner's observations after the first `views` views.
 
         **Raises:** `ValueError` unless 1 <= `views` <= the number of views.
         """
@@ -72,9 +72,9 @@ class Episode(eqx.Module):
         return next(itertools.islice(self.observations(), views - 1, None))
 
     def actual_scores(self, observations: Iterable[Observations] | None = None) -> Iterator[float | None]:
-        """Yield the score of each view's actual scan, given the observations before it.
+        """Yield the acquisition's score of each view's actual scan, given the observations before the view.
 
-        In scene units; None for the first view. Compare it with the value that the proposal expected.
+        In scene units; None for the first view. Compare a score with the value that the view's proposal expected.
 
         - `observations`: the result of `observations()`, if it is already computed.
         """
@@ -90,8 +90,8 @@ class Episode(eqx.Module):
     def load(cls, path: str | Path, planner: Planner | None = None, scene: Surface | None = None) -> "Episode":
         """Load a saved episode, or the views that `simulate` has stored so far.
 
-        - `planner`, `scene`: replace the stored ones. Needed if these hold a function or network that cannot be
-          restored from its description. Both must have the same description.
+        - `planner`, `scene`: planner and scene to use in place of the stored ones. Give them if the stored ones hold a
+          function or network that cannot be restored. They must have the same descriptions as the stored ones.
 
         **Raises:** `ValueError` if the folder holds no episode or no view, or if its planner or scene cannot be
         restored.
@@ -113,7 +113,7 @@ class Episode(eqx.Module):
     def save(self, path: str | Path) -> None:
         """Save the episode to a folder (see `jaxnbv.storage` for its files). `simulate` can continue from it.
 
-        **Raises:** `ValueError` if the folder holds other files, an episode of another configuration, or a longer one.
+        **Raises:** `ValueError` if the folder holds other files, an episode of another configuration, or more views.
         """
         folder = self.open(path)
         with folder.writing():
@@ -134,7 +134,7 @@ class Episode(eqx.Module):
         folder.write_cloud(self.frame.to_world(self.cloud))
 
     def open(self, path: str | Path) -> RunFolder:
-        """Open a folder for the views of an episode of this configuration.
+        """Open or create a folder that stores the views of an episode with this episode's configuration.
 
         **Raises:** `ValueError` as `RunFolder` does.
         """
@@ -144,7 +144,7 @@ class Episode(eqx.Module):
 
 
 def read_views(folder: RunFolder) -> list[tuple[Pose, PointCloud, Proposal | None]]:
-    """Pose, scan and proposal of every view in a folder.
+    """Return the pose, scan and proposal of every view in a folder.
 
     **Raises:** `ValueError` if a view is damaged, or missing between others.
     """
@@ -153,7 +153,7 @@ def read_views(folder: RunFolder) -> list[tuple[Pose, PointCloud, Proposal | Non
 
 
 def _read_end(folder: RunFolder, views: int) -> str | None:
-    """Reason why an episode of `views` views ended; None if it was continued since, or no rule ended it."""
+    """Return the reason why an episode ended after `views` views; None if no rule ended it there."""
     if not folder.file("end", 0).exists():
         return None
     end = folder.read("end", 0)

@@ -23,9 +23,9 @@ from jaxnbv.surfaces.part_hypotheses import hypotheses_of
 
 
 class ViewRecord(NamedTuple):
-    """Result of one view.
+    """Result of one view of a simulated episode.
 
-    - `value`: value of the view in the search; NaN for the first view.
+    - `value`: value that the search gave the view; NaN for the first view.
     - `answer`: values of the acquisition's answer, or `PartHypotheses.part_weights` if `answers_by_parts`.
     """
 
@@ -47,7 +47,7 @@ def run(
     rows: tuple[Surface, Pose, Key[Array, " episodes"]],
     at_once: int,
 ) -> tuple[ViewRecord, PointCloud, Bool[Array, " episodes"]]:
-    """Run episodes, and return three results for each episode.
+    """Simulate episodes, and return three results for each episode.
 
     The results are the record of each view with axes (episodes, max_views), the cloud after the last view, and whether
     the first view hit the object.

@@ -29,7 +29,7 @@ class Episodes(eqx.Module):
     """Results of `episodes` in scene coordinates. All arrays have a leading axis of episodes.
 
     - `poses`: poses of the views, (episodes, views).
-    - `values`: value of each view in the search; NaN for the first view, which was not proposed.
+    - `values`: value that the search gave each view; NaN for the first view, which was not proposed.
     - `clouds`: the cloud D after the last view.
     - `answers`: values of `View.answer` after each view. None if there is no answer, or if the answer needs code
       outside JAX.
@@ -89,7 +89,7 @@ def episodes(
     require(not is_traced(scenes, first, keys), "episodes is a compiled program itself: call it outside jit and vmap")
     count = len(keys)
     rows = scene_batch(scenes, count), _batch_of_poses(first, count), keys
-    # The value of the first view is NaN, which is not an error.
+    # The value of the first view is NaN, so JAX must not check for NaN.
     with _devices(count), jax.debug_nans(False):
         at_once = min(batch_size or (1 if on_cpu() else count), share_of(count))
         records, clouds, sees = run(planner, noise, jnp.asarray(views), rows, at_once)
@@ -118,7 +118,7 @@ def _batch_of_poses(first: Pose, count: int) -> Pose:
 
 
 def _devices(count: int) -> AbstractContextManager:
-    """Return a context that uses up to `count` local devices, unless the user has chosen devices."""
+    """Return a context manager: let JAX use up to `count` local devices, unless the user chose devices."""
     chosen = not get_abstract_mesh().empty or jax.config.jax_default_device is not None  # type: ignore[attr-defined]
     devices = jax.local_devices()[:count]
     return nullcontext() if chosen or len(devices) == 1 else jax.set_mesh(Mesh(np.array(devices), "devices"))

@@ -59,7 +59,10 @@ class Image(NamedTuple):
         return cls(pixels.copy(), as_numbers(matrix, "the matrix of a pose", np.float64), scale, pixel_mask)
 
     def cleaned(self, camera: Camera, pose: Pose, box: Box) -> "Image":
-        """Return a copy with depth zero where a value means "not measured", see `without_sentinels`."""
+        """Return a copy in which pixels whose value stands for "not measured" have depth zero.
+
+        Such a value is beyond the camera's range or the box, or the largest integer, see `without_sentinels`.
+        """
         return self._replace(depth=without_sentinels(self.depth, camera, pose, self.scale, box))
 
     def points(self, camera: Camera, pose: Pose) -> Float[np.ndarray, "height width 3"]:
@@ -91,7 +94,7 @@ class Image(NamedTuple):
         return self._replace(robot=robot)
 
     def cloud(self, camera: Camera, pose: Pose, stride: int, box: Box | None = None) -> PointCloud:
-        """Convert the image to a cloud without the robot's points, see `PointCloud.from_depth`. Ignore `mask`."""
+        """Convert the image without the robot's pixels by `PointCloud.from_depth`. The `mask` is not applied."""
         cloud = PointCloud.from_depth(self.depth, camera, pose, self.scale, stride, box)
         return cloud if self.robot is None else only_where(cloud, ~self.robot, camera, stride)
 
@@ -109,10 +112,10 @@ class Image(NamedTuple):
         return not bool(np.any(cloud.missed)) or (len(values) == 1 and bool(np.isfinite(values[0])))
 
     def check_moved(self, earlier: "tuple[Image, ...]") -> None:
-        """Check that the image is not an old frame of the driver.
+        """Check that the image is not a stale frame, which the driver recorded before the camera moved.
 
-        **Raises:** `ValueError` if an earlier image has the same depth but a different pose. Images without a positive
-        depth are not checked.
+        **Raises:** `ValueError` if one of the `earlier` images has the same depths but a different pose. An image
+        without a positive depth is not checked.
         """
         if not (self.depth > 0).any():
             return
@@ -126,7 +129,7 @@ class Image(NamedTuple):
 
 
 def only_where(cloud: PointCloud, pixels: Bool[np.ndarray, "height width"], camera: Camera, stride: int) -> PointCloud:
-    """Return a cloud with the points of some pixels only. The other rays keep their lengths.
+    """Return a cloud with only the points of some pixels. The rays of other pixels keep their lengths.
 
     - `pixels`: mask of the pixels to keep, at the image's full resolution.
     - `stride`: stride of the rows and columns from which the cloud was made.

@@ -38,12 +38,12 @@ class Intake:
         self.images: tuple[Image, ...] = ()
         self.mount_error = MountError(camera, convention)
         self.table: Obstacles | None = None
-        # If there is no table with the session's upward axis, the axes with which there would be one.
+        # If no table is detected with the session's upward axis, the axes with which one would be detected.
         self.other_ups: tuple[str, ...] = ()
         self.clutter = self._no_clutter()
 
     def without_images(self) -> "Intake":
-        """Return a copy without images, which keeps the pose corrections. The images can be added again."""
+        """Return a copy without images that keeps the pose corrections, to add the images again with these."""
         intake = copy.copy(self)
         intake.images, intake.clutter = (), self._no_clutter()
         return intake
@@ -86,7 +86,7 @@ class Intake:
         return loop
 
     def _cloud(self, image: Image, pose: Pose, is_first: bool) -> PointCloud:
-        """Return the points of an image that lie in the box, or in the margin around the box that carving needs.
+        """Return the points of an image in the box, or in the margin around the box that carving needs.
 
         **Raises:** `ValueError` if the first image shows nothing of the box.
         """

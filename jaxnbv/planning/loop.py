@@ -73,9 +73,9 @@ class Step(NamedTuple):
     """A view of an episode, with the inputs and the time of the search that proposed the view.
 
     - `observations`: observations after the view.
-    - `inputs`: inputs of the search: posterior and samples. None if the search uses no samples, and for a first or
-      stored view.
-    - `seconds`: duration of the search; zero for a first or stored view.
+    - `inputs`: inputs of the search: posterior and samples. None if the search uses no samples, for the first view, and
+      for a view that was read from a folder.
+    - `seconds`: duration of the search; zero for the first view and for a view that was read from a folder.
     """
 
     view: View
@@ -138,9 +138,10 @@ class Loop:
         self._next = _StepState()
 
     def without_views(self, planner: Planner) -> "Loop":
-        """Return a copy without views and with a different planner, to which the views can be added again.
+        """Return a copy without views that uses `planner`.
 
-        The copy keeps the time of the first view.
+        A session uses it if obstacles or pose errors were detected, and adds its views again with corrected poses. The
+        copy keeps the start time of the first view, from which stop rules count seconds.
         """
         loop = copy.copy(self)
         loop.planner, loop.views, loop._observations = planner, (), None
@@ -148,7 +149,7 @@ class Loop:
         return loop
 
     def with_clutter(self, clutter: SignedDistance | None) -> "Loop":
-        """Return a copy whose planner has this clutter in its obstacles.
+        """Return a copy with different clutter in the obstacles of its planner.
 
         - `clutter`: solid in scene units; None for no clutter.
         """
@@ -253,7 +254,7 @@ class Loop:
         return self._next.proposal
 
     def settle(self, proposal: Proposal) -> None:
-        """Replace the search's proposal by `proposal`, which has a different pose of the same search."""
+        """Use this proposal for the next view instead of the search's, for example if an arm can reach it."""
         self._next.proposal = proposal
 
     def resume(self, proposal: Proposal) -> None:
@@ -291,7 +292,7 @@ class Loop:
 
     @property
     def stop_reason(self) -> str | None:
-        """Reason to stop that `done` returned since the last view; None without a reason or a call."""
+        """Reason that `done` returned since the last view; None if it returned None or was not called."""
         return self._next.stop
 
     def in_world(self, value: Float[Array, ""]) -> float:

@@ -15,7 +15,7 @@ from jaxnbv.planning.session_warnings import warn_of_mount
 _COARSER = 3
 # Smallest number of views for a correction or warning. Two views may disagree by chance.
 _ENOUGH = 3
-# New corrections are ignored if they move points by at most this fraction of the noise.
+# New corrections are ignored if they move points by at most this fraction of the points' noise.
 _EQUAL = 0.5
 
 
@@ -60,7 +60,7 @@ class MountError:
         return self._alignment
 
     def warn_if_off(self) -> bool:
-        """Warn if the images disagree, and return whether they do."""
+        """Warn if the images disagree, and return whether they do. Two images are not enough to tell."""
         if len(self._images) < _ENOUGH or not (alignment := self.alignment()).disagrees:
             return False
         warn_of_mount(alignment)
@@ -73,7 +73,7 @@ class MountError:
         return first if bool(np.all(self.corrections == first)) else np.eye(4)
 
     def pose(self, image: Image, index: int) -> Pose:
-        """Return the corrected pose of an image."""
+        """Return the corrected world pose of an image. The correction of a new image is `mount`."""
         pose = Pose.from_matrix(image.matrix, self.convention)
         correction = self.corrections[index] if index < len(self.corrections) else self.mount
         if np.array_equal(correction, np.eye(4)):
@@ -87,7 +87,7 @@ class MountError:
         return Pose.from_matrix(np.asarray(poses.to_matrix(), np.float64) @ np.linalg.inv(self.mount))
 
     def update(self) -> bool:
-        """Update the corrections from the images so far. Returns whether they changed noticeably."""
+        """Update the corrections from the images so far, and return whether they changed noticeably."""
         if len(self._images) < _ENOUGH:
             return False
         alignment = self.alignment()

@@ -41,7 +41,7 @@ from jaxnbv.utility import Quantity
 
 _PARTS_GRID = 64
 
-# Functions are converted on the way in, which mypy cannot see.
+# The constructor converts a plain function to an acquisition, which mypy cannot see.
 if TYPE_CHECKING:
     AnyAcquisition: TypeAlias = Any
 else:
@@ -119,7 +119,7 @@ class Planner(eqx.Module):
 
     @property
     def quantity(self) -> Quantity:
-        """Name, unit and power of length of the proposals' values."""
+        """Name and unit of the proposals' values, and the power of length in this unit."""
         value = self.search.quantity(self.acquisition)
         return value if self.cost is None else self.cost.quantity(value)
 
@@ -215,19 +215,20 @@ class Planner(eqx.Module):
 
     @own_settings()
     def step_inputs(self, observations: Observations, key: PRNGKeyArray) -> StepInputs:
-        """Return the inputs of the search: `sampled`, or only the observations if the search uses no samples.
+        """Return the inputs of the search, for `choose`. `propose` calls both.
 
-        This is the first half of `propose`. The second half is `choose`.
+        The inputs are the result of `sampled`, or only the observations if the search uses no samples.
         """
         check_type(observations, Observations, "observations")
         return self.sampled(observations, key) if self.search.uses_samples else StepInputs(observations)
 
     @own_settings()
     def sampled(self, observations: Observations, key: PRNGKeyArray) -> StepInputs:
-        """Condition the model on the observations, and draw samples of the surface.
+        """Return the observations, the model's posterior given them, and surfaces drawn from the posterior.
 
-        If the acquisition is `measurable_only`, the samples omit surface that an earlier view should have measured but
-        did not. If the acquisition needs hypotheses, the only sample is the most probable part.
+        For an acquisition with `measurable_only` (`NewSurface`), the surfaces omit what an earlier view should have
+        measured but did not. For an acquisition with `needs_hypotheses` (`Identify`), there is no posterior, and the
+        only surface is that of the most probable part.
         """
         if self.acquisition.needs_hypotheses:
             return StepInputs(observations, None, hypotheses_of(observations).surfaces(self.sampler.grid, 1))
@@ -239,7 +240,7 @@ class Planner(eqx.Module):
 
     @own_settings()
     def choose(self, inputs: StepInputs, key: PRNGKeyArray, pending: PoseList | None = None) -> Proposal:
-        """Search for the next pose, given the inputs of the search. This is the second half of `propose`.
+        """Search for the next pose, given the inputs of the search.
 
         - `inputs`: result of `step_inputs`, or inputs with samples of your own.
         - `pending`: as in `propose`.

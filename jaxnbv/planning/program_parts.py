@@ -1,4 +1,4 @@
-"""Computation within a compiled program with results that are bit for bit the same as outside `jit`."""
+"""Computes a function within a compiled program with the same bits as outside `jit`."""
 
 from collections.abc import Callable
 from typing import Any

@@ -1,4 +1,4 @@
-"""Proposals that an arm can reach. The user's function checks poses in the order of their value, best first."""
+"""Chooses the best pose that an arm can reach. A function of the user checks poses, best first."""
 
 import dataclasses
 import math
@@ -63,10 +63,11 @@ class _Option(NamedTuple):
 
 @dataclasses.dataclass
 class _Checks:
-    """Iterator over the reachable options of poses, in the order in which the poses are checked.
+    """Checks poses one after the other, and yields what the arm can reach of each.
 
-    - `poses`, `values`: poses and values in this order.
-    - `answers`: function that returns the scores or reasons of a batch of poses.
+    - `poses`, `values`: poses to check and their values, in order.
+    - `answers`: function of a batch of poses. It returns the score of each pose, or the reason why the arm cannot reach
+      the pose.
     - `refused`, `values_at`: as in `best_reachable`.
     - `refusals`: for each reason, the number of poses so far that cannot be reached.
     """
@@ -79,10 +80,10 @@ class _Checks:
     refusals: Counter[str] = dataclasses.field(default_factory=Counter)
 
     def __iter__(self) -> Iterator[list[_Option]]:
-        """Yield the options of each pose.
+        """Yield, for each pose, the list of its options.
 
-        The options are the pose itself if the arm can reach it, otherwise the reachable rotations of the pose about the
-        optical axis.
+        The only option is the pose itself if the arm can reach it. Otherwise the options are the rotations of the pose
+        about the optical axis that the arm can reach.
         """
         for start in range(0, len(self.values), _BATCH):
             rows = range(start, min(start + _BATCH, len(self.values)))
@@ -119,7 +120,7 @@ def best_reachable(
     values_at: Callable[[Pose], Float[Array, " n"]] | None = None,
     seconds: float = math.inf,
 ) -> Choice:
-    """Find the reachable pose with the highest value times score.
+    """Find the pose with the highest value, times the user's score, that the arm can reach.
 
     All poses that the search evaluated are considered. They are checked in batches, highest value first, until no
     unchecked pose can be better. If a pose cannot be reached, the same pose with the camera rotated about its optical
@@ -193,12 +194,12 @@ def _rolled(pose: Pose) -> Pose:
 
 
 def _refusal(pose: Pose, refused: Sequence[Refused]) -> str | None:
-    """Return the reason if a pose was refused, in any rotation about the optical axis; otherwise None."""
+    """Return why the user refused a pose or a rotation of it about the optical axis; otherwise None."""
     return next((earlier.reason for earlier in refused if is_same_view(pose, earlier.pose)), None)
 
 
 def _answers(reachable: Reachable, matrices: Float[np.ndarray, "n 4 4"]) -> list[float | str]:
-    """Return, for each matrix, the score or the reason why the pose cannot be reached.
+    """Call the user's function, and return a score or the reason for no reach for each matrix.
 
     **Raises:** `ValueError` unless the function returns a list of bools, reasons or scores.
     """

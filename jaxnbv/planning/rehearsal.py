@@ -17,7 +17,7 @@ from jaxnbv.planning.loop import Loop
 from jaxnbv.programs import LOADED
 
 _COMPILED = "/jax/core/compile/backend_compile_duration"
-# Radius of the ball, as a fraction of the box's shortest side.
+# Radius of the simulated ball, as a fraction of the box's shortest side.
 _RADIUS = 0.2
 
 
@@ -69,7 +69,8 @@ def slanted(poses: Pose, count: int) -> Pose:
 def ball_on_a_table(camera: Camera, pose: Pose, box: Box) -> Float[np.ndarray, "height width"]:
     """Return a depth image of a ball in the middle of a box, with a table at the bottom of the box.
 
-    The depths are exact, in scene units with y up. A pixel is zero if its ray misses both, or is out of range.
+    The depths are exact, in scene units with y up. A pixel is zero if its ray misses ball and table, or if the hit is
+    outside the camera's range.
     """
     origin = np.asarray(pose.position, np.float64)
     ahead = np.asarray(camera.pixel_directions(), np.float64)

@@ -1,4 +1,4 @@
-"""Live sessions, which take images of a real sensor and return the next camera pose in world coordinates."""
+"""Live sessions, which take images of a real sensor and return the camera's next pose in the world."""
 
 import math
 import threading
@@ -55,7 +55,7 @@ class NextView(eqx.Module):
 
     - `matrix`: camera-to-world matrix of the pose to command, in the session's convention. With `correct_mount`, the
       matrix compensates for the error of the camera's mount.
-    - `value`: value of the pose in the search, with lengths or areas in world units.
+    - `value`: value that the search gave the pose, with lengths or areas in world units.
     - `standard_error`: standard error of the value as a mean over posterior samples; None with fewer than two samples.
     - `proposal`: full result of the search, in scene coordinates.
     - `refusals`: for each reason, the number of poses that were tried but cannot be reached.
@@ -403,7 +403,7 @@ class Session:
             self._loop, self._next = loop, None
 
     def _correct(self) -> None:
-        """Estimate the pose errors from the images so far, and add all images again if the corrections changed."""
+        """Estimate the pose errors from the images so far. If corrections changed, add all images again."""
         if not self._intake.mount_error.update():
             return
         images, views = self._intake.images, self.views
@@ -414,7 +414,7 @@ class Session:
             self._add(image)
 
     def _read(self, folder: SessionFolder) -> None:
-        """Restore the images of the folder, the proposal before each image, and the proposal after the last image."""
+        """Add the images of the folder to the session, with their proposals and the latest proposal."""
         self._refused, count = folder.refused(), folder.num_images
         for index in range(count + 1):
             if index and (proposal := folder.proposal(index)) is not None:
@@ -426,7 +426,7 @@ class Session:
                     self._correct()
 
     def _next_of(self, proposal: Proposal, refusals: Mapping[str, int] = MappingProxyType({})) -> NextView:
-        """Convert a proposal to world coordinates."""
+        """Convert a proposal to the result of `next`, in world coordinates."""
         error = None if proposal.standard_error is None else self._loop.in_world(proposal.standard_error)
         error = error if error is not None and math.isfinite(error) else None
         (matrix,), value = self._matrices(proposal.pose[None]), self._loop.in_world(proposal.value)
@@ -458,7 +458,7 @@ class Session:
 
     @contextmanager
     def _planning(self) -> Iterator[None]:
-        """Context that closes the progress bar at its end."""
+        """Context manager: close the progress bar at the end of the block."""
         try:
             yield
         finally:
@@ -468,7 +468,7 @@ class Session:
 
     @contextmanager
     def _alone(self) -> Iterator[SessionFolder | None]:
-        """Context with exclusive write access to the folder. Yields None if the session has no folder.
+        """Context manager: lock the folder for writing, and yield it; None if the session has no folder.
 
         **Raises:** `ValueError` if a different process writes to the folder or has added images.
         """

@@ -1,4 +1,4 @@
-"""The folder of a session, in which images, proposals and refused poses are stored before they are used."""
+"""The folder of a session, which stores images, proposals and refused poses before they are used."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -40,7 +40,7 @@ class SessionFolder:
 
     @contextmanager
     def writing(self, num_images: int) -> Iterator[None]:
-        """Context with exclusive write access to the folder.
+        """Context manager: lock the folder for writing.
 
         - `num_images`: number of images in the session.
 
@@ -68,7 +68,8 @@ class SessionFolder:
     def store_image(self, index: int, image: Image) -> None:
         """Store an image.
 
-        A stored proposal after this image is removed. It is outdated, because it was made before images were deleted.
+        A stored proposal for the view after this image is removed. It is outdated, because it was computed from images
+        that the user has deleted.
         """
         self._folder.file("proposal", index + 1).unlink(missing_ok=True)
         pixels = {"mask": image.mask, "robot": image.robot}

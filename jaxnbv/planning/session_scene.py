@@ -49,7 +49,7 @@ def in_scene(
 ) -> Planner:
     """Return a copy of a planner for a sensor and a box, in scene coordinates.
 
-    - `camera`, `box`: as for `Session`, in world units.
+    - `camera`, `box`, `convention`: as for `Session`, in world units.
     - `matrices`: poses as for `Session`, in world units; None for the candidates of the planner's search.
     - `obstacles`: as for `Session`, in world units; None for the planner's own obstacles.
     """

@@ -1,4 +1,4 @@
-"""Warnings of a session, for example about a box that cuts the object, a table, or views without value."""
+"""Warnings of a session, such as those about a box that cuts the object, or about a table."""
 
 import math
 import warnings
@@ -12,7 +12,7 @@ from jaxnbv.planning.alignment import Alignment
 from jaxnbv.planning.table import plane_of
 from jaxnbv.scanning import Obstacles
 
-# Smallest fraction of points beyond a face that leads to a warning. Fewer points may be stray.
+# Smallest fraction of points beyond a face of the box that leads to a warning. Fewer points may be stray.
 _STRAY = 0.01
 # `stacklevel` for the user's call of a session's method. For `add` it is one more, because a wrapper checks arguments.
 _CALLER, _CALLER_OF_ADD = 3, 4
@@ -21,7 +21,7 @@ _CALLER, _CALLER_OF_ADD = 3, 4
 def warn_of_cut(box: Box, points: Float[np.ndarray, "n 3"], voxel: float, faces: frozenset[str]) -> frozenset[str]:
     """Warn about faces beyond which the object seems to extend. Return the faces of all warnings so far.
 
-    - `box`, `points`: box and points in world units. They must include points within about a voxel beyond a face.
+    - `box`, `points`: box and measured points in world units, up to about a voxel outside the box.
     - `voxel`: side of a cell of the planner's grid, in world units.
     - `faces`: faces of earlier warnings, which are not repeated.
     """
@@ -114,7 +114,7 @@ def warn_of_little(value: float, error: float | None, value_at_visited: float) -
     Either everything has been seen, or no candidate looks at the unseen surface.
 
     - `value`, `error`: value of the best view and its standard error, in world units.
-    - `value_at_visited`: mean value that is expected at visited poses, in world units.
+    - `value_at_visited`: mean value expected at visited poses, where nothing new is left to see, in world units.
     """
     has_error = error is not None and math.isfinite(error)
     if value <= (3.0 * error if has_error and error is not None else 0.0) + value_at_visited:

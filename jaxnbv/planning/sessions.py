@@ -1,4 +1,4 @@
-"""Sessions for several objects on a table. There is one session for each object, and all use the same images."""
+"""Sessions for several objects on a table: one session for each object, all with the same images."""
 
 import warnings
 from pathlib import Path
@@ -218,7 +218,7 @@ class Sessions:
         return points, inside
 
     def _numbers(self, points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
-        """Return, for each point, the number of the object of the point's cluster; zero for stray points."""
+        """Return the number of the earlier or new object that each point belongs to; zero for stray points."""
         owner = np.zeros(len(points), int)
         nearest = np.full(len(points), self._gap)
         for number, session in self.objects.items():
@@ -238,10 +238,10 @@ class Sessions:
         return owner
 
     def _on_a_part(self, points: Float[np.ndarray, "n 3"]) -> int | None:
-        """Return the number of the object to whose surface a cluster belongs; None if there is no such object.
+        """Return the number of the earlier object to which a cluster belongs; None for a new object.
 
-        The distance of the points from the surface is the expectation over the object's hypotheses. It must be below
-        the gap.
+        The cluster belongs to the object whose surface is nearest to its points, if the distance is below the gap. The
+        distance is the expected distance over the object's hypotheses.
         """
         few = points[np.linspace(0, len(points) - 1, _COMPARED).astype(int)]
         distances = {number: _expected_distance(session, few) for number, session in self.objects.items()}
@@ -284,9 +284,9 @@ def _values(session: Session) -> Float[np.ndarray, " candidates"]:
 
 
 def _expected_distance(session: Session, points: Float[np.ndarray, "n 3"]) -> float:
-    """Return the median over points of the expected distance from an object's surface, in world units.
+    """Return the median over points of the expected distance from the surface of a session's object.
 
-    The expectation is over the object's hypotheses.
+    The distance is in world units. The expectation is over the object's hypotheses except "none of these".
     """
     hypotheses, frame = hypotheses_of(session.observations), session.frame
     own = jnp.asarray(frame.to_scene(points), hypotheses.weights.dtype)

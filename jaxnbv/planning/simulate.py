@@ -111,7 +111,7 @@ def observe_scene(
     key: PRNGKeyArray,
     obstacles: Obstacles | None = None,
 ) -> PointCloud:
-    """Return a noisy scan of the true surface, which obstacles may hide. It is compiled if `scene.in_jit`."""
+    """Return a noisy scan of the true surface, which obstacles may hide. Compiled if `scene.in_jit`."""
     barrier = None if obstacles is None else _barrier(obstacles, camera, pose)
     observe = _noisy_scan_in_jit if scene.in_jit else _noisy_scan
     return observe(scene, camera, pose, barrier, noise, key)

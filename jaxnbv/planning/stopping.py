@@ -59,7 +59,7 @@ class StopContext:
     def cost(self, poses: tuple[Pose, ...], of: CostFunction) -> float:
         """Return the cost of the path through scene poses.
 
-        - `of`: cost function of poses in the user's world.
+        - `of`: cost function, which gets poses in world coordinates.
         """
         return total_cost(poses, WorldCost(of, self.frame))
 
@@ -129,12 +129,12 @@ def checked_reason(rule: StopRule, reason: str | None) -> str | None:
 
 
 class Sure(StopRule):
-    """Stop once the most probable class has at least this probability.
+    """Stop once the most probable class has at least a given probability.
 
-    The probability must hold given D, and also given each of several random halves of D. The halves are checked because
-    a classifier may be sure of a single cloud by chance.
+    It must have this probability given the cloud D, and also given each of several random halves of D. The halves are
+    checked because a classifier may be sure of a single cloud by chance.
 
-    - `probability`: within (0, 1).
+    - `probability`: smallest probability at which to stop, within (0, 1).
     - `num_resamplings`: number of random halves.
 
     **Raises:** `ValueError` for a value out of range, or an acquisition without a classifier.
@@ -157,7 +157,7 @@ class Sure(StopRule):
         return self.reason(context.planner.acquisition, context.observations.cloud, context.key)
 
     def reason(self, acquisition: Acquisition, cloud: PointCloud, key: PRNGKeyArray) -> str | None:
-        """Return the reason to stop given D, as a text; None to continue. `key` decides the random halves."""
+        """Return the reason to stop given a cloud, as a text; None to continue. `key` draws the halves."""
         acquisition = _of_classes(acquisition)
         answer = acquisition.answer(cloud)
         best = int(np.argmax(answer.values))
@@ -235,11 +235,11 @@ class PartsFound(StopRule):
 
 
 class Covered(StopRule):
-    """Stop once views are expected to cover this fraction of the visible area, see `expected_coverage`.
+    """Stop once the views have probably seen a given fraction of the visible area (`expected_coverage`).
 
-    - `share`: fraction of the area, within (0, 1].
-    - `size`: size of `NewSurface`, in world units. The default is the acquisition's size if the acquisition is a
-      `NewSurface`, otherwise the size of `NewSurface()`.
+    - `share`: fraction of the area at which to stop, within (0, 1].
+    - `size`: surface within this distance of measured surface counts as seen, in world units (`NewSurface.size`). The
+      default is the acquisition's size if the acquisition is a `NewSurface`, otherwise the size of `NewSurface()`.
 
     **Raises:** `ValueError` for a `share` outside (0, 1], or a size that is not positive.
     """
@@ -267,7 +267,7 @@ def expected_coverage(context: StopContext, new: NewSurface) -> float:
     The visible area is the area of the posterior samples that is visible from any candidate, see `seen_share`. Sampled
     surface that an earlier view should have measured but did not is left out.
 
-    - `new`: acquisition that decides which surface is new.
+    - `new`: acquisition that decides which surface is new, that is, not seen yet.
     """
     planner, observations, surfaces = context.planner, context.observations, context.surfaces()
     if observations.looks is not None and not planner.acquisition.measurable_only:
@@ -279,9 +279,9 @@ def expected_coverage(context: StopContext, new: NewSurface) -> float:
 
 
 class Identified(StopRule):
-    """Stop once one of the known parts, or "none of these", has at least this probability.
+    """Stop once one of the known parts, or "none of these", has at least a given probability.
 
-    - `probability`: within (0, 1).
+    - `probability`: smallest probability at which to stop, within (0, 1).
 
     **Raises:** `ValueError` for a probability outside (0, 1), or a planner without known parts.
     """
@@ -298,11 +298,11 @@ class Identified(StopRule):
 
 
 class Placed(StopRule):
-    """Stop once the expected error of the most probable part's surface is at most this length.
+    """Stop once the expected error of the most probable part's surface is at most a given length.
 
     The error is `surface_error`, a root mean square over the surface and over the hypotheses.
 
-    - `length`: length in world units in a session, and in scene units in a simulation.
+    - `length`: largest error at which to stop, in world units in a session, and in scene units in a simulation.
 
     **Raises:** `ValueError` for a length that is not positive, or a planner without known parts.
     """
@@ -321,7 +321,7 @@ class Placed(StopRule):
 
 
 class ValueBelow(StopRule):
-    """Stop once the proposed view's value is below this limit.
+    """Stop once the proposed view's value is below a limit.
 
     - `value`: limit in the unit of the search's values. Lengths are in world units in a session, and in scene units in
       a simulation.

@@ -17,7 +17,7 @@ _LEVEL, _AGREES = np.cos(np.radians(30.0)), np.cos(np.radians(40.0))
 _BELOW, _BESIDE = 0.25, 0.2
 # Largest fraction of the box's points below a table, and smallest number of points outside the box on a table.
 _STRAY, _FEWEST = 0.02, 50
-# Largest distance of a point from its plane, in scene units.
+# Largest distance from a plane at which a point counts as on the plane, in scene units.
 _TOLERANCE = 0.03
 # Number of random planes, and number of points on which each plane is evaluated.
 _DRAWS, _COUNTED = 1000, 3000
@@ -44,10 +44,10 @@ class _Points(NamedTuple):
 def table_under(cloud: PointCloud, box: Box) -> Obstacles | None:
     """Return the half space below the plane that an object stands on; None if no such plane is detected.
 
-    The margin is three standard deviations of the plane's points, or the default margin if this is larger. RANSAC
-    (Fischler and Bolles 1981) draws planes through points that are sampled by weight, and near points have higher
-    weights. Among all planes that can be a table, the plane with the most points outside the box is used. A plane can
-    be a table if it satisfies four conditions:
+    The margin of the returned obstacle is three standard deviations of the plane's points, or the default margin if
+    this is larger. RANSAC (Fischler and Bolles 1981) draws planes through random points, which are mostly close to the
+    box. Among all planes that can be a table, the plane with the most points outside the box is used. A plane can be a
+    table if it satisfies four conditions:
 
     - It is level to within 30 degrees, so it is not a wall.
     - Its height at the middle of the box is below the top of the box. It is at most a quarter of the box's longest side
@@ -92,7 +92,7 @@ def other_ups(cloud: PointCloud, box: Box, up: str) -> tuple[str, ...]:
 
 
 def _points_about(cloud: PointCloud, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], side: float) -> _Points:
-    """Return the points of an image relative to the middle of a box with corners `low` and `high`."""
+    """Return points relative to the middle of a box with corners `low` and `high` and longest side `side`."""
     points, normals = (rows.astype(np.float64) for rows in cloud.to_numpy())
     inside = np.all((points > low) & (points < high), axis=1)
     room = np.array([_BESIDE * side, np.inf, _BESIDE * side])
@@ -150,7 +150,10 @@ def _on_and_below(
 
 
 def _is_table(image: _Points, on: Bool[np.ndarray, "n k"], below: Bool[np.ndarray, "n k"]) -> Bool[np.ndarray, " k"]:
-    """Return, for each plane, whether an object can stand on it. The last two conditions of `table_under` decide."""
+    """Return, for each plane, whether so few points lie below it that it may be a table.
+
+    These are the last two conditions of `table_under`. `on` and `below` are the result of `_on_and_below`.
+    """
     free = below[image.inside].sum(axis=0) <= _STRAY * image.inside.sum()
     return free & (on[image.around].sum(axis=0) >= below[image.around].sum(axis=0))
 

@@ -32,7 +32,7 @@ _COST, _ONE_NUMBER = "the cost of going from one pose to another", "make it one 
 class ArcLength(eqx.Module):
     """Length of the path between two camera positions around a centre.
 
-    The length is hypot(mean distance x angle, difference of distances), with distances and the angle at the centre. For
+    The length is hypot(mean of the distances from the centre x angle at the centre, difference of the distances). For
     two positions at equal distance it is the length of the arc on a great circle.
 
     - `center`: the centre. The default is the middle of the scene, or the middle of the box in a session.
@@ -92,7 +92,10 @@ class ValuePerCost(eqx.Module):
     def __call__(
         self, values: Float[Array, "*samples poses"], observations: Observations, poses: Pose
     ) -> Float[Array, "*samples poses"]:
-        """Return the values of poses divided by their costs, including the move from the last view if there is one."""
+        """Return the values of poses, each divided by the fixed cost plus the cost of the move to the pose.
+
+        The move starts at the last view of the observations. Without a view, only the fixed cost counts.
+        """
         cost = jax.vmap(lambda pose: checked_result(self.of(observations.poses.last, pose), _COST, 0, _ONE_NUMBER))(
             poses
         )
@@ -106,7 +109,7 @@ class ValuePerCost(eqx.Module):
         return dataclasses.replace(self, of=WorldCost(of, frame))
 
     def quantity(self, value: Quantity) -> Quantity:
-        """Return the quantity of a value divided by a cost, given the quantity `value` of the value."""
+        """Return the name, unit and meaning of values per cost, given those of the values alone."""
         meaning = f"{value.meaning.rstrip('.')}, over the cost of going there."
         unit = f"{value.unit or ('' if value.length_power else value.name)} per unit of cost".lstrip()
         return dataclasses.replace(value, name=f"{value.name} per cost", unit=unit, meaning=meaning)

@@ -96,12 +96,12 @@ def closure(function: FunctionType) -> dict[str, Any]:
 
 
 def reads_of(code: CodeType, names: dict[str, Any], way: str) -> Iterator[tuple[str, Any]]:
-    """Yield names and values of the globals that code reads.
+    """Yield the names and values of the global variables that code reads.
 
     If the code reads an attribute of a user's module, yields this attribute instead of the module.
 
-    - `names`: the globals, keyed by name.
-    - `way`: path to the code, for errors.
+    - `names`: values of the global variables, keyed by name.
+    - `way`: path of the code in the configuration, such as "planner.search", for error messages.
 
     **Raises:** `ValueError` if the code imports a user's module.
     """
@@ -134,9 +134,12 @@ def is_written(name: str, member: Any) -> bool:
 
 
 def source_of(function: FunctionType, way: str) -> str:
-    """Read the source of a function, for a lambda only its body.
+    """Return the source of a function as text, for a lambda only its body.
 
-    A line may have several lambdas, so the line does not identify a lambda.
+    A line may have several lambdas. Therefore the body of a lambda is found by the lines and columns that Python stores
+    for its instructions.
+
+    - `way`: path of the function in the configuration, such as "planner.search", for error messages.
 
     **Raises:** `ValueError` if the source cannot be read.
     """

@@ -37,7 +37,7 @@ def describe(thing: Any, arrays: dict[str, np.ndarray] | None = None, way: str =
     and version.
 
     - `arrays`: a dictionary to fill with the contents of the large arrays, keyed by hash.
-    - `way`: path to `thing`, for errors.
+    - `way`: path of `thing` in a larger configuration, such as "planner.search", for error messages.
 
     **Raises:** `ValueError` if the state of an object cannot be described, or the source of a function cannot be read,
     and the object or function has no `version`. The error names its path.
@@ -56,7 +56,7 @@ def fields_of(kind: type) -> Sequence[str]:
 
 
 class _Describer:
-    """State of one call of `describe`. If an object refers to itself, the second visit is described as a reference."""
+    """State of one call of `describe`, which describes an object inside itself by a reference."""
 
     def __init__(self, arrays: dict[str, np.ndarray]):
         self.arrays = arrays
@@ -162,7 +162,7 @@ class _Describer:
         return {name: self.describe(value, f"{way}.{name}".lstrip(".")) for name, value in values.items()}
 
     def _function(self, function: FunctionType, way: str) -> dict[str, Any]:
-        """Describe everything that the result of a function depends on, except definitions of installed packages."""
+        """Describe all that a function's result depends on, except definitions of installed packages."""
         own = not is_installed(function.__globals__.get("__name__"))
         parts = {"defaults": (function.__defaults__, function.__kwdefaults__), "closure": closure(function)}
         if own:

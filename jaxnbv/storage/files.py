@@ -8,14 +8,14 @@ from typing import Any
 
 from jaxnbv.errors import InputError
 
-# Pattern of the names of partial files, which a killed process leaves.
+# Pattern of the names of partial files, which a killed process leaves behind.
 PARTS = "." + 16 * "[0-9a-f]" + ".partial"
 
 
 def write_whole(path: Path, write: Callable[[Any], Any]) -> None:
     """Write a file completely or not at all: a reader finds the old file or the complete new file.
 
-    Writes a partial file in the same folder, then renames this file.
+    The function `write` gets a partial file in the same folder, opened in binary mode, which is then renamed to `path`.
 
     **Raises:** `ValueError` if the disk is full, the folder is missing or may not be written, or the name is too long.
     """

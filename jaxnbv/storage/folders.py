@@ -1,4 +1,4 @@
-"""Folders of results. All results in a folder have the same configuration, and one process at a time writes there."""
+"""Folders of results with the same configuration. One process at a time writes to a folder."""
 
 import importlib.metadata
 import json
@@ -21,7 +21,7 @@ from jaxnbv.storage.files import PARTS, make_folder, write_text, write_whole
 _LOCK = ".lock"
 # File of the large arrays of the configuration.
 ARRAYS = "arrays.npz"
-# Largest size of a file of arrays after unpacking, in bytes. It holds sixteen million rays, far more than a camera has.
+# Largest size of a file of arrays after unpacking, in bytes. Sixteen million rays fit, far more than a camera has.
 LARGEST = 2**29
 _LONGEST_SHOWN = 60
 
@@ -45,7 +45,7 @@ def versions() -> dict[str, Any]:
 
 
 def differences(stored: Any, current: Any, name: str = "") -> list[str]:
-    """List the differences in words between a `stored` and the `current` description."""
+    """Return a text for each difference of two descriptions. `name` is their path, which begins the text."""
     if isinstance(stored, dict) and isinstance(current, dict):
         keys = list(dict.fromkeys([*stored, *current]))
         nested = (differences(stored.get(key), current.get(key), f"{name}.{key}".lstrip(".")) for key in keys)
@@ -71,7 +71,7 @@ def check_format(format: Any, supported: int, file: Path) -> None:
 def read_json(file: Path, problem: str, remedy: str) -> dict[str, Any]:
     """Read the object in a JSON file.
 
-    **Raises:** `ValueError` with `problem` and `remedy`, if the file cannot be read or holds no JSON object.
+    **Raises:** `ValueError` with the texts `problem` and `remedy`, if the file cannot be read or holds no JSON object.
     """
     # Check this first, because reading from something that is not a file, such as a pipe, may never end.
     require(os.path.isfile(file) or not os.path.lexists(file), f"{file} {problem} (it is no file): {remedy}")
@@ -99,14 +99,14 @@ def read_arrays(file: Path, remedy: str, check: Callable[[dict[str, np.ndarray]]
 
     - `check`: a function that raises any error if the arrays differ from those that were written.
 
-    **Raises:** `ValueError` with `remedy` if the file is damaged.
+    **Raises:** `ValueError` with the text `remedy` if the file is damaged.
     """
     try:
         if not file.is_file():
             raise ValueError("there is no file")
         with np.load(file, allow_pickle=False) as saved:
             size = sum(member.file_size for member in saved.zip.infolist())
-            # A margin for the headers.
+            # The headers of the file may take another 2^20 bytes.
             if size > LARGEST + 2**20:
                 raise ValueError(f"it unpacks to {size} bytes")
             arrays = {key: saved[key] for key in saved.files}
@@ -118,9 +118,9 @@ def read_arrays(file: Path, remedy: str, check: Callable[[dict[str, np.ndarray]]
 
 
 def read_record(folder: Path, kind: str, remedy: str) -> dict[str, Any]:
-    """Read the record of a folder. It has a `config`.
+    """Read the record of a folder, the file `kind`.json: a dictionary with the key "config".
 
-    **Raises:** `ValueError` with `remedy` if there is no record, or if the record has no configuration.
+    **Raises:** `ValueError` with the text `remedy` if there is no record, or if the record has no configuration.
     """
     file, problem = folder / f"{kind}.json", f"is no {kind} record"
     record = read_json(file, problem, remedy)

@@ -36,8 +36,8 @@ def rebuild(description: Any, arrays: Mapping[str, np.ndarray], way: str) -> Any
     constructor is called.
 
     - `arrays`: contents of the large arrays, keyed by hash, from `describe`.
-    - `way`: path to the configuration, for errors. The first name in this path is the argument of `load` that can
-      replace the configuration.
+    - `way`: path of the configuration for error messages, such as "planner". The first name in this path is the
+      argument of `load` that can replace the configuration.
 
     **Raises:** `ValueError` if a part cannot be rebuilt, or has changed since it was described. The error names the
     part's path.

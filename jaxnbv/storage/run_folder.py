@@ -67,7 +67,7 @@ class RunFolder(ResultFolder):
 
     @classmethod
     def config_of(cls, path: str | Path, kind: str, **given: Any) -> dict[str, Any]:
-        """Rebuild the configuration of an existing folder, see `read_config`."""
+        """Rebuild the configuration of an existing folder. `given` replaces parts of it, see `read_config`."""
         return read_config(path, kind, cls.format, given)
 
     def count(self, name: str) -> int:
@@ -139,7 +139,7 @@ def _checksum(arrays: dict[str, np.ndarray]) -> str:
 
 
 def _parts(arrays: dict[str, Any]) -> dict[str, Any]:
-    """Make modules and arrays, keyed by name. Keys of a module's arrays are paths such as "scan.points"."""
+    """Return modules and arrays by name. In `arrays`, a module's arrays have keys such as "scan.points"."""
     parts: dict[str, Any] = {}
     for name, array in arrays.items():
         part, _, rest = name.partition(".")
