@@ -23,8 +23,8 @@ _Places = TypeVar("_Places", Float[Array, "*n 2"], Float[np.ndarray, "*n 2"])
 _SKEW = 1e-6
 
 
-# Depth cameras have no rays more than 70 degrees off the axis (`_WIDEST` is the tangent). `_OFF_CENTER` is the largest
-# distance of a principal point from an image's centre, as a fraction of half the image, at which it may be the centre.
+# Depth cameras have no rays more than 70 degrees off the axis (`_WIDEST` is the tangent). A principal point may be the
+# centre of an image if it is off by at most `_OFF_CENTER` times half the width and half the height.
 _WIDEST, _OFF_CENTER = math.tan(math.radians(70.0)), 0.2
 # If the principal point lies at this fraction or more of both the width and the height, the matrix is certainly for a
 # larger image.
@@ -32,9 +32,10 @@ _SURELY = 0.96
 
 
 def _limit(depth: Any) -> Any:
-    """Convert a limit of the range to an array, so that a program compiled for one scale of a scene runs for any scale.
+    """Convert a limit of the camera's range to an array.
 
-    A missing limit stays 0.0 or None, so that programs can branch on it.
+    A program compiled for one limit then runs for any limit. A missing limit stays 0.0 or None, so that programs can
+    branch on it.
     """
     is_number = isinstance(depth, int | float) and not isinstance(depth, bool) and depth != 0
     return np.float64(depth) if is_number else depth
@@ -52,8 +53,8 @@ class Camera(eqx.Module):
       up to `farthest` is missed, so it is empty up to `farthest`.
     - `max_incidence`: largest angle between a ray and the surface normal at which the sensor measures a hit, in radians
       within (0, pi/2].
-    - `distortion`: coefficients of the lens, see `from_intrinsics`. The rays are those of the pinhole without
-      distortion. `PointCloud.from_depth` undoes the distortion of an image first.
+    - `distortion`: coefficients of the lens distortion, see `from_intrinsics`. The rays are those of the pinhole
+      without distortion. `PointCloud.from_depth` undoes the distortion of an image first.
 
     The defaults are the paper's: 30 degrees, 50 x 50 pixels, no limits.
 
@@ -136,7 +137,7 @@ class Camera(eqx.Module):
 
     @property
     def intrinsics(self) -> Float[np.ndarray, "3 3"]:
-        """The intrinsic matrix of `from_intrinsics`, in pixels."""
+        """The intrinsic matrix in pixels. As in `from_intrinsics`, the centre of the first pixel is at (0, 0)."""
         (fx, fy), (x, y) = self.focal_lengths, self.center
         return np.array([[fx, 0.0, x * self.width - 0.5], [0.0, fy, y * self.height - 0.5], [0.0, 0.0, 1.0]])
 
@@ -148,7 +149,7 @@ class Camera(eqx.Module):
 
     @checked
     def strided(self, stride: int) -> "Camera":
-        """Return the camera of every `stride`-th row and column of the image, starting at `stride // 2`.
+        """Return the camera whose image is every `stride`-th row and column, starting at `stride // 2`.
 
         **Raises:** `ValueError` for a stride below one, or one that leaves no pixel.
         """
@@ -196,7 +197,7 @@ class Camera(eqx.Module):
         return jnp.asarray(directions, dtype=jnp.result_type(float))
 
     def to_pixels(self, image: _Places) -> _Places:
-        """Convert points (x / z, y / z) in the camera's frame to columns and rows.
+        """Convert points (x, y) in the plane z = 1 of the camera's frame to (column, row) in pixels.
 
         The centre of the first pixel has column and row 0.5.
         """
@@ -213,7 +214,9 @@ class Camera(eqx.Module):
 
 
 def _check_image_size(matrix: np.ndarray, height: int, width: int, center: tuple[float, float]) -> None:
-    """Warn if the principal point is probably the centre of an image of a different size.
+    """Warn if a matrix's principal point is probably the centre of an image of a different size.
+
+    - `matrix`: the intrinsic matrix. `center`: its principal point, as fractions of the width and the height.
 
     **Raises:** `ValueError` if such a principal point is at the corner of this image or beyond it, or if it lies
     outside this image and the image would extend more than 70 degrees off the axis.

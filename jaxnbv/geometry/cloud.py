@@ -1,4 +1,4 @@
-"""Oriented point clouds of fixed capacity."""
+"""Point clouds with normals, in arrays with a fixed number of rows."""
 
 import functools
 import warnings
@@ -34,7 +34,7 @@ _LONGEST_NORMAL = 10.0
 
 
 class PointCloud(eqx.Module):
-    """Oriented points (x, n), the paper's D, in an array with a fixed number of rows.
+    """Points with normals (the paper's cloud D), in arrays with a fixed number of rows.
 
     The number of rows is the cloud's capacity. It is fixed under `jit`, since it is a shape. Rows whose mask is False
     are empty, and their points and normals are zero. Leading axes make a batch of clouds.
@@ -150,10 +150,10 @@ class PointCloud(eqx.Module):
         that lie on the same surface. The window of these pixels grows with the noise (`geometry/plane_fit.py`). The
         plane gives the point and its normal, which points towards the camera. A pixel is invalid if its neighbours do
         not define a plane. It is also invalid if six of its eight neighbours disagree with it, since sensors mix the
-        depths of two surfaces at edges. If an image has gaps between its valid pixels, such as a lidar's, each block of
-        the gap's size gives one sample, and each row of the cloud lies on the ray of its pixel.
+        depths of two surfaces at edges. If an image has gaps between its valid pixels, such as a lidar's, planes are
+        fitted to one pixel per block of the gap's size. Each point still lies on the ray of its own pixel.
 
-        - `depth`: depths along the camera's forward axis. Integers count as rounded.
+        - `depth`: depths along the camera's forward axis. The noise of integer depths is at least their rounding.
         - `depth_scale`: units of the pose per unit of depth, such as 0.001 for an image in millimetres and a pose in
           metres. The camera's range and the box are in units of the pose.
         - `stride`: keep every `stride`-th row and column. The cloud is then an image of `camera.strided(stride)`.
@@ -264,10 +264,10 @@ def check_oriented(cloud: PointCloud, name: str, limit: float, unit: bool = True
 
 @checked
 def concatenate(first: PointCloud, second: PointCloud) -> PointCloud:
-    """Join two clouds into one, the paper's union of D and D'.
+    """Return one cloud with the points of two clouds (the paper's union of D and D').
 
-    The capacity of the result is the sum of both capacities, and rows keep their order. `missed` and `sight` are None,
-    since the result is not a sensor's image.
+    The rows of `first`, including empty rows, come before those of `second`, so the result's capacity is the sum of
+    both. `missed` and `sight` are None, since the result is not a sensor's image.
 
     **Raises:** `ValueError` for a batch of clouds.
     """
@@ -283,7 +283,7 @@ def _without_rays(cloud: PointCloud) -> PointCloud:
 @checked
 @functools.partial(jax.jit, static_argnames="count")
 def farthest_point_subsample(cloud: PointCloud, count: int) -> PointCloud:
-    """Choose `count` points by farthest point sampling (Eldar et al. 1997).
+    """Return a cloud of `count` points, chosen by farthest point sampling (Eldar et al. 1997).
 
     Sampling starts at the first filled row, and the points are returned in the order in which they are chosen. If
     the cloud has fewer points than `count`, all its points come first and the remaining rows are empty.

@@ -1,4 +1,4 @@
-"""Conversion of a depth image to oriented points, missed rays, and the distance that each ray saw."""
+"""Conversion of a depth image to points with normals, missed rays, and distances to the hits of rays."""
 
 import math
 import warnings
@@ -21,10 +21,10 @@ from jaxnbv.programs import program
 Rows = tuple[Float[Array, "n 3"], Float[Array, "n 3"], Bool[Array, " n"], Bool[Array, " n"], Float[Array, " n"]]
 # Depths that differ from the depths of the box by more than this factor are probably in different units.
 _OTHER_UNITS = 20.0
-# A value beyond the box's far depth times this factor may be a sentinel ("not measured"). The surface that the object
-# stands on is nearer than that.
+# A value beyond the box's greatest depth times this factor may be a sentinel ("not measured"). The surface that the
+# object stands on is nearer than that.
 _BEHIND = 1.1
-# If at least this fraction of the depths is within the factor `_OTHER_UNITS`, the units are right.
+# If at least this fraction of the depths is within the factor `_OTHER_UNITS` of the box's depths, the units are right.
 _SOME = 1e-3
 
 
@@ -35,10 +35,12 @@ class NothingInside(UserWarning):
 def points_of_depth(
     depth: Real[AnyArray, "height width"], camera: Camera, pose: Pose, scale: float, stride: int, box: Box | None
 ) -> Rows:
-    """Compute the fields of the cloud of `PointCloud.from_depth`: points, normals, mask, missed and sight.
+    """Compute the fields points, normals, mask, missed and sight of the cloud of `PointCloud.from_depth`.
 
-    **Raises:** `ValueError` for an image whose shape differs from the camera's, a scale that is not positive, a batch
-    of poses, or a stride that does not fit.
+    - `scale`: units of the pose per unit of depth.
+
+    **Raises:** `ValueError` for a scale that is not positive, a batch of poses, a stride below one or that leaves no
+    pixel, or for the same reasons as `from_depth`.
     """
     shape = (camera.height, camera.width)
     # Infinite depths are detected before a conversion that may round large numbers to infinity.
@@ -93,10 +95,13 @@ def _oriented(
     Bool[Array, " n"],
     Float[Array, " n"],
 ]:
-    """Return the points, their normals, and four arrays with one entry per ray.
+    """Return points and normals, and four arrays with one entry per ray.
 
     These arrays are: whether the point is valid, whether the ray is missed (it met nothing, or it crossed the box),
-    whether the point lies in the box, and how far the ray saw.
+    whether the point lies in the box, and the distance from the camera to the hit (infinite without a hit).
+
+    - `missed`: whether the ray of each pixel met nothing.
+    - `rounding`: standard deviation of the rounding of depths. `gap`: see `gap_of`.
     """
     rows, strided = slice(stride // 2, None, stride), camera.strided(stride)
     samples = _rows_of(depth, jnp.isfinite(depth) & (depth > 0), stride, gap)[0]
@@ -124,10 +129,10 @@ def _oriented(
 def _rows_of(
     depth: Float[Array, "h w"], valid: Bool[Array, "h w"], stride: int, gap: int
 ) -> tuple[Float[Array, "k l"], Bool[Array, "k l"], Float[Array, "k l"]]:
-    """Return, for every `stride`-th row and column, the depth, whether it is valid, and a lower bound on the depth.
+    """Return the depth, its validity and a lower bound on it at every `stride`-th row and column.
 
-    The depth is the sample of the pixel's block (see `gaps`). The bound is the least sample of this block and, if the
-    image has gaps, of the eight blocks around it.
+    The image is divided into square blocks with side `gap`. The depth is that of the valid pixel nearest to the middle
+    of the pixel's own block. The bound is the least such depth of this block and, if `gap` > 1, of the eight around it.
     """
     samples, is_sample, _ = block_samples(depth, valid, gap)
     nearest = jnp.where(is_sample, samples, jnp.inf)
@@ -148,9 +153,9 @@ def _depth_behind(box: Box, camera: Camera, pose: Pose) -> Float[Array, " n"]:
 def without_sentinels(
     depth: Real[np.ndarray, "height width"], camera: Camera, pose: Pose, scale: float, box: Box
 ) -> Real[np.ndarray, "height width"]:
-    """Return the image with zeros in place of the sentinels that `points_of_depth` finds with this box.
+    """Return the depth image with zeros in place of sentinels, values that mean "not measured".
 
-    A sentinel is a value that stands for "not measured" (see `sentinels`).
+    The sentinels are those that `points_of_depth` finds with the same arguments.
 
     **Raises:** `ValueError` if the box lies behind the camera.
     """
@@ -165,7 +170,9 @@ def _is_sentinel(
 
 
 def _depths_of(box: Box, pose: Pose) -> tuple[float, float]:
-    """Return the least and greatest depth of a box. Both are made positive.
+    """Return the least and greatest depth of a box's corners, seen from a pose.
+
+    The least depth is at least a thousandth of the greatest, even if the camera is inside the box.
 
     **Raises:** `ValueError` if the box lies behind the camera.
     """
@@ -181,11 +188,10 @@ def _depths_of(box: Box, pose: Pose) -> tuple[float, float]:
 
 
 def _check_meaning(depth: Float[np.ndarray, " valid"], camera: Camera, ahead: tuple[float, float] | None) -> None:
-    """Check that the units of the measured depths can be right.
+    """Check that the measured depths can be in the units of the camera's range and of the box.
 
     The depths must not all be nearer or all be farther than the camera's range. At least 0.1 % of the depths in the
-    range must be of the order of magnitude of the box's depths. The other depths may come from a far background or from
-    glare.
+    range must be within a factor of 20 of the box's depths. The other depths may come from a far background or glare.
 
     - `ahead`: least and greatest depth of the box; None if there is no box.
 
@@ -212,7 +218,7 @@ def _check_meaning(depth: Float[np.ndarray, " valid"], camera: Camera, ahead: tu
 
 
 def _warn_of_nothing_inside(points: Float[np.ndarray, "valid 3"], inside: Bool[np.ndarray, " n"], box: Box) -> None:
-    """Warn if no point lies in the box. The image may not show the object, but more often its pose is wrong."""
+    """Warn if no point lies in the box. Most often the pose is wrong, but the object may also be out of view."""
     if len(points) and not inside.any():
         low, high = points.min(axis=0), points.max(axis=0)
         warnings.warn(

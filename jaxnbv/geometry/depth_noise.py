@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Shaped
 
 # The image is divided into at most 40 x 40 square tiles of at least 8 x 8 pixels, and depths into steps of 10 %. The
-# noise is estimated from a pixel's tile and the eight tiles around it, at the pixel's depth step and the two beside it.
+# noise of a pixel is estimated from its tile and the eight around it, at its depth step and the two steps beside it.
 _TILES, _SMALLEST_TILE = 40, 8
 _DEPTH_STEP, _DEPTH_STEPS = math.log(1.1), 48
 # Third differences, divided by the depth, are counted in a histogram whose bins are powers of two from this value on.
@@ -26,11 +26,11 @@ def depth_noise(
 ) -> Float[Array, "h w"]:
     """Return the standard deviation of each pixel's noise and rounding, in units of the depth.
 
-    The result is at least `least`. It is computed from the median of third differences along rows and columns, which
-    are mostly noise on a smooth surface. The median is over the differences near the pixel and at its depth. If there
-    are few of them, it is over all differences in the image at this depth, and if there are few of them too, over the
-    differences at all depths. If at least half but at most three quarters of the differences are zero, depths are
-    rounded to steps, and the size of the steps is computed from the other differences.
+    The result is at least `least`. It is computed from the median magnitude of the third differences of depth along
+    rows and columns, which are mostly noise on a smooth surface. The median is over the differences near the pixel and
+    at a similar depth. If these are fewer than 16, it is over the whole image at a similar depth, and if these are also
+    fewer than 16, over all differences. If at least half but at most three quarters of the differences are zero, depths
+    are rounded to steps, and the size of the steps is computed from the other differences.
     """
     tile = max(-(-max(depth.shape) // _TILES), _SMALLEST_TILE)
     tiles = tuple(-(-size // tile) for size in depth.shape)
@@ -61,7 +61,7 @@ def depth_noise(
 
 
 def _every_second(image: Shaped[Array, "h w"], axis: int, index: int) -> Shaped[Array, "k l"]:
-    """Return one pixel of each group of four pixels that are two apart along an axis: the one with this index (0-3)."""
+    """Return pixel `index` (0 to 3) of each group of four pixels that are two apart along an axis."""
     kept = slice(2 * index, 2 * index + max(image.shape[axis] - 6, 0))
     return image[kept] if axis == 0 else image[:, kept]
 
@@ -69,8 +69,8 @@ def _every_second(image: Shaped[Array, "h w"], axis: int, index: int) -> Shaped[
 def _median(counts: Float[Array, "*n levels"]) -> Float[Array, "*n"]:
     """Return the median of a histogram whose bins are powers of two; zero for an empty histogram.
 
-    The median is interpolated linearly within its bin. The first bin holds numbers that are nearly zero. It is left out
-    if it holds between a half and three quarters of all numbers.
+    The median is interpolated linearly within its bin. The first bin holds numbers that are nearly zero. If it holds
+    between a half and three quarters of all numbers, depths are rounded to steps, and the bin is left out.
     """
     zeros = counts[..., 0] / jnp.maximum(jnp.sum(counts, axis=-1), 1.0)
     counts = counts.at[..., 0].multiply((zeros < 0.5) | (zeros > 0.75))

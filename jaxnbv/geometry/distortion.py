@@ -1,6 +1,7 @@
-"""Lens distortion by OpenCV's model with four, five or eight coefficients (Brown 1971), and its removal from images.
+"""OpenCV's lens distortion with 4, 5 or 8 coefficients (Brown 1971), and its removal from images.
 
-With (x, y) = (X / Z, Y / Z) and r^2 = x^2 + y^2, a point (X, Y, Z) appears at
+With (x, y) = (X / Z, Y / Z) and r^2 = x^2 + y^2, a lens shows a point (X, Y, Z) of the camera's frame at (x', y') in
+the plane Z = 1, where g is the radial part of the distortion:
 
     x' = x g + 2 p1 x y + p2 (r^2 + 2 x^2),    y' = y g + p1 (r^2 + 2 y^2) + 2 p2 x y,
     g = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)
@@ -51,7 +52,7 @@ def undistort_points(
 def pixels_of(
     place: Float[AnyArray, "*n 2"], matrix: Float[AnyArray, "3 3"], coefficients: tuple[float, ...]
 ) -> tuple[Float[AnyArray, "*n"], Float[AnyArray, "*n"]]:
-    """Return the column and row in pixels at which the lens shows each point of the plane Z = 1."""
+    """Return the column and row in pixels at which a lens shows each point `place` of the plane Z = 1."""
     across, down = distort_points(place[..., 0], place[..., 1], coefficients)
     return across * matrix[0, 0] + matrix[0, 2], down * matrix[1, 1] + matrix[1, 2]
 
@@ -62,7 +63,7 @@ def check_distortion(coefficients: tuple[float, ...], radius: float) -> None:
     - `radius`: largest distance from the axis to a point of the image, in the plane Z = 1.
 
     **Raises:** `ValueError` for a number of coefficients other than four, five and eight, a coefficient that is not
-    finite, or if the distorted radius does not grow with the radius everywhere in the image.
+    finite, or if the distorted distance from the axis does not grow with the true distance, up to `radius`.
     """
     array = as_numbers(coefficients, "the distortion", np.float64)
     require(

@@ -14,9 +14,9 @@ from jaxnbv.checks import require
 def farthest_point_indices(points: Float[Array, "n d"], mask: Bool[Array, " n"], count: int) -> Int[Array, " count"]:
     """Return the indices of `count` rows, each chosen as far as possible from all earlier chosen rows.
 
-    The first filled row is chosen first. Ties go to the first row. No row is chosen twice while an unchosen filled row
-    is left, even if points coincide. If there are fewer points than `count`, the first filled row repeats at the end.
-    The indices have no derivative, but `points[indices]` can be differentiated in the points.
+    The first filled row (`mask` is True) is chosen first. Ties go to the first row. No row is chosen twice while an
+    unchosen filled row is left, even if points coincide. If there are fewer points than `count`, the first filled row
+    repeats at the end. The indices have no derivative, but `points[indices]` can be differentiated in the points.
 
     **Raises:** `ValueError` if `count` < 1.
     """
@@ -38,7 +38,7 @@ def farthest_point_indices(points: Float[Array, "n d"], mask: Bool[Array, " n"],
 
 
 # These values take the place of distances for chosen and for empty rows. If the bits of floats are read as integers,
-# -1.0 is smaller than -2.0, and both are smaller than any distance.
+# -1.0 is smaller than -2.0, and both are smaller than any distance. So a chosen row comes before an empty row.
 _CHOSEN, _EMPTY = -2.0, -1.0
 # An array is first reduced elementwise across this many parts of it. On a CPU this is several times as fast as reducing
 # the whole array.
@@ -49,7 +49,9 @@ def _first_of_largest(distance: Float[Array, " n"], rows: Int[Array, " n"]) -> I
     """Return the argmax of `distance`, with the bits of the floats compared as integers.
 
     For floats that are not negative, the order of the bits is the order of the floats. On a CPU, a maximum of integers
-    followed by a minimum of rows is several times as fast as `jnp.argmax`.
+    followed by a minimum of row indices is several times as fast as `jnp.argmax`.
+
+    - `rows`: the indices 0, 1, 2, ... of the rows.
     """
     bits = jax.lax.bitcast_convert_type(distance, jnp.dtype(f"int{8 * distance.dtype.itemsize}"))
     largest = jnp.max(_folded(jnp.maximum, bits))

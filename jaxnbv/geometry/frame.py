@@ -87,7 +87,7 @@ class Frame(eqx.Module):
     def to_scene(self, value):
         """Convert points (..., 3), a `PointCloud`, a `Pose`, a `Box` or a `Camera` from world to scene.
 
-        Of a camera, only the limits of the range change. Clouds and poses have JAX's floating-point type, which rounds
+        For a camera, only the limits of its range change. Clouds and poses have JAX's floating-point type, which rounds
         coordinates far from the world's origin, such as map coordinates. In that case convert the arrays to the scene
         first, and build clouds and poses from the result.
 
@@ -122,7 +122,11 @@ class Frame(eqx.Module):
 
 
 def _apply(value, place, turn, scale: float):
-    """Apply `place` to the points of a value and `turn` to its directions, and multiply its lengths by `scale`."""
+    """Convert a cloud, pose, box, camera or points by functions for points and for directions.
+
+    - `place`, `turn`: function that converts points, and function that converts directions.
+    - `scale`: factor for lengths.
+    """
     if isinstance(value, PointCloud):
         points = jnp.where(value.mask[..., None], place(value.points), 0.0).astype(value.points.dtype)
         sight = None if value.sight is None else scale * value.sight

@@ -1,6 +1,6 @@
 """Sampling of depth images that have gaps between valid pixels.
 
-Such images come from lidars, or from depth images that were aligned to a camera of higher resolution.
+Such images come from lidars, or are depth images that were aligned to a camera of higher resolution.
 """
 
 import jax.numpy as jnp
@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.ndimage import correlate
 
-# Sides of blocks that are tried. A side fits if the fraction of filled blocks is at least `_FILLED` times the fraction
-# for blocks of four times the side.
+# Sides of blocks that are tried. A side fits if the fraction of blocks with a valid pixel is at least `_FILLED` times
+# the fraction for blocks of four times the side.
 _SIDES, _FILLED = (2, 3, 4, 6, 8, 12, 16, 24), 0.7
 # In an image without gaps, at least the fraction `_WITH_PLANE` of the valid pixels has enough valid pixels in its 3 x 3
 # neighbourhood for a plane, that is, `_FEWEST` with the pixel itself.
@@ -17,7 +17,7 @@ _WITH_PLANE, _FEWEST = 0.8, 4
 
 
 def gap_of(valid: Bool[np.ndarray, "h w"]) -> int:
-    """Return the gap between a depth image's valid pixels: the side of square blocks with one sample each.
+    """Return the gap of a depth image: the smallest side of square blocks that rarely lack a valid pixel.
 
     The gap is 1 if most valid pixels have enough neighbours for a plane, even if the image has holes. Otherwise it is
     the smallest side for which the fraction of blocks with a valid pixel is about that of blocks of four times the
@@ -38,10 +38,10 @@ def gap_of(valid: Bool[np.ndarray, "h w"]) -> int:
 def block_samples(
     depth: Float[Array, "h w"], valid: Bool[Array, "h w"], side: int
 ) -> tuple[Float[Array, "k l"], Bool[Array, "k l"], Int[Array, "k l 2"]]:
-    """Return the depth of each block's sample, whether the block has a sample, and the sample's position.
+    """Return, for each square block of an image, its sample's depth, whether it has a sample, and where.
 
-    The sample is the valid pixel that is nearest to the middle of the block. Its position is its column and row within
-    the block.
+    The sample of a block is the valid pixel nearest to the middle of the block. The last result is the sample's column
+    and row within the block.
 
     - `side`: side of the blocks in pixels.
     """

@@ -44,7 +44,7 @@ def distance_to_others(cloud: PointCloud, rows: Int[Array, " r"]) -> Float[Array
 
 
 class DistanceField(eqx.Module):
-    """Distances to a cloud, interpolated linearly between the nodes of a cube, fast for many points.
+    """Distances to a cloud, interpolated linearly between the nodes of a cubic grid. Fast for many points.
 
     - `values`: distance at each node.
     - `low`: position of the first node.
@@ -73,9 +73,9 @@ class DistanceField(eqx.Module):
         return cls(jnp.sqrt(squared).reshape(nodes.shape[:-1]), low, spacing)
 
     def __call__(self, x: Float[Array, "n 3"]) -> Float[Array, " n"]:
-        """Return the distance at each point x. Differentiable in x.
+        """Return the distance from each point x to the cloud. Differentiable in x.
 
-        Outside the cube, it is the distance at the nearest point of the cube.
+        For a point outside the cube, return the distance from the nearest point of the cube.
         """
         places = jnp.moveaxis((x - self.low) / self.spacing, -1, 0)
         return jax.scipy.ndimage.map_coordinates(self.values, list(places), order=1, mode="nearest")
@@ -110,9 +110,10 @@ def _nearest_index(x: Float[Array, "n 3"], points: Float[Array, "m 3"], mask: Bo
 
 
 def _loop(x, points, mask, best, closer):
-    """Fold `closer(best, row, |y|^2 - 2 x.y)` over the rows y up to the last filled row.
+    """Apply `best = closer(best, row, value)` to each row up to the last filled row, and return `best`.
 
-    Each iteration of the loop processes `_UNROLL` rows.
+    For the point y of a row, `value` is |y|^2 - 2 x.y at each point x. It is |x - y|^2 minus |x|^2, so the nearest row
+    has the least value. It is infinite for an empty row. Each iteration of the loop processes `_UNROLL` rows.
     """
     padding = -points.shape[0] % _UNROLL
     squared = jnp.where(mask, jnp.sum(points**2, axis=-1), jnp.inf)

@@ -13,7 +13,7 @@ def estimate_normals(
     viewpoint: Float[AnyArray, "3"] | Float[AnyArray, "n 3"] | tuple | list,
     neighbours: int = 16,
 ) -> Float[np.ndarray, "n 3"]:
-    """Estimate unit normals of points, which point towards the sensor.
+    """Estimate the unit normals of a surface at points on it, directed towards the sensor.
 
     The normal of a point is that of the least-squares plane through its nearest neighbours. For a depth image, use
     `PointCloud.from_depth`, which takes the noise of the image into account.

@@ -1,16 +1,16 @@
-"""Planes fitted to the neighbours of each pixel of a depth image, which give depths and normals with less noise.
+"""Planes that are fitted to the neighbours of each pixel of a depth image, to reduce its noise.
 
-The inverse depth of a plane is linear in (u, v), the point where a ray meets depth 1. For a pixel with depth z0 at
-(u0, v0), the function
+The inverse depth 1 / z of a plane is linear in (u, v), the point where a ray meets depth 1. For a pixel with depth z0
+at (u0, v0), a function with three coefficients a, b and c,
 
     z0 / z(u, v) = a + b (u - u0) + c (v - v0),     normal along  (b, c, a - b u0 - c v0)
 
 is fitted by least squares to those pixels of a window that can belong to the same surface. If the pixels are a distance
-p apart on the surface and their noise is sigma, a slope fitted to (2 r + 1)^2 pixels has the error
+p apart on the surface and their noise is sigma, a slope fitted to a window of (2 r + 1)^2 pixels has the error
 
     sqrt(3) sigma / (p r (2 r + 1)).
 
-The radius r is the smallest one for which this error is below 2.5 degrees, and at most 10.
+The radius r of the window is the smallest one for which this error is below 2.5 degrees, and at most 10.
 """
 
 import math
@@ -42,10 +42,10 @@ def fitted_planes(
     least_noise: float | Float[Array, ""],
     gap: int = 1,
 ) -> tuple[Float[Array, "k l"], Float[Array, "k l 3"], Bool[Array, "k l"]]:
-    """Return the depth and normal at every `stride`-th row and column, and whether there is a plane.
+    """Return the plane's depth and normal at every `stride`-th row and column, and whether a plane exists.
 
-    Normals are in the camera's frame and point towards the camera. The depth is that of the plane, but without gaps it
-    moves by at most three standard deviations of the noise.
+    Normals are in the camera's frame and point towards the camera. In an image without gaps, the plane's depth is
+    limited to three standard deviations of the noise from the measured depth.
 
     - `depth`: depths, positive and finite where `valid`.
     - `camera`: the camera of the whole image.
@@ -107,9 +107,11 @@ def fitted_planes(
 
 
 def _radius(spacing: Float[Array, "k l"], sigma: Float[Array, "k l"]) -> Int[Array, "k l"]:
-    """Return the radius in pixels of the smallest window whose slope error is below `_SLOPE_ERROR`.
+    """Return the radius in pixels of the smallest window whose slope has an error below `_SLOPE_ERROR`.
 
     The radius is at most `_LARGEST_RADIUS`.
+
+    - `spacing`, `sigma`: distance between neighbouring pixels on the surface, and standard deviation of their depth.
     """
     radii = jnp.arange(1, _LARGEST_RADIUS + 1)
     error = math.sqrt(3.0) * sigma[..., None] / (spacing[..., None] * radii * (2 * radii + 1))
@@ -117,9 +119,9 @@ def _radius(spacing: Float[Array, "k l"], sigma: Float[Array, "k l"]) -> Int[Arr
 
 
 def _breadth(normal: Float[Array, "k l 3 3"]) -> Float[Array, "k l"]:
-    """Return how evenly the neighbours spread about their mean: 0 if they lie on a line, 1 if evenly in all directions.
+    """Return how evenly neighbours spread about their mean, from 0 (on a line) to 1 (in all directions).
 
-    - `normal`: matrix of the normal equations.
+    - `normal`: matrix of the normal equations of the plane through the neighbours.
     """
     total = jnp.maximum(normal[..., 0, 0], 1e-12)
     mean = normal[..., 0, 1:] / total[..., None]

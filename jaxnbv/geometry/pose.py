@@ -85,7 +85,7 @@ class Pose(eqx.Module):
 
     @own_settings()
     def to_matrix(self, convention: str = "opencv") -> Float[Array, "*batch 4 4"]:
-        """Return the camera-to-scene matrix in a convention of `from_matrix`.
+        """Return the camera-to-scene matrix in the "opencv" or "opengl" convention, see `from_matrix`.
 
         **Raises:** `ValueError` for an unknown convention.
         """
@@ -127,7 +127,7 @@ def _axes(convention: str) -> np.ndarray:
 def rigid_matrices(
     matrices: Float[np.ndarray, "n 4 4"],
 ) -> tuple[Float[np.ndarray, "n 4 4"], Bool[np.ndarray, " n"]]:
-    """Make R in matrices [[R, t], [0, 1]] orthonormal, and return whether each is a rigid motion.
+    """Return matrices [[R, t], [0, 1]] with R made orthonormal, and whether each is a rigid motion.
 
     A matrix whose R is rounded to three digits still counts as a rigid motion. Matrices that are not rigid motions are
     returned unchanged.
@@ -140,14 +140,14 @@ def rigid_matrices(
 
 
 def _off_rotation(rotation: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n"]:
-    """Return the largest entry of |R R^T - I|; infinite for a reflection or an entry that is not finite."""
+    """Return the largest entry of |R R^T - I| for each matrix R; infinite if R reflects or is not finite."""
     finite = np.where(np.isfinite(rotation).all(axis=(-1, -2), keepdims=True), rotation, 0.0)
     error = np.abs(finite @ np.swapaxes(finite, -1, -2) - np.eye(3)).max(axis=(-1, -2))
     return np.where(np.linalg.det(finite) > 0, error, np.inf)
 
 
 def _nearest_rotation(rotation: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n 3 3"]:
-    """Return the nearest rotation in the Frobenius norm (orthogonal Procrustes)."""
+    """Return the rotation nearest to each matrix in the Frobenius norm (orthogonal Procrustes)."""
     left, _, right = np.linalg.svd(rotation)
     return left @ right
 

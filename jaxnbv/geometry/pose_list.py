@@ -1,4 +1,4 @@
-"""A list of poses with fixed capacity, so that nothing recompiles as it grows."""
+"""A list of poses in arrays of fixed size, so that JAX does not recompile programs as it grows."""
 
 import dataclasses
 
@@ -33,7 +33,7 @@ class PoseList(eqx.Module):
 
     @property
     def capacity(self) -> int:
-        """The capacity: the number of poses that fit."""
+        """Largest number of poses that the list can hold."""
         return self.rows.position.shape[0]
 
     @property
@@ -51,7 +51,7 @@ class PoseList(eqx.Module):
         return jnp.any(is_same_view(poses[:, None], self.rows[None]) & self.is_filled, axis=1)
 
     def distance(self, poses: Pose) -> Float[Array, " poses"]:
-        """Return the distance from each pose of a batch to the nearest position in the list.
+        """Return the distance from the position of each pose of a batch to the nearest position in the list.
 
         The distance is in scene units, and infinite if the list is empty.
         """
@@ -67,7 +67,7 @@ class PoseList(eqx.Module):
 def is_same_view(poses: Pose, others: Pose) -> Bool[Array, "*batch"]:
     """Return whether two poses agree to 1e-3 in position (scene units) and in viewing direction.
 
-    Leading axes of the two arguments are broadcast.
+    A rotation about the viewing direction is ignored. Leading axes of the two arguments are broadcast.
     """
     near = jnp.linalg.norm(poses.position - others.position, axis=-1) < _SAME
     return near & (jnp.linalg.norm(poses.forward - others.forward, axis=-1) < _SAME)

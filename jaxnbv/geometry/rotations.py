@@ -1,4 +1,4 @@
-"""Rotations, and norms and directions of vectors whose derivatives are finite at zero."""
+"""Rotations, and norms and directions of vectors, with derivatives that are finite at the zero vector."""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ from jaxnbv.checks import AnyArray
 
 @jax.custom_jvp
 def safe_norm(*components: Float[AnyArray, "*#n"]) -> Float[Array, "*n"]:
-    """Return the Euclidean length of the vectors with these components. Its derivative is zero at zero."""
+    """Return the Euclidean length of the vectors with these components. Its derivative at the zero vector is zero."""
     return jnp.sqrt(sum(c * c for c in components))
 
 
@@ -22,18 +22,20 @@ def _safe_norm_jvp(components, tangents):
 
 @jax.jit
 def rotation_about(axis: Float[Array, "3"], angle: Float[Array, ""]) -> Float[Array, "3 3"]:
-    """Return the right-handed rotation about an axis by an angle in radians; NaN for an axis of zero.
+    """Return the right-handed rotation about an axis by an angle in radians; NaN if the axis is zero.
 
-    With the unit axis k, Rodrigues' formula gives cos I + sin [k]_x + (1 - cos) k k^T.
+    For the unit axis k and the angle a, this is Rodrigues' formula cos(a) I + sin(a) [k]_x + (1 - cos(a)) k k^T, where
+    [k]_x is the matrix of the cross product with k.
     """
     unit = axis / safe_norm(*axis)
     return jnp.cos(angle) * jnp.eye(3) + jnp.sin(angle) * _cross(unit) + (1.0 - jnp.cos(angle)) * unit[:, None] * unit
 
 
 def rotation_from_vector(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """Return the rotation about a vector by an angle (radians) that equals the vector's length.
+    """Convert a rotation vector to a matrix. The vector's direction is the axis, its length the angle in radians.
 
-    Rodrigues' formula is written in terms of w = angle k, which is differentiable at zero too.
+    For the vector w and its length a, Rodrigues' formula is I + sin(a) / a [w]_x + (1 - cos(a)) / a^2 [w]_x^2. Near
+    zero, both fractions are replaced by their Taylor series, so the result is differentiable at w = 0 too.
     """
     square = jnp.sum(vector**2)
     small = square < 1e-12
@@ -60,7 +62,7 @@ def rotation_to_6d(rotation: Float[AnyArray, "*batch 3 3"]) -> Float[Array, "*ba
 
 @jax.jit
 def rotation_from_6d(columns: Float[AnyArray, "*batch 6"]) -> Float[Array, "*batch 3 3"]:
-    """Return the rotation of the 6-D representation (a, b) of Zhou et al. (2019).
+    """Return the rotation for a pair of vectors (a, b), the 6-D representation of Zhou et al. (2019).
 
     Its columns are b_1 = a / |a|;  b_2 = b - (b_1 . b) b_1, normalised;  b_3 = b_1 x b_2. Every pair (a, b) gives a
     rotation. If a is zero, the x axis replaces a. If b is zero or parallel to a, a coordinate axis replaces b.
@@ -94,7 +96,7 @@ def rotation_between(
 
 
 def _reflection(unit: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
-    """Return the reflection I - 2 u u^T."""
+    """Return the reflection I - 2 u u^T, which reverses the direction of a unit vector u."""
     return jnp.eye(3, dtype=unit.dtype) - 2.0 * unit[..., :, None] * unit[..., None, :]
 
 

@@ -1,4 +1,4 @@
-"""Detection of sentinels: values in a depth image that mean "not measured", such as 65535, 10000 or 2047."""
+"""Detection of sentinels, values such as 65535 or 2047 in a depth image that mean "not measured"."""
 
 import warnings
 
@@ -16,7 +16,7 @@ def sentinel_pixels(image: Real[np.ndarray, "h w"], reach: float) -> Bool[np.nda
     """Return, for each pixel, whether it holds a sentinel: a value that means "not measured".
 
     Two kinds of values are sentinels. The first is the largest value of an integer type. The second is a value beyond
-    `reach` that fills far more pixels than any value near it. It gives a `UserWarning`. If all measured pixels hold
+    `reach` that fills far more pixels than any similar value. It gives a `UserWarning`. If all measured pixels hold
     the same value, this value is not a sentinel, since the image may show a wall.
 
     - `image`: depths in any units.

@@ -1,4 +1,4 @@
-"""Evaluation of functions at the nodes of a tensor grid."""
+"""Evaluation of functions at the nodes of a cubic grid."""
 
 from collections.abc import Callable
 
@@ -12,9 +12,9 @@ from jaxnbv.checks import AnyArray
 def on_tensor_grid(
     function: Callable[[Float[Array, "n 3"]], Shaped[Array, "*s n"]], axis: Float[AnyArray, " g"]
 ) -> Shaped[Array, "*s g g g"]:
-    """Return the values of a function of points at the nodes of the grid axis x axis x axis.
+    """Return a function's values at the nodes of a grid whose x, y and z coordinates are all in `axis`.
 
-    The function is evaluated slab by slab to save memory.
+    To save memory, the function is evaluated at the nodes of one x coordinate at a time.
     """
     axis = jnp.asarray(axis)
     y, z = jnp.meshgrid(axis, axis, indexing="ij")

@@ -1,4 +1,4 @@
-"""The volume that can hold the object, given as a signed distance, and points on the volume's boundary."""
+"""Volumes that can hold the object, given as signed distances, and points on their boundaries."""
 
 import functools
 import math
@@ -83,7 +83,7 @@ class Box(eqx.Module):
     @takes_native
     @program
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
-        """Return the exact signed distance at the points x."""
+        """Return the exact signed distance from the points x to the faces of the box, negative inside."""
         x = jnp.asarray(x)
         low, high = jnp.asarray(self.low, x.dtype), jnp.asarray(self.high, x.dtype)
         center, half = 0.5 * (low + high), 0.5 * (high - low)
