@@ -1,4 +1,4 @@
-"""Searches for the next pose: over candidates, by gradient ascent, by both together, and the paper's baselines."""
+"""Searches for the next pose: over candidates, by gradient ascent, by both, and the paper's baselines."""
 
 from jaxnbv.search.base import Baseline as Baseline
 from jaxnbv.search.base import CandidateSearch as CandidateSearch

@@ -44,22 +44,22 @@ class Search(eqx.Module):
         return
 
     def quantity(self, acquisition: Acquisition) -> Quantity:
-        """Return the quantity of the proposals' values, by default the acquisition's quantity."""
+        """Return the name, unit and meaning of the maximised values, by default those of the acquisition."""
         return acquisition.quantity
 
     def poses_around(self) -> Pose:
-        """Return poses around the object, from which the visible surface is computed.
+        """Return poses around the object. Surface that at least one of these poses sees counts as visible.
 
         The default is the paper's candidates.
         """
         return SphereCandidates().poses()
 
     def upper_half(self) -> "Search":
-        """Return a copy over the upper half of the candidates if they are a sphere; otherwise `self`."""
+        """Return a copy with only the upper half of the candidates, or `self` if they are not a whole sphere."""
         return self
 
     def over(self, poses: Pose) -> "Search":
-        """Return a copy whose candidates are these poses (n,).
+        """Return a copy whose candidates are the poses of a batch (n,).
 
         **Raises:** `ValueError` if the search has no candidates to replace.
         """
@@ -76,7 +76,7 @@ class Search(eqx.Module):
 class CandidateSearch(Search):
     """Base class of searches that score all candidates, then pick one of them.
 
-    The two halves are separate methods. A study can therefore compute the scores of `acquisitions` once for several
+    `score` and `pick` are separate methods. A study can therefore compute the scores of `acquisitions` once for several
     searches, and call `pick` of each search with these scores.
 
     - `candidates`: `Candidates`, for example `SphereCandidates`. A number is converted to `SphereCandidates`, and a
@@ -100,7 +100,7 @@ class CandidateSearch(Search):
         return (acquisition,)
 
     def score(self, problem: Problem, candidates: Pose) -> Scores:
-        """Score the candidates, for each acquisition of `acquisitions` and each posterior sample (first half)."""
+        """Return the score of each candidate for each acquisition of `acquisitions` and each posterior sample."""
         acquisitions = self.acquisitions(problem.acquisition)
         if not acquisitions:
             return jnp.zeros((0, 0, self.candidates.count))
@@ -110,7 +110,11 @@ class CandidateSearch(Search):
 
     @abstractmethod
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
-        """Propose one of the candidates, given the scores of all candidates (second half)."""
+        """Choose one of the candidates by their scores, and return it as a proposal.
+
+        - `scores`: scores of all candidates, as `score` returns them.
+        - `key`: random key of searches that choose at random.
+        """
 
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
         """Score the candidates, then pick one of them."""
@@ -125,15 +129,15 @@ class Baseline(CandidateSearch):
     uses_cost: ClassVar[bool] = False
 
     def acquisitions(self, acquisition: Acquisition) -> tuple[Acquisition, ...]:
-        """Return no acquisitions."""
+        """Return an empty tuple, since `pick` needs no scores."""
         return ()
 
     @abstractmethod
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
-        """Return the value of each candidate. The search picks the highest value that is not excluded."""
+        """Return the value of each candidate. The search proposes the best one that `problem` does not exclude."""
 
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
-        """Propose the candidate of the highest value in `values`. The scores are empty."""
+        """Propose the candidate with the highest value of `values`. The scores are not used."""
         return best_unvisited(problem, candidates, self.values(problem, candidates, key))
 
 
@@ -144,10 +148,10 @@ def best_unvisited(
     tie: float = _TIE,
     scores: Float[Array, "samples candidates"] | None = None,
 ) -> Proposal:
-    """Propose the candidate of the highest value that is not excluded. If values tie, propose the first.
+    """Propose the candidate with the highest value among those that `problem` does not exclude.
 
-    - `tie`: relative difference up to which values tie. The default exceeds the rounding error that depends on the
-      order of a sum.
+    - `tie`: relative difference up to which values count as equal. The first candidate of equal values is proposed. The
+      default exceeds the rounding error that depends on the order of a sum.
     - `scores`: scores whose means are `values`. The proposal has standard errors only if scores are passed.
     """
     values = jnp.where(problem.is_excluded(candidates), -jnp.inf, values)
@@ -164,8 +168,8 @@ def best_unvisited(
 def best_or_farthest(problem: Problem, candidates: Pose, scores: Float[Array, "samples candidates"]) -> Proposal:
     """Propose the best candidate or, among tied candidates, the one farthest from earlier cameras.
 
-    Ties are decided by distance only if the acquisition `gains_once` and there is no cost, because a cost already
-    favours near candidates. Otherwise propose as `best_unvisited` does.
+    The distance matters only if a second view from the same pose gains nothing (`Acquisition.gains_once`), and if there
+    is no cost, because a cost already favours near candidates. Otherwise propose as `best_unvisited` does.
     """
     proposal = best_unvisited(problem, candidates, jnp.mean(scores, axis=0), scores=scores)
     if not problem.acquisition.gains_once or problem.cost is not None:
@@ -177,9 +181,9 @@ def best_or_farthest(problem: Problem, candidates: Pose, scores: Float[Array, "s
 
 
 def preferred(proposal: Proposal, preference: Float[Array, " candidates"]) -> Proposal:
-    """Change a proposal to the most preferred candidate among those tied with the best.
+    """Change a proposal to the candidate of the highest `preference` among those tied with the best.
 
-    Excluded candidates are not considered.
+    Candidates that the proposal excludes (value -inf) are not considered.
     """
     tied, errors = proposal.tied_with_best(), proposal.standard_errors
     assert tied is not None

@@ -14,14 +14,14 @@ from jaxnbv.utility import Quantity
 
 
 class FarthestView(Baseline):
-    """Farthest point sampling, which proposes the candidate farthest from the nearest earlier camera."""
+    """Farthest point sampling: proposes the candidate that is farthest from its nearest earlier camera."""
 
     def quantity(self, acquisition: Acquisition) -> Quantity:
         meaning = "distance from a candidate to the nearest camera so far, whatever the surface."
         return Quantity("distance to the nearest camera", "", meaning, length_power=1)
 
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
-        """Return the distances to the nearest earlier camera, in scene units. The key is not used."""
+        """Return each candidate's distance to its nearest earlier camera, in scene units. The key is not used."""
         return problem.observations.poses.distance(candidates)
 
 
@@ -38,7 +38,7 @@ class RandomView(Baseline):
 
 
 class UncertaintyView(Baseline):
-    """Baseline that proposes the candidate with the most uncertain hit of the principal ray.
+    """Baseline that proposes the candidate whose principal ray has the most uncertain hit.
 
     The source is Holalkere et al. (2025). The transmittance T(t) is the fraction of samples whose surface the ray has
     not entered before distance t. The value is the length of the ray between the first t with T(t) < 1 and the last t
@@ -53,15 +53,16 @@ class UncertaintyView(Baseline):
         return Quantity("uncertain length of the principal ray", "", meaning, length_power=1)
 
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
-        """Return the lengths in scene units, after the cost is applied. The key is not used."""
+        """Return `uncertain_length` of each candidate, after the cost of the move is applied. The key is not used."""
         return problem.apply_cost(uncertain_length(problem, candidates), candidates)
 
 
 def uncertain_length(problem: Problem, poses: Pose) -> Float[Array, " poses"]:
-    """Return the length between the first T < 1 and the last T > 0.05 along each principal ray.
+    """Return the length of each pose's principal ray along which its hit is uncertain, in scene units.
 
-    The length is in scene units. T is the transmittance of `UncertaintyView`, evaluated every half cell within the
-    samples' grid. The length is zero for a ray that hits no sample or misses the grid.
+    The length is from the first point with T < 1 to the last point with T > 0.05. The transmittance T is the fraction
+    of samples that the ray has not entered yet, evaluated every half cell within the samples' grid. The length is zero
+    for a ray that hits no sample or misses the grid.
     """
     surfaces = problem.surfaces
     grid = surfaces.grid

@@ -1,4 +1,4 @@
-"""Candidates, which are the sets of poses among which a search chooses."""
+"""Candidates: sets of poses from which a search chooses one."""
 
 import dataclasses
 import math
@@ -15,7 +15,7 @@ from jaxnbv.geometry.pose import Pose, fibonacci_sphere, look_at
 from jaxnbv.geometry.rotations import rotation_between
 from jaxnbv.scanning.sensors import SENSOR_RADIUS
 
-# The real root of x^3 = x + 1.
+# The plastic number, which is the real root of x^3 = x + 1.
 _PLASTIC = 1.324717957244746
 
 
@@ -119,7 +119,7 @@ class Reach(Candidates):
         low, high = math.sin(self.min_elevation), math.sin(self.max_elevation)
         y = high - (high - low) * (index + 0.5) / self.count
         ring, angle = np.sqrt(1.0 - y**2), index * math.pi * (3.0 - math.sqrt(5.0))
-        # Roberts' low-discrepancy sequence (2018) of the plastic number spaces directions and distances evenly
+        # Roberts' low-discrepancy sequence (2018) of the plastic number spreads directions and distances evenly
         # together.
         share = (0.5 + index / _PLASTIC**2) % 1.0
         distance = np.cbrt(self.nearest**3 + share * (self.farthest**3 - self.nearest**3))
@@ -161,7 +161,7 @@ def _check_places(number: int, nearest: float, farthest: float, up: tuple[float,
 
 
 def _looking(places: Float[Array, "n 3"], up: tuple[float, float, float]) -> Pose:
-    """Return poses that look at the origin, from `places` after the rotation that takes the y axis to `up`."""
+    """Rotate `places` as the y axis is rotated to `up`, and return poses there that look at the origin."""
     axis = jnp.asarray(up, places.dtype)
     if up[0] or up[2] or up[1] < 0:
         turn = rotation_between(jnp.asarray([0.0, 1.0, 0.0], places.dtype), axis / jnp.linalg.norm(axis))
@@ -174,7 +174,7 @@ def as_candidates(value: object) -> Candidates:
 
     Candidates are returned unchanged.
 
-    **Raises:** `ValueError` for any other value, and as `SphereCandidates` and `GivenPoses` do.
+    **Raises:** `ValueError` for any other value, and for the same reasons as `SphereCandidates` and `GivenPoses`.
     """
     if isinstance(value, Candidates):
         return value

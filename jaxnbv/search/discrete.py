@@ -17,16 +17,17 @@ from jaxnbv.search.proposal import Proposal
 class DiscreteSearch(CandidateSearch):
     """Search that proposes the candidate of the highest value.
 
-    For an acquisition that `gains_once`, such as `NewSurface`, several candidates may be tied with the best. The search
-    then proposes the tied candidate that is farthest from the earlier cameras. A candidate is tied if its value differs
-    from the best by at most two standard errors of the difference, plus the mean value expected at visited poses. The
-    true value at visited poses is zero, so this mean is an error, and may be as large at other poses.
+    With an acquisition for which a second view from the same pose gains nothing (`gains_once`), such as `NewSurface`,
+    several candidates may be tied with the best. The search then proposes the tied candidate that is farthest from the
+    earlier cameras. A candidate is tied if its value differs from the best by at most two standard errors of the
+    difference, plus the mean value expected at visited poses. The true value at visited poses is zero, so this mean is
+    an error, and may be as large at other poses.
     """
 
     uses_samples: ClassVar[bool] = True
 
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
-        """Propose one of the candidates that are not excluded. The random key is not used."""
+        """Propose the best candidate that is not excluded, or one tied with it. The random key is not used."""
         return best_or_farthest(problem, candidates, scores[0])
 
 
@@ -55,7 +56,7 @@ class TieBreakSearch(CandidateSearch):
         return acquisition, self.second
 
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
-        """Propose the tied candidate with the highest value in the second acquisition. The key is not used."""
+        """Propose the tied candidate with the highest value of the second acquisition. The key is not used."""
         first, second = scores
         proposal = best_unvisited(problem, candidates, jnp.mean(first, axis=0), scores=first)
         return preferred(proposal, jnp.mean(second, axis=0))

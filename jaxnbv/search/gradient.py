@@ -118,7 +118,7 @@ class GradientSearch(Search):
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
         """Propose the best pose of all trajectories, or the best candidate if its value is higher.
 
-        The random key decides the rotation of the space's candidates.
+        The key decides how the candidates are rotated, unless the field `candidates` is set.
         """
         if self.candidates is None:
             candidates = self.space.candidates(self.num_candidates, key if self.rotates_candidates else None)
@@ -149,9 +149,11 @@ class GradientSearch(Search):
     def _walk(
         self, problem: Problem, scale: Float[Array, ""], start: Pose
     ) -> tuple[Trajectories, Float[Array, " steps"]]:
-        """Run the solver from a start, and return the trajectory and the standard errors of the trajectory's values.
+        """Run the solver from a start, and return the trajectory and the standard errors of its values.
 
         The trajectory contains every evaluated pose. For a solver with a line search, it contains accepted poses only.
+
+        - `scale`: range of the candidates' values, by which the solver's objective is divided.
         """
         solver = self.minimiser
 
@@ -186,8 +188,8 @@ class HybridSearch(GradientSearch):
     """Discrete search, followed by gradient ascent from the best candidates.
 
     This is a `GradientSearch` whose defaults differ: it takes fewer and longer steps from fewer starts. Its candidates
-    are not rotated. On the sphere they equal the same number of candidates of a `DiscreteSearch`. The value of the
-    proposal is therefore at least the best value of that search.
+    are not rotated. On the sphere they are the candidates of a `DiscreteSearch` with the same number of candidates. The
+    value of the proposal is therefore at least the best value of that search.
     """
 
     rotates_candidates: ClassVar[bool] = False

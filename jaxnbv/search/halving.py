@@ -15,7 +15,7 @@ from jaxnbv.search.base import CandidateSearch, Scores
 from jaxnbv.search.problem import Problem
 from jaxnbv.search.proposal import Proposal
 
-# Smallest number of candidates that are scored together, and the rank that marks an unused entry of a block.
+# Smallest number of candidates that are scored together, and the rank that marks an unused entry of a `_Block`.
 _LEAST = 8
 _NOBODY = np.iinfo(np.int32).max
 
@@ -62,9 +62,9 @@ class HalvingSearch(CandidateSearch):
         zeros = jnp.zeros(count, candidates.position.dtype)
 
         def ranked(state, left):
-            """Return the order of the candidates, and their mean scores.
+            """Return the indices of the candidates in a new order, and their mean scores so far.
 
-            The first `left` candidates of the current order come first, highest mean first.
+            The first `left` candidates of the current order stay first, and are sorted from the highest mean.
             """
             order, totals, scored = state
             values = jnp.where(is_excluded, -jnp.inf, totals / jnp.maximum(scored, 1))
@@ -95,9 +95,10 @@ class HalvingSearch(CandidateSearch):
         )
 
     def _blocks(self, num_samples: int) -> tuple["_Block", int]:
-        """Return all rounds as blocks, and the number of candidates in the last round.
+        """Divide all rounds into blocks, and return these and the number of candidates in the last round.
 
-        All blocks have the same size, so the program that scores a block is compiled once.
+        A block is a group of candidates that are scored together on one posterior sample. All blocks have the same
+        size, so the program that scores a block is compiled once.
         """
         rounds: list[tuple[int, range]] = []
         left, scored = self.candidates.count, 0
@@ -119,9 +120,9 @@ class HalvingSearch(CandidateSearch):
 
 
 class _Block(NamedTuple):
-    """Candidates that are scored together on one sample.
+    """Candidates that are scored together on one posterior sample.
 
-    - `sorts`: whether to rank the first `left` candidates before this block.
+    - `sorts`: whether to rank the first `left` candidates by their mean scores before this block is scored.
     - `left`: number of remaining candidates before the ranking.
     - `sample`: index of the posterior sample.
     - `ranks`: ranks of the candidates to score; `_NOBODY` for an unused entry.

@@ -22,7 +22,7 @@ from jaxnbv.scanning.sensors import SENSOR_RADIUS
 
 
 class PoseSpace(eqx.Module):
-    """Base class of the poses that a gradient search can reach.
+    """Base class of pose spaces, the sets of poses that a gradient search can reach.
 
     - `num_parameters`: number of parameters that move a pose.
     """
@@ -44,7 +44,7 @@ class PoseSpace(eqx.Module):
         """
 
     def check_camera(self, camera: Camera) -> None:
-        """Raise `ValueError` if the camera does not fit the space."""
+        """Raise `ValueError` if the camera's image is too narrow for the poses. By default, every camera is valid."""
         return
 
 
@@ -52,8 +52,8 @@ class SpherePoses(PoseSpace):
     """2-DOF poses on a sphere about the origin, all looking at the origin.
 
     The parameters (3,) are added to the unit vector from the origin to the start, and the sum is normalised. The camera
-    follows by the smallest rotation, which has no singularity at the poles. A start at a different radius is moved to
-    the sphere.
+    then turns to the origin by the smallest rotation, which has no singularity at the poles. A start at a different
+    radius is moved to the sphere.
 
     - `radius`: radius of the sphere, in scene units.
 
@@ -111,9 +111,9 @@ class ConstrainedPoses(PoseSpace):
     The pose satisfies the constraints for any parameters (8,):
 
     - Three parameters move the direction from the origin, as in `SpherePoses`.
-    - One parameter moves the distance, and two move the image of the origin. The map s / sqrt(1 + s^2) keeps them in
-      their ranges.
-    - Two parameters are added to (cos, sin) = (1, 0) of the roll angle, and the sum is normalised.
+    - One parameter moves the distance, and two move the image of the origin. The map s / sqrt(1 + s^2) of any number s
+      into (-1, 1) keeps them in their ranges.
+    - Two parameters are added to (1, 0), and the sum is normalised. It is the cosine and sine of a roll angle.
 
     A start that violates the constraints is first moved just inside the constraints.
 
@@ -165,7 +165,7 @@ class ConstrainedPoses(PoseSpace):
         return Pose(_product(_product(turned, rotation_between(target, to_origin)), about_axis), position)
 
     def check_camera(self, camera: Camera) -> None:
-        """Raise `ValueError` if the image is too narrow to keep the origin in view."""
+        """Raise `ValueError` if an edge of the image is less than `off_axis` from the optical axis."""
         left, top, right, bottom = camera.edges
         half = math.atan(min(-left, -top, right, bottom))
         require(

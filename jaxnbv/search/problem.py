@@ -30,7 +30,7 @@ class Problem(eqx.Module):
     - `camera`: the camera whose scans are simulated.
     - `acquisition`: the expected value of a view.
     - `obstacles`: solids around the object, or None. Obstacles may hide the object, and cameras keep clear of them.
-    - `cost`: function that applies the cost of the move to the value of a pose; None to ignore the cost.
+    - `cost`: function that applies the cost of moving from the last view to the value of a pose; None to ignore it.
     - `pending`: poses of earlier proposals without a view; None if there are none.
     - `context`: context of the acquisition, computed once from the inputs by `prepared`.
     """
@@ -67,7 +67,7 @@ class Problem(eqx.Module):
     def scores(
         self, poses: Pose, samples: slice | Int[Array, " some"] = slice(None)
     ) -> Float[Array, "*scores samples poses"]:
-        """Return the acquisition's score for each sample and pose, after the cost is applied.
+        """Return the acquisition's score for each sample and pose, after the cost of the move is applied.
 
         For an `AcquisitionList`, the result has a leading axis of acquisitions.
 
@@ -83,10 +83,10 @@ class Problem(eqx.Module):
         return values if self.cost is None else self.cost(values, self.observations, poses)
 
     def value_at_visited(self) -> Float[Array, ""]:
-        """Return the mean value that the acquisition expects at the visited poses, without the cost.
+        """Return the mean value that the acquisition expects at the visited poses, without the cost of moves.
 
         If a second view from the same pose gains nothing, this value is an error, and the error may be as large at
-        other poses. Return zero for fewer than two views, because the value at a single visited pose is no error. There
+        other poses. Return zero for fewer than two views, because the value at a single visited pose is not an error:
         it counts surface that the view saw only at a steep angle.
         """
         visited = self.observations.poses
@@ -115,16 +115,16 @@ class Problem(eqx.Module):
         return self.inputs.surfaces
 
     def is_excluded(self, poses: Pose) -> Bool[Array, " poses"]:
-        """Return a mask of the poses that were visited or proposed before, or that violate the clearance."""
+        """Return a mask of poses that were visited or proposed before, or are too close to an obstacle or D."""
         excluded = self.observations.poses.contains(poses)
         if self.pending is not None:
             excluded |= self.pending.contains(poses)
         return excluded | (self.violation(poses) > 0)
 
     def violation(self, poses: Pose) -> Float[Array, " poses"]:
-        """Return the amount by which each pose violates the clearance, see `Obstacles.violation`.
+        """Return the length by which each pose is too close to an obstacle or to the cloud D.
 
-        The amount is in scene units, and zero for a permitted pose.
+        The length is in scene units, and zero for a permitted pose, see `Obstacles.violation`.
         """
         if self.obstacles is None:
             return jnp.zeros(poses.position.shape[:-1], poses.position.dtype)

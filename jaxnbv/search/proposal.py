@@ -1,4 +1,4 @@
-"""Proposals, which are the results of searches, and trajectories of gradient searches."""
+"""Proposals, the results of searches, and trajectories of gradient searches."""
 
 import equinox as eqx
 import jax
@@ -22,7 +22,7 @@ class Trajectories(eqx.Module):
 
     @property
     def flat(self) -> tuple[Pose, Float[Array, " looks"]]:
-        """All poses and values along a single axis: first those of all starts, then of all first steps, etc."""
+        """All poses and values along a single axis: first the starts, then their first steps, and so on."""
         poses, values = jax.tree.map(lambda rows: jnp.swapaxes(rows, 0, 1), (self.poses, self.values))
         return jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), (poses, values))
 
@@ -39,8 +39,8 @@ class Proposal(eqx.Module):
       than `standard_errors`, because all candidates are scored on the same samples. None for a search that does not
       score all candidates on all samples.
     - `standard_error`: standard error of `value`. NaN for one sample; None for a search without scores.
-    - `value_at_visited`: mean value expected at visited poses, see `Problem.value_at_visited`. None if the acquisition
-      does not `gains_once` or ties are not decided by distance.
+    - `value_at_visited`: mean value expected at visited poses, see `Problem.value_at_visited`. None if ties are not
+      decided by the distance from earlier cameras.
     """
 
     pose: Pose
@@ -97,7 +97,7 @@ class Proposal(eqx.Module):
 
     @property
     def num_tied(self) -> int | None:
-        """Number of further candidates that are tied with the best; None if standard errors are unknown."""
+        """Number of other candidates that are tied with the best; None if standard errors are unknown."""
         tied = self.tied_with_best()
         if tied is None or bool(jnp.isnan(jnp.asarray(self.difference_errors)).any()):
             return None
