@@ -1,4 +1,4 @@
-"""Study of heat, which measures how near the coldest point of the scanned cloud is to the object's coldest points."""
+"""Study of heat: how near the coldest point of the scanned cloud is to the object's coldest points."""
 
 import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -36,10 +36,10 @@ from jaxnbv.viz.render import Still
 # Methods whose acquisition values the coldest point. All other methods ignore heat.
 HEAT_METHODS = ("heat", "heat-reached", "heat-halving")
 _OTHERS = ("coverage", *BASELINES)
-# Names of the estimates of the coldest point, and the points of the cloud among which each estimate is the coldest.
+# Names of the two estimates of the coldest point, and the points of the cloud from which each takes the coldest.
 ESTIMATES = {"all": "of all points", "reached": "of the warmed points"}
-# Points count as coldest if their temperature exceeds the lowest by at most this fraction of the range. Several points
-# must count, because objects have symmetries and the inner floor of a mug is equally cold all over.
+# Points count as coldest if their temperature exceeds the lowest by at most this fraction of the range from the lowest
+# to the highest. Several points must count, because objects have symmetries and a mug's inner floor is equally cold.
 _NEARLY = 0.01
 # Matplotlib's inferno without its palest colours, which would not stand out against grey, the colour of unscanned
 # surface.
@@ -78,7 +78,8 @@ class Truth(NamedTuple):
 def _saturated(record: Record, method: str) -> dict[int, float]:
     """Return, for each view after the first, 1.0 if the chosen view has value zero, else 0.0.
 
-    If the chosen view has value zero, all candidates have value zero. Methods not in `HEAT_METHODS` have no values.
+    A search chooses the highest value. So if it is zero, all candidates have value zero. The result of a method that is
+    not in `HEAT_METHODS` is {}.
     """
     steps = record["methods"][method]["steps"] if method in HEAT_METHODS else []
     return {view: float(step["value"] == 0.0) for view, step in enumerate(steps, start=2)}
@@ -107,8 +108,8 @@ class HeatStudy(Study):
 
     It has the settings of `Study`, and:
 
-    - `num_points`: number to which the points of D are thinned before an imagined scan is added to simulate its
-      temperature.
+    - `num_points`: number of points to which the cloud is thinned before an imagined scan is added. The temperature is
+      then simulated on both together.
     - `imagined_rays`: rays along each side of an imagined scan. True scans have 50 x 50 rays.
     - `true_grid`: grid on which a procedural object is meshed. The default resolves the thinnest rods (radius 0.04).
     """
@@ -221,7 +222,7 @@ class HeatStudy(Study):
         return {"reached": shares, "estimates": estimates}
 
     def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
-        """Return tiles of the cloud's visible points, coloured by temperature, over the object in grey.
+        """Return images of the cloud's visible points, coloured by temperature, over the object in grey.
 
         Markers show the object's coldest point and the coldest point of the cloud.
         """

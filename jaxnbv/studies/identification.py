@@ -54,7 +54,7 @@ _RAYS = (28, 28)
 _POINTS, _DENSE = 500, 20_000
 # A pose is right if its error is below this fraction of the part's size.
 _RIGHT = 0.01
-# Names whose weights are at least this fraction of the largest weight count as tied.
+# Names of parts whose weights are at least this fraction of the largest weight count as tied.
 _LEVEL = 0.99
 # Colour scale of distances to the true part, in scene units.
 _ERRORS = LogNorm(0.01, 0.5)
@@ -197,7 +197,7 @@ class IdentificationStudy(Study):
         return int(scan.count) >= _ENOUGH * self.camera.num_rays
 
     def sampler_of(self, scene: Scene) -> SurfaceSampler:
-        """Return a sampler with the bank at the scene's scale. If there is a table, the parts rest on it."""
+        """Return a sampler whose bank holds the parts in scene units. If there is a table, the parts rest on it."""
         return self.sampler.with_bank(scene.task.bank, scene.task.poses)
 
     def planner_of(self, acquisition: Acquisition, search: Search, scene: Scene) -> Planner:
@@ -252,7 +252,7 @@ class IdentificationStudy(Study):
         }
 
     def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
-        """Return tiles that show the most likely part, as placed after each view.
+        """Return images of the most likely part after each view, in its most likely pose.
 
         The part is coloured by its distance to the true part.
         """

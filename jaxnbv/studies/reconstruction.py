@@ -1,4 +1,4 @@
-"""Study of reconstruction, which measures how near the surface made from a method's views is to the true surface."""
+"""Study of reconstruction: how near the surface made from a method's views is to the true surface."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar, cast
@@ -50,8 +50,9 @@ def _distances(name: str, title: str) -> Measure:
 class ReconstructionStudy(Study):
     """Measures the distance between the surface reconstructed from a method's cloud and the true surface.
 
-    It has the settings of `Study`. Procedural objects come from the test split of `part_scene`. The posterior mean is
-    meshed on the grid of the samples and carved as the samples are.
+    The surface is reconstructed by screened Poisson, and as the posterior mean, which is meshed on the grid of the
+    samples and carved as the samples are. Procedural objects come from the test split of `part_scene`. The study has
+    the settings of `Study`.
     """
 
     title: ClassVar[str] = "Distances to the true surface after the last view"
@@ -138,7 +139,7 @@ class ReconstructionStudy(Study):
         return {"chamfer": distance.chamfer, **distance._asdict()}
 
     def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
-        """Return tiles of each reconstruction after the last view, coloured by distance to the true surface.
+        """Return images of each reconstruction after the last view, coloured by distance to the true surface.
 
         **Raises:** `ValueError` if the record has a Poisson reconstruction but `pymeshlab` is not installed.
         """

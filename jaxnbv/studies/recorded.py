@@ -50,7 +50,7 @@ _COARSE, _ROOM = 16, 0.05
 
 
 class Recording(NamedTuple):
-    """The frames of a recording, and the voxels of the box that at least three frames show.
+    """The frames of a recording, and the voxels of a box that at least three frames show.
 
     - `poses`: camera poses of the frames; `scans`: scans of the frames, cropped to the box; both in scene units.
     - `is_shown`: True where any pixel of a frame shows a voxel.
@@ -108,9 +108,10 @@ class MostNewVoxels(Baseline):
 
 
 def _gains(record: Record, method: str) -> dict[int, float | None]:
-    """Return the number of voxels that a method has added by each later view, as a fraction of the oracle's number.
+    """Return, for each view after the first, the ratio of voxels added by a method and by the oracle.
 
-    Both numbers count all voxels added since the first view. The fraction is None if the oracle has added no voxels.
+    Both count the voxels that views 2 to this view have added to those of view 1. The ratio is None if the oracle has
+    added no voxels. Without a run of the oracle, the result is {}.
     """
     if ORACLE not in record["methods"]:
         return {}
@@ -268,7 +269,7 @@ class RecordedStudy(Study):
         return {"frames": frames, "covered": is_shown.mean(axis=1).tolist()}
 
     def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
-        """Return tiles that show the box's voxels, projected along the shortest side of the box.
+        """Return images of the box's voxels after each view, projected along the shortest side of the box.
 
         Voxels that a chosen frame shows are coloured. The line is the path of the recorded camera, and the numbers mark
         the chosen frames in their order.
@@ -323,7 +324,7 @@ def bounds_of(frames: RecordedFrames) -> list[float]:
 
 
 def frame_of_box(box: Box) -> Frame:
-    """Return the frame that maps the recording's coordinates to scene coordinates."""
+    """Return the frame that maps the recording's coordinates to the scene, with the box in the centre."""
     return Frame.fit(np.array([box.low, box.high]), up="z")
 
 

@@ -52,7 +52,7 @@ def _hit(by_view: Callable) -> Callable[[Record, str], Float[np.ndarray, " views
 
 
 def _seen(record: Record, method: str) -> Float[np.ndarray, " views"] | list:
-    """Return, for each view, the fraction of runs in which this view or an earlier view shows the cue."""
+    """Return, for each view, the fraction of runs that showed the cue by this view; [] without a cue."""
     pixels = record["methods"][method]["pixels"]
     return first_hits(np.array(pixels) >= CUE_PIXELS).mean(axis=0) if pixels else []
 

@@ -32,13 +32,13 @@ from jaxnbv.studies.scenes.class_object import ClassMesh, choose_hidden
 from jaxnbv.studies.scenes.splits import scene_key
 from jaxnbv.studies.scenes.truck_meshes import loaded_truck
 
-# Lower limits of three groups of first views, in degrees. Of the cameras that cannot see the pattern, about 40 %, 40 %
-# and 20 % fall into these groups.
+# Smallest angles from the base's normal, in degrees, of three groups of first views. About 40 %, 40 % and 20 % of the
+# cameras that cannot see the pattern fall into these groups.
 _ANGLES = (0, 110, 140)
 
 
 class PyramidStudy(ClassificationStudy):
-    """Study of the class of a pyramid. The first view does not show the pattern that tells the class.
+    """Measures how many views a method needs to tell a pyramid's class. The first view hides the pattern.
 
     It has the settings of `ClassificationStudy`.
     """
@@ -54,14 +54,14 @@ class PyramidStudy(ClassificationStudy):
 
     @classmethod
     def group(cls, record: Record) -> str:
-        """Return the range of angles from the base's normal that contains the first view's angle."""
+        """Return a group name that says in which range the first view's angle from the base's normal lies."""
         least = max(angle for angle in _ANGLES if angle <= record["angle"])
         return f"first view at {least:03d}° or more from the base's normal"
 
     def scene_record(self, scene: Scene, truth: Truth, first: int) -> Record:
-        """Add the angle between the first view and the base's normal to the record, in degrees.
+        """Return the facts about the scene, with the angle between first view and base's normal in degrees.
 
-        The angle is 180 degrees if the camera is on the side of the apex.
+        The angle is 180 degrees if the camera looks straight at the apex.
         """
         direction = np.asarray(self.candidates.poses().position[first])
         # In the pyramid's own frame, the outward normal of the base is -z.
@@ -82,7 +82,7 @@ class PyramidStudy(ClassificationStudy):
 
 
 class TruckStudy(ClassificationStudy):
-    """Study of the class of a truck's cargo, from a random first view.
+    """Measures how many views a method needs to tell the class of a truck's cargo. The first view is random.
 
     It has the settings of `ClassificationStudy`, and:
 
@@ -111,10 +111,10 @@ class TruckStudy(ClassificationStudy):
 
     @classmethod
     def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
-        """Return the studies of one command by the names of their folders.
+        """Return the study, under the name "".
 
-        - `meshes`: folder with one subfolder `trucks` of truck meshes and one subfolder per class of cargo, see
-          `class_meshes`.
+        - `meshes`: option with a folder that holds one subfolder `trucks` of truck meshes and one subfolder per class
+          of cargo, see `class_meshes`.
 
         **Raises:** `ValueError` as `ClassificationStudy` does, or if there is no truck.
         """
@@ -123,13 +123,13 @@ class TruckStudy(ClassificationStudy):
         return super().configured(model, views, quick, **options)
 
     def of_mesh(self, file: MeshFile, index: int) -> ClassMesh:
-        """Return the object of a file on the bed of truck `index % len(trucks)`."""
+        """Return a truck, `trucks[index % len(trucks)]`, that carries the object of a mesh file."""
         truck = self.trucks[index % len(self.trucks)].read()
         return loaded_truck(truck, file.read(), file.label, scene_key(self.seed, self.split, index))
 
 
 class HouseholdStudy(ClassificationStudy):
-    """Study of the class of a household object, from a random first view.
+    """Measures how many views a method needs to tell a household object's class. The first view is random.
 
     The ten classes differ in global shape, which any view shows. It has the settings of `ClassificationStudy`.
     """
@@ -147,7 +147,7 @@ class HouseholdStudy(ClassificationStudy):
 
 
 class OmniObject3DStudy(ClassificationStudy):
-    """Study of the class of a scanned fruit, from a random first view.
+    """Measures how many views a method needs to tell a scanned fruit's class. The first view is random.
 
     The classes differ in small details. The user provides the meshes and the classifier. It has the settings of
     `ClassificationStudy`.
@@ -161,7 +161,7 @@ class OmniObject3DStudy(ClassificationStudy):
 
     @classmethod
     def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
-        """Return the studies of one command by the names of their folders.
+        """Return the study, under the name "".
 
         **Raises:** `ValueError` as `ClassificationStudy` does, or if `meshes` or `classifier` is missing.
         """

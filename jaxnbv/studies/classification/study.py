@@ -1,4 +1,4 @@
-"""Base class of classification studies, which count the views that a method needs to tell the class of an object."""
+"""Base class of studies that count the views that a method needs to tell the class of an object."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -57,7 +57,7 @@ class Truth(eqx.Module):
 
     - `label`: index of the class; `thing`: the object.
     - `scans`: true noisy scan of each candidate.
-    - `pixels`: number of rays of each candidate that hit the cue.
+    - `pixels`: number of rays of each candidate that hit the cue, the part of the object that tells its class.
     """
 
     label: int
@@ -91,11 +91,11 @@ class ClassificationStudy(Study):
     It has the settings of `Study`, and:
 
     - `classifier`: classifier of clouds in scene coordinates, applied to the cloud after each view.
-    - `imagined_classifier`: classifier applied to D u scan for imagined scans; default: `classifier`. A classifier that
-      gets fewer points saves time.
+    - `imagined_classifier`: classifier applied to the cloud joined with an imagined scan; default: `classifier`. A
+      classifier that gets fewer points saves time.
     - `framing`: size of the object in the image, which decides how much of the object a view shows.
     - `split`: split from which the scenes come. Tune settings on the validation split.
-    - `num_points`: number to which the points of D are thinned, once per step, before imagined scans are added.
+    - `num_points`: number of points to which the cloud is thinned, once per step, before imagined scans are added.
     - `first`: condition for first views, see `FirstView`.
 
     Class attributes:
@@ -155,7 +155,7 @@ class ClassificationStudy(Study):
 
     @classmethod
     def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
-        """Return one study for the option `framing`, or one study for each of `framings` without this option.
+        """Return one study for the option `framing`; without this option, one study for each of `framings`.
 
         - `classifier`: option with the file of a network, see `load_checkpoint`; default: the shipped network.
 
@@ -196,9 +196,9 @@ class ClassificationStudy(Study):
 
     @classmethod
     def group(cls, record: Record) -> str:
-        """Return a group name that says whether the first view, which all methods share, shows any of the cue.
+        """Return a group name that says whether the first view shows the cue (what tells the class).
 
-        The name is "" if the study has no cue.
+        All methods share the first view. The name is "" if the study has no cue.
         """
         if not cls.cue:
             return ""
@@ -299,9 +299,9 @@ class ClassificationStudy(Study):
         return lists | {"log_p": [lists["log_p"]], "pixels": [lists["pixels"]] if self.cue else []}
 
     def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
-        """Return tiles that show the true surface as the sensor sees it from each view, with the cue tinted.
+        """Return images of the true surface as seen from each view. The cue (what tells the class) is tinted.
 
-        The text below a tile gives the class predicted after the view, and the probability of this class.
+        The text below an image gives the class predicted after the view, and the probability of this class.
         """
         runs, scene, names = record["methods"], self.scene(record["scene"]), self.objects.classes
         poses = {method: poses_of(runs[method]) for method in methods}
@@ -331,7 +331,7 @@ def _classify(classifier: Classifier, cloud: PointCloud) -> Float[Array, " class
 
 
 def _image(scene: Scene, camera: Camera, pose: Pose, tinted: bool) -> Float[np.ndarray, "h w 3"]:
-    """Return an image of the scene from a pose, lit from the camera. If `tinted`, the cue is tinted."""
+    """Return an image of the scene from a pose, lit from the camera. If `tinted`, the cue has its own colour."""
     cloud = scan(scene.surface, camera, jax.tree.map(jnp.asarray, pose))
     on_cue = np.asarray(scene.task.thing.on_cue(cloud.points)) & tinted
     points, normals, hit = (np.asarray(array) for array in (cloud.points, cloud.normals, cloud.mask))

@@ -1,1 +1,1 @@
-"""Engine of studies: their base class, and functions that run scenes and make tables, charts and pages."""
+"""Engine of studies: base class, and functions that run scenes and make tables, charts and pages."""

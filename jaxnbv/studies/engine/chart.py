@@ -52,7 +52,7 @@ _OTHERS = (("#8c564b", "-", "p"), ("#7f3fbf", "-", "h"), ("#b8860b", "--", "d"))
 
 
 def chart(table: pd.DataFrame, study: type[Study]) -> bytes:
-    """Draw a table of `results` over all scenes, one panel per measure, and return the content of a PNG file.
+    """Draw a table of `results` over all scenes, one panel per measure, and return the PNG file as bytes.
 
     Error bars show the bootstrap intervals, because bands of this many methods would overlap.
     """

@@ -176,9 +176,9 @@ def _call(
 
 @functools.cache
 def _prepare() -> dict[str, Any]:
-    """Enable the cache of compiled programs, as the command does, and return the software versions of this process.
+    """Enable the cache of compiled programs, as the command does, and return the versions of this process.
 
-    It runs once per process.
+    Only the first call in a process does this. Later calls return the same versions.
     """
     with contextlib.suppress(InputError):
         keep_compiled()

@@ -1,4 +1,4 @@
-"""Functions that choose the first view of an episode, run and record the episode, and replay its views."""
+"""Functions that choose the first view of an episode, run and record it, and replay its views."""
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence

@@ -1,4 +1,4 @@
-"""Functions that make the sampler of a study, with or without known shapes, and that select shapes from its bank."""
+"""Functions that make the sampler of a study, with or without known shapes, and select its shapes."""
 
 import dataclasses
 from collections.abc import Callable, Sequence

@@ -1,4 +1,4 @@
-"""HTML page of all studies in a folder, with the claims, tables, chart, pictures, settings and times of each study."""
+"""HTML page with the claims, tables, chart, pictures, settings and times of all studies in a folder."""
 
 import json
 import os

@@ -119,7 +119,7 @@ def _means(rows: pd.DataFrame, measure: Measure, best: pd.Series) -> list[str]:
 
 
 def _leads(rows: pd.DataFrame, measure: Measure) -> list[str]:
-    """Format the leads of the reference over other methods as text, with a star if the interval excludes zero."""
+    """Format the leads of the reference over other methods. A star marks an interval that excludes zero."""
     form, scale = ("+.0f", 100) if measure.unit == "%" else (f"+.{measure.digits}f", 1)
     return [
         f"{scale * lead:{form}} [{scale * low:{form}}, {scale * high:{form}}]{_star(low > 0 or high < 0)}"

@@ -1,4 +1,4 @@
-"""Functions that run all methods of a study on a scene, load stored studies, and replay the views of a method."""
+"""Functions that run all methods of a study on a scene, load stored studies, and replay views."""
 
 import functools
 import time

@@ -48,7 +48,7 @@ def caption_tile(axes: Axes, text: str, right: bool = False) -> None:
 
 
 def opposite_direction(record: Record) -> Float[np.ndarray, "3"]:
-    """Return a direction from which pictures show the side of the object that the first view does not show.
+    """Return a direction from which pictures show the side of the object that the first view hides.
 
     The direction is opposite the first view, which all methods share, and slopes upwards.
     """

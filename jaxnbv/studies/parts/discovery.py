@@ -1,4 +1,4 @@
-"""Base class of the studies of semantic parts, which count the views until all parts of an object are found."""
+"""Base class of studies that count the views until all semantic parts of an object are found."""
 
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
@@ -31,8 +31,8 @@ from jaxnbv.studies.sensors import PART_SETTING
 from jaxnbv.tasks import Coverage, Segmenter, SoftPartCount, part_counts
 from jaxnbv.viz.style import GREY, SERIES
 
-# Values of N_target in the paper's Table 1, the authors' N_target for the utility, and the number of points that the
-# network gets. All values of N_target refer to this number of points.
+# A part is found once the segmenter assigns N_target points to it: values of N_target in the paper's Table 1, the
+# authors' N_target for the utility, and the number of points that the network gets, to which all these values refer.
 TARGETS = (20, 40, 60, 80, 100)
 TARGET, NETWORK_POINTS = 60, 2048
 _BY_PARTS = ("discrete", "gradient-2dof", "gradient-6dof")
@@ -52,8 +52,8 @@ class NearestPart(Segmenter):
 
         p_ic proportional to exp(-d_ic^2 / 2 w^2),   w = 0.02 scene units,
 
-    where d_ic is the distance of point i from the true part c. Oracles that have the same number of parts after padding
-    share one compilation.
+    where d_ic is the distance of point i from the true part c. `of` pads the parts of each object to the same number,
+    so that all objects share one compilation.
 
     - `distances`: distance of each node of `grid` from each part. Values between nodes are interpolated linearly.
     - `num_points`: number of points to segment. They are chosen by farthest point sampling.
@@ -65,13 +65,13 @@ class NearestPart(Segmenter):
 
     @classmethod
     def of(cls, parts: MeshParts, room: int, grid: Grid, num_points: int) -> "NearestPart":
-        """Make the oracle of a mesh, padded with absent parts to `room` parts."""
+        """Make the oracle of a mesh. Absent parts are added until there are `room` parts."""
         distances = parts.distances(grid)
         absent = ((0, room - len(distances)), (0, 0), (0, 0), (0, 0))
         return cls(jnp.pad(distances, absent, constant_values=_NOWHERE), grid, num_points)
 
     def __call__(self, cloud: PointCloud) -> Float[Array, "num_points parts"]:
-        """Return the probabilities p. They are zero in rows without a point."""
+        """Return the probability that each point belongs to each part; zeros in rows without a point."""
         fed = farthest_point_subsample(cloud, self.num_points)
         p = jax.nn.softmax(-0.5 * (self.distances_at(fed.points) / _WIDTH) ** 2, axis=-1)
         return jnp.where(fed.mask[:, None], p, 0.0)
@@ -100,23 +100,25 @@ PartSegmenter: TypeAlias = CloudSegmenter | NearestPart
 
 
 def discovery_time(counts: Int[np.ndarray, "views parts"], target: int) -> int | None:
-    """Return T_discovery, the first view (counted from 1) after which every part has `target` points.
+    """Return the first view (counted from 1) after which every part has `target` points, or None.
 
-    Return None if there is no such view.
+    This is the paper's T_discovery.
+
+    - `counts`: number of points that are assigned to each part after each view.
     """
     is_complete: Bool[np.ndarray, " views"] = np.all(np.asarray(counts) >= target, axis=1)
     return int(np.argmax(is_complete)) + 1 if is_complete.any() else None
 
 
 def _times(record: Record, method: str) -> dict[int, float]:
-    """Return T_discovery for each target, or the number of views plus one if some part was not found."""
+    """Return `discovery_time` for each of `TARGETS`, or the number of views plus one if it is None."""
     counts = np.asarray(record["methods"][method]["counts"])
     times = {target: discovery_time(counts, target) for target in TARGETS}
     return {target: float(record["study_views"] + 1 if time is None else time) for target, time in times.items()}
 
 
 def _found(record: Record, method: str) -> dict[int, float]:
-    """Return, for each target, 1.0 if all parts were found by the last view, else 0.0."""
+    """Return, for each of `TARGETS`, 1.0 if all parts had as many points by the last view, else 0.0."""
     return {target: float(time <= record["study_views"]) for target, time in _times(record, method).items()}
 
 
@@ -131,8 +133,8 @@ class PartDiscoveryStudy(Study):
     It has the settings of `Study`, and:
 
     - `imagined_rays`: rays along each side of an imagined scan. True scans have 64 x 64 rays.
-    - `num_points`: number of points that the segmenter gets of D and an imagined scan together. The utility's N_target
-      is scaled in proportion to this number.
+    - `num_points`: number of points that the segmenter gets of the cloud and an imagined scan together. The utility's
+      target number of points per part (N_target) is scaled in proportion to this number.
     """
 
     title: ClassVar[str] = "Views until all parts are found"
@@ -200,10 +202,10 @@ class PartDiscoveryStudy(Study):
         return {"counts": counts}
 
     def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
-        """Return tiles of the cloud over the true shape. The points are coloured by their predicted part.
+        """Return images of the cloud over the true shape. The points are coloured by their predicted part.
 
-        The text below a tile gives the number of parts that have at least 60 points (N_target). The tiles of a method
-        end once every part has 100 points, because its episode ends there.
+        The text below an image gives the number of parts that have at least 60 points. The images of a method end once
+        every part has 100 points, because its episode ends there.
         """
         scene, runs = self.scene(record["scene"]), record["methods"]
         parts, segmenter = np.asarray(self.truth(scene)), self.segmenter_of(scene)

@@ -1,4 +1,4 @@
-"""Studies that count the views until all semantic parts of an object are found, as in the paper's Table 1.
+"""Studies that count the views until all semantic parts of an object are found (the paper's Table 1).
 
 `PartStudy` uses procedural objects, which a network segments. `MeshPartStudy` uses mesh files whose nodes are parts,
 which an oracle segments.
@@ -146,7 +146,7 @@ class PartStudy(PartDiscoveryStudy):
         return CloudSegmenter(base.network, scene.task.category, num_points or base.num_points, base.scale)
 
     def sampler_of(self, scene: Scene) -> SurfaceSampler:
-        """Return the sampler with only the known shapes of the object's category."""
+        """Return the study's sampler, restricted to the known shapes of the object's category."""
         return keep_shapes(self.sampler, lambda name: kind_of(name) == scene.name)
 
     def true_parts(self, scene: Scene, points: Float[Array, "n 3"]) -> Int[Array, " n"]:

@@ -1,4 +1,4 @@
-"""Procedural scenes: pyramids, trucks, household objects, objects with labelled parts, and heated objects."""
+"""Procedural scenes: pyramids, trucks, household objects, objects with labelled parts, heated objects."""
 
 import lazy_loader
 

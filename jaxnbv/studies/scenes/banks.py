@@ -14,11 +14,11 @@ from jaxnbv.surfaces import ShapeBank
 
 
 class BankRecipe(NamedTuple):
-    """Defines the shapes of a bank.
+    """Defines the shapes of a bank of known shapes.
 
     - `number`: number of shapes.
     - `kinds`: names of the kinds of shapes. Shape i is of kind `kinds[i % len(kinds)]`.
-    - `shape`: function that returns the shape of an index without a random rotation.
+    - `shape`: function that returns the shape with an index. Shapes are not rotated at random.
     """
 
     number: int

@@ -45,7 +45,7 @@ class ClassObject(SignedDistance):
 class SolidObject(ClassObject):
     """A solid made of labelled primitives. The primitives with a label above 0 are the cue.
 
-    The value is a bound of the signed distance, as for `LabelledSolid`.
+    The solid, called with points, returns bounds of their signed distances, as `LabelledSolid` does.
 
     - `solid`: the primitives, in scene coordinates.
     - `label`: index of the class.
@@ -77,7 +77,7 @@ class ClassMesh(eqx.Module):
     """A mesh that belongs to one of several classes.
 
     - `label`: index of the class.
-    - `part`: the triangles of `mesh` that are the cue; default: all triangles.
+    - `part`: the triangles of `mesh` that are the cue (they tell the class); default: all triangles.
     """
 
     mesh: TriangleMesh
@@ -99,7 +99,7 @@ def surface_of(thing: ClassObject | ClassMesh) -> Surface:
 
 
 def scan_cue(thing: ClassObject | ClassMesh, camera: Camera, poses: Pose) -> tuple[Int[Array, " poses"], PointCloud]:
-    """Return the number of rays from each pose that hit the cue, and the scans without noise."""
+    """Return how many rays of each pose hit the cue (the part that tells the class), and noiseless scans."""
     return _scan_telling(thing, camera, poses) if isinstance(thing, ClassMesh) else _compiled(thing, camera, poses)
 
 
@@ -116,7 +116,7 @@ _compiled = program(_scan_telling)
 def hidden_view(
     thing: ClassObject | ClassMesh, key: PRNGKeyArray, camera: Camera = Camera(), poses: Pose | None = None
 ) -> Pose:
-    """Return a random pose from which the object is visible but its cue is hidden.
+    """Return a random pose that shows the object but not its cue (the part that tells the class).
 
     - `poses`: poses from which the result is drawn uniformly; default: the paper's 120 candidates.
 
@@ -129,7 +129,8 @@ def hidden_view(
 def choose_hidden(cue_pixels: Int[AnyArray, " poses"], scans: PointCloud, key: PRNGKeyArray) -> int:
     """Return the index of a random pose whose scan hits the object but not its cue, drawn uniformly.
 
-    - `cue_pixels`: number of rays of each pose that hit the cue; `scans`: scan from each pose.
+    - `cue_pixels`: number of rays of each pose that hit the cue, the part of the object that tells its class.
+    - `scans`: scan from each pose.
 
     **Raises:** `ValueError` if there is no such pose.
     """

@@ -36,7 +36,9 @@ def _pin(radius: float, half_height: float, center: Sequence[float]) -> SignedDi
 
 
 def _housing(side: float = 1.0, floor: float = _FLOOR) -> SignedDistance:
-    """Make a block with a deep pocket that is open above, and a notch at one corner that breaks the block's symmetry.
+    """Make a housing: a block with a deep pocket that is open above, and a notch at one corner.
+
+    The notch breaks the block's symmetry.
 
     - `side`: 1, or -1 for the mirror image; `floor`: height of the pocket's floor.
     """
@@ -46,7 +48,7 @@ def _housing(side: float = 1.0, floor: float = _FLOOR) -> SignedDistance:
 
 
 def _bosses() -> list[SignedDistance]:
-    """Make housings with a boss on the floor of the pocket. The position, radius and height of the boss differ."""
+    """Make blocks with a pocket. The position, radius and height of a boss on the pocket's floor differ."""
     variants = [
         (-0.25, 0.0, 0.12, 0.25),
         (0.25, 0.0, 0.12, 0.25),
@@ -61,7 +63,7 @@ def _bosses() -> list[SignedDistance]:
 
 
 def _bores() -> list[SignedDistance]:
-    """Make housings with a blind hole in the floor of the pocket. The position and radius of the hole differ."""
+    """Make blocks with a pocket. The position and radius of a blind hole in the pocket's floor differ."""
     places = [(-0.25, 0.0), (0.25, 0.0), (0.0, 0.15), (0.0, -0.15), (0.0, 0.0), (0.0, 0.0), (-0.25, 0.15), (0.25, 0.15)]
     radii = [0.12, 0.12, 0.12, 0.12, 0.12, 0.22, 0.12, 0.12]
     return [
@@ -71,7 +73,7 @@ def _bores() -> list[SignedDistance]:
 
 
 def _ribs() -> list[SignedDistance]:
-    """Make housings with a rib on the floor of the pocket. The position and direction of the rib differ."""
+    """Make blocks with a pocket. The position and direction of a rib on the pocket's floor differ."""
     along = [(-0.28, 0.0, 90.0), (0.0, 0.0, 90.0), (0.28, 0.0, 90.0)]
     across = [(0.0, -0.2, 0.0), (0.0, 0.0, 0.0), (0.0, 0.2, 0.0)]
     aslant = [(0.0, 0.0, 45.0), (0.0, 0.0, -45.0)]
@@ -84,7 +86,7 @@ def _ribs() -> list[SignedDistance]:
 
 
 def _connectors() -> list[SignedDistance]:
-    """Make housings with a connector on the floor of the pocket. The size and position of the connector differ."""
+    """Make blocks with a pocket. The size and position of a connector on the pocket's floor differ."""
     variants = [
         (0.3, 0.1, 0.0, 0.0),
         (0.1, 0.22, 0.0, 0.0),
@@ -101,7 +103,7 @@ def _connectors() -> list[SignedDistance]:
 
 
 def _pins() -> list[SignedDistance]:
-    """Make housings with pins at two to four of four positions on the floor of the pocket."""
+    """Make blocks with a pocket, and with pins at two to four of four positions on the pocket's floor."""
     places = [(-0.24, -0.15), (-0.24, 0.15), (0.24, -0.15), (0.24, 0.15)]
     patterns = ["1111", "0111", "1011", "1101", "1110", "1001", "0110", "1010"]
 
@@ -115,7 +117,7 @@ def _pins() -> list[SignedDistance]:
 
 
 def _channels() -> list[SignedDistance]:
-    """Make blocks with a channel and a boss on one of its walls. The wall and the position along the channel differ."""
+    """Make blocks with a channel and a boss in it. The blocks differ in the wall and the place of the boss."""
     block = Difference(Cuboid(np.array([0.7, 0.6, 1.25])), _box([0.28, 0.28, 1.5], [0.0, 0.1, 0.0]))
     block = Difference(block, _box([0.2, 0.2, 0.2], [0.7, -0.6, 1.25]))
     places = [(wall, z) for wall in (-0.24, 0.24) for z in (-0.6, -0.2, 0.2, 0.6)]
@@ -153,7 +155,7 @@ def _mugs() -> list[SignedDistance]:
 
 
 def _mirrored() -> list[SignedDistance]:
-    """Make four housings with a boss, and the mirror image of each."""
+    """Make four blocks with a boss in a pocket, and the mirror image of each."""
     places = [(-0.25, 0.0), (0.25, 0.0), (0.0, 0.15), (0.0, -0.15)]
     return [
         Union(_housing(side), _pin(0.12, 0.25, [side * (_ACROSS + x), _FLOOR + 0.2, z]))
@@ -181,13 +183,13 @@ HIDDEN_CUES = ("boss", "bore", "rib", "connector", "pins", "channel", "cup")
 
 
 def confusable_solids(name: str) -> list[SignedDistance]:
-    """Return the parts of a set as solids. All solids have the same pytree structure."""
+    """Return the parts of a set of `CONFUSABLE_SETS` as solids. All solids have the same pytree structure."""
     return _SETS[name]()
 
 
 @functools.cache
 def confusable_meshes(name: str) -> tuple[TriangleMesh, ...]:
-    """Return the parts of a set as meshes. Meshing rounds the edges by about 0.03."""
+    """Return the parts of a set of `CONFUSABLE_SETS` as meshes. Meshing rounds edges by about 0.03 scene units."""
     values = [np.array(_values(solid, _nodes(_MESH_GRID))) for solid in confusable_solids(name)]
     triangles = [level_triangles(rows, _MESH_GRID) for rows in values]
     return tuple(TriangleMesh(mesh[0], mesh[1], Frame()) for mesh in triangles if mesh is not None)
@@ -195,7 +197,7 @@ def confusable_meshes(name: str) -> tuple[TriangleMesh, ...]:
 
 @functools.cache
 def confusable_bank(name: str) -> ShapeBank:
-    """Return the parts of a set as a bank at true size.
+    """Return the parts of a set of `CONFUSABLE_SETS` as a bank at true size.
 
     The bank stores signed distances on a grid, because a tree of set operations takes minutes to compile in a search.
     """

@@ -56,7 +56,7 @@ def heat_scene(index: int, turned: bool = True) -> HeatScene:
 
 
 def source_view(scene: HeatScene, key: PRNGKeyArray, num_candidates: int = 100, radius: float = 3.0) -> Pose:
-    """Return a random candidate on the sphere from which the heat source is visible, drawn uniformly.
+    """Return a random candidate pose on a sphere that shows the heat source, drawn uniformly.
 
     **Raises:** `ValueError` if there is no such candidate.
     """

@@ -12,7 +12,7 @@ from jaxnbv.studies.scenes.labelled import assemble, generator
 from jaxnbv.studies.scenes.parts import furniture
 from jaxnbv.studies.scenes.splits import Split, scene_key
 
-# The whole object tells its class, so all primitives have the label 1.
+# Labels above 0 mark what tells an object's class. Here this is the whole object, so all primitives have the label 1.
 ball, bar, box, ring, rod = (
     partial(make, 1) for make in (labelled.ball, labelled.bar, labelled.box, labelled.ring, labelled.rod)
 )
@@ -60,7 +60,7 @@ def _bathtub(rng):
 
 
 def _bed(rng):
-    """Build a bed: a mattress in a frame, with pillows and a headboard, and with or without a lower footboard."""
+    """Build a bed: a mattress in a frame with pillows, a headboard, and perhaps a lower footboard."""
     x, z, level = rng.uniform(0.95, 1.15), rng.uniform(0.45, 0.9), rng.uniform(0.2, 0.35)
     thick, frame = rng.uniform(0.09, 0.16), 0.07
     yield box((0, level, 0), (x, frame, z))
@@ -152,7 +152,7 @@ def _monitor(rng):
 
 
 def _night_stand(rng):
-    """Build a night stand: a chest on legs, as high as wide, with two drawers or one drawer above an open shelf."""
+    """Build a night stand: a chest on legs, as high as wide, with two drawers, or one and an open shelf."""
     x, z, height, legs = rng.uniform(0.55, 0.7), rng.uniform(0.6, 0.75), rng.uniform(0.5, 0.7), rng.uniform(0.25, 0.6)
     wall, top = 0.05, legs + 2 * height
     yield box((0, top, 0), (x + 0.06, wall, z + 0.06))
@@ -190,7 +190,7 @@ def _sofa(rng):
 
 
 def _toilet(rng):
-    """Build a toilet: a bowl on a foot, with a seat, a lid that is open or shut, and a tank behind the bowl."""
+    """Build a toilet: a bowl on a foot, with a seat, a lid (open or shut), and a tank behind the bowl."""
     bowl, level = rng.uniform(0.4, 0.48), rng.uniform(0.55, 0.7)
     deep, slant = 0.2, rng.uniform(0.3, 0.6)
     foot = rng.uniform(0.22, 0.3)

@@ -2,7 +2,7 @@
 
 An object is a list of primitives, which `assemble` joins into a `LabelledSolid`. A primitive is a rounded box, or the
 solid that a rounded rectangle sweeps when it revolves about an axis: a ring, a wheel, a rod, a cone or a ball. All
-solids of one capacity share one compiled program for scanning.
+solids with the same number of slots for primitives share one compiled program for scanning.
 """
 
 import dataclasses
@@ -25,7 +25,7 @@ _UNTURNED, _UNMOVED = np.eye(3), np.zeros(3)
 
 @dataclasses.dataclass(frozen=True)
 class Primitive:
-    """One primitive of a `LabelledSolid`, as NumPy arrays on the host. The fields are those of the solid."""
+    """One primitive of a `LabelledSolid`, as NumPy arrays on the host. `LabelledSolid` describes the fields."""
 
     label: int
     centre: np.ndarray
@@ -37,12 +37,12 @@ class Primitive:
     revolved: bool = False
 
     def bounds(self) -> Float[np.ndarray, "2 3"]:
-        """Compute the exact lowest and highest coordinates of the primitive."""
+        """Return the lowest and highest corner of the primitive's exact bounding box."""
         inner = self.half_size - self.rounding
         if not self.revolved:
             reach = np.abs(self.rotation) @ inner + self.rounding
             return self.centre + np.stack([-reach, reach])
-        # Take both directions of each coordinate axis in the plane of the profile, and then apply the shear to them.
+        # Take both directions of each coordinate axis in the plane of the swept rectangle, and then apply the slant.
         up = np.stack([-self.rotation[:, 1], self.rotation[:, 1]])
         out = np.sqrt(np.maximum(1.0 - up**2, 0.0))
         up = up + self.slant * out
@@ -53,6 +53,7 @@ class Primitive:
 def box(label: int, centre, half_size, rounding: float = 0.02, turn: tuple | None = None) -> Primitive:
     """Return a box with rounded edges.
 
+    - `rounding`: radius of the edges, at most the smallest half size.
     - `turn`: axis and angle (radians) of a right-handed rotation of the box about its centre; None for no rotation.
     """
     half_size = np.asarray(half_size, dtype=float)
@@ -61,9 +62,10 @@ def box(label: int, centre, half_size, rounding: float = 0.02, turn: tuple | Non
 
 
 def bar(label: int, start, end, half_width: float, half_depth: float, rounding: float = 0.02) -> Primitive:
-    """Return a box that extends from `start` to `end`.
+    """Return a box with rounded edges that extends from `start` to `end`.
 
-    Its width is horizontal. If the bar is upright, its width is along z.
+    - `half_width`: half the size across the bar along the horizontal direction (z if the bar is upright).
+    - `half_depth`: half the size along the other direction across the bar.
     """
     start, end = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
     half_size = np.array([half_depth, 0.5 * np.linalg.norm(end - start), half_width])
@@ -151,7 +153,7 @@ def assemble(primitives: list[Primitive], turn: float = 0.0, longest_side: float
 
 
 def moved(p: Primitive, scale: float = 1.0, rotation=_UNTURNED, offset=_UNMOVED) -> Primitive:
-    """Return the image of a primitive under x -> scale rotation x + offset."""
+    """Return a primitive moved by x -> scale rotation x + offset."""
     return dataclasses.replace(
         p,
         centre=scale * rotation @ p.centre + offset,
@@ -163,13 +165,13 @@ def moved(p: Primitive, scale: float = 1.0, rotation=_UNTURNED, offset=_UNMOVED)
 
 
 def bounds(primitives: list[Primitive]) -> Float[np.ndarray, "2 3"]:
-    """Compute the lowest and highest coordinates of a list of primitives."""
+    """Return the lowest and highest corner of the joint bounding box of primitives."""
     lows, highs = zip(*(p.bounds() for p in primitives), strict=True)
     return np.stack([np.min(lows, axis=0), np.max(highs, axis=0)])
 
 
 def fitted(primitives: list[Primitive], longest_side: float) -> list[Primitive]:
-    """Move and scale primitives so that their joint bounding box is centred and has this longest side."""
+    """Move and scale primitives so that their joint bounding box is centred, with this longest side."""
     low, high = bounds(primitives)
     scale = longest_side / (high - low).max()
     return [moved(p, scale, offset=-0.5 * scale * (low + high)) for p in primitives]
@@ -178,7 +180,7 @@ def fitted(primitives: list[Primitive], longest_side: float) -> list[Primitive]:
 def united(primitives: list[Primitive], capacity: int = CAPACITY) -> LabelledSolid:
     """Return the union of primitives without moving them.
 
-    - `capacity`: number of slots for primitives in the solid.
+    - `capacity`: number of slots for primitives in the solid. Spare slots stay unused.
 
     **Raises:** `ValueError` if there are no primitives, or more primitives than the capacity.
     """

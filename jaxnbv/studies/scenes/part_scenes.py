@@ -35,7 +35,7 @@ _LARGEST_TURN = np.radians(10.0)
 
 
 class PartScene(eqx.Module):
-    """An object with its category and its parts, of the fifty parts of ShapeNet-part.
+    """An object, its category, and which of the fifty parts of ShapeNet-part it has.
 
     - `solid`: the object. Its labels are indices of the fifty parts.
     - `category`: index of the object's category in `networks.CATEGORIES`.

@@ -1,4 +1,4 @@
-"""Known parts placed in a scene, either with a random rotation or resting on a table, with or without a box."""
+"""Known parts placed in a scene: rotated at random, or resting on a table with or without a box on it."""
 
 import dataclasses
 import functools
@@ -29,9 +29,8 @@ _ORDER = 123
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Parts:
-    """Parts at true size.
+    """Known parts at true size, as a bank and as meshes.
 
-    - `bank`: the bank of the parts, at true size.
     - `meshes`: the mesh of each part, in the coordinates of the bank's shapes.
     """
 
@@ -46,7 +45,8 @@ class Parts:
     def choose(self, index: int) -> int:
         """Return the index of the part for the scene with this index.
 
-        Scenes with even and odd indices share no part. Every part comes once before any part repeats.
+        One half of the parts is for scenes with even indices, and the other half for odd indices. In each half, every
+        part comes once before any part repeats.
         """
         half = np.random.default_rng(_ORDER).permutation(len(self.meshes))[index % 2 :: 2]
         return int(half[index // 2 % len(half)])
@@ -155,7 +155,7 @@ def _resting(vertices: Float[np.ndarray, "v 3"], random: np.random.Generator) ->
 
 
 def _obstacles(half: Float[np.ndarray, "3"], has_box: bool, random: np.random.Generator) -> Obstacles:
-    """Return the table below a part of half size `half`.
+    """Return a table below a part whose bounding box is centred and has the half sizes `half`.
 
     If `has_box`, a box on the table hides half of one side of the part.
     """

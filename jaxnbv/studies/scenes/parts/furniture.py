@@ -167,7 +167,7 @@ def _desk_lamp(rng, tube):
 
 
 def _shade(low, high, wide, narrow):
-    """Build a cone without caps, from its wide rim at `low` to its narrow rim at `high`."""
+    """Build a lamp shade, open at both ends, whose radius is `wide` at `low` and `narrow` at `high`."""
     low, high = np.asarray(low, dtype=float), np.asarray(high, dtype=float)
     length = float(np.linalg.norm(high - low))
     slant = (narrow - wide) / length
