@@ -27,9 +27,7 @@ _SYNSETS = {category.name: category.synset for category in CATEGORIES}
 
 
 class MeshFile(NamedTuple):
-    """A mesh file with the class, the name and the up axis of its object.
-
-    The file is read only on request.
+    """A mesh file with the class, the name and the up axis of its object. `read` loads the file.
 
     - `label`: index of the object's class.
     - `name`: name of the object.

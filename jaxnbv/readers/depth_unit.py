@@ -1,4 +1,4 @@
-"""Finds the unit of recorded depth images: the common unit with which frames that show the same surface agree."""
+"""Finds which common unit recorded depth images have: the one with which overlapping frames agree."""
 
 import math
 from collections.abc import Callable
@@ -24,8 +24,8 @@ def depth_unit(
 ) -> float | None:
     """Return the length of the images' unit in world units, or None if the frames do not determine it.
 
-    Projects the points of a frame into a second frame, which has a similar viewing direction and a different position.
-    With the right unit, the depths of the projected points agree with the second image.
+    For each common unit, projects the points of a frame into a second frame, which has a similar viewing direction and
+    a different position. With the right unit, the depths of the projected points agree with the second image.
 
     - `image`: returns the depth image of a frame, 0 where nothing was measured.
     - `matrices`: poses of the frames, camera to world, OpenCV's axes.

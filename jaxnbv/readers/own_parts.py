@@ -18,8 +18,8 @@ _FRAMES, _FEWEST, _BLOCKS = 16, 4, 80
 _EQUAL, _ALIKE = 0.02, 0.05
 # Neighbouring blocks belong to the same component if their depths differ by at most this factor.
 _OF_PART = 1.1
-# A component belongs to the mount if other frames see something deeper at its position in the world more than this many
-# times as often as they see a surface there.
+# A component belongs to the mount if other frames look through its position in the world more than this many times as
+# often as they see a surface there.
 _CLEAR = 4
 
 
@@ -31,10 +31,10 @@ def own_parts(
 ) -> Float[np.ndarray, "h w"]:
     """Return, for each pixel, the depth up to which it shows the camera's mount; zero where it does not.
 
-    Depths are in units of the images. Most frames show the mount at the same pixels and at the same depth. At the
-    mount's position in the world during one frame, frames from different poses see something deeper. A vase in the
-    middle of an orbit also has nearly equal depths in all frames, but all frames see the vase at the same position in
-    the world.
+    Depths are in units of the images. Most frames show the mount at the same pixels and at the same depth. Frames from
+    other poses look through the place in the world where the mount was during one frame, and see something deeper. A
+    vase in the middle of an orbit also has nearly equal depths in all frames, but all frames see the vase at the same
+    place in the world.
 
     - `image`: returns the depth image of a frame, 0 where nothing was measured.
     - `matrices`: poses of the frames, camera to world, OpenCV's axes.
@@ -59,7 +59,7 @@ def own_parts(
 
 
 def _nearest_of_blocks(image: UInt16[np.ndarray, "h w"], side: int) -> Float[np.ndarray, "k l"]:
-    """Return the least depth in each block of `side` x `side` pixels, or zero if nothing was measured in the block."""
+    """Return the least depth in each block of `side` x `side` pixels; zero if nothing was measured in it."""
     image = np.pad(image, [(0, -size % side) for size in image.shape]).astype(float)
     blocks = np.where(image > 0, image, np.inf).reshape(image.shape[0] // side, side, image.shape[1] // side, side)
     least = blocks.min(axis=(1, 3))
@@ -75,10 +75,11 @@ def _is_looked_through(
 ) -> Bool[np.ndarray, "k l"]:
     """Return a mask of the connected components of `part` that belong to the mount.
 
-    A component belongs to the mount if other frames see something deeper at its position in the world during one frame.
+    A component belongs to the mount if other frames see through the place in the world where it was during one frame.
 
     - `part`: depths of the blocks with the same depth in most frames, in world units; zero in all other blocks.
     - `depths`: depths of the blocks in each frame, in world units.
+    - `side`: length of a block's side in pixels.
     """
     row, column = np.nonzero(part)
     own, count = _pieces(part)
@@ -113,7 +114,7 @@ def _is_looked_through(
 
 
 def _pieces(part: Float[np.ndarray, "k l"]) -> tuple[Int[np.ndarray, " blocks"], int]:
-    """Return the index of the connected component of each block with positive depth, and the number of components.
+    """Return the index of the connected component of each block with positive depth, and their number.
 
     Neighbouring blocks at about the same depth belong to the same component.
     """

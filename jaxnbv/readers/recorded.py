@@ -39,7 +39,7 @@ _ASK_UNIT = (
 
 
 class _Layout(NamedTuple):
-    """Image files of a recording, their camera-to-world matrices, and the intrinsics and length unit if stored."""
+    """Image files of a recording, camera-to-world matrices, and intrinsics and length unit if stored."""
 
     files: list[Path]
     matrices: Float[np.ndarray, "n 4 4"]
@@ -64,8 +64,8 @@ class RecordedFrames:
       file of 3DMatch, ScanNet, ETH3D, BundleFusion or Open3D. The formats 7-Scenes and TUM RGB-D do not store
       intrinsics.
     - `depth_scale`: length of the images' unit in the unit of the poses, for example 1/5000. By default it is read from
-      `frames.json`, or it is the common unit (1/1000, 1/5000, 1/10000, ...) with which frames that show the same
-      surface agree.
+      `frames.json`, or chosen from the common units (1/1000, 1/5000, 1/10000, ...): with the right unit, frames that
+      show the same surface agree.
 
     `camera` is the sensor, and `matrices` (n, 4, 4) are its poses in world units, with OpenCV's axes. `depth_scale`
     times an image is in world units. To add frame i to a session, call
@@ -199,7 +199,7 @@ _READERS: dict[str, Callable[[Path], _Layout]] = {
 
 
 def _with_pose(files: list[Path], has_pose: Bool[np.ndarray, " n"], folder: Path) -> list[Path]:
-    """Return the files that have a valid pose, with a `UserWarning` if any file has none.
+    """Return the files with a valid pose. Emits a `UserWarning` if files without one are left out.
 
     **Raises:** `ValueError` if most files have no valid pose.
     """
@@ -215,7 +215,7 @@ def _with_pose(files: list[Path], has_pose: Bool[np.ndarray, " n"], folder: Path
 
 
 def _upward(up: tuple[float, float, float]) -> Float[np.ndarray, "4 4"]:
-    """Return the rotation that maps `up` to z and the x axis into the plane y = 0."""
+    """Return the 4 x 4 matrix of the rotation that maps `up` to z and the x axis into the plane y = 0."""
     direction = as_numbers(up, "up", np.float64)
     length = float(np.linalg.norm(direction)) if direction.shape == (3,) else 0.0
     require(0 < length < math.inf, f"up is {short_text(up)}; give a direction, such as (0, -1, 0)")

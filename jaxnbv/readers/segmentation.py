@@ -15,7 +15,8 @@ _BETWEEN = "._-"
 class Segmentation:
     """A folder of label images or masks, which say which object each pixel of a recording shows.
 
-    For each frame that shows an object, the folder has one of these:
+    `frames` are the files of the recording's depth images. For each frame that shows an object, the folder has one of
+    these:
 
     - a label image with the frame's name and an object number in each pixel, zero for none: `000012.png` for
       `000012.png`;
@@ -45,7 +46,9 @@ class Segmentation:
         return {number: name for name, number in self._numbers.items()}
 
     def labels(self, index: int) -> Int[np.ndarray, "height width"] | None:
-        """Return the object number of each pixel of a frame (zero for no object), or None without an image.
+        """Return the object number of each pixel of a frame; zero where the pixel shows no object.
+
+        Returns None if the folder has neither a label image nor a mask for the frame.
 
         **Raises:** `ValueError` for an image that cannot be read, or has several channels.
         """
@@ -67,7 +70,11 @@ def _stem(file: Path) -> str:
 
 
 def _of_frame(stem: str, files: dict[str, Path]) -> dict[str, Path]:
-    """Return the images of a frame, keyed by object name. The key of a label image is ""."""
+    """Return the masks of a frame keyed by object name, or its label image with the key "".
+
+    - `stem`: name of the frame's file without its ending.
+    - `files`: all files in the folder, keyed by their names without endings.
+    """
     if stem in files:
         return {"": files[stem]}
     return {

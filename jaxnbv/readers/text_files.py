@@ -16,7 +16,7 @@ _NOT_FINITE = re.compile(r"[+-]?1\.#[A-Z]+\d*")
 def read_text(path: Path) -> str:
     """Read the text of a file in UTF-8, UTF-16 or UTF-32, without its byte order mark.
 
-    **Raises:** `OSError` if it cannot be read.
+    **Raises:** `OSError` if the file cannot be read.
     """
     content = path.read_bytes()
     return content.decode(json.detect_encoding(content), "surrogateescape")
@@ -25,7 +25,7 @@ def read_text(path: Path) -> str:
 def read_rows(path: Path) -> list[list[str]]:
     """Read the words of each line of a file, without blank lines and lines that begin with #.
 
-    **Raises:** `OSError` if it cannot be read.
+    **Raises:** `OSError` if the file cannot be read.
     """
     rows = (line.split() for line in read_text(path).splitlines())
     return [row for row in rows if row and not row[0].startswith("#")]
@@ -34,8 +34,8 @@ def read_rows(path: Path) -> list[list[str]]:
 def read_table(path: Path) -> Float[np.ndarray, "rows columns"]:
     """Read a table of numbers from a text file.
 
-    **Raises:** `ValueError` if it holds something else, nothing, or rows of different lengths; `OSError` if it cannot
-    be read.
+    **Raises:** `ValueError` if the file is empty, has words that are not numbers, or rows of different lengths;
+    `OSError` if it cannot be read.
     """
     try:
         rows = [[float(_NOT_FINITE.sub("nan", word)) for word in row] for row in read_rows(path)]
