@@ -2,9 +2,9 @@
 
 A solid is defined by a signed distance function, which is negative inside. All functions here have slopes of at most
 one, so their magnitude never exceeds the distance to the surface, and a ray may advance by this magnitude (Hart 1996).
-A class is *exact* if the magnitude equals the distance to the surface, and a *bound* if the magnitude may be smaller.
-The docstring of each class says which holds, provided that the solids it combines are exact. Parameters are arrays, so
-`jax.vmap` can build a batch of solids that one compiled program scans.
+A class is *exact* if the magnitude equals the distance to the surface, and a *lower bound* if the magnitude may be
+smaller. The docstring of each class says which holds, provided that the solids it combines are exact. Parameters are
+arrays, so `jax.vmap` can build a batch of solids that one compiled program scans.
 """
 
 import functools
@@ -22,7 +22,7 @@ from jaxnbv.checks import AnyArray, InputError, as_floats, check_type, is_traced
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.rotations import rotation_about, safe_norm
 
-# The converter of these fields also accepts numbers and lists, which mypy does not know.
+# Fields of these types also accept numbers and lists, which their converter makes arrays. mypy does not know this.
 if TYPE_CHECKING:
     Scalar: TypeAlias = Any
     Vector: TypeAlias = Any
@@ -64,10 +64,10 @@ def greatest(a, b):
 
 @jax.custom_jvp
 def least_of_last(values):
-    """Return the minimum along the last axis. The derivative is that of the first least entry.
+    """Return the minimum along the last axis. Its derivative is that of the first least entry.
 
-    The derivative of `jnp.min` compares the values with their minimum. If the values and the minimum are compiled
-    separately, they can differ in the last bit, and the derivative of `jnp.min` is then 0 / 0.
+    The derivative here finds this entry by its index. The derivative of `jnp.min` would compare the values with their
+    minimum. If both are compiled separately, they can differ in the last bit, and that derivative is then 0 / 0.
     """
     return jnp.min(values, axis=-1)
 
@@ -80,9 +80,9 @@ def _least_of_last_jvp(values, tangents):
 
 
 def corner_distance(*q):
-    """Return the signed distance to the solid where all q <= 0; each q is the signed distance to a plane.
+    """Return the signed distance to a corner, the solid where all q <= 0.
 
-    The planes must be orthogonal to each other.
+    - `q`: signed distances to planes that are orthogonal to each other.
     """
     outside = safe_norm(*(greatest(c, 0.0) for c in q))
     return outside + least(functools.reduce(greatest, q), 0.0)
@@ -108,11 +108,11 @@ class SignedDistance(eqx.Module):
 
     @property
     def class_label(self) -> Int[AnyArray, ""] | None:
-        """See `Surface.class_label`."""
+        """Index of the object's class; None if the object has no class."""
         return None
 
     def part_labels(self, x: Float[AnyArray, "*n 3"]) -> Int[Array, "*n"] | None:
-        """See `Surface.part_labels`."""
+        """Return the index of the part that each surface point x belongs to; None without parts."""
         return None
 
     def __check_init__(self):
@@ -170,7 +170,7 @@ class SignedDistance(eqx.Module):
 
 
 class Union(SignedDistance):
-    """The union of two solids, min(a, b). The distance is exact outside and a bound inside."""
+    """The union of two solids: the smaller of their distances, exact outside, a lower bound inside."""
 
     first: SignedDistance
     second: SignedDistance
@@ -182,8 +182,8 @@ class Union(SignedDistance):
 class SmoothUnion(SignedDistance):
     """The union of two solids with a fillet where their distances a and b differ by less than `width`.
 
-    The distance is min(a, b) - h^2 / (4 width), with h = max(width - |a - b|, 0). It is a bound. Its gradient is a
-    weighted mean of the gradients of a and b.
+    The distance is min(a, b) - h^2 / (4 width), with h = max(width - |a - b|, 0). It is a lower bound. Its gradient is
+    a weighted mean of the gradients of a and b.
     """
 
     first: SignedDistance
@@ -197,7 +197,7 @@ class SmoothUnion(SignedDistance):
 
 
 class Intersection(SignedDistance):
-    """The intersection of two solids, max(a, b). The distance is a bound outside and exact inside."""
+    """The intersection of two solids: the larger of their distances, exact inside, a lower bound outside."""
 
     first: SignedDistance
     second: SignedDistance
@@ -207,7 +207,7 @@ class Intersection(SignedDistance):
 
 
 class Difference(SignedDistance):
-    """The first solid without the second, max(a, -b). The distance is a bound outside and exact inside."""
+    """The first solid without the second: max(first, -second), exact inside, a lower bound outside."""
 
     first: SignedDistance
     second: SignedDistance
@@ -217,7 +217,7 @@ class Difference(SignedDistance):
 
 
 class Translated(SignedDistance):
-    """A solid moved by `offset`. The distance is exact if that of the solid is."""
+    """A solid moved by `offset`. The distance is exact if the distance of `solid` is exact."""
 
     solid: SignedDistance
     offset: Vector = parameter()
@@ -227,7 +227,7 @@ class Translated(SignedDistance):
 
 
 class Rotated(SignedDistance):
-    """A solid rotated about the origin by a matrix. The distance is exact if that of the solid is.
+    """A solid rotated about the origin by a matrix. The distance is exact if that of `solid` is exact.
 
     **Raises:** `ValueError` if the matrix is not a rotation, or for the same reasons as `SignedDistance`.
     """
@@ -245,7 +245,7 @@ class Rotated(SignedDistance):
 
 
 class Scaled(SignedDistance):
-    """A solid scaled about the origin by `factor` > 0. The distance is exact if that of the solid is.
+    """A solid scaled about the origin by `factor`. The distance is exact if that of `solid` is exact.
 
     **Raises:** `ValueError` if the factor is not positive.
     """

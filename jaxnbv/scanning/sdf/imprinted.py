@@ -13,7 +13,7 @@ PATTERNS = ("cross", "ring", "star", "triangle", "square")
 
 
 class ImprintedPyramid(SignedDistance):
-    """A pyramid on a square base with a pattern pressed into the base. The distance is a bound.
+    """A pyramid on a square base with a pattern pressed into the base. The distance is a lower bound.
 
     In the pyramid's own frame the base is [-1, 1]^2 at z = 0 and the apex is at (0, 0, height). A point u in this frame
     lies at `scale * rotation @ u + offset` in the scene.
@@ -42,7 +42,7 @@ class ImprintedPyramid(SignedDistance):
     def imprint(self, x: Float[AnyArray, "*n 3"]) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
         """Return the signed distance to the prism pressed into the base, and the height above the base.
 
-        Both are in scene units.
+        Both are given for each point x, in scene units.
         """
         u, v, w = self._own(x)
         return self.scale * self._imprint(u, v, w), self.scale * w
@@ -65,9 +65,9 @@ class ImprintedPyramid(SignedDistance):
 
 
 def pattern_distance(pattern: Int[Array, ""], x: Float[Array, "*n"], y: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Return the signed distance (negative inside) to a pattern within the unit circle.
+    """Return the signed distance (negative inside) from points (x, y) to a pattern in the unit circle.
 
-    The distance is a bound: its magnitude may be smaller than the distance to the pattern's edge.
+    The distance is a lower bound: its magnitude may be smaller than the distance to the pattern's edge.
 
     - `pattern`: index in `PATTERNS`. All five patterns are evaluated, so that scenes of all classes share one compiled
       program.

@@ -7,12 +7,12 @@ from jaxnbv.checks import AnyArray
 from jaxnbv.geometry.rotations import safe_norm
 from jaxnbv.scanning.sdf.base import SignedDistance, corner_distance, least_of_last, nonnegative, parameter
 
-# Label of an unused slot. All unions have the same number of slots, and each primitive takes one slot.
+# Label of an unused slot. All unions have arrays with the same number of slots, and each primitive takes one slot.
 UNUSED = -1
 
 
 class LabelledSolid(SignedDistance):
-    """The union of labelled rounded boxes and solids of revolution. The distance is a bound.
+    """The union of labelled rounded boxes and solids of revolution. The distance is a lower bound.
 
     A point x has the coordinates u = rotation^T (x - centre) in the frame of a primitive. With h = half_size and
     t = rounding, the distance to the box [-h, h] rounded by t is
@@ -63,6 +63,6 @@ class LabelledSolid(SignedDistance):
     def part_labels(self, x: Float[AnyArray, "*n 3"]) -> Int[Array, "*n"]:
         """Return the label of the primitive whose surface is nearest to each point x.
 
-        Distances to primitives are bounds, so the label is reliable only for points on the surface of the union.
+        Distances to primitives are lower bounds, so the label is reliable only for points on the surface of the union.
         """
         return self.labels[jnp.argmin(jnp.abs(self.distances(x)), axis=-1)]

@@ -19,7 +19,7 @@ _PADDING = 0.1
 class Sampled(SignedDistance):
     """A solid whose signed distance is interpolated linearly between the nodes of a grid.
 
-    The distance is accurate to about a cell inside the grid, and a bound outside the grid.
+    The distance is accurate to about a cell inside the grid, and a lower bound outside the grid.
 
     - `values`: signed distance at each node.
     - `low`, `spacing`: position of the first node, and the distance between neighbouring nodes.
@@ -53,7 +53,7 @@ def solid_of_mesh(
     Inside and outside follow from winding numbers, so the mesh may have holes.
 
     - `resolution`: number of nodes along the longest side of the grid.
-    - `sheet`: thickness that is given to faces with the outside on both sides. With 0, such faces vanish.
+    - `sheet`: thickness that is given to faces with the outside on both sides. If it is 0, such faces vanish.
     - `cubic`: use `resolution` nodes along all sides, so that the solids of different meshes can be stacked.
 
     **Raises:** `ValueError` if the triangles are invalid (see `TriangleMesh.from_arrays`), all vertices coincide, or
