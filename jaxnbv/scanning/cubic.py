@@ -1,7 +1,7 @@
-"""The cubic polynomial that a cell's trilinear interpolant is along a ray, and the first root of this cubic.
+"""The cubic polynomial of a cell's trilinear function along a ray, and the first root of this cubic.
 
-A batch of n vectors is a list of components (n,), in coordinates local to the cell. A batch of n cubics is a list of
-coefficients (n,), constant first.
+A batch of n vectors is a list of three components (n,). In their coordinates the cell is [0, 1]^3. A batch of n cubics
+is a list of four coefficients (n,), constant first.
 """
 
 import jax
@@ -14,13 +14,13 @@ _ROOT_ITERATIONS = 8
 
 
 def cubic(corners: list, a: list, b: list) -> list[Float[Array, " n"]]:
-    """Return the coefficients c_0, ..., c_3 in s of the trilinear function along a + s b.
+    """Return the coefficients of the cubic polynomials of trilinear functions along rays.
 
-    The corner values are interpolated linearly along z, y and x in turn. Each step raises the degree of the polynomials
-    by one.
+    On the ray a + s b the function is c_0 + c_1 s + c_2 s^2 + c_3 s^3. The corner values are interpolated linearly
+    along z, y and x in turn, and each of these steps raises the degree by one.
 
-    - `corners`: values at the cell's corners, in the order of `CORNERS`.
-    - `a`, `b`: start and direction of the rays, in coordinates local to the cell.
+    - `corners`: values of the functions at the corners of their cells, in the order of `CORNERS`.
+    - `a`, `b`: start and direction of the rays, in coordinates in which the cell is [0, 1]^3.
     """
     polynomials = [[corner] for corner in corners]
     for x, dx in ((a[2], b[2]), (a[1], b[1]), (a[0], b[0])):
@@ -38,8 +38,10 @@ def first_bracket(c: list) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
     """Return an s for which [0, s] holds only the first root of each cubic, and whether [0, 1] has a root.
 
     If a cubic is positive at 0 but not at its local minimum, there is exactly one root before the minimum, and s is the
-    minimum. Otherwise s is 1: a cubic that is positive at 0 then has one root in [0, 1] if it is not positive at 1, and
-    none if it is. A cubic that is not positive at 0 counts as having its first root there.
+    position of the minimum. Otherwise s is 1: a cubic that is positive at 0 then has one root in [0, 1] if it is not
+    positive at 1, and none if it is. A cubic that is not positive at 0 counts as having its first root there.
+
+    - `c`: the coefficients, constant first.
     """
     discriminant = c[2] * c[2] - 3.0 * c[3] * c[1]
     root = jnp.sqrt(jnp.maximum(discriminant, 0.0))
@@ -54,11 +56,14 @@ def first_bracket(c: list) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
 
 
 def first_root(c: list) -> Float[Array, " n"]:
-    """Return the first root in [0, 1] of cubics that have one; 0 for cubics that are not positive at 0.
+    """Return the first root in [0, 1] of each cubic, which must have one.
 
-    The root is found by Newton's method. A step that leaves the bracket by more than the rounding error is replaced by
-    bisection. The tolerance is needed because compiled code may compute the same value twice with different rounding,
-    and then the bracket may end just beside the root.
+    The root is 0 for a cubic that is not positive at 0. `first_bracket` returns an interval that holds only the first
+    root, and Newton's method finds the root in it. A step that leaves the interval by more than the rounding error is
+    replaced by bisection. This tolerance is needed because compiled code may compute the same value twice with
+    different rounding, and then the interval may end just beside the root.
+
+    - `c`: the coefficients, constant first.
     """
     high, _ = first_bracket(c)
     drop = c[0] - _polynomial(c, high)

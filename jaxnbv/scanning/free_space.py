@@ -22,7 +22,7 @@ from jaxnbv.geometry.volume import Box, Volume
 from jaxnbv.programs import program
 from jaxnbv.scanning.grid import Grid
 
-# Fraction of points that may lie more than two margins outside the volume. Noise moves fewer points of a face that far.
+# Fraction of points that may lie more than two margins outside the volume. Noise moves fewer points than this so far.
 _STRAY = 0.01
 
 
@@ -70,7 +70,8 @@ class Carving(eqx.Module):
 
         All nodes are False if the scan is a cloud that is not a sensor's image (`missed` is None).
 
-        - `barrier`: distance along each ray to an obstacle. A ray that misses shows nothing behind the obstacle.
+        - `barrier`: distance along each ray to the first obstacle, see `Obstacles.barrier`. A ray that hits no surface
+          shows that space is empty only up to the obstacle.
         """
         if scan.missed is None:
             return jnp.zeros((grid.resolution,) * 3, bool)
@@ -84,16 +85,16 @@ class Carving(eqx.Module):
 
     @program
     def outside(self, grid: Grid) -> Bool[Array, "g g g"]:
-        """Return, for each node, whether it lies more than two margins outside the volume."""
+        """Return, for each node, whether it is more than two margins (`margin_voxels`) outside the volume."""
         axis = jnp.asarray(grid.axis, jnp.result_type(float))
         return on_tensor_grid(self.volume, axis) > self._beyond_volume(grid)
 
     def with_room(self, box: Box, grid: Grid, frame: Frame) -> Box:
-        """Move all faces of a box (world coordinates) but the lower one outward by two margins / sqrt(3).
+        """Return a larger box: all faces but the lower one are moved outward by two margins / sqrt(3).
 
-        The corners of the wider box are then at most two margins from the original box, so points in the wider box
-        still count as inside the volume. A scan cropped to the wider box shows that the surface goes on where the
-        original box cuts it.
+        Both boxes are in world coordinates. The margin is `margin_voxels` spacings of the grid. The corners of the
+        larger box are at most two margins from the original box, so points in the larger box still count as inside the
+        volume. A scan cropped to the larger box shows that the surface goes on where the original box cuts it.
         """
         return frame.to_world(frame.to_scene(box).widened(self._beyond_volume(grid) / math.sqrt(3.0)))
 
@@ -106,7 +107,7 @@ class Carving(eqx.Module):
         return on_tensor_grid(self.volume, jnp.asarray(grid.axis, jnp.result_type(float))) < 0
 
     def check_inside(self, cloud: PointCloud, grid: Grid) -> None:
-        """Check that the volume, widened by two margins, holds the cloud.
+        """Check that the volume, widened by two margins (`margin_voxels`), holds the cloud.
 
         Carving would cut the object otherwise. Because of noise, up to 1 % of the points may lie outside.
 
@@ -127,10 +128,11 @@ class Carving(eqx.Module):
 def carve(values: Float[Array, "*s g g g"], empty: Bool[Array, "g g g"]) -> Float[Array, "*s g g g"]:
     """Return node values in which all empty nodes are positive, that is, outside the surface.
 
-    - `values`: f minus its level at the nodes.
+    The new value of an empty node is twice the largest magnitude among the node and its neighbours. So on the edge from
+    an inside node to an empty node, the surface lies in the third of the edge next to the inside node.
 
-    The new value of an empty node is twice the largest magnitude among the node and its neighbours. So the surface
-    crosses an edge between an inside node and an empty node within a third of the edge from the inside node.
+    - `values`: values of a function at the nodes, minus the level that the function has on the surface.
+    - `empty`: whether each node was seen to be empty.
     """
     magnitude = jnp.maximum(jnp.abs(values), jnp.finfo(values.dtype).tiny)
     for axis in (-3, -2, -1):
@@ -142,7 +144,7 @@ def carve(values: Float[Array, "*s g g g"], empty: Bool[Array, "g g g"]) -> Floa
 
 @program
 def _beyond(volume: Volume, cloud: PointCloud, limit: float) -> tuple[Int[Array, ""], Float[Array, ""]]:
-    """Return the number of points farther than `limit` outside the volume, and the distance of the farthest point."""
+    """Return the number of points more than `limit` outside the volume, and the largest signed distance."""
     # Evaluate all rows, so that clouds with different counts share a compilation.
     distance = jnp.where(cloud.mask, volume(cloud.points), -jnp.inf)
     # The comparison is negated so that NaN counts as outside.
@@ -150,10 +152,10 @@ def _beyond(volume: Volume, cloud: PointCloud, limit: float) -> tuple[Int[Array,
 
 
 def _crossed(grid: Grid, depth: Float[Array, "h w"], camera: Camera, pose: Pose, margin: float) -> Bool[Array, "g g g"]:
-    """Return, for each node, whether all rays that pass it within `margin` stayed empty to `margin` beyond it.
+    """Return, for each node, whether all rays near it stayed empty to at least `margin` beyond it.
 
     - `depth`: depth along the camera's axis up to which each pixel's ray was empty.
-    - `margin`: in scene units.
+    - `margin`: a ray is near a node if it passes within this length of the node, in scene units.
     """
     # nearest[k] is the least depth within 2^k pixels of each pixel. Pixels beyond the border are ignored.
     nearest = [_least_within(depth, 1)]
@@ -174,8 +176,8 @@ def _crossed(grid: Grid, depth: Float[Array, "h w"], camera: Camera, pose: Pose,
         # The node must have rays on all sides.
         inside = (place >= 0.5) & (place <= jnp.array([[camera.width - 0.5], [camera.height - 0.5]]))
         column, row = jnp.floor(place).astype(jnp.int32)
-        # The image of a ball about the node lies within this radius, in pixels. The factor 1 + a^2 + b^2 bounds its
-        # stretch off the axis. One pixel is added to include the rays on both sides.
+        # The image of the ball of radius `margin` about the node lies within this radius, in pixels. The factor
+        # 1 + a^2 + b^2 bounds its stretch off the axis. One pixel is added to include the rays on both sides.
         radius = max(camera.focal_lengths) * margin / (safe - margin) * (1.0 + a**2 + b**2) + 1.0
         radius = jnp.ceil(radius)
         level = jnp.floor(jnp.log2(radius)).astype(jnp.int32)
@@ -195,7 +197,7 @@ def _crossed(grid: Grid, depth: Float[Array, "h w"], camera: Camera, pose: Pose,
 
 
 def _least_within(image: Float[Array, "h w"], pixels: int) -> Float[Array, "h w"]:
-    """Return the minimum of each pixel and the eight pixels that are `pixels` rows or columns away from it.
+    """Return the minimum of each pixel and its eight neighbours at a distance of `pixels` rows or columns.
 
     Pixels beyond the border count as infinite.
     """

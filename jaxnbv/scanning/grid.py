@@ -20,8 +20,8 @@ from jaxnbv.scanning import tracing
 from jaxnbv.scanning.scanner import Hits, Surface, scan
 from jaxnbv.sharding import on_cpu, shared_map
 
-# Two normals count as opposite if the cosine between them is below `_OPPOSITE`. `Grid.check` warns if more than this
-# fraction of the points lies on thin parts.
+# Two normals count as opposite if the cosine between them is below `_OPPOSITE`. `Grid.check` warns if more than the
+# fraction `_THIN_SHARE` of the points lies on thin parts.
 _OPPOSITE, _THIN_SHARE = -0.8, 0.05
 
 
@@ -57,7 +57,7 @@ class Grid(eqx.Module):
     def check(self, cloud: PointCloud) -> None:
         """Warn if many points lie on parts thinner than a cell.
 
-        A point counts as such if a point with the opposite normal is closer than a cell.
+        A point lies on a thin part if a point with the opposite normal is less than a cell's width away.
         """
         points, normals = cloud.to_numpy()
         pairs = cKDTree(points).query_pairs(self.spacing, output_type="ndarray")
@@ -82,9 +82,9 @@ class GridSurface(Surface):
     Rays are traced exactly. They hit nothing outside the grid's box. A ray that starts outside the box is traced from
     the point where it enters the box.
 
-    - `values`: f minus its level at the nodes; positive outside the solid.
-    - `distance`: lower bound, in cells, on the distance from each cell to the nearest cell in which f changes sign,
-      with the sign of f (`tracing.free_distance`).
+    - `values`: values of a function f at the nodes, minus the level of f on the surface; positive outside the solid.
+    - `distance`: lower bound, in cells, on the distance from each cell to the nearest cell in which the values change
+      sign; negative inside the solid (`tracing.free_distance`).
     - `is_void`: whether a sensor cannot see the surface in each cell. A ray whose first zero is in such a cell misses.
       None if there are no such cells.
     """
@@ -123,15 +123,15 @@ class GridSurface(Surface):
 
     @program
     def trace(self, origins: Float[AnyArray, "rays 3"], directions: Float[AnyArray, "rays 3"]) -> Hits:
-        """Return the first zeros along the rays inside the box; see `Surface.trace`.
+        """Return the first zeros along the rays inside the grid's box; see `Surface.trace`.
 
         A ray starts at its origin or, if the origin is outside the box, where the ray enters the box. The hit is the
         first point at which the sign of the interpolant differs from its sign at the start. Zero counts as negative.
         Normals are central differences at the nodes, interpolated linearly, so they are continuous.
 
-        Hits are differentiable in origins, directions and values. At a hit x = o + t d the implicit function theorem
-        gives dt = -(df + grad f . (do + t dd)) / (grad f . d). The denominator is kept away from zero for grazing
-        rays, so |dt| is at most about 34 |dx|.
+        Hits are differentiable in origins o, directions d and values f. At a hit o + t d the implicit function theorem
+        gives dt = -(df + grad f . dx) / (grad f . d), with dx = do + t dd. The denominator is kept away from zero for
+        grazing rays, so |dt| is at most about 34 |dx| if f is fixed.
 
         **Raises:** `ValueError` for a batch of surfaces.
         """
@@ -160,12 +160,15 @@ class GridSurface(Surface):
 def scan_samples(
     surfaces: GridSurface, camera: Camera, poses: Pose, barrier: Float[Array, "poses rays"] | None = None
 ) -> PointCloud:
-    """Scan each surface of a batch from each pose of a batch. Leading axes are (surfaces, poses)."""
+    """Scan each surface of a batch from each pose of a batch. Leading axes are (surfaces, poses).
+
+    - `barrier`: distance along each ray to the first obstacle, see `Obstacles.barrier`.
+    """
     return shared_map(scan, surfaces, camera, poses, barrier, at_once=samples_at_once(camera, poses))
 
 
 def samples_at_once(camera: Camera, poses: Pose) -> int:
-    """Return the number of samples to scan together from a batch of poses.
+    """Return the number of sampled surfaces to scan together from a batch of poses.
 
     On a CPU this is one, so that the scans of a sample stay in the cache. On a GPU it is the number that gives about
     eight million rays, and at least one.
@@ -192,7 +195,7 @@ def mean_depth(scans: PointCloud, pose: Pose) -> Float[Array, " rays"]:
 def _prepared(
     values: Float[Array, "*s g g g"], level: Float[Array, ""]
 ) -> tuple[Float[Array, "*s g g g"], Bool[Array, ""], Int8[Array, "*s m m m"]]:
-    """Return the values minus the level, whether all of them are finite, and `tracing.free_distance` of each cell."""
+    """Return the values minus the level, whether all are finite, and each cell's `tracing.free_distance`."""
     values = values - level
     distances = shared_map(tracing.free_distance, values.reshape(-1, *values.shape[-3:]))
     return values, jnp.isfinite(values).all(), distances.reshape(*values.shape[:-3], *distances.shape[1:])

@@ -1,9 +1,9 @@
 """The surface that earlier views have measured, and how far each view saw.
 
-The cloud D is thinned to its capacity, so surface between its points may have been measured too. This module stores the
-hits of all rays instead, which show the measured surface at the resolution of the sensor. If a view should have seen a
-sampled surface but did not measure it, later views will not measure it either: the surface does not exist, or it is too
-dark or too shiny for the sensor.
+The observed cloud is thinned, so surface between its points may have been measured too. This module stores the hits of
+all rays instead, which show the measured surface at the resolution of the sensor. If a view should have seen a sampled
+surface but did not measure it, later views will not measure it either: the surface does not exist, or it is too dark or
+too shiny for the sensor.
 """
 
 import dataclasses
@@ -40,9 +40,9 @@ class Looks(eqx.Module):
 
     - `distance`: distance from each node of the grid to the nearest surface that a pixel measured, in scene units, at
       most `reach`.
-    - `sight`: how far each view saw along the rays of `camera` (see `PointCloud`); zero for a ray outside the image of
-      the view.
-    - `camera`: a copy of the sensor that keeps every few rows and columns, to limit the number of rays.
+    - `sight`: distance from each view's position to what it saw along each ray of `camera`, in scene units; infinite if
+      the ray met nothing, and zero for a ray outside the image of the view.
+    - `camera`: a copy of the sensor's camera with only every k-th row and column, to limit the number of rays.
     """
 
     distance: Float[Array, "g g g"]
@@ -52,7 +52,7 @@ class Looks(eqx.Module):
 
     @classmethod
     def empty(cls, grid: Grid, camera: Camera, max_views: int) -> "Looks":
-        """Return the `Looks` before the first view, for a sensor `camera` and at most `max_views` views."""
+        """Return a `Looks` without views that has room for `max_views` views of the sensor's camera."""
         camera = camera.strided(math.ceil(math.sqrt(camera.num_rays / _RAYS)))
         far = jnp.full((grid.resolution,) * 3, _REACH * grid.spacing, jnp.result_type(float))
         return cls(far, jnp.zeros((max_views, camera.num_rays), far.dtype), camera, grid)
@@ -64,7 +64,7 @@ class Looks(eqx.Module):
 
     @program
     def with_points(self, cloud: PointCloud, radii: Float[Array, " n"] | float = 0.0) -> "Looks":
-        """Return a copy with the points of a cloud added as hits.
+        """Return a copy with the points of a cloud added to the measured surface.
 
         - `radii`: radius of the surface that was measured around each point, in scene units. Radii above a spacing of
           the grid are reduced to it.
@@ -96,7 +96,8 @@ class Looks(eqx.Module):
 
         - `index`: index of the view, from 0.
         - `pose`, `scan`, `camera`: the view's pose, its scan, and the camera that took the scan.
-        - `barrier`: distance along each ray of the camera to an obstacle. The view saw nothing behind the obstacle.
+        - `barrier`: distance along each ray of the camera to the first obstacle. The view saw nothing behind the
+          obstacle.
         """
         # The radius is half the diagonal of a pixel on the surface, so that surface between the rays of a coarse image
         # counts as measured.
@@ -110,9 +111,11 @@ class Looks(eqx.Module):
         return dataclasses.replace(looks, sight=looks.sight.at[index].set(sight.astype(looks.sight.dtype)))
 
     def __call__(self, x: Float[Array, "*n 3"]) -> Float[Array, "*n"]:
-        """Return the distance from each point x to the nearest hit, at most `reach`. Differentiable in x.
+        """Return the distance from each point x to the nearest measured surface, in scene units.
 
-        The distance is interpolated linearly between nodes, so it can be up to half a spacing at a hit.
+        Distances of `reach` or more are returned as `reach`. The distances are stored at the nodes of a grid and
+        interpolated linearly, so on a measured surface the result is not zero, but up to half the spacing of the nodes.
+        The result is differentiable in x (scene coordinates).
         """
         places = list(jnp.moveaxis((x + self.grid.half_extent) / self.grid.spacing, -1, 0))
         return jax.scipy.ndimage.map_coordinates(self.distance, places, order=1, mode="nearest")
@@ -123,17 +126,18 @@ class Looks(eqx.Module):
 
         The removed cells are those of `unmeasured_cells` for all views, and the cells next to them.
 
-        - `surfaces`: a batch along a leading axis.
+        - `surfaces`: the sampled surfaces, a batch along a leading axis.
         - `poses`: the poses of the views.
         """
         return surfaces.without_cells(shared_map(_unmeasured_by_any, surfaces, self, poses))
 
     def unmeasured_cells(self, surface: Surface, index: Int[Array, ""] | int, pose: Pose) -> Int[Array, "rays 3"]:
-        """Return the cells of hits on a surface that the view should have measured but did not, one per ray.
+        """Return, for each ray of a view, the cell of its hit on a surface if the hit is unmeasured.
 
-        The view should have measured the hit if the surface faces the camera and the ray saw as far as the hit, or if
-        the ray passed the hit and went on to something deeper. The view did not measure the hit if no stored hit lies
-        within a spacing of it. Other rays get an index beyond the grid's cells.
+        A hit is unmeasured if the view should have measured it, but no measured surface lies within a spacing of the
+        grid. The view should have measured a hit if the surface faces the camera there and the view saw as far as the
+        hit, or if the view's ray passed the hit and went on to something deeper. All other rays get an index beyond the
+        grid's cells.
 
         - `surface`: the sampled surface.
         - `index`: index of the view, from 0.

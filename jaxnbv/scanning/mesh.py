@@ -172,8 +172,10 @@ def level_triangles(
 ) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"], Float[np.ndarray, "v 3"]] | None:
     """Return vertices, faces and vertex normals of the zero set of `values`; None if the set is empty.
 
-    The triangles come from marching cubes. Values are positive outside. Faces are wound outward, and normals have unit
-    length and point outward.
+    The triangles come from marching cubes, in scene coordinates. Faces are wound outward, and normals have unit length
+    and point outward.
+
+    - `values`: one value per node of the grid, positive outside the solid.
     """
     if not values.min() < 0 < values.max():
         return None

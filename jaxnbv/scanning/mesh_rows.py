@@ -32,7 +32,7 @@ def without_mark(content: bytes) -> bytes:
 
 
 def read_obj(content: bytes) -> dict[str, Triangles]:
-    """Read the triangles of each material of an OBJ file. Polygons are cut into fans.
+    """Read the triangles of an OBJ file, keyed by material name. Polygons are cut into triangle fans.
 
     **Raises:** `ValueError` for a vertex or a face that is not a row of numbers.
     """
@@ -106,7 +106,7 @@ def triangles_of(polygons: Sequence[Sequence[int]] | Sequence[np.ndarray] | np.n
 
 
 def _used(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Triangles:
-    """Drop the vertices that no triangle uses. Triangles with an index out of range are returned unchanged."""
+    """Drop the vertices that no triangle uses. If an index is out of range, return all unchanged."""
     if not len(faces) or faces.min() < 0 or faces.max() >= len(vertices):
         return vertices, faces
     rows, faces = np.unique(faces, return_inverse=True)

@@ -17,7 +17,7 @@ from jaxnbv.scanning.mesh import TriangleMesh, mesh_from_sdf
 from jaxnbv.scanning.scanner import Surface
 from jaxnbv.scanning.sphere_tracing import SDFSurface
 
-# The authors' number of sample points on each of the two surfaces.
+# Number of points that the paper's authors sample on each of two surfaces to compare the surfaces.
 SURFACE_POINTS = 20_000
 # Least cosine of incidence. A pixel whose cosine is smaller is treated as if its cosine had this value.
 GRAZING = 0.2
@@ -32,8 +32,8 @@ def coverage(views: Iterable[Any], truth: Float[AnyArray, "n 3"], size: float = 
 
     - `views`: the views of an episode, or other objects with the attributes `scan`, `camera` and `pose`.
     - `truth`: points on the true surface, in scene coordinates.
-    - `size`: largest distance along the ray between a point and the hit of its pixel, in scene units. It must be well
-      above the sensor noise.
+    - `size`: largest distance along the ray between a covered point and the hit of its pixel, in scene units. It must
+      be well above the sensor noise.
 
     **Raises:** `ValueError` if `truth` is empty or not finite, `size` <= 0, or a scan does not have one row per ray of
     its camera.
@@ -53,8 +53,8 @@ def is_shown(
 ) -> Bool[np.ndarray, " n"]:
     """Return, for each point of the true surface, whether a scan shows the point.
 
-    The scan shows a point if the distances from the camera to the point and to the hit of its pixel differ by at most
-    `size` plus a tolerance. The tolerance is the change of distance within half a pixel on the plane of the hit.
+    The scan shows a point if the point and the hit of its pixel are at the same distance from the camera, up to `size`
+    plus a tolerance. The tolerance is the change of distance within half a pixel on the plane of the hit.
 
     **Raises:** `ValueError` if the scan does not have one row per ray of the camera.
     """
@@ -114,7 +114,7 @@ class SurfaceDistance(NamedTuple):
 
     @property
     def chamfer(self) -> float:
-        """Chamfer distance: accuracy + completeness. The paper's numbers have the size of this sum."""
+        """Chamfer distance: accuracy + completeness. The paper's values have the magnitude of this sum."""
         return self.accuracy + self.completeness
 
 

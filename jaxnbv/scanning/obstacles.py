@@ -73,13 +73,13 @@ class Obstacles(eqx.Module):
         return eqx.tree_at(lambda obstacles: obstacles.clutter, self, clutter, is_leaf=lambda leaf: leaf is None)
 
     def distance(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
-        """Return the signed distance from each point to the nearest solid; infinite if there are no solids."""
+        """Return the signed distance from each point x to the nearest solid; infinite if there are no solids."""
         return _distance(self.solids, x)
 
     def barrier(self, camera: Camera, poses: Pose) -> Float[Array, "*batch rays"] | None:
         """Return the distance along each ray of a camera to the first obstacle, clutter included.
 
-        The distance is infinite for a ray that meets no obstacle. Returns None if there are no obstacles at all.
+        The distance (scene units) is infinite for a ray that meets no obstacle. Returns None if there are no obstacles.
         """
         if not self._all:
             return None
@@ -91,7 +91,7 @@ class Obstacles(eqx.Module):
 
     @program
     def remove_points(self, scan: PointCloud) -> PointCloud:
-        """Remove the points that belong to solids from a scan. In a sensor's image, their rays become missed."""
+        """Remove the points of solids from a scan. In a sensor's image, their rays then count as missed."""
         own = scan.mask & (self.distance(scan.points) < self.margin)
         missed = None if scan.missed is None else scan.missed | own
         return dataclasses.replace(scan.only(~own), missed=missed)
@@ -103,9 +103,9 @@ class Obstacles(eqx.Module):
         return on_tensor_grid(lambda x: self.distance(x) < 0, axis)
 
     def violation(self, poses: Pose, cloud: PointCloud) -> Float[Array, " poses"]:
-        """Return the length by which each camera is closer to an obstacle or to the cloud D than `clearance`.
+        """Return by how much each camera is closer than `clearance` to an obstacle or a point of the cloud.
 
-        The length is in scene units, zero for a camera that is far enough away, and differentiable in the poses.
+        The result is in scene units, zero for a camera that is far enough away, and differentiable in the poses.
         """
         to_cloud = jnp.sqrt(jnp.maximum(nearest_squared_distance(poses.position, cloud), 1e-12))
         return jnp.maximum(self.clearance - jnp.minimum(_distance(self._all, poses.position), to_cloud), 0.0)

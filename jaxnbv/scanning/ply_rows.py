@@ -20,7 +20,7 @@ _Property: TypeAlias = tuple[str, np.dtype, np.dtype | None]
 
 
 def read_ply(content: bytes) -> Triangles:
-    """Read the triangles of a PLY file, from its faces, which are cut into fans, and its triangle strips.
+    """Read the triangles of a PLY file: its faces, which are cut into fans, and its triangle strips.
 
     **Raises:** `ValueError` for an invalid header, missing rows, or entries that are not numbers.
     """
@@ -42,7 +42,7 @@ def read_ply(content: bytes) -> Triangles:
 
 
 def _header(text: str) -> tuple[str, dict[str, tuple[int, list[_Property]]]]:
-    """Return the encoding of a PLY file, and the number of rows and the properties of each element by name."""
+    """Return the encoding of a PLY file, and by name of each element, its row count and its properties."""
     encoding, elements = "", dict[str, tuple[int, list[_Property]]]()
 
     def kind_of(word: str) -> np.dtype:
@@ -66,7 +66,7 @@ def _header(text: str) -> tuple[str, dict[str, tuple[int, list[_Property]]]]:
 def _element(
     body: bytes, start: int, element: str, count: int, properties: list[_Property]
 ) -> tuple[dict[str, Any], int]:
-    """Return the columns of an element by property name, and the byte at which the element ends.
+    """Return the columns of one element, keyed by property name, and the byte at which the element ends.
 
     - `start`: the byte of the file's body at which the element starts.
     - `element`: name of the element.
@@ -96,9 +96,9 @@ def _element(
 
 
 def _row(body: bytes, start: int, properties: list[_Property], message: str) -> tuple[list[np.ndarray], int]:
-    """Return the values of a row, and the byte at which the row ends.
+    """Return the values of a row that begins at the byte `start`, and the byte at which the row ends.
 
-    **Raises:** `ValueError` with this message if the file ends before the row does.
+    **Raises:** `ValueError` with `message` if the file ends before the row does.
     """
     row: list[np.ndarray] = []
     for _, kind, length in properties:
@@ -115,8 +115,8 @@ def _row(body: bytes, start: int, properties: list[_Property], message: str) -> 
 def _of_strips(strips: Iterable[np.ndarray]) -> Int[np.ndarray, "f 3"]:
     """Convert triangle strips to triangles.
 
-    A row may hold several strips, separated by -1. Every second triangle of a strip is reversed, so that all triangles
-    have the same winding.
+    An array of `strips` has the vertex indices of one strip, or of several strips separated by -1. Every second
+    triangle of a strip is reversed, so that all triangles have the same winding.
     """
     faces = [np.zeros((0, 3), np.int64)]
     for strip in strips:

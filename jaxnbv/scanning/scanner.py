@@ -111,8 +111,8 @@ class SensorNoise(eqx.Module):
     ) -> PointCloud:
         """Return the cloud with noise on its filled rows. `camera` is ignored.
 
-        If `pose` is given, `sight` becomes the distance from the pose to the noisy points, because the old `sight`
-        would reveal the exact ranges.
+        The field `sight` of the cloud would reveal the exact distances to the hits. So if the camera's `pose` is given,
+        `sight` becomes the distance from the pose to the noisy points.
         """
         point_key, normal_key = jax.random.split(key)
         points = cloud.points + self.points * jax.random.normal(point_key, cloud.points.shape, cloud.points.dtype)
@@ -207,7 +207,7 @@ Noise: TypeAlias = SensorNoise | DepthNoise
 def distance_problem(pose: Pose) -> str | None:
     """Return a message if a pose is so far from the scene that its unit must be wrong, else None.
 
-    Accepts a pose or a batch of poses, which JAX must not be tracing.
+    Accepts a pose or a batch of poses, but not under JAX transformations.
     """
     distance = float(np.linalg.norm(np.asarray(pose.position), axis=-1).max(initial=0.0))
     if distance <= _FAR_OFF:
@@ -224,13 +224,13 @@ def scan(
 ) -> PointCloud:
     """Return the scan of a surface from a pose: one row per pixel, without noise.
 
-    A row is missed if its ray hits nothing within the camera's range. A row is invalid if the hit is nearer than the
-    range, or if its angle of incidence is too large. Points are in scene coordinates. Normals have unit length and
+    A row is missed if its ray hits nothing within the camera's range. A row is invalid if the hit is too near for the
+    camera, or if its angle of incidence is too large. Points are in scene coordinates. Normals have unit length and
     point towards the sensor. Poses with leading axes give clouds with the same leading axes. To add noise, apply a
     `SensorNoise` or `DepthNoise` to the result.
 
-    - `barrier`: distance along each ray to an obstacle (`Obstacles.barrier`). A ray that reaches the obstacle before
-      the surface counts as missed.
+    - `barrier`: distance along each ray to the first obstacle (`Obstacles.barrier`). A ray that reaches the obstacle
+      before the surface counts as missed.
 
     Runs under `jit` if `surface.in_jit`. Warns if the scan is empty and the camera is so far away that the unit of its
     pose must be wrong.
@@ -252,7 +252,7 @@ def _returns(
     pose: Pose,
     barrier: Float[Array, "*batch rays"] | None,
 ) -> PointCloud:
-    """Return the scan that consists of the hits that the sensor measures."""
+    """Return the scan that consists of the hits that the sensor can measure."""
     shape = origins.shape[:-1]
     mask = hits.mask.reshape(shape)
     points, normals = hits.points.reshape(*shape, 3), hits.normals.reshape(*shape, 3)
@@ -282,16 +282,17 @@ def implicit_depth(
     mask: Bool[Array, " n"],
     grazing: Float[Array, " n"],
 ) -> Float[Array, " n"]:
-    """Return the depths t at which n rays meet a surface, with derivatives in the arrays of `along`.
+    """Return `depth` unchanged, but with derivatives from the implicit function theorem.
 
-    The derivative dt = -(df/dtheta dtheta) / (df/dt) follows from f(theta, t(theta)) = 0. This rule can itself be
+    A ray meets the surface at a depth t where a function f is zero. f and t depend on parameters theta of the ray and
+    of the surface: f(theta, t(theta)) = 0. So dt = -(df/dtheta dtheta) / (df/dt). This rule can itself be
     differentiated, so derivatives of higher order are right too.
 
-    - `along`: a module that returns f at a depth along each ray. Its arrays are the parameters theta.
-    - `depth`: the roots of f, computed by any method. They are returned unchanged.
-    - `mask`: whether each ray hits. The derivative is zero for rays that do not hit.
-    - `grazing`: least slope |df/dt|. A smaller slope is replaced by this value with the slope's sign, since the
-      derivative is unbounded for a ray that runs along the surface.
+    - `along`: a module that returns f at a given depth along each of n rays. Its arrays are the parameters theta.
+    - `depth`: depth t of a root of f on each ray, computed by any method.
+    - `mask`: whether each ray hits the surface. The derivative is zero for rays that miss.
+    - `grazing`: least slope |df/dt| for each ray. A smaller slope is replaced by this value with the slope's sign,
+      since the derivative is unbounded for a ray that runs along the surface.
     """
     return depth
 

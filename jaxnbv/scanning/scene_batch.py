@@ -58,7 +58,7 @@ def _traceable(scene: Any, name: str) -> Surface:
 
 
 def _structure(surface: Surface) -> Any:
-    """Return the structure, array shapes and static values, which surfaces must have in common to be stacked."""
+    """Return the structure, array shapes and static values, which surfaces must share to be stacked."""
     arrays, rest = eqx.partition(surface, eqx.is_array)
     return jax.tree.structure(arrays), list(map(np.shape, jax.tree.leaves(arrays))), jax.tree.leaves(rest)
 

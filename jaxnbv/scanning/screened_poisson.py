@@ -24,7 +24,7 @@ def screened_poisson(cloud: PointCloud, depth: int = 8) -> TriangleMesh:
 
     MeshLab computes the surface by the method of Kazhdan and Hoppe (2013). The mesh is in scene coordinates (its frame
     is the identity), and its faces are wound outward. Every run gives the same mesh. The mesh bridges gaps in the scan.
-    It is open where the surface leaves a cube of 1.1 times the cloud's size.
+    It ends where the surface leaves a cube of 1.1 times the cloud's size, and is open there.
 
     - `depth`: depth of the octree. The smallest details have 1 / 2^depth of the cloud's size, if points are that dense.
 

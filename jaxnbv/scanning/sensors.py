@@ -25,7 +25,8 @@ SENSOR_RADIUS = USUAL_SETTING.radius
 def fit_distance(setting: Setting, bounding_radius: float) -> Setting:
     """Return the setting with a distance from which an image shows the whole object, from any side.
 
-    The camera must have a square image. The object's bounding ball is enlarged by 5 %:
+    The camera must have a square image. With its field of view fov and 5 % of room around the object, the distance is
+    the `radius` in
 
         sin(fov / 2) = 1.05 bounding_radius / radius
 

@@ -38,8 +38,8 @@ class SDFSurface(Surface):
     stride. A ray may miss a part that is thinner than 0.001 along the ray. A ray at an angle of less than a degree to a
     flat face may use up its 512 strides and miss the face.
 
-    Hits are differentiable in the rays and in the solid's parameters, see `implicit_depth`. For grazing rays, the slope
-    in the derivative is at least 0.05.
+    Hits are differentiable in the rays and in the solid's parameters, see `implicit_depth`. For grazing rays, the
+    derivative is bounded: it uses a slope of at least 0.05.
 
     **Raises:** `ValueError` if the bounding radius is not positive.
     """
@@ -104,7 +104,10 @@ class _Along(eqx.Module):
 def _first_root(
     sdf: SignedDistance, origins: Float[Array, "n 3"], directions: Float[Array, "n 3"], radius: float
 ) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
-    """Return the depth along each ray at which the sign first changes within the ball, and whether it changes."""
+    """Return the depth at which each ray first crosses the solid's boundary, and whether it does.
+
+    At the crossing, the sign of the distance changes. Only the ball of `radius` about the scene's origin is searched.
+    """
     middle = -jnp.sum(origins * directions, axis=-1)
     squared = middle**2 - jnp.sum(origins**2, axis=-1) + radius**2
     half_chord = jnp.sqrt(jnp.maximum(squared, 0.0))
@@ -130,7 +133,7 @@ class _March(eqx.Module):
     """State of the rays during sphere tracing.
 
     - `side`: sign of the signed distance at the start of each ray.
-    - `leave`: depth at which the ray leaves the ball.
+    - `leave`: depth at which the ray leaves the ball in which surfaces are searched.
     - `depth`, `f`: current depth, and the signed distance at this depth.
     - `before`, `f_before`: depth one stride earlier, and the signed distance at that depth.
     - `alive`: whether the ray is unfinished.
@@ -148,7 +151,7 @@ class _March(eqx.Module):
 
 
 def _advance(sdf: SignedDistance, march: _March, count, enough: int):
-    """Advance the rays until at most `enough` of them are alive or `_MAX_STRIDES` strides are used up.
+    """Advance the rays until at most `enough` are unfinished or `_MAX_STRIDES` strides are used up.
 
     Returns the rays and the total number of strides, which starts at `count`.
     """
@@ -167,7 +170,7 @@ def _advance(sdf: SignedDistance, march: _March, count, enough: int):
 
 
 def _refine(sdf: SignedDistance, march: _March) -> Float[Array, " n"]:
-    """Return the root within the last stride by regula falsi.
+    """Return the depth of the root within each ray's last stride, by regula falsi.
 
     The interval is short, so a few chords are enough to reach the rounding error.
     """

@@ -1,7 +1,7 @@
 """First zeros of a trilinear interpolant f along rays.
 
 A ray marches to the cell that holds its first zero. The zero is then the root of a cubic within the cell. Coordinates
-are grid coordinates: the nodes have the integers 0, ..., g - 1 along every axis. A batch of n vectors is a list of
+are grid coordinates: the nodes lie at the integers 0, ..., g - 1 along every axis. A batch of n vectors is a list of
 three components (n,). The first zero of a ray is the first point at which the sign of f differs from its sign at the
 start of the ray. The value zero counts as negative.
 """
@@ -35,7 +35,7 @@ Triple = list[Float[Array, " n"]]
 class March(NamedTuple):
     """State of a march along rays u + t du.
 
-    - `u`, `du`: point at which each ray enters the box, and its direction.
+    - `u`, `du`: point at which each ray enters the grid's box, and its direction.
     - `t`: the ray's current position.
     - `end`: t at which the ray leaves the box. Once the ray has reached a cell with a zero, `end` is the t at which it
       leaves this cell. So if t < end after the march, there is a zero between t and end.
@@ -52,7 +52,11 @@ class March(NamedTuple):
 
 
 class Field(eqx.Module):
-    """A function on g^3 nodes and the `free_distance` of its (g - 1)^3 cells, both as flat arrays."""
+    """A function f on a grid, and the distance from each cell of the grid to a change of sign of f.
+
+    - `values`: f at the g^3 nodes, flattened in row-major order.
+    - `distance`: `free_distance` of the (g - 1)^3 cells, in cells, flattened in the same way.
+    """
 
     values: Float[Array, " nodes"]
     distance: Int8[Array, " cells"]
@@ -70,11 +74,13 @@ class Field(eqx.Module):
 
 
 def free_distance(values: Float[Array, "g g g"]) -> Int8[Array, "m m m"]:
-    """Return the signed distance, in cells, from each of the m^3 = (g - 1)^3 cells to a change of sign.
+    """Return the signed distance, in cells, from each cell of a grid to the nearest change of sign of f.
 
     The distance is 0 for a cell whose own corners differ in sign. Otherwise it has the sign of f in the cell, and its
     magnitude is a lower bound on the Chebyshev distance to the nearest cell with a change of sign. The magnitude is 1,
     2, 3, 5, 9 or 17. The value zero counts as negative.
+
+    - `values`: f at the g^3 nodes. There are m^3 = (g - 1)^3 cells.
     """
     maximum = functools.partial(
         jax.lax.reduce_window, init_value=jnp.int8(-1), computation=jax.lax.max, window_strides=(1, 1, 1)
@@ -95,7 +101,7 @@ def free_distance(values: Float[Array, "g g g"]) -> Int8[Array, "m m m"]:
 
 
 class _InCell(eqx.Module):
-    """The trilinear function of one fixed cell per ray, along the rays u + t du."""
+    """The trilinear function of one fixed cell per ray, at positions t on the rays u + t du."""
 
     field: Field
     u: Triple
@@ -113,11 +119,13 @@ class _InCell(eqx.Module):
 
 
 def first_zero(field: Field, u: Triple, du: Triple) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
-    """Return the t of the first zero along each ray u + t du, and whether there is a zero.
+    """Return the position t of the first zero of f on each ray u + t du, and whether there is a zero.
 
-    A ray starts at its origin u or, if u is outside the box, where it enters the box. t is differentiable in the values
-    of the field and in the rays. Slopes are kept away from zero for grazing rays (`implicit_depth`). If there is no
-    zero, t and its derivatives are zero.
+    A ray starts at its origin u or, if u is outside the grid's box, where it enters the box. t is differentiable in the
+    values of the field and in the rays. If a ray grazes the surface, its derivative uses a larger slope of f, see
+    `implicit_depth`. If there is no zero, t and its derivatives are zero.
+
+    - `u`, `du`: origins and directions of the rays in grid coordinates.
     """
     t, mask, cell = _traced_zero(*jax.lax.stop_gradient((field, u, du)))
     along = _InCell(field, u, du, cell)
@@ -125,7 +133,7 @@ def first_zero(field: Field, u: Triple, du: Triple) -> tuple[Float[Array, " n"],
 
 
 def _first_zero(field: Field, u: Triple, du: Triple):
-    """Return the t of the first zero of each ray, whether there is a zero, and the cell of the zero."""
+    """Return the results of `first_zero`, without their derivatives, and the cell of each zero."""
     rays, start = enter(u, du, field)
     rays = march(rays, field)
     mask = rays.t < rays.end
@@ -142,7 +150,7 @@ _traced_zero = jax.custom_batching.custom_vmap(_first_zero)
 
 @_traced_zero.def_vmap
 def _traced_zero_batched(size: int, batched, field: Field, u: list[Array], du: list[Array]):
-    """Join batches of rays through one field into one batch, which is faster than a batch of marches."""
+    """Join a `vmap`'s batches of rays through one field into one batch, which takes less time."""
     u, du = jax.tree.map(
         lambda x, has: x if has else jnp.broadcast_to(x, (size, *x.shape)), (u, du), tuple(batched[1:])
     )
@@ -183,7 +191,7 @@ def smooth_gradient(field: Field, x: Triple) -> Triple:
 
 
 def enter(u: Triple, du: Triple, field: Field) -> tuple[March, Float[Array, " n"]]:
-    """Return a march that starts where the rays enter the box, and the t of this point on the rays.
+    """Start a march where the rays u + t du enter the grid's box. Return it and the t of this point.
 
     The `t` of the march counts from this point.
     """
@@ -217,7 +225,7 @@ def march(rays: March, field: Field) -> March:
 
 
 def _stride(rays: March, field: Field) -> March:
-    """Move rays through cells without a change of sign, until most rays are at a change of sign or outside the box."""
+    """Move rays through cells without a change of sign until most reach one or leave the grid's box."""
 
     def step(state):
         rays, _ = state
@@ -235,7 +243,7 @@ def _stride(rays: March, field: Field) -> March:
 
 
 def _search_cell(rays: March, field: Field) -> March:
-    """Search the cells that rays are in for zeros.
+    """Search the current cell of each ray for a zero.
 
     A ray in a cell with a change of sign stops if the cell holds its first zero. Otherwise it leaves the cell.
     """
@@ -266,7 +274,7 @@ def cell_at(rays: March, field: Field) -> tuple[Triple, list[Int[Array, " n"]]]:
 
 
 def _leave(rays: March, cell: list[Int[Array, " n"]], cells) -> Float[Array, " n"]:
-    """Return the t at which each ray leaves the cube of all cells within Chebyshev distance `cells` of its cell."""
+    """Return the t at which each ray leaves the cube of cells that are within `cells` cells of its own."""
     sides = [c + jnp.where(d > 0, cells + 1, -cells) for c, d in zip(cell, rays.du, strict=True)]
     return _smallest([(side - x) / d for side, x, d in zip(sides, rays.u, rays.du, strict=True)])
 

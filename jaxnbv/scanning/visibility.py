@@ -33,10 +33,10 @@ class SurfacePoints(NamedTuple):
 
 @program
 def spread_points(surface: GridSurface, count: int) -> SurfacePoints:
-    """Return points where edges of the grid cross a surface, chosen evenly among these edges.
+    """Return points where a surface crosses edges of its grid, chosen evenly among the crossed edges.
 
-    A plane with unit normal n crosses |n_x| + |n_y| + |n_z| edges per squared grid spacing. So each crossed edge
-    represents an area of 1 / (|n_x| + |n_y| + |n_z|) squared spacings (Cauchy-Crofton formula).
+    A plane with unit normal n crosses |n_x| + |n_y| + |n_z| edges per squared grid spacing of its area. So each crossed
+    edge represents an area of 1 / (|n_x| + |n_y| + |n_z|) squared spacings (Cauchy-Crofton formula).
 
     - `count`: number of points. Points repeat if the surface crosses fewer edges.
     """
