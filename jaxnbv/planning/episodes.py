@@ -118,7 +118,7 @@ def _batch_of_poses(first: Pose, count: int) -> Pose:
 
 
 def _devices(count: int) -> AbstractContextManager:
-    """Return a context manager: let JAX use up to `count` local devices, unless the user chose devices."""
+    """Return a context manager that lets JAX use up to `count` local devices, unless the user chose some."""
     chosen = not get_abstract_mesh().empty or jax.config.jax_default_device is not None  # type: ignore[attr-defined]
     devices = jax.local_devices()[:count]
     return nullcontext() if chosen or len(devices) == 1 else jax.set_mesh(Mesh(np.array(devices), "devices"))

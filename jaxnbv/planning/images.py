@@ -61,7 +61,8 @@ class Image(NamedTuple):
     def cleaned(self, camera: Camera, pose: Pose, box: Box) -> "Image":
         """Return a copy in which pixels whose value stands for "not measured" have depth zero.
 
-        Such a value is beyond the camera's range or the box, or the largest integer, see `without_sentinels`.
+        Such a value is the largest of an integer type, or it fills many pixels and is beyond the camera's range or well
+        beyond the box, see `without_sentinels`.
         """
         return self._replace(depth=without_sentinels(self.depth, camera, pose, self.scale, box))
 

@@ -140,8 +140,8 @@ class Loop:
     def without_views(self, planner: Planner) -> "Loop":
         """Return a copy without views that uses `planner`.
 
-        A session uses it if obstacles or pose errors were detected, and adds its views again with corrected poses. The
-        copy keeps the start time of the first view, from which stop rules count seconds.
+        A session uses it once it has detected obstacles, and to add its views again after correcting their poses. The
+        copy keeps the time of the first view, from which stop rules count seconds.
         """
         loop = copy.copy(self)
         loop.planner, loop.views, loop._observations = planner, (), None
@@ -254,7 +254,7 @@ class Loop:
         return self._next.proposal
 
     def settle(self, proposal: Proposal) -> None:
-        """Use this proposal for the next view instead of the search's, for example if an arm can reach it."""
+        """Use this proposal for the next view instead of the search's, because an arm can reach it."""
         self._next.proposal = proposal
 
     def resume(self, proposal: Proposal) -> None:

@@ -60,7 +60,7 @@ class MountError:
         return self._alignment
 
     def warn_if_off(self) -> bool:
-        """Warn if the images disagree, and return whether they do. Two images are not enough to tell."""
+        """Warn if the images disagree, and return whether they do. Return False for fewer than three images."""
         if len(self._images) < _ENOUGH or not (alignment := self.alignment()).disagrees:
             return False
         warn_of_mount(alignment)
@@ -73,7 +73,7 @@ class MountError:
         return first if bool(np.all(self.corrections == first)) else np.eye(4)
 
     def pose(self, image: Image, index: int) -> Pose:
-        """Return the corrected world pose of an image. The correction of a new image is `mount`."""
+        """Return the corrected world pose of an image. An image without its own correction gets `mount`."""
         pose = Pose.from_matrix(image.matrix, self.convention)
         correction = self.corrections[index] if index < len(self.corrections) else self.mount
         if np.array_equal(correction, np.eye(4)):

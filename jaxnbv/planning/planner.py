@@ -269,7 +269,7 @@ class Planner(eqx.Module):
     @jax.debug_nans(False)
     @program
     def expected_depth(self, surfaces: GridSurface, pose: Pose) -> Float[Array, "h w"]:
-        """Return the expected depth image from a pose in scene units, see `mean_depth`."""
+        """Return the depth image that is expected from a pose, in scene units, see `mean_depth`."""
         scans = scan_samples(surfaces, self.camera, pose[None], barrier_of(self.obstacles, self.camera, pose[None]))
         depth = mean_depth(jax.tree.map(lambda rows: rows[:, 0], scans), pose)
         return depth.reshape(self.camera.height, self.camera.width)

@@ -194,12 +194,12 @@ def _rolled(pose: Pose) -> Pose:
 
 
 def _refusal(pose: Pose, refused: Sequence[Refused]) -> str | None:
-    """Return why the user refused a pose or a rotation of it about the optical axis; otherwise None."""
+    """Return why the user refused a pose, or a rotation of it about the optical axis; None if not refused."""
     return next((earlier.reason for earlier in refused if is_same_view(pose, earlier.pose)), None)
 
 
 def _answers(reachable: Reachable, matrices: Float[np.ndarray, "n 4 4"]) -> list[float | str]:
-    """Call the user's function, and return a score or the reason for no reach for each matrix.
+    """Return, for each matrix, the user's score or the reason why the arm cannot reach the pose.
 
     **Raises:** `ValueError` unless the function returns a list of bools, reasons or scores.
     """

@@ -19,7 +19,7 @@ _CALLER, _CALLER_OF_ADD = 3, 4
 
 
 def warn_of_cut(box: Box, points: Float[np.ndarray, "n 3"], voxel: float, faces: frozenset[str]) -> frozenset[str]:
-    """Warn about faces beyond which the object seems to extend. Return the faces of all warnings so far.
+    """Warn about faces of the box that seem to cut the object. Return the faces of all warnings so far.
 
     - `box`, `points`: box and measured points in world units, up to about a voxel outside the box.
     - `voxel`: side of a cell of the planner's grid, in world units.

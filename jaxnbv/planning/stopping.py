@@ -235,7 +235,7 @@ class PartsFound(StopRule):
 
 
 class Covered(StopRule):
-    """Stop once the views have probably seen a given fraction of the visible area (`expected_coverage`).
+    """Stop once `expected_coverage`, the fraction of the visible area seen so far, is large enough.
 
     - `share`: fraction of the area at which to stop, within (0, 1].
     - `size`: surface within this distance of measured surface counts as seen, in world units (`NewSurface.size`). The

@@ -70,7 +70,7 @@ def table_under(cloud: PointCloud, box: Box) -> Obstacles | None:
     normal, offset = plane
     height = np.abs(image.points @ normal - offset)
     own = image.around & (height <= 4.0 * _TOLERANCE) & (image.normals @ normal >= _AGREES)
-    # Standard deviation of normal noise, from the median absolute deviation.
+    # Standard deviation of Gaussian noise, from the median absolute deviation.
     deviation = 1.4826 * float(np.median(height[own]))
     table = Obstacles((HalfSpace(middle + offset * normal, normal),), max(Obstacles().margin, 3.0 * deviation))
     return table if deviation <= _TOLERANCE else None
@@ -159,7 +159,7 @@ def _is_table(image: _Points, on: Bool[np.ndarray, "n k"], below: Bool[np.ndarra
 
 
 def _fitted(points: _Points) -> tuple[Float[np.ndarray, "3"], float]:
-    """Fit the plane y = h + a x + b z by weighted least squares, and return the plane's normal and offset."""
+    """Fit the plane y = h + a x + b z (y is up) by weighted least squares. Return its normal and offset."""
     root = np.sqrt(points.weights)
     columns = np.stack([np.ones(len(root)), points.points[:, 0], points.points[:, 2]], axis=1)
     height, across, along = np.linalg.lstsq(root[:, None] * columns, root * points.points[:, 1])[0]

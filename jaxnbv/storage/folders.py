@@ -45,7 +45,7 @@ def versions() -> dict[str, Any]:
 
 
 def differences(stored: Any, current: Any, name: str = "") -> list[str]:
-    """Return a text for each difference of two descriptions. `name` is their path, which begins the text."""
+    """Return a text for each difference between two descriptions. Each text starts with their path `name`."""
     if isinstance(stored, dict) and isinstance(current, dict):
         keys = list(dict.fromkeys([*stored, *current]))
         nested = (differences(stored.get(key), current.get(key), f"{name}.{key}".lstrip(".")) for key in keys)

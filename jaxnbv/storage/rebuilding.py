@@ -155,7 +155,10 @@ class _Rebuilder:
         return thing
 
     def _code(self, name: str, way: str) -> Any:
-        """Look up a function, or the class of a record or of a NumPy scalar, by its name."""
+        """Look up a function, or the class of a record or of a NumPy scalar, by its name.
+
+        **Raises:** `ValueError` for other classes, and for functions of packages that may have side effects.
+        """
         thing = self._lookup(name, way)
         module = name.partition(":")[0]
         harmless = (

@@ -9,7 +9,7 @@ cloud.ply         the points of the cloud, in world units, once the episode is c
 
 session.json      the configuration (planner, sensor, box, upward axis) and the versions of the software
 image_00.npz      the first depth image of the sensor, its pose and scale; image_01.npz and so on
-proposal_01.npz   the planner's proposed pose for the image with this number, and the depth expected there
+proposal_01.npz   the search's proposal for the image with this number: pose, candidates, values and trajectories
 refused_00.npz    a proposed pose that cannot be reached, and the reason; refused_01.npz and so on
 """
 
