@@ -1,6 +1,7 @@
-"""Words and charts of answers and quantities. The tasks themselves hold only numbers.
+"""Words and charts for the answers of tasks. The tasks themselves return only numbers.
 
-`words_of` dispatches on the kind of answer. Your own kind is shown by its names and values, or as you register it:
+An answer is what is known after a view, such as class probabilities. `words_of` dispatches on the type of an answer. An
+answer of your own type is shown by its names and values, unless you register words for it:
 
     @words_of.register
     def _(answer: MyAnswer) -> Words: ...
@@ -23,24 +24,25 @@ from jaxnbv.tasks.identification import IdentityAnswer
 from jaxnbv.tasks.segmentation import PartAnswer
 from jaxnbv.utility import Answer, Quantity
 
-# An answer that changes by less than this share from one view to the next has settled.
+# An answer is reliable if it changed by less than this fraction since the previous view.
 _SETTLED = 0.05
+# Numbers of classes and of kinds of known shapes that a text names.
 _CLASSES_SAID, _KINDS_SAID = 3, 4
-# Lines of a chart, rows of its table.
+# Number of parts in a chart.
 _PARTS_SHOWN = 6
 
-# Whether a rule held after the view of an index, from 0.
+# Function that returns whether a stop rule held after a view, given the index of the view from 0.
 Holds: TypeAlias = Callable[[Sure, int], bool]
 
 
 class Chart(NamedTuple):
-    """Numbers by view.
+    """Data of a line chart: named numbers with a value after each view.
 
-    - `label`: of their axis, with the unit.
-    - `names`, `values`: one each, `values` for every view.
-    - `true`: what the values would be if all of the surface had been seen; None where that is not known.
-    - `one_true`: whether the truth is one of the names, which stands out, rather than values to be reached.
-    - `goal`: a value to be reached; None without one.
+    - `label`: label of the vertical axis, with the unit.
+    - `names`, `values`: names of the numbers, and their values after each view.
+    - `true`: values of the numbers if all of the surface had been seen; None if they are not known.
+    - `one_true`: whether `true` only marks one of the names as the true one. Otherwise `true` has values to reach.
+    - `goal`: a value that the numbers should reach; None for no such value.
     """
 
     label: str
@@ -52,27 +54,27 @@ class Chart(NamedTuple):
 
 
 class Words:
-    """Words and charts of any answer. Kinds of answers override parts of it."""
+    """Texts and charts about an answer. Subclasses for particular types of answers override some of them."""
 
     def __init__(self, answer: Answer):
         self.answer = answer
 
     @property
     def shown(self) -> Sequence[int]:
-        """Indices of the numbers to show."""
+        """Indices of the answer's numbers that are shown."""
         return range(len(self.answer.names))
 
     @property
     def question(self) -> str:
-        """The question, for the head of the report."""
+        """The question of the task, as text for the head of the report."""
         return f"{capital(' and '.join(self.answer.names[index] for index in self.shown))}?"
 
     def value(self, answer: Answer, index: int) -> str:
-        """A number as text."""
+        """Return the number of an answer with this index, as text."""
         return answer.form.format(answer.values[index])
 
     def said(self, before: Answer | None = None) -> str:
-        """Each number, with its value in the previous answer."""
+        """Return each shown number as text. Given the answer `before` this one, add its value there."""
 
         def one(index: int) -> str:
             was = "" if before is None else f" (was {self.value(before, index)})"
@@ -82,25 +84,27 @@ class Words:
 
     @property
     def found(self) -> str:
-        """The answer in short."""
+        """The answer as a short text."""
         return self.said()
 
     @property
     def settled_means(self) -> str:
-        """The condition of `settled` in words."""
+        """The condition of `settled` as text."""
         return f"within {100 * _SETTLED:.0f} % of the view before"
 
     def settled(self, answers: Sequence[Answer], holds: Holds) -> list[bool]:
-        """Whether each of the answers of all views, of which this is the last, can be relied on.
+        """Return, for each view, whether the answer after this view is reliable.
 
-        `holds`: whether a rule held after the view of an index.
+        - `answers`: answers after all views. The last one is this answer.
+        - `holds`: function that returns whether a stop rule held after a view, given the index of the view from 0.
         """
         return [False, *(np.allclose(now.values, was.values, rtol=_SETTLED) for was, now in pairwise(answers))]
 
     def charts(self, answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...]:
-        """Charts of the answers after all views. The last of them is this answer.
+        """Return charts of the answers over the views.
 
-        `truth`: the answer if all of the surface had been seen, or None.
+        - `answers`: answers after all views. The last one is this answer.
+        - `truth`: the answer if all of the surface had been seen, or None.
         """
         names = self.answer.names
         return (Chart(", ".join(names), names, _rows(answers), None if truth is None else truth.values),)
@@ -112,13 +116,13 @@ def _rows(answers: Sequence[Answer]) -> Float[np.ndarray, "views n"]:
 
 @functools.singledispatch
 def words_of(answer: Answer) -> Words:
-    """Words and charts of an answer, by its type."""
+    """Return the words and charts of an answer, according to its type."""
     return Words(answer)
 
 
 @words_of.register(ClassAnswer)
 class _ClassWords(Words):
-    """The likeliest three are said, in percent."""
+    """Words about class probabilities. They name the three likeliest classes, in percent."""
 
     question = "What is it?"
     rule = Sure()
@@ -138,14 +142,17 @@ class _ClassWords(Words):
         return name if p == 1.0 else f"{name}, probability {p:.2f}"
 
     def settled(self, answers: Sequence[Answer], holds: Holds) -> list[bool]:
-        """Sure, and not of another class than the view before was sure of."""
+        """Return, for each view, whether the rule `Sure` held.
+
+        A view does not count if the rule also held after the previous view, but for a different class.
+        """
         sure = [holds(self.rule, index) for index in range(len(answers))]
         best = [int(np.argmax(answer.values)) for answer in answers]
         contradicted = [False, *(was and a != b for was, (a, b) in zip(sure, pairwise(best), strict=False))]
         return [now and not other for now, other in zip(sure, contradicted, strict=True)]
 
     def charts(self, answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...]:
-        """The probabilities of all classes; of the truth, 1 and 0."""
+        """Return a chart of the probabilities of all classes. If it is known, the true class is marked."""
         true = None if truth is None else truth.values
         return (
             Chart("probability", self.answer.names, _rows(answers), true, one_true=True, goal=self.rule.probability),
@@ -154,18 +161,18 @@ class _ClassWords(Words):
 
 @words_of.register(IdentityAnswer)
 class _IdentityWords(_ClassWords):
-    """The likeliest three parts are said, "none of these" among them."""
+    """Words about part probabilities. They name the three likeliest parts, or "none of these"."""
 
     question = "Which part is it?"
     least = Identified().probability
     settled_means = f"probability {least} or more"
 
     def settled(self, answers: Sequence[Answer], holds: Holds) -> list[bool]:
-        """See `_ClassWords`, by the probability alone."""
+        """Return the same as `_ClassWords.settled`, for the rule that a probability is at least `least`."""
         return super().settled(answers, lambda _, index: bool(answers[index].values.max() >= self.least))
 
     def charts(self, answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...]:
-        """The probabilities of the parts that were likely after any view."""
+        """Return a chart of the parts that had the highest probabilities after any view, six at most."""
         values = _rows(answers)
         kept = np.sort(np.argsort(-values.max(axis=0), kind="stable")[:_PARTS_SHOWN])
         names = tuple(self.answer.names[index] for index in kept)
@@ -174,7 +181,7 @@ class _IdentityWords(_ClassWords):
 
 @words_of.register(PartAnswer)
 class _PartWords(Words):
-    """The parts that were asked for are said."""
+    """Words about the predicted points of each part. They name the parts to find."""
 
     answer: PartAnswer
     question = "Which parts does it have?"
@@ -201,7 +208,7 @@ class _PartWords(Words):
         ]
 
     def charts(self, answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...]:
-        """How many parts have N_target points, and the points of each."""
+        """Return a chart of the number of parts with `target` points or more, and one of each part's points."""
         known = answers if truth is None else [*answers, truth]
         shown = sorted({index for answer in known for index in words_of(answer).shown})
         values, target = _rows(answers)[:, shown], self.answer.target
@@ -216,7 +223,7 @@ class _PartWords(Words):
 
 @words_of.register(Coldest)
 class _ColdestWords(Words):
-    """Where the cloud is coldest, and how cold it is there."""
+    """Words about the coldest point of the cloud: its position and temperature."""
 
     answer: Coldest
     question = "Where does it stay coldest while it is heated?"
@@ -227,7 +234,10 @@ class _ColdestWords(Words):
         return f"coldest at {place}, {number(float(self.answer.values[0]))} degrees{was}"
 
     def charts(self, answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...]:
-        """The temperature of the coldest point and, where the truth is known, its distance to the true one."""
+        """Return a chart of the lowest temperature.
+
+        Given the truth, also return a chart of the distance between the coldest point and the true coldest point.
+        """
         true = None if truth is None else truth.values
         temperature = Chart("lowest temperature (degrees)", ("coldest",), _rows(answers), true)
         if not isinstance(truth, Coldest):
@@ -240,13 +250,13 @@ class _ColdestWords(Words):
 
 
 class CoverageAnswer(Answer):
-    """Surface seen: percent of the true surface, or the area if the truth is not known."""
+    """Amount of surface seen: percent of the true surface, or an area in `unit` if the truth is not known."""
 
     unit: str = "%"
 
     @property
     def amount(self) -> str:
-        """The value in words."""
+        """The amount as text, with its unit."""
         value = float(self.values[0])
         return f"{value:.0f} %" if self.unit == "%" else f"{number(value)} {self.unit}"
 
@@ -264,40 +274,43 @@ class _CoverageWords(Words):
 
 
 def label_of(quantity: Quantity, frame: Frame = Frame()) -> str:  # noqa: B008
-    """A quantity's name with its unit, lengths in the units of a frame's world."""
+    """Return a quantity's name, with its unit in the world of a frame in parentheses."""
     unit = quantity.unit_in(frame)
     return f"{quantity.name} ({unit})" if unit else quantity.name
 
 
 def shown_value(quantity: Quantity, value: float, frame: Frame) -> str:
-    """A value in the world of a frame, with its unit where that is a length or an area."""
+    """Return a value in world units as text, with its unit if it is a length or an area."""
     return f"{number(value)} {quantity.unit_in(frame)}" if quantity.length_power else number(value)
 
 
 def coordinates(point: Float[np.ndarray, "3"], frame: Frame = Frame()) -> str:  # noqa: B008
-    """A point of the scene, in the world of a frame."""
+    """Convert a point from scene to world coordinates, and return it as text "(x, y, z)"."""
     x, y, z = (fixed(coordinate, frame) for coordinate in frame.to_world(np.asarray(point)))
     return f"({x}, {y}, {z})"
 
 
 def fixed(length: float, frame: Frame) -> str:
-    """A length in world units, to a hundredth of a scene unit or finer."""
+    """Return a length in world units as text, rounded to a hundredth of a scene unit or finer."""
     return f"{length:.{max(0, 2 + math.ceil(math.log10(frame.scale)))}f}".replace("-", "−")
 
 
 def capital(text: str) -> str:
-    """A text that starts with a capital letter, and is otherwise as it was."""
+    """Return the text with its first letter capitalised and the rest unchanged."""
     return text[:1].upper() + text[1:]
 
 
 def number(value: float) -> str:
-    """Three significant digits, without an exponent where none is needed."""
+    """Return a number as text: three significant digits, or no decimals from 1,000 to 10 million."""
     text = f"{value:,.0f}" if 999.5 <= abs(value) < 1e7 else f"{value:.3g}"
     return text.replace("-", "−")
 
 
 def may_be_words(kinds: Sequence[tuple[str, float]]) -> str:
-    """A sentence with the kinds of known shapes in the samples, the likeliest first."""
+    """Return a sentence with the probabilities of the kinds of known shapes that the samples show.
+
+    - `kinds`: name and probability of each kind, the likeliest first.
+    """
     shown = [f"{name} {100 * weight:.0f} %" for name, weight in kinds[:_KINDS_SAID]]
     rest = sum(weight for _, weight in kinds[_KINDS_SAID:])
     return f"Imagined, as known shapes fit: {', '.join(shown)}{f', others {100 * rest:.0f} %' if rest else ''}."

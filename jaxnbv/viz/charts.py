@@ -1,4 +1,4 @@
-"""The charts of an episode by view: answers, surface seen, and values of the chosen views."""
+"""Draws charts of an episode over the views: answers, surface seen, and values of the chosen views."""
 
 import textwrap
 from typing import Any
@@ -14,18 +14,20 @@ from jaxnbv.viz.choice import best_first
 from jaxnbv.viz.data import ReportData
 from jaxnbv.viz.style import GREY, INK, LINE, NEW, SERIES
 
+# Maximum number of lines, of letters in a name, and of views for which a chart prints the values.
 _MOST_NAMES, _LONGEST_NAME, _MOST_NUMBERS = 6, 22, 10
-# Lines nearer to each other than this share of the range look like one.
+# Lines that differ by less than this fraction of the range of values look like one line.
 _SAME_LINE = 0.02
-# Inches. On a telephone's page of 390 pixels the letters of a large chart are eleven pixels tall.
+# Sizes in inches. On a phone (390 pixels wide), the letters of a large chart are eleven pixels tall.
 _LARGE, _SMALL = (4.0, 2.6), (3.1, 2.6)
 _BELOW: dict[str, Any] = {"loc": "outside lower center", "frameon": False, "fontsize": 9, "handlelength": 1.4}
 
 
 def shown_names(chart: Chart) -> dict[int, int]:
-    """Indices of the numbers of a chart that are drawn, each with how many others its line hides.
+    """Return the indices of the numbers to draw, each with the number of other lines that its line hides.
 
-    All are drawn if they are few, and otherwise those that are true or become the largest.
+    A line that nearly coincides with a drawn line is hidden. At most six lines are drawn: those with the largest
+    values, where the true values count too.
     """
     reached = chart.values.max(axis=0)
     reached = reached if chart.true is None else np.maximum(reached, chart.true)
@@ -33,7 +35,7 @@ def shown_names(chart: Chart) -> dict[int, int]:
     hidden = dict[int, int]()
     for index in np.argsort(-reached, kind="stable").tolist():
         same = (other for other in hidden if np.abs(chart.values[:, other] - chart.values[:, index]).max() < near)
-        # The line of the true one, and lines with a truth of their own, stand for themselves.
+        # The line of the true name hides no other line. Lines that each have a true value are never hidden.
         over = next(same, None) if chart.true is None or chart.one_true else None
         if over is not None and not (chart.one_true and chart.true is not None and chart.true[over] > 0):
             hidden[over] += 1
@@ -43,9 +45,10 @@ def shown_names(chart: Chart) -> dict[int, int]:
 
 
 def draw_chart(axes: Axes, chart: Chart, rival: Chart | None = None, rival_name: str = "") -> list[Line2D]:
-    """Draw the numbers and the truth as lines over the views, and return the entries of a legend.
+    """Draw the numbers and their true values as lines over the views, and return the entries of a legend.
 
-    - `rival`: the chart of another search. Its line of the true number is drawn, or its only line.
+    - `rival`: chart of a different search. Only its line of the true name is drawn, or its only line.
+    - `rival_name`: name of this search in the legend.
     """
     views, is_one = np.arange(1, len(chart.values) + 1), len(chart.names) == 1
     marked = None if chart.true is None or not chart.one_true else int(np.argmax(chart.true))
@@ -78,7 +81,7 @@ def draw_chart(axes: Axes, chart: Chart, rival: Chart | None = None, rival_name:
 
 
 def over_views(axes: Axes, count: int) -> None:
-    """Set the horizontal axis to views, with half a view of room on both sides."""
+    """Let the horizontal axis run over views 1 to `count`, with a margin of half a view on both sides."""
     axes.set(xlabel="view", xlim=(0.5, count + 0.5))
     axes.xaxis.set_major_locator(MaxNLocator(min(count, 10), integer=True, min_n_ticks=1))
     axes.yaxis.set_major_locator(MaxNLocator(5))
@@ -86,7 +89,7 @@ def over_views(axes: Axes, count: int) -> None:
 
 
 def draw_values(axes: Axes, data: ReportData) -> list[Line2D]:
-    """Draw the value of each chosen view, its standard error, and the value of the median candidate."""
+    """Draw the chosen views' values with errors, and the median candidates. Return entries of a legend."""
     for view, shown in enumerate(data.views, start=1):
         if shown.proposal is None:
             axes.annotate("given", (view, 0), (0, 4), textcoords="offset points", ha="center", color=GREY, fontsize=8)
@@ -108,14 +111,14 @@ def draw_values(axes: Axes, data: ReportData) -> list[Line2D]:
 
 
 def task_charts(data: ReportData) -> list[tuple[str, Figure]]:
-    """Charts of the task, with their titles."""
+    """Draw the charts of the task, and return the title and figure of each."""
     task, size = data.task, _LARGE if len(data.task.charts) == 1 else _SMALL
     others = [None] * len(task.charts) if task.rival is None else task.rival.charts
     return [_drawn(data, chart, other, size) for chart, other in zip(task.charts, others, strict=True)]
 
 
 def other_charts(data: ReportData) -> list[tuple[str, Figure]]:
-    """Charts, with titles, of the surface seen (unless this is the task) and of values of chosen views."""
+    """Draw the surface seen (unless it is the task) and the chosen views' values; return titles, figures."""
     task, charts = data.task, []
     if not task.is_coverage:
         charts.append(_drawn(data, task.seen, None if task.rival is None else task.rival.seen, _LARGE))

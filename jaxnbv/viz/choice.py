@@ -1,4 +1,4 @@
-"""Why a view was chosen: candidates and ascents on a map of the sphere, and candidates by value."""
+"""Draws why a view was chosen: a map of candidates and gradient ascents, and candidates by value."""
 
 import textwrap
 from typing import Any
@@ -19,25 +19,26 @@ from jaxnbv.viz import sphere
 from jaxnbv.viz.answers import number
 from jaxnbv.viz.style import GREY, INK, LINE, NEW, VALUE
 
-# Fewer candidates than this say little about what lies between them.
+# With fewer candidates than this, the map is not coloured between them.
 _FEWEST_OF_A_MAP = 12
+# Letters in a line of the caption.
 _LETTERS = 56
 
 
 def open_values(proposal: Proposal) -> Float[np.ndarray, " c"]:
-    """The values of a proposal's candidates, NaN where one was excluded as visited."""
+    """Return the values of a proposal's candidates, NaN for candidates that were excluded as visited."""
     values = np.asarray(proposal.values, dtype=np.float64)
     return np.where(np.isfinite(values), values, np.nan)
 
 
 def best_first(proposal: Proposal) -> Float[np.ndarray, " o"]:
-    """The values of the candidates that were open."""
+    """Return the values of the candidates that were not excluded, the highest first."""
     values = open_values(proposal)
     return np.sort(values[~np.isnan(values)])[::-1]
 
 
 def colour_range(values: Float[np.ndarray, "*n"]) -> tuple[float, float]:
-    """Smallest and largest value except NaN; widened if they are equal."""
+    """Return the smallest and the largest value that is not NaN, and a wider range if they are equal."""
     numbers = values[~np.isnan(values)]
     if not numbers.size:
         return 0.0, 1.0
@@ -46,12 +47,12 @@ def colour_range(values: Float[np.ndarray, "*n"]) -> tuple[float, float]:
 
 
 def has_rings(proposal: Proposal) -> bool:
-    """Whether to mark the candidates tied with the best: some, but at most a third of all."""
+    """Return whether to mark tied candidates: if there are any, but at most a third of all candidates."""
     return 0 < (proposal.num_tied or 0) <= len(proposal.values) // 3
 
 
 def marks(*proposals: Proposal) -> list[str]:
-    """Legend entries for the marks that some maps lack."""
+    """Return legend entries for the optional marks (visited, tied, ascent) on the maps of these proposals."""
     visited = any(np.isnan(open_values(proposal)).any() for proposal in proposals)
     entries = ["× visited"] * visited + ["◯ tied with the best"] * any(map(has_rings, proposals))
     climbed = any(proposal.trajectories is not None for proposal in proposals)
@@ -59,11 +60,11 @@ def marks(*proposals: Proposal) -> list[str]:
 
 
 def draw_choice(figure: Figure, proposal: Proposal | None, quantity: Quantity, frame: Frame) -> None:
-    """Draw the map, and under it the candidates by value over a colour bar.
+    """Draw a map of the candidates, and below it the candidates by value over a colour bar.
 
-    For a given view only the grid is drawn.
+    A given view has no proposal. Then only the grid of the map is drawn.
 
-    - `frame`: frame of the world; values are in its units.
+    - `frame`: frame of the world. The values are in its units.
     """
     colours = draw_acquisition(figure.add_axes((0.06, 0.4, 0.88, 0.58)), proposal, quantity)
     if proposal is None or colours is None:
@@ -80,7 +81,7 @@ def draw_choice(figure: Figure, proposal: Proposal | None, quantity: Quantity, f
 
 
 def draw_candidates(axes: Axes, proposal: Proposal) -> None:
-    """Draw the open candidates by value with standard errors, best on top, above the colour bar."""
+    """Draw value and standard error of each candidate in a row, and the chosen pose's value above (star)."""
     best = best_first(proposal)
     order = np.argsort(-open_values(proposal))[: len(best)]
     rows = -np.arange(len(best))
@@ -96,10 +97,12 @@ def draw_candidates(axes: Axes, proposal: Proposal) -> None:
 def draw_acquisition(
     axes: Axes, proposal: Proposal | None, quantity: Quantity, weight: float = 1.0
 ) -> ScalarMappable | None:
-    """Draw the candidates' values as a map of the sphere.
+    """Draw the candidates' values as a map of the sphere, and return the colours for a colour bar.
 
-    Returns the colours for a colour bar, or None for a given view. The map is coloured between candidates if these are
-    many and their values are not random.
+    Without a proposal (for a given view) the map is empty, and the result is None. If the values are not random and
+    there are many candidates, the map is also coloured between them.
+
+    - `weight`: factor for the sizes of lines, marks and letters.
     """
     axes.axis("off")
     globe: Any = axes.inset_axes((0.0, 0.0, 1.0, 1.0), projection="mollweide")
@@ -133,12 +136,12 @@ def draw_acquisition(
 
 
 def directions_of(poses: Pose) -> Float[np.ndarray, "*n 3"]:
-    """Unit vectors from the origin to poses."""
+    """Return the unit vectors from the origin to the positions of poses."""
     return sphere.unit(np.asarray(poses.position, dtype=np.float64))
 
 
 def _draw_ascents(globe: Any, ascents: Float[np.ndarray, "starts steps 3"], weight: float) -> None:
-    """Draw trajectories on the map, each from a ring to a dot."""
+    """Draw each gradient ascent on the map as a line from a ring (start) to a dot (end)."""
     for directions in ascents:
         way = sphere.path(directions).T
         globe.plot(*way, color="white", lw=2.2 * weight, zorder=6)

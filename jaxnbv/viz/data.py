@@ -1,4 +1,4 @@
-"""Data of the pictures of an episode as plain arrays, computed once a view and drawn by `report` and `figures`."""
+"""Data that the pictures of an episode show, computed once per view for `report` and `figures`."""
 
 import dataclasses
 import itertools
@@ -34,14 +34,15 @@ from jaxnbv.viz.words import told
 class ViewData(eqx.Module):
     """One view, ready to be drawn.
 
-    - `view`: itself, the values of its proposal in world units.
-    - `before`: points kept before it, in scene coordinates.
-    - `surface`: of the likeliest part after it, or else of the posterior mean, where it holds points, with a deviation
-      that allows for what was not seen, in world units; None where there is none within the grid.
-    - `seen`: how much of the surface was seen.
-    - `told`: what happened, in words by their headings.
-    - `imagined`: what was imagined before it was taken; None for a view that was given.
-    - `look`: the scan itself; None where it is no image.
+    - `view`: the view, with the values of its proposal in world units.
+    - `before`: points of the cloud before the view, in scene coordinates.
+    - `surface`: the surface after the view: the likeliest known shape, or else the pieces of the posterior mean's
+      surface near points. None if the grid holds no surface. The deviation is in world units, and larger far from
+      points.
+    - `seen`: amount of surface seen after the view.
+    - `told`: sentences about the view, keyed by heading.
+    - `imagined`: surfaces imagined before the view; None for a given view.
+    - `look`: picture of the view's scan; None if the scan is not an image.
     """
 
     view: View
@@ -54,7 +55,7 @@ class ViewData(eqx.Module):
 
     @property
     def has_shape(self) -> bool:
-        """Whether its surface is a known shape."""
+        """Whether the view's surface is a known shape."""
         return isinstance(self.surface, PlacedShape)
 
     @property
@@ -73,7 +74,7 @@ class ViewData(eqx.Module):
 
 
 class ReportData(eqx.Module):
-    """All views of an episode, the quantity of its search, its task, and the viewpoint of its pictures."""
+    """Data of a report: all views of an episode, the search's quantity, the task, and the viewpoint."""
 
     episode: Episode
     views: tuple[ViewData, ...]
@@ -88,19 +89,19 @@ class ReportData(eqx.Module):
 
     @property
     def deviations(self) -> tuple[float, float]:
-        """One range of standard deviations for all views."""
+        """Range of the surfaces' standard deviations in world units, which the colours of all views share."""
         by_view = [view.surface.deviation for view in self.views if view.surface is not None and not view.has_shape]
         return middle_range(np.concatenate(by_view)) if by_view else (1e-3, 1.0)
 
     @property
     def has_deviations(self) -> bool:
-        """Whether any surface is coloured by its deviation; known shapes are not."""
+        """Whether any surface is coloured by its standard deviation. Known shapes are not."""
         is_mean = [view.surface is not None and not view.has_shape for view in self.views]
         return any(is_mean) or (self.samples_surfaces and not self.has_shapes)
 
     @property
     def samples_surfaces(self) -> bool:
-        """Whether the steps imagined sampled surfaces, not known parts."""
+        """Whether the steps imagined samples of the posterior. Otherwise they imagined known parts."""
         return not isinstance(self.episode.views[0].hypotheses, PartHypotheses)
 
     @property
@@ -122,13 +123,13 @@ def report_data(
     rival: Episode | None = None,
     sketches: Sketches | None = None,
 ) -> ReportData:
-    """Everything that the pictures of an episode show.
+    """Compute everything that the pictures of an episode show.
 
-    - `truth`: points of the true surface (scene coordinates); by default sampled from the scene, where it can be.
-    - `imagine`: whether what the steps imagined is shown.
-    - `rival`: an episode of another search from the same first view.
-    - `sketches`: what was drawn while the episode was under way. For a step that is not among them the model is
-      conditioned and sampled again.
+    - `truth`: points of the true surface, in scene coordinates. By default they are sampled from the scene if possible.
+    - `imagine`: whether to show the surfaces that the steps imagined.
+    - `rival`: an episode of a different search from the same first view.
+    - `sketches`: sketches made while the episode ran. For a step without a sketch, the model is conditioned and sampled
+      again.
     """
     planner, frame = episode.planner, episode.frame
     if truth is None and episode.scene is not None:
@@ -145,7 +146,7 @@ def report_data(
         for view in episode.views
     ]
     leading = Sketch(None, None)
-    # Only such an acquisition promises what one view can give.
+    # Only for such an acquisition can one view gain what its value promises.
     actual = episode.actual_scores(replayed) if planner.acquisition.gains_once else itertools.repeat(None)
     for index, (next_one, gain) in enumerate(zip(following, actual, strict=False)):
         view, gain = views[index], None if gain is None else float(frame.length_to_world(gain, power))

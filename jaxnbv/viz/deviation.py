@@ -23,16 +23,17 @@ from jaxnbv.scanning.mesh_files import read_nodes
 from jaxnbv.scanning.sdf.sampled import checked_triangles
 from jaxnbv.surfaces.rigid import orient_outward, register_scan
 
-# Points sampled from a mesh, fewest points of a cloud, points of the CAD at which coverage is tested.
+# Points sampled from a scanned mesh, least number of points of a cloud, points of the CAD at which coverage is tested.
 _POINTS, _FEWEST, _SAMPLES = 50_000, 10, 20_000
-# A scan that is this many times larger than the CAD, or smaller, has other units.
+# A scan that is this many times larger or smaller than the CAD must be in different units.
 _LARGER, _SMALLER = 8.0, 50.0
-# Shares of the CAD's diameter: distance between the worst places, farthest scan that covers it, median of a poor fit.
+# Fractions of the CAD's diameter: least distance between worst places, largest distance at which a scanned point covers
+# the CAD, median distance above which a fit is poor.
 _APART, _FAR, _POOR = 0.05, 0.05, 0.02
-# Neighbours whose median smooths the deviation.
+# Number of nearest points over which a median smooths the deviation.
 _NEIGHBOURS = 9
-# Places of the CAD are covered by this many points within a radius, in distances to the fourth neighbour, if the cosine
-# of their normals is larger.
+# A place on the CAD is covered by this many points within a radius (relative to the distance between a point and its
+# fourth neighbour). The cosine of the angle between the normals must exceed the last value.
 _COVERING, _RADIUS, _FACING = 3, 1.5, 0.3
 # Numbered places are this many times worse than the median. End of the colours if nothing deviates.
 _STANDS_OUT, _LEAST = 4.0, 1e-9
@@ -43,9 +44,9 @@ _Mesh: TypeAlias = trimesh.Trimesh | trimesh.Scene | str | Path
 class WorstPlace(NamedTuple):
     """A local extreme of the deviation, in the coordinates and units of the scan.
 
-    - `position`: the point of the scan.
-    - `distance`: signed, the median over its nine nearest points.
-    - `extent`: diameter of the connected region about it where the deviation is more than half as large.
+    - `position`: a point of the scan.
+    - `distance`: signed distance from the CAD, the median over the nine points nearest to `position`.
+    - `extent`: diameter of the connected region around `position` where the deviation is at least half as large.
     """
 
     position: Float[np.ndarray, "3"]
@@ -58,12 +59,14 @@ class Deviation(eqx.Module):
 
     - `pose`: pose of the CAD, from its coordinates to the scan's.
     - `points`: points of the scan, uniform by area if it is a mesh.
-    - `distances`: from the CAD to each point, positive outside (too much material).
-    - `feet`, `normals`: the nearest point of the CAD for each point, and its outward normal there.
+    - `distances`: signed distance from the CAD to each point, positive outside (too much material).
+    - `feet`, `normals`: for each point, the nearest point of the CAD and its outward normal.
     - `cad`: the CAD at this pose.
-    - `area`, `missing_area`: area of the CAD that the scan covers, and of the rest, for which there are no distances.
-    - `imagined`: share of the scanned mesh that no view measured, which is left out.
-    - `radius`: a place of the CAD is covered if three of its four nearest `feet` are nearer than this, on its side.
+    - `area`, `missing_area`: area of the CAD that the scan covers, and area that it does not cover. There are no
+      distances for the latter.
+    - `imagined`: fraction of the scanned mesh that no view measured. This part is left out.
+    - `radius`: a place on the CAD is covered if at least three of the four nearest `feet` are within this distance, on
+      the same side of a wall.
     """
 
     pose: Float[np.ndarray, "4 4"]
@@ -79,12 +82,12 @@ class Deviation(eqx.Module):
 
     @property
     def median(self) -> float:
-        """Median of |distance|."""
+        """Median of the absolute distances."""
         return self.percentile(50.0)
 
     @checked
     def percentile(self, share: float) -> float:
-        """The |distance| that `share` percent of the points do not exceed.
+        """Return the absolute distance that `share` percent of the points do not exceed.
 
         **Raises:** `ValueError` for a share outside [0, 100].
         """
@@ -93,9 +96,9 @@ class Deviation(eqx.Module):
 
     @checked
     def worst(self, count: int = 5, apart: float | None = None) -> tuple[WorstPlace, ...]:
-        """At most `count` places of the largest deviation, the worst first.
+        """Return at most `count` places with the largest deviations, the worst first.
 
-        Two extremes count as one if the deviation stays above half of the smaller one between them.
+        Two extremes count as one place if the deviation between them stays above half of the smaller extreme.
 
         - `apart`: least distance between two places; 5 % of the CAD's diameter by default.
 
@@ -124,10 +127,10 @@ class Deviation(eqx.Module):
         return tuple(places)
 
     def values_at(self, places: Float[np.ndarray, "m 3"], normals: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, " m"]:
-        """Signed distances of the scan at places on the CAD; NaN where the scan does not cover it.
+        """Return the signed distances of the scan from the CAD at places on the CAD, NaN where not covered.
 
-        - `places`, `normals`: points of `cad` and the outward normals there. One side of a wall does not cover the
-          other.
+        - `places`, `normals`: points of `cad` and the outward normals there. A scan of one side of a wall does not
+          cover the other side.
         """
         rows = np.flatnonzero(np.abs(self.distances) < _FAR * _diameter(self.cad.vertices))
         if len(rows) == 0:
@@ -149,18 +152,19 @@ class Deviation(eqx.Module):
         count: int = 5,
         up: str = "z",
     ) -> Any:
-        """A matplotlib `Figure` of the CAD from two sides, coloured by the deviation.
+        """Draw the CAD from two sides, coloured by the deviation, and return the matplotlib `Figure`.
 
-        The CAD is grey where it was not scanned. Numbers mark the worst place, and others of at least four times the
-        median deviation.
+        The CAD is grey where it was not scanned. Numbers mark the worst place, and other places with at least four
+        times the median deviation.
 
         - `unit`: name of the unit of the colours.
-        - `scale`: factor from the scan's unit to it, 1000 for millimetres if the scan is in metres.
-        - `limit`: deviation at the ends of the colours, in this unit. By default that of the worst place.
-        - `count`: largest number of numbered places.
+        - `scale`: factor from the scan's unit to `unit`: 1000 for millimetres if the scan is in metres.
+        - `limit`: deviation at the ends of the colours, in `unit`. By default the deviation of the worst place.
+        - `count`: maximum number of numbered places.
         - `up`: upward axis of the scan, see `Frame`.
 
-        **Raises:** `ValueError` for a scale or limit that is not positive, another axis, or if matplotlib is missing.
+        **Raises:** `ValueError` for a scale or limit that is not positive, an unknown axis, or if matplotlib is
+        missing.
         """
         with explained_imports():
             from jaxnbv.viz.deviation_figure import Mark, deviation_figure
@@ -188,14 +192,14 @@ def deviation(
     """Compare a scanned surface, or a part of it, with a CAD model in the same units.
 
     Iterative closest points align the CAD with the scan. A symmetric CAD has several equally good poses. Distances are
-    to the nearest surface, so that a dent deeper than half of a wall is measured from the wall's other side.
+    to the nearest surface, so a dent deeper than half of a wall is measured from the wall's other side.
 
-    - `mesh`: the scan, as a mesh whose faces are wound outward, a file of one, or a cloud with outward normals. If a
-      mesh says which faces were measured, as `surface_mesh` and the PLY files of `save_mesh` do, only these are
+    - `mesh`: the scan: a mesh whose faces are wound outward, the file of such a mesh, or a cloud with outward normals.
+      If a mesh says which faces were measured, as `surface_mesh` and the PLY files of `save_mesh` do, only these are
       compared.
-    - `cad`: need not be closed. The outside of a sheet is where the normals of its faces point.
-    - `pose`: from the CAD's coordinates to the scan's: a start, such as `session.object_pose.matrix`. Without it all
-      rotations are tried.
+    - `cad`: the CAD model, which need not be closed. The outside of a sheet is where the normals of its faces point.
+    - `pose`: pose of the CAD (from its coordinates to the scan's) at which the alignment starts, such as
+      `session.object_pose.matrix`. By default all rotations are tried.
     - `register`: False to leave the CAD at `pose`, or at the identity without one.
 
     A `UserWarning` says if no pose fits well, or if other poses fit nearly as well.
@@ -249,7 +253,7 @@ def _registered(
 
 
 def _mesh_of(thing: _Mesh | TriangleMesh) -> trimesh.Trimesh:
-    """The mesh in its own units, its faces marked as measured if they are."""
+    """Convert to a trimesh mesh in its own units, with the attribute `measured` of faces if there is one."""
     if isinstance(thing, TriangleMesh):
         return trimesh.Trimesh(thing.frame.to_world(thing.vertices), thing.faces, process=False)
     parts = [part for _, part in read_nodes(thing)]
@@ -270,7 +274,7 @@ def _mesh_of(thing: _Mesh | TriangleMesh) -> trimesh.Trimesh:
 
 
 def _points_of(scan: _Mesh | PointCloud) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], float]:
-    """Points of a scan, their normals, and the share of its surface that was left out."""
+    """Return points of a scan, their normals, and the fraction of its surface that no view measured."""
     if isinstance(scan, PointCloud):
         check_single(scan)
         points, normals = (rows.astype(np.float64) for rows in scan.to_numpy())
@@ -295,7 +299,10 @@ def _check_units(scan: float, cad: float) -> None:
 
 
 def _checked_pose(pose: Float[AnyArray, "4 4"] | list | None) -> Float[np.ndarray, "4 4"]:
-    """The pose as a rigid matrix; the identity for None."""
+    """Convert a pose to a rigid matrix, and None to the identity.
+
+    **Raises:** `ValueError` unless the pose is a rigid (4, 4) matrix.
+    """
     matrix = np.eye(4) if pose is None else as_numbers(pose, "the pose", np.float64)
     require(
         matrix.shape == (4, 4), f"the pose has shape {matrix.shape}: give a matrix (4, 4), from the CAD to the scan"
@@ -306,6 +313,6 @@ def _checked_pose(pose: Float[AnyArray, "4 4"] | list | None) -> Float[np.ndarra
 
 
 def _diameter(points: Float[np.ndarray, "n 3"]) -> float:
-    """Distance between two points that lie about the farthest apart."""
+    """Return the approximate distance between the two points that are farthest apart."""
     far = points[np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1))]
     return float(np.linalg.norm(points - far, axis=1).max())

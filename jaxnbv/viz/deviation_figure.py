@@ -1,4 +1,4 @@
-"""Picture of a deviation: the CAD from two sides, coloured where it was scanned, with its worst places numbered."""
+"""Draws a CAD model from two sides, coloured by a scan's deviation, with the worst places numbered."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -22,14 +22,16 @@ from jaxnbv.viz.style import INK
 
 # Blue where material is missing, red where there is too much; grey where nothing was scanned.
 _COLOURS, _BLANK = mpl.colormaps["RdBu_r"], "#76808f"
+# Pixels along each side of a picture. Width and height of the figure in inches.
 _SIZE, _WIDTH, _HEIGHT = 640, 7.2, 3.7
-# Directions from which the CAD may be drawn, largest height of these, points that decide between them, and their
-# distance from the surface when rays are traced to the eye.
+# Number of viewing directions to choose from, and their largest height. Number of points on the CAD whose visibility
+# decides, and distance from the surface at which their rays to the viewer start.
 _EYES, _HIGHEST, _SAMPLES, _CLEAR = 120, 0.7, 400, 0.02
-# Weight of a numbered place, if all scanned samples together weigh 1 and the others a third each of a scanned one.
+# Weight of the visibility of a numbered place (a fully scanned surface has weight 1 in all), and of a point that was
+# not scanned relative to a scanned point.
 _PLACE, _UNSCANNED = 1.0, 1.0 / 3.0
 
-# Deviations at places on the CAD with these normals; NaN where it was not scanned.
+# Function that returns the deviations at places on the CAD, given the places and their normals. NaN if not scanned.
 Values = Callable[[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]], Float[np.ndarray, " m"]]
 
 
@@ -44,10 +46,10 @@ class Mark(NamedTuple):
 def deviation_figure(
     cad: TriangleMesh, values_at: Values, marks: Sequence[Mark], limit: float, unit_name: str, caption: str, up: str
 ) -> Figure:
-    """The figure, 7.2 by 3.7 inches.
+    """Draw the CAD from two sides, coloured by deviation, with numbered places (7.2 by 3.7 inches).
 
-    - `marks`: at least one, in the coordinates of `cad`.
-    - `limit`: deviation at the ends of the colours. `up`: upward axis, see `Frame`.
+    - `values_at`: see `Values`. `marks`: places to number, at least one, in the coordinates of `cad`.
+    - `limit`: deviation at the ends of the colours. `up`: upward axis of `cad`, see `Frame`.
     """
     scene = TriangleMesh.from_arrays(cad.vertices, cad.faces, up)
     positions = np.asarray(scene.frame.to_scene(np.stack([mark.position for mark in marks])))
@@ -76,7 +78,10 @@ def deviation_figure(
 def _two_eyes(
     scene: TriangleMesh, values_at: Values, positions: Float[np.ndarray, "k 3"], outward: Float[np.ndarray, "k 3"]
 ) -> Float[np.ndarray, "2 3"]:
-    """The direction that shows most of the places and of the scanned surface, and the one that adds most to it."""
+    """Return two viewing directions that together show most of the numbered places and the scan.
+
+    - `positions`, `outward`: numbered places and the outward normals there, in scene coordinates.
+    """
     mesh = scene.to_trimesh()
     samples, rows = trimesh.sample.sample_surface(mesh, _SAMPLES, seed=0)
     normals = mesh.face_normals[rows]
@@ -118,7 +123,11 @@ def _painted(scene: TriangleMesh, eye: Float[np.ndarray, "3"], values_at: Values
 
 
 def _number(axes: Any, still: Still, positions: Float[np.ndarray, "k 3"], middle: Float[np.ndarray, "2"]) -> None:
-    """Write numbers beside the visible places, on the side away from the middle of the picture."""
+    """Write the number of each visible place beside it, on the side away from the centre of the object.
+
+    - `positions`: places in scene coordinates, in the order of their numbers.
+    - `middle`: mean pixel of the object's vertices.
+    """
     pixels, in_front = still.project(positions)
     for number, (pixel, is_visible) in enumerate(zip(pixels, in_front, strict=True), start=1):
         if not is_visible:

@@ -1,4 +1,4 @@
-"""Points and surface of an episode, as files in world units."""
+"""Exports the points and the surface of an episode, in world units."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,9 +23,9 @@ _CLOUDS, _MESHES = ("ply", "obj", "glb", "xyz"), ("ply", "obj", "glb", "stl", "o
 
 @checked
 def scanned_cloud(episode: Episode) -> PointCloud:
-    """All points that the views measured on the object, in world units.
+    """Return all points that the views measured on the object, in world units.
 
-    They have the resolution of the scans. `Episode.cloud` has the points that planning keeps.
+    The points have the resolution of the scans. `Episode.cloud` has only the points that planning keeps.
 
     **Raises:** `ValueError` for an episode without views.
     """
@@ -38,12 +38,12 @@ def scanned_cloud(episode: Episode) -> PointCloud:
 
 @checked
 def surface_mesh(episode: Episode, imagined: bool = True) -> trimesh.Trimesh:
-    """The surface after the last view in world units: the posterior's mean, or the likeliest known part.
+    """Return the surface after the last view in world units: the posterior mean's, or the likeliest part.
 
     - `imagined`: whether to keep surface that no view measured.
 
     `vertex_attributes["deviation"]` is the standard deviation of each vertex along its normal.
-    `face_attributes["measured"]` is 1 for a face with points within a cell of the sampler's grid, else 0.
+    `face_attributes["measured"]` is 1 if each vertex of a face is within one grid spacing of a scanned point, else 0.
 
     **Raises:** `ValueError` for an episode without views, or whose grid holds no surface.
     """
@@ -66,10 +66,10 @@ def surface_mesh(episode: Episode, imagined: bool = True) -> trimesh.Trimesh:
 
 
 class Region(NamedTuple):
-    """A part of the surface that no view measured, in world units.
+    """A connected part of the surface that no view measured, in world units.
 
-    - `center`: the mean of its points; `normal`: its mean normal, the side to look from; `area`; `radius`: how far its
-      points are from the center at most.
+    - `center`, `normal`: mean position, and mean outward normal: look at the region from this side.
+    - `area`, `radius`: area, and largest distance of a triangle of the region from `center`.
     """
 
     center: Float[np.ndarray, "3"]
@@ -80,11 +80,11 @@ class Region(NamedTuple):
 
 @checked
 def missing_regions(episode: Episode, smallest: float = 0.0) -> list[Region]:
-    """Connected parts of the expected surface that no view measured, the largest first.
+    """Return the connected parts of the expected surface that no view measured, the largest first.
 
-    Surface on which the object stands on an obstacle cannot be measured, and does not count as missing.
+    Surface near an obstacle, on which the object may stand, cannot be measured, and does not count as missing.
 
-    - `smallest`: the least area of a region, in world units.
+    - `smallest`: area that a region must exceed, in squared world units.
 
     **Raises:** `ValueError` as `surface_mesh` does.
     """
@@ -104,16 +104,18 @@ def _region(mesh: trimesh.Trimesh, faces: Int[np.ndarray, " f"]) -> Region:
     areas, centers = mesh.area_faces[faces], mesh.triangles_center[faces]
     normal, area = areas @ mesh.face_normals[faces], float(areas.sum())
     center = areas @ centers / max(area, np.finfo(float).tiny)
-    # A closed surface has no side.
+    # The mean normal of a closed surface is zero.
     length = max(float(np.linalg.norm(normal)), np.finfo(float).tiny)
     return Region(center, normal / length, area, float(np.linalg.norm(centers - center, axis=1).max()))
 
 
 @checked
 def save_cloud(episode: Episode, path: str | Path) -> Path:
-    """Write `scanned_cloud` as a PLY, OBJ, GLB or XYZ file, by its ending; PLY holds the normals too.
+    """Write `scanned_cloud` to a PLY, OBJ, GLB or XYZ file, according to the suffix of `path`.
 
-    **Raises:** `ValueError` as `scanned_cloud` does, for another ending, or if the file cannot be written.
+    Only a PLY file holds the normals.
+
+    **Raises:** `ValueError` as `scanned_cloud` does, for a different suffix, or if the file cannot be written.
     """
     points, normals = scanned_cloud(episode).to_numpy()
     kind = _kind(path, _CLOUDS)
@@ -126,11 +128,11 @@ def save_cloud(episode: Episode, path: str | Path) -> Path:
 
 @checked
 def save_mesh(episode: Episode, path: str | Path, imagined: bool = True) -> Path:
-    """Write `surface_mesh` as a PLY, OBJ, GLB, STL or OFF file, by its ending.
+    """Write `surface_mesh` to a PLY, OBJ, GLB, STL or OFF file, according to the suffix of `path`.
 
-    PLY holds the deviation of each vertex, and whether each face was measured.
+    Only a PLY file holds the deviation of each vertex, and whether each face was measured.
 
-    **Raises:** `ValueError` as `surface_mesh` does, for another ending, or if the file cannot be written.
+    **Raises:** `ValueError` as `surface_mesh` does, for a different suffix, or if the file cannot be written.
     """
     kind = _kind(path, _MESHES)
     return _written(path, surface_mesh(episode, imagined).export(file_type=kind))

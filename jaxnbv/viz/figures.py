@@ -1,4 +1,4 @@
-"""The picture of all views of an episode, and the style of figures."""
+"""Draws all views of an episode in one figure. `STYLE` is the style of all figures."""
 
 from typing import Any
 
@@ -33,7 +33,7 @@ _ROW, _LINE = 5.0, 0.26
 
 
 def overview_figure(data: ReportData) -> Figure:
-    """Scenes over acquisition maps, at most five to a row, and a legend."""
+    """Draw each view's scene above its map of the acquisition, at most five views in a row, and a legend."""
     columns = min(len(data.views), 5)
     rows, width = -(-len(data.views) // columns), max(3.0 * columns, 6.0)
     chosen = [view.proposal for view in data.views if view.proposal is not None]
@@ -67,7 +67,7 @@ def overview_figure(data: ReportData) -> Figure:
 
 
 def _draw_deviations(axes: Any, data: ReportData) -> None:
-    """Draw the colour bar of the surfaces' deviations."""
+    """Draw the colour bar of the surfaces' standard deviations."""
     low, high = data.deviations
     bar = axes.figure.colorbar(ScalarMappable(LogNorm(low, high), DEVIATION), cax=axes, orientation="horizontal")
     bar.outline.set_visible(False)

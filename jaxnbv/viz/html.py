@@ -1,4 +1,4 @@
-"""HTML pages from Jinja templates. Values are escaped unless the template says `safe`."""
+"""Makes HTML pages from Jinja templates. Values are escaped unless the template says `safe`."""
 
 import base64
 from pathlib import Path
@@ -8,7 +8,7 @@ import jinja2
 
 
 def render(template: Path, **values: Any) -> str:
-    """Render a template, a file beside the code, with some values."""
+    """Return the HTML text that a Jinja template file makes of these values."""
     settings: dict[str, Any] = {"autoescape": True, "trim_blocks": True, "lstrip_blocks": True}
     environment = jinja2.Environment(undefined=jinja2.StrictUndefined, **settings)
     environment.filters["base64"] = lambda content: base64.b64encode(content).decode()

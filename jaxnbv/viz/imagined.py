@@ -1,4 +1,4 @@
-"""Sampled surfaces of a step, as the chosen camera would see them."""
+"""Pictures of a step's imagined surfaces, as the chosen camera would see them."""
 
 import math
 from typing import NamedTuple
@@ -27,16 +27,16 @@ SHOWN = 4
 _PIXELS = 96
 # Colours of surface seen before, and of other imagined surface. The latter is light, so that its shape shows.
 _KNOWN, _UNSEEN = "#c3c9d2", "#5b8fc7"
-# A surface counts as seen before if it is nearer to the cloud than this, or than this many spacings of the cloud.
+# A point counts as seen before if it is nearer to the cloud than this (scene units) or this many spacings of the cloud.
 _SEEN, _SPACINGS = 0.05, 3.0
 
 
 class Look(eqx.Module):
-    """An image of a surface from a camera.
+    """A shaded picture of a surface from a camera.
 
     - `mask`: whether each ray hits the surface.
     - `lit`: brightness by a lamp beside the camera, in [0, 1].
-    - `known`: whether the place was seen before.
+    - `known`: whether an earlier view saw the surface at this pixel.
     """
 
     mask: Bool[np.ndarray, "h w"]
@@ -47,7 +47,7 @@ class Look(eqx.Module):
 class Imagined(eqx.Module):
     """Imagined surfaces of a step before its view.
 
-    - `samples`: some sampled surfaces, or the likeliest parts, seen from the chosen pose.
+    - `samples`: pictures from the chosen pose of some sampled surfaces, or of the likeliest parts.
     - `names`: name of each sample.
     - `kinds`: kinds of known shapes with their probabilities. Empty without known shapes.
     """
@@ -58,9 +58,9 @@ class Imagined(eqx.Module):
 
 
 def imagined(episode: Episode, index: int, inputs: StepInputs) -> Imagined | None:
-    """Imagined surfaces before view `index` (from 0), or None if the view was not chosen.
+    """Return pictures of the surfaces imagined before view `index` (from 0); None for a given view.
 
-    - `inputs`: of the view's step, with its samples.
+    - `inputs`: inputs of the step that chose the view, with the samples.
     """
     planner, sampler, view = episode.planner, episode.planner.sampler, episode.views[index]
     parts = inputs.observations.hypotheses if planner.acquisition.needs_hypotheses else None
@@ -68,7 +68,7 @@ def imagined(episode: Episode, index: int, inputs: StepInputs) -> Imagined | Non
         return None
     camera, cloud = _finer(planner.camera), inputs.observations.cloud.to_numpy()[0]
     barrier, samples = barrier_of(planner.obstacles, camera, view.pose), list[Look]()
-    # Scans of triangles need no compilation, which a picture of this size is not worth.
+    # Scan triangles: other scans must be compiled, which takes too long for a picture of this size.
     if isinstance(parts, PartHypotheses):
         likely = placed_parts(parts, SHOWN)
         names, kinds = [part.name for part in likely], parts.names()
@@ -92,13 +92,13 @@ def imagined(episode: Episode, index: int, inputs: StepInputs) -> Imagined | Non
 
 
 def taken_look(view: View, cloud: Float[np.ndarray, "n 3"]) -> Look | None:
-    """The look of a view, or None if its scan is no image. `cloud`: points seen before."""
+    """Return the picture of a view's scan; None if the scan is not an image. `cloud`: points seen before."""
     is_image = view.scan.capacity == view.camera.num_rays
     return look(view.scan, view.camera, view.pose, cloud) if is_image else None
 
 
 def look(seen: PointCloud, camera: Camera, pose: Pose, cloud: Float[np.ndarray, "n 3"]) -> Look:
-    """The look of a scan, whose rows are pixels. `cloud`: points seen before."""
+    """Return the picture of a scan that has one row per pixel. `cloud`: points seen before."""
     points, normals = (np.asarray(rows, np.float64) for rows in (seen.points, seen.normals))
     mask = np.asarray(seen.mask)
     lit = np.clip(0.35 + 0.65 * normals @ lamp(pose), 0.0, 1.0)
@@ -110,21 +110,21 @@ def look(seen: PointCloud, camera: Camera, pose: Pose, cloud: Float[np.ndarray, 
 
 
 def lamp(pose: Pose) -> Float[np.ndarray, "3"]:
-    """The direction to a lamp beside a camera, a unit vector."""
+    """Return the unit vector toward the lamp of a picture, which is beside the camera."""
     right, down, forward = np.asarray(pose.rotation, np.float64).T
     return unit(-forward - 0.5 * right - 0.7 * down)
 
 
 def _finer(camera: Camera) -> Camera:
-    """The camera with about as many pixels along its longer side as the picture."""
+    """Return the camera with a multiple of its pixels: at least `_PIXELS` along the longer side."""
     factor = math.ceil(_PIXELS / max(camera.height, camera.width))
     return camera if factor == 1 else camera.resized(factor * camera.height, factor * camera.width)
 
 
 def look_picture(look: Look, hidden: str = BEFORE, plain: bool = False) -> UInt8[np.ndarray, "h w 3"]:
-    """A lit image of a look: grey where seen before, `hidden` elsewhere, and white without a hit.
+    """Colour a picture: grey where seen before, `hidden` elsewhere on the surface, and white without a hit.
 
-    - `plain`: whether all is grey.
+    - `plain`: whether to make the whole surface grey.
     """
     tints = np.array([mpl.colors.to_rgb(colour) for colour in (hidden, _KNOWN)])
     colours = tints[(look.known | plain).astype(int)] * (0.25 + 0.75 * look.lit[..., None])
@@ -132,14 +132,14 @@ def look_picture(look: Look, hidden: str = BEFORE, plain: bool = False) -> UInt8
 
 
 class Tile(NamedTuple):
-    """A small picture, and what it is."""
+    """A small picture and its caption."""
 
     name: str
     picture: UInt8[np.ndarray, "h w 3"]
 
 
 def looks(imagined: Imagined, taken: Look | None) -> list[Tile]:
-    """The sampled surfaces from the chosen pose, and beside them what was then seen."""
+    """Return pictures of the imagined surfaces from the chosen pose, and of what the view then saw."""
     pairs = zip(imagined.names, imagined.samples, strict=True)
     tiles = [Tile(name, look_picture(sample, _UNSEEN)) for name, sample in pairs]
     return tiles if taken is None else [*tiles, Tile("then seen", look_picture(taken, NEW))]

@@ -54,13 +54,13 @@ _ASIDE = (
 
 
 class LiveView:
-    """A page that shows an episode or a session, and changes with it.
+    """A web page that shows an episode or a session. `update` draws it again.
 
     Coordinates are those of the scene, with y up. The page shows points, cameras, candidates coloured by value, and the
     next view with its expected depth. The surface is the likeliest known shape, or else the posterior mean coloured by
     its uncertainty. Imagined surfaces can be switched on in the scene tree. A slider goes back to earlier views.
 
-    - `port`, `host`: address of the page, by default for this machine alone.
+    - `port`, `host`: address of the page. By default only this machine can open it.
 
     **Raises:** `ValueError` if viser is not installed.
     """
@@ -157,7 +157,7 @@ class LiveView:
 def _surfaces(
     sampler: SurfaceSampler, observations: Observations, key: PRNGKeyArray
 ) -> tuple[MeanSurface | None, list[tuple[str, Triangles]], Kinds]:
-    """The surface that pictures show, names and triangles of some imagined ones, and what the object may be.
+    """Return the surface to show, names and triangles of some imagined surfaces, and kinds of known shapes.
 
     With known parts, the imagined surfaces are the likeliest parts.
     """
@@ -178,7 +178,7 @@ def _surfaces(
 
 
 def _told(episode: Episode, kinds: Kinds, proposal: Proposal | None) -> str:
-    """The answer, the next view, and what else is known, as Markdown.
+    """Return the answer, the next view, the amount seen and the kinds of known shapes, as Markdown.
 
     - `proposal`: the next view, with values in world units.
     """
@@ -233,7 +233,7 @@ def _surface(scene: Any, surface: MeanSurface | None) -> list[Any]:
 
 
 def _imagined(scene: Any, surfaces: Iterable[tuple[str, Triangles]]) -> list[Any]:
-    """Some surfaces, by the shapes that they are about."""
+    """Add imagined surfaces to the scene, hidden at first, and return their handles."""
     settings: dict[str, Any] = {"color": to_rgb("#8fb8d8"), "opacity": 0.9, "visible": False}
     return [
         scene.add_mesh_simple(f"/imagined/{number} {shape}".rstrip(), *triangles, **settings)
@@ -242,7 +242,7 @@ def _imagined(scene: Any, surfaces: Iterable[tuple[str, Triangles]]) -> list[Any
 
 
 def _depth_picture(depth: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Near is bright, far dark; white where nothing is expected."""
+    """Colour a depth image: near is bright, far is dark, and NaN (no surface expected) is white."""
     colours = mpl.colormaps["viridis_r"].with_extremes(bad="white")
     return colours(Normalize(*colour_range(depth))(depth), bytes=True)[..., :3]
 
@@ -259,7 +259,7 @@ def _choice(scene: Any, camera: Camera, proposal: Proposal, picture: np.ndarray 
 
 
 def _legend(surface: MeanSurface | None, proposal: Proposal | None, sought: Quantity, frame: Frame) -> str:
-    """The legend of colours, as HTML."""
+    """Return the legend of the colours as HTML."""
     marks = [("points before", BEFORE), ("new points, last camera", NEW), ("earlier cameras", GREY)]
     marks += [] if proposal is None else [("next view", _NEXT)]
     if isinstance(surface, PlacedShape):

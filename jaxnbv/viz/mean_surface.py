@@ -1,4 +1,4 @@
-"""The surface of a posterior's mean as triangles, with a standard deviation at each vertex."""
+"""Computes the surface of a posterior's mean as triangles, with a standard deviation at each vertex."""
 
 import equinox as eqx
 import jax
@@ -15,24 +15,25 @@ from jaxnbv.sampler import StepInputs, SurfaceSampler
 from jaxnbv.scanning import Grid
 from jaxnbv.scanning.mesh import level_triangles
 
-# The variance of a point costs a triangular solve with the whole cloud. The slope costs two evaluations of the mean.
+# Variance and slope are computed at this many vertices and interpolated to the others. The variance of a point costs a
+# triangular solve with the whole cloud. The slope costs two evaluations of the mean.
 _DEVIATION_ANCHORS = 256
 _SLOPE_ANCHORS = 1024
 _SLOPE_STEP = 0.005
-# Deviation as a share of the distance to the nearest point. On a cow after one to five views, between 0.1 and 0.4 from
-# the points, the error of the surface is 0.2 to 0.3 of this distance (root mean square), which is two to three of the
-# posterior's standard deviations. Measured from the truth to the surface, which may lack a part, it is 0.4 to 0.7.
+# Deviation as a fraction of the distance to the nearest point. On a cow after one to five views, between 0.1 and 0.4
+# from the points, the error of the surface is 0.2 to 0.3 of this distance (root mean square), which is two to three of
+# the posterior's standard deviations. Measured from the truth to the surface, which may lack a part, it is 0.4 to 0.7.
 _UNSEEN = 0.25
-# A piece of the surface counts as measured if a point is nearer than this, in scene units.
+# A piece of the surface is kept if a point of the cloud is nearer than this, in scene units.
 _HELD = 0.1
 
 
 class MeanSurface(eqx.Module):
     """Triangles of the surface where the posterior mean equals its level, in scene coordinates.
 
-    - `normals`: unit, outward.
-    - `deviation`: standard deviation of the surface's position along its normal, to first order:
-      sd f(x) / |grad E f(x)|, in scene units.
+    - `normals`: outward unit normal at each vertex.
+    - `deviation`: standard deviation (sd) of the surface's position along its normal, to first order: sd f(x) / |grad E
+      f(x)|, in scene units.
     """
 
     vertices: Float[np.ndarray, "v 3"]
@@ -47,12 +48,12 @@ class MeanSurface(eqx.Module):
 
 
 def mean_surface(sampler: SurfaceSampler, inputs: StepInputs) -> MeanSurface | None:
-    """The surface of the posterior's mean with its standard deviation. None if there is no surface.
+    """Return the surface where the posterior mean equals its level; None if there is no such surface.
 
     The mean is carved like the samples.
 
-    - `inputs`: must have a posterior. If it has no closed forms, mean and deviation come from the samples, by default
-      under a fixed key.
+    - `inputs`: inputs of a step, with a posterior. If the posterior has no closed forms, mean and deviation are those
+      of the inputs' samples, or of samples drawn with a fixed key.
     """
     observations, posterior, surfaces = inputs.observations, inputs.posterior, inputs.surfaces
     assert posterior is not None
@@ -90,10 +91,11 @@ def _mean_of_samples(values: Float[np.ndarray, "s g g g"], grid: Grid) -> MeanSu
 
 
 def as_shown(surface: MeanSurface | None, cloud: PointCloud) -> MeanSurface | None:
-    """The pieces of the surface that hold points of the cloud, or None. Other pieces are guesses.
+    """Return the connected pieces of a surface that are near points of the cloud; None if there are none.
 
-    The deviation becomes sqrt(sd^2 + (r / 4)^2), where r is the distance to the nearest point of the cloud. The
-    posterior's own deviation is too small where no ray has hit, beside the image's border or behind the object.
+    Other pieces are guesses. The deviation becomes sqrt(sd^2 + (r / 4)^2), where sd is the surface's deviation and r
+    the distance to the nearest point of the cloud. The posterior's own deviation is too small where no ray has hit,
+    beside the image's border or behind the object.
     """
     if surface is None:
         return None
@@ -109,15 +111,18 @@ def as_shown(surface: MeanSurface | None, cloud: PointCloud) -> MeanSurface | No
 
 
 def _spread(features: np.ndarray, count: int) -> np.ndarray:
-    """Indices of `count` rows far from each other, in order of choice. Repeats the first if there are fewer rows."""
-    # Padded to a power of two, so that surfaces of other sizes share a compilation.
+    """Return the indices of `count` rows far from each other, in order of choice.
+
+    If there are fewer rows, the first index is repeated.
+    """
+    # Pad to a power of two, so that surfaces of different sizes share a compiled program.
     capacity = 1 << (len(features) - 1).bit_length()
     padded = np.pad(features.astype(np.float32), ((0, capacity - len(features)), (0, 0)))
     return np.asarray(farthest_point_indices(jnp.asarray(padded), jnp.arange(capacity) < len(features), count))
 
 
 def _interpolate(features: np.ndarray, anchors: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Interpolate positive values from the anchors to all rows: a Gaussian mean of the logarithms of the nearest."""
+    """Interpolate positive values from anchors to all rows: a weighted mean of logarithms at near anchors."""
     distance, near = cKDTree(features[anchors]).query(features, k=min(8, len(anchors)))
     width = 0.5 * distance[:, -1:] + 1e-12
     weight = np.exp(-0.5 * (distance / width) ** 2) + 1e-12

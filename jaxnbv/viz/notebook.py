@@ -1,4 +1,4 @@
-"""Representations in notebooks: pictures of clouds, posteriors, proposals and episodes, and lines of facts."""
+"""Shows objects in notebooks: pictures of clouds, posteriors, proposals and episodes, and captions."""
 
 import base64
 import builtins
@@ -38,14 +38,14 @@ from jaxnbv.viz.scene import seen_items
 from jaxnbv.viz.style import BEFORE, VALUE
 
 _INCHES, _LARGE, _LETTERS, _DPI = 2.4, 4.8, 62, 110
-# Viewpoint for clouds whose normals look in all directions.
+# Viewpoint for clouds whose normals point in all directions.
 _USUAL_EYE = np.array([0.8, 0.9, 2.2])
 # Half the side of the slice of a posterior, in scene units, and its pixels along a side.
 _REACH, _PIXELS = 1.5, 48
 
 
 class Drawing(NamedTuple):
-    """A function that draws into an empty axes, or None; and what is said of it."""
+    """A function that draws an object into empty axes (None for no picture), and the object's caption."""
 
     draw: Callable[[Axes], Any] | None
     facts: str
@@ -67,7 +67,7 @@ class Picture:
 
 
 def html_of(shown: Any) -> str:
-    """A small picture and a line of facts, as HTML."""
+    """Return HTML with a small picture of an object and its caption."""
     drawing = drawing_of(shown)
     caption = html.escape(drawing.facts)
     if drawing.draw is None:
@@ -84,7 +84,7 @@ def html_of(shown: Any) -> str:
 
 @functools.singledispatch
 def drawing_of(shown: Any) -> Drawing:
-    """Picture and caption of an object, by its type."""
+    """Return the drawing of an object, according to its type."""
     return Drawing(None, repr(shown))
 
 
@@ -105,7 +105,7 @@ def _(cloud: PointCloud) -> Drawing:
 
 
 def _draw_shaded(points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], axes: Axes) -> None:
-    """From where the normals look to, bright where they look at the eye; in any unit."""
+    """Draw a cloud (in any unit) from the mean direction of its normals, bright where it faces the viewer."""
     eye = normals.mean(axis=0)
     eye = eye if np.linalg.norm(eye) > 0.2 else _USUAL_EYE
     rotation = np.asarray(look_at(eye).rotation)
@@ -126,7 +126,7 @@ def _(posterior: SurfacePosterior) -> Drawing:
 
 
 def _draw_slice(posterior: SurfacePosterior, axes: Axes) -> None:
-    """P(f < level) on a plane through the scene, x to the right and y up."""
+    """Draw P(f < level), the probability of being inside, on the plane z = 0, with x to the right and y up."""
     axis = jnp.linspace(-_REACH, _REACH, _PIXELS)
     x, y = jnp.meshgrid(axis, axis)
     places = jnp.stack([x.ravel(), y.ravel(), jnp.zeros(_PIXELS**2)], axis=-1)
@@ -159,7 +159,7 @@ def _(episode: Episode) -> Drawing:
 
 
 def _draw_views(episode: Episode, part: PlacedShape | None, axes: Axes) -> None:
-    """The points, those of the last view told apart, the likeliest part, and where the cameras stood."""
+    """Draw the points (those of the last view in a different colour), the likeliest part, and the cameras."""
     poses = [view.pose for view in episode.views]
     extent = max(1.8, *(float(np.linalg.norm(pose.position)) for pose in poses))
     still = Still(beside(poses[-1]), part, 400, extent)
@@ -199,7 +199,7 @@ def _(planner: Planner) -> Drawing:
 def show(
     shown: PointCloud | Observations | SurfacePosterior | Proposal | Episode | Session | Planner, progress: bool = True
 ) -> Picture:
-    """A large picture for a notebook. Elsewhere it is saved as a PNG file, and its path is printed.
+    """Return a large picture for a notebook. Outside notebooks, also save it as PNG and print its path.
 
     For an episode or a session it shows all views, with the surface and the candidates of each.
 
