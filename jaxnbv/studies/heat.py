@@ -78,8 +78,8 @@ class Truth(NamedTuple):
 def _saturated(record: Record, method: str) -> dict[int, float]:
     """Return, for each view after the first, 1.0 if the chosen view has value zero, else 0.0.
 
-    A search chooses the highest value. So if it is zero, all candidates have value zero. The result of a method that is
-    not in `HEAT_METHODS` is {}.
+    A search chooses the highest value, so all candidates then have value zero. The result of a method that is not in
+    `HEAT_METHODS` is {}.
     """
     steps = record["methods"][method]["steps"] if method in HEAT_METHODS else []
     return {view: float(step["value"] == 0.0) for view, step in enumerate(steps, start=2)}

@@ -181,7 +181,7 @@ class IdentificationStudy(Study):
         return Scene(index, parts.bank.names[part], placed.mesh, placed)
 
     def sensor(self, scene: Scene) -> Sensor:
-        """Return a depth camera with noisy points, normals and ranges.
+        """Return a depth camera whose points, normals and ranges (distances along the rays) are noisy.
 
         Obstacles hide the part, and points on obstacles are removed from the scans.
         """
@@ -234,7 +234,7 @@ class IdentificationStudy(Study):
         (task, points, diameter), bank = truth, hypotheses.bank
         weights = np.append(np.asarray(hypotheses.shape_weights), hypotheses.weights[-1])
         named, (part, placement) = int(np.argmax(weights)), hypotheses.most_likely
-        # Count parts that the scans so far do not distinguish as tied. Otherwise their order in the bank would decide.
+        # Parts that the scans do not distinguish yet are tied. Otherwise their order in the bank would decide.
         is_tied = weights >= _LEVEL * weights.max()
         right = float(is_tied[task.part] / is_tied.sum())
         rotation, shift = np.asarray(placement.rotation, np.float64), np.asarray(placement.shift, np.float64)

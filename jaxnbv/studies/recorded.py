@@ -101,7 +101,7 @@ class MostNewVoxels(Baseline):
         return Quantity("new voxels", "", "voxels that a frame shows and no earlier frame does.", smooth=False)
 
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
-        """Return the number of new voxels of each candidate. The key is not used."""
+        """Return how many voxels each candidate shows that no visited one does. The key is not used."""
         is_shown = jnp.any(self.is_shown & problem.observations.poses.contains(candidates)[:, None], axis=0)
         gain = jnp.sum(self.is_shown & ~is_shown, axis=1)
         return gain.astype(candidates.position.dtype)

@@ -1,7 +1,7 @@
 """Measures of classification studies: hits, visible cues, and the quality of samples and values.
 
-A view is a first hit if some prediction up to this view is the right class. A view is a stable hit if all predictions
-from this view to the last view are the right class. The cue is the part of the object that tells its class.
+A view is a first hit if at least one prediction up to this view is the right class. A view is a stable hit if all
+predictions from this view to the last view are the right class. The cue is the part of an object that tells its class.
 """
 
 from collections.abc import Callable
@@ -66,10 +66,10 @@ def roughness(sampler: SurfaceSampler, inputs: StepInputs) -> float:
     """Return the roughness of the samples in `inputs`.
 
     It is the average number of grid cells that a sample's surface crosses, divided by the number of cells that the
-    surface of the posterior mean crosses. The posterior mean is carved as the samples are. If the posterior has no
-    closed forms, the mean of the samples is used. The roughness is about 1 for samples as smooth as the mean, and it
-    rises if the spacing of the data exceeds the kernel's width. If it is near 5, values of an acquisition say little
-    about which view is best.
+    surface of the posterior mean crosses. The posterior mean is carved as the samples are. If it has no closed form,
+    the mean of the samples is used. The roughness is about 1 for samples as smooth as the mean, and it rises if the
+    spacing of the data exceeds the kernel's width. If it is near 5, values of an acquisition say little about which
+    view is best.
     """
     posterior, surfaces = inputs.posterior, inputs.surfaces
     assert posterior is not None

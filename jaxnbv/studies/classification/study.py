@@ -56,7 +56,7 @@ class Truth(eqx.Module):
     """The class of a scene's object, and what the candidates show of the object.
 
     - `label`: index of the class; `thing`: the object.
-    - `scans`: true noisy scan of each candidate.
+    - `scans`: noisy scan of the true object from each candidate.
     - `pixels`: number of rays of each candidate that hit the cue, the part of the object that tells its class.
     """
 
@@ -236,7 +236,7 @@ class ClassificationStudy(Study):
         return Grid(self.grid_resolution, 0.7 * self.framing.longest_side)
 
     def shows_enough(self, scene: Scene, scan: PointCloud) -> bool:
-        """Return whether a scan shows the object and meets the condition `first`.
+        """Return whether a scan shows the object and meets the condition for first views, `self.first`.
 
         With `FirstView.MISCLASSIFIED`, the classifier must be wrong about the scan.
         """

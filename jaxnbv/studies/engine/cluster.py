@@ -176,7 +176,7 @@ def _call(
 
 @functools.cache
 def _prepare() -> dict[str, Any]:
-    """Enable the cache of compiled programs, as the command does, and return the versions of this process.
+    """Enable the cache of compiled programs, as commands do, and return `versions` of this process.
 
     Only the first call in a process does this. Later calls return the same versions.
     """

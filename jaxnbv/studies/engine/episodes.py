@@ -48,10 +48,10 @@ def episode_record(
 ) -> Record:
     """Run an episode and return its record.
 
-    The record holds the poses of the views, the value and seconds of each step, and the record that `follow` returns.
-    The episode ends after `views` views, or earlier if `follow` stops drawing steps.
+    The record holds the poses of the views, the value and the time (seconds) of each proposal, and the record that
+    `follow` returns. The episode ends after `views` views, or earlier if `follow` stops drawing steps.
 
-    - `first`: pose of the first view.
+    - `first`: pose of the first view; `camera`: camera of the sensor.
     - `follow`: function that draws the steps from an iterator and returns a record.
     """
     poses: list[dict[str, list]] = []

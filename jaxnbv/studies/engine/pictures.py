@@ -73,7 +73,7 @@ def _drawn(tiles: Tiles, record: Record, methods: Sequence[str]) -> Figure:
 
 
 def _of_one_column(tiles: Tiles, record: Record, methods: Sequence[str], column: str) -> Figure:
-    """Draw a picture with one tile per method, several tiles to a row. The title names their only `column`."""
+    """Draw a picture with one tile per method, several in a row. Its title ends in `column`."""
     cells = ([("truth", None)] if tiles.truth is not None else []) + [(method, method) for method in methods]
     wide = min(len(cells), _MOST_A_ROW)
     tall = -(-len(cells) // wide)

@@ -203,7 +203,10 @@ class Study(eqx.Module):
         """
 
     def scene_record(self, scene: Scene, truth: Any, first: int) -> Record:
-        """Return the facts about the scene that its record stores, which must be JSON-serialisable."""
+        """Return the facts about the scene that its record stores, which must be JSON-serialisable.
+
+        - `truth`: the result of `truth` for the scene; `first`: index of the first view among the candidates.
+        """
         return {"name": scene.name}
 
     def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles | None:

@@ -69,8 +69,8 @@ def still_of(
 ) -> Still:
     """Render a mesh, seen from the direction `eye`, in an image of `size` x `size` pixels.
 
-    - `value`: function that returns a value for each point. The values, at least 1e-6, colour the surface; default: one
-      colour.
+    - `value`: function that returns a value for each point. The values colour the surface, and values below 1e-6 count
+      as 1e-6; default: one colour.
     - `norm`: colour scale of the values.
     """
     vertices, faces = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, _EDGE, max_iter=12)

@@ -95,7 +95,7 @@ class MeshPartStudy(PartDiscoveryStudy):
         return scene.task.oracle.nearest(points)
 
     def truth(self, scene: Scene) -> list[int]:
-        """Return the indices of the parts that can be found.
+        """Return the indices of the parts that can be found, see `MeshPartStudy`.
 
         **Raises:** `ValueError` if no part can be found.
         """
