@@ -197,7 +197,7 @@ class IdentificationStudy(Study):
         return int(scan.count) >= _ENOUGH * self.camera.num_rays
 
     def sampler_of(self, scene: Scene) -> SurfaceSampler:
-        """Return a sampler whose bank holds the parts in scene units. If there is a table, the parts rest on it."""
+        """Return a sampler whose bank holds the parts in scene units. If there is a table, they rest on it."""
         return self.sampler.with_bank(scene.task.bank, scene.task.poses)
 
     def planner_of(self, acquisition: Acquisition, search: Search, scene: Scene) -> Planner:

@@ -82,9 +82,9 @@ class PyramidStudy(ClassificationStudy):
 
 
 class TruckStudy(ClassificationStudy):
-    """Measures how many views a method needs to tell the class of a truck's cargo. The first view is random.
+    """Measures how many views a method needs to tell the class of a truck's cargo.
 
-    It has the settings of `ClassificationStudy`, and:
+    The first view is random. The study has the settings of `ClassificationStudy`, and:
 
     - `trucks`: mesh files of trucks, which carry the objects of `meshes`.
     """

@@ -104,7 +104,7 @@ class RecordFolder(ResultFolder):
                 raise InputError(f"{file} and {own} differ in {'; '.join(changes[:3])}: delete the one that is wrong")
 
     def failures(self, scenes: Sequence[int]) -> dict[int, str]:
-        """Return the error of each failed scene (one line) by scene index. Files scene_*.failed hold the tracebacks."""
+        """Return the error of each failed scene as one line. Tracebacks are in the files scene_*.failed."""
         files = {index: self._file(index).with_suffix(_FAILED) for index in scenes}
         return {index: file.read_text().partition("\n")[0] for index, file in files.items() if os.path.isfile(file)}
 

@@ -75,7 +75,7 @@ def interval(values: Float[np.ndarray, "scenes columns"]) -> Float[np.ndarray, "
 
 
 def groups_of(table: pd.DataFrame) -> dict[str, int]:
-    """Return the number of scenes in each group of a table of `results`. The first group, "all", holds all scenes."""
+    """Return the number of scenes in each group of a table. The first group, "all", holds all scenes."""
     return table.groupby("group", sort=False)["scenes"].max().to_dict()
 
 

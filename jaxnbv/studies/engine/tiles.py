@@ -42,7 +42,7 @@ class Tiles(NamedTuple):
 
 
 def caption_tile(axes: Axes, text: str, right: bool = False) -> None:
-    """Write a line of text below an image. If `right` (correct), the text is bold and green and starts with a tick."""
+    """Write a line of text below an image. If `right` (correct), it is bold and green, with a tick."""
     colour, weight = (_RIGHT, "bold") if right else (GREY, "normal")
     axes.set_xlabel(f"{'✓ ' if right else ''}{text}", fontsize=9, color=colour, fontweight=weight)
 
@@ -86,7 +86,7 @@ def draw_on(
     points: Float[np.ndarray, "n 3"],
     colours: Float[np.ndarray, "n channels"],
 ) -> None:
-    """Draw a rendered image, and over it the points that its surface does not hide. Near points cover far points."""
+    """Draw a rendered image and the points that its surface does not hide. Near points cover far ones."""
     axes.imshow(still.image, interpolation="antialiased", zorder=1)
     pixels, in_front = still.project(points)
     depth = (points - np.asarray(still.pose.position)) @ np.asarray(still.pose.forward)

@@ -189,7 +189,7 @@ def confusable_solids(name: str) -> list[SignedDistance]:
 
 @functools.cache
 def confusable_meshes(name: str) -> tuple[TriangleMesh, ...]:
-    """Return the parts of a set of `CONFUSABLE_SETS` as meshes. Meshing rounds edges by about 0.03 scene units."""
+    """Return the parts of a set of `CONFUSABLE_SETS` as meshes, whose edges are rounded by about 0.03."""
     values = [np.array(_values(solid, _nodes(_MESH_GRID))) for solid in confusable_solids(name)]
     triangles = [level_triangles(rows, _MESH_GRID) for rows in values]
     return tuple(TriangleMesh(mesh[0], mesh[1], Frame()) for mesh in triangles if mesh is not None)

@@ -25,7 +25,7 @@ _UNTURNED, _UNMOVED = np.eye(3), np.zeros(3)
 
 @dataclasses.dataclass(frozen=True)
 class Primitive:
-    """One primitive of a `LabelledSolid`, as NumPy arrays on the host. `LabelledSolid` describes the fields."""
+    """One primitive of a `LabelledSolid` (which explains the fields), as NumPy arrays on the host."""
 
     label: int
     centre: np.ndarray
