@@ -122,7 +122,7 @@ def _finer(camera: Camera) -> Camera:
 
 
 def look_picture(look: Look, hidden: str = BEFORE, plain: bool = False) -> UInt8[np.ndarray, "h w 3"]:
-    """Colour a picture: grey where seen before, `hidden` elsewhere on the surface, and white without a hit.
+    """Colour a picture: grey where seen before, `hidden` elsewhere on the surface, white without a hit.
 
     - `plain`: whether to make the whole surface grey.
     """

@@ -32,8 +32,8 @@ class MeanSurface(eqx.Module):
     """Triangles of the surface where the posterior mean equals its level, in scene coordinates.
 
     - `normals`: outward unit normal at each vertex.
-    - `deviation`: standard deviation (sd) of the surface's position along its normal, to first order: sd f(x) / |grad E
-      f(x)|, in scene units.
+    - `deviation`: standard deviation of the surface's position along its normal, in scene units. To first order, this
+      is the deviation of f divided by the slope of its mean, sd f(x) / |grad E f(x)|.
     """
 
     vertices: Float[np.ndarray, "v 3"]

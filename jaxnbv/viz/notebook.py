@@ -126,7 +126,7 @@ def _(posterior: SurfacePosterior) -> Drawing:
 
 
 def _draw_slice(posterior: SurfacePosterior, axes: Axes) -> None:
-    """Draw P(f < level), the probability of being inside, on the plane z = 0, with x to the right and y up."""
+    """Draw P(f < level), the probability of being inside, on the plane z = 0. x is to the right, y is up."""
     axis = jnp.linspace(-_REACH, _REACH, _PIXELS)
     x, y = jnp.meshgrid(axis, axis)
     places = jnp.stack([x.ravel(), y.ravel(), jnp.zeros(_PIXELS**2)], axis=-1)

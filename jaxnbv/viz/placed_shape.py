@@ -1,4 +1,4 @@
-"""The known shape that the object most likely is, where it was registered, and what is still open about it."""
+"""The likeliest known shape at its placement, and where the other hypotheses differ from it."""
 
 import dataclasses
 from typing import NamedTuple, TypeAlias
@@ -27,16 +27,16 @@ from jaxnbv.viz.sphere import unit
 
 _Values: TypeAlias = Float[np.ndarray, "_ _ _"]
 
-# Nodes of the grids on which a shape, and what is open about it, are extracted, and hypotheses compared; their half
-# extent relative to the shapes'.
+# Nodes along each axis of the grids for the surface of a shape, for its ghost, and for the distances to the hypotheses.
+# Half extent of the grids relative to the half extent of the shapes.
 _NODES, _FINE, _COARSE, _ROOM = 128, 96, 48, 1.05
-# Probability of "none of these" from which no shape of a bank of examples is drawn: few objects fit an example exactly.
+# No shape is drawn if the probability of "none of these" is higher. Few objects fit an example of a bank exactly.
 _SURELY_NONE = 0.9
-# Number of hypotheses that say what is open, and the least share of their probability that makes space open.
+# Number of hypotheses to compare, and the least fraction of their probability that makes space part of the ghost.
 _RIVALS, _OPEN = 12, 0.1
-# Registrations differ by this much where they agree, and the surface of a share is this soft, in scene units.
+# Distance between two registrations that still agree, and softness of a surface's step, in scene units.
 _TOLERANCE, _SOFTNESS = 0.05, 0.012
-# Open pieces smaller than this share of the shape's area are left out.
+# Pieces of the ghost smaller than this fraction of the shape's area are left out.
 _SMALLEST = 0.01
 # Surface this near to a scanned point counts as measured, and beyond twice this distance as imagined, in scene units.
 _NEAR = 0.06
@@ -45,7 +45,7 @@ _FACING = 0.1
 
 
 class PlacedShape(MeanSurface):
-    """A known shape where it was registered, in scene coordinates. Its deviation is zero.
+    """A known shape at its registered placement, in scene coordinates. Its deviation is zero.
 
     - `name`, `probability`: name and probability of the part, or of the kind of shape.
     - `measured`: for each vertex 1 where points were scanned, 0 where the shape is imagined.
@@ -63,12 +63,12 @@ class PlacedShape(MeanSurface):
 
     @property
     def caption(self) -> str:
-        """Name and probability."""
+        """Name and probability as text."""
         return f"{self.name}  {100 * self.probability:.0f} %"
 
 
 class _Fits(NamedTuple):
-    """Some registered shapes with their probabilities, the one to be drawn first."""
+    """Some registered shapes with their probabilities. The first one is the shape to draw."""
 
     bank: ShapeBank
     placed: Hypotheses
@@ -76,13 +76,13 @@ class _Fits(NamedTuple):
 
     @classmethod
     def of(cls, bank: ShapeBank, placed: Hypotheses, weights: Float[np.ndarray, " h"], rows: list[int]) -> "_Fits":
-        """The fits in these rows."""
+        """Select these rows of `placed`, whose weights are `weights`, and normalise the weights."""
         chosen = np.asarray(rows)
         return cls(bank, jax.tree.map(lambda leaf: leaf[chosen], placed), weights / max(weights.sum(), 1e-30))
 
 
 def placed_parts(hypotheses: PartHypotheses, count: int) -> list[PlacedShape]:
-    """The likeliest parts, each in the likeliest of its placements."""
+    """Return the likeliest parts, `count` at most, each at its likeliest placement."""
     shapes, weights = np.asarray(hypotheses.placed.shape), np.asarray(hypotheses.shape_weights)
     return [
         _placed(hypotheses.bank, hypotheses.placed, int(np.argmax(shapes == part)), float(weights[part]))
@@ -92,9 +92,9 @@ def placed_parts(hypotheses: PartHypotheses, count: int) -> list[PlacedShape]:
 
 
 def likeliest_part(hypotheses: PartHypotheses, cloud: PointCloud | None = None) -> PlacedShape | None:
-    """The likeliest part; None if the object is more likely none of the bank's.
+    """Return the likeliest part at its placement; None if "none of these" is more likely.
 
-    - `cloud`: points that were scanned. Without it all of the part counts as measured, and nothing is open.
+    - `cloud`: scanned points. Without them, all of the part counts as measured, and hypotheses are not compared.
     """
     if next(iter(hypotheses.names())) == NONE:
         return None
@@ -113,11 +113,11 @@ def likeliest_part(hypotheses: PartHypotheses, cloud: PointCloud | None = None) 
 def likeliest_shape(
     bank: ShapeBank, placed: Hypotheses, weights: Float[AnyArray, " h_and_none"], cloud: PointCloud
 ) -> PlacedShape | None:
-    """The likeliest shape of the likeliest kind; None if the object is almost surely none of the bank's.
+    """Return the likeliest shape of the likeliest kind; None if "none of these" is nearly certain.
 
     - `bank`: examples of categories.
-    - `placed`, `weights`: the registered shapes, and the weight of each, last of "none of these".
-    - `cloud`: points that were scanned.
+    - `placed`, `weights`: the registered shapes and their weights. The last weight is that of "none of these".
+    - `cloud`: scanned points.
     """
     weights = np.asarray(weights, np.float64)
     if weights[-1] > _SURELY_NONE:
@@ -154,17 +154,17 @@ def _placed(bank: ShapeBank, placed: Hypotheses, row: int, probability: float) -
 
 
 def _compared(shape: PlacedShape, fits: _Fits, cloud: PointCloud) -> PlacedShape:
-    """The shape with what the scan has measured of it, what other hypotheses share, and what they have elsewhere."""
+    """Return a copy of the shape with `measured`, `agreed` and `ghost`, from the scan and the other fits."""
     half = min(_ROOM * float(_extent(fits.bank, fits.placed)) + _TOLERANCE, np.pi)
     grid, coarse = Grid(_FINE, half), Grid(_COARSE, half)
-    # Distances are compared on a coarse grid: they are smooth, and each costs as much as the whole shape.
+    # Compute distances on a coarse grid: they are smooth, and each hypothesis costs as much as the whole shape.
     others = np.array(_distances(fits.bank, fits.placed, jnp.asarray(coarse.axis, jnp.float32)))
     filled, own = np.zeros((_FINE,) * 3, others.dtype), _resampled(others[0], coarse, grid)
     at, agreed = (shape.vertices + half).T / coarse.spacing, np.zeros(len(shape.vertices))
     for weight, distance in zip(fits.weights.tolist(), others, strict=True):
         filled += weight * _step(-_resampled(distance, coarse, grid))
         agreed += weight * _step(2.0 * _TOLERANCE - np.abs(map_coordinates(distance, at, order=1)))
-    # Positive outside of what is open, and near the shape itself.
+    # Positive outside the ghost, and near the shape itself.
     outside = np.maximum(4.0 * _SOFTNESS * (_OPEN - filled), _TOLERANCE - own)
     ghost = _pieces(outside, grid, _SMALLEST * shape.mesh.area)
     agreed = np.clip(4.0 * agreed - 1.5, 0.0, 1.0)
@@ -176,18 +176,18 @@ def _step(x: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
 
 
 def _resampled(values: _Values, coarse: Grid, fine: Grid) -> _Values:
-    """Values on a finer grid of the same extent, by linear interpolation along each axis."""
+    """Interpolate values linearly from a coarse grid to a finer grid of the same extent."""
     hats = np.stack([np.interp(fine.axis, coarse.axis, row) for row in np.eye(coarse.resolution)], axis=1)
     hats = hats.astype(values.dtype)
     for _ in range(3):
-        # The axis that is done goes to the end.
+        # `tensordot` moves the new axis to the end, so that three rounds interpolate along all axes.
         values = np.tensordot(values, hats, ([0], [1]))
     return values
 
 
 @program
 def _extent(bank: ShapeBank, placed: Hypotheses) -> Float[Array, ""]:
-    """Largest coordinate of the placed shapes."""
+    """Return the largest absolute coordinate of the placed shapes."""
     corners = bank.shape(placed.shape).extremes * placed.placement.scale[:, None]
     turned = jnp.einsum("hpj,hij->hpi", corners, placed.placement.rotation) + placed.placement.shift[:, None]
     return jnp.max(jnp.abs(turned))
@@ -219,7 +219,7 @@ def _measured(surface: MeanSurface, cloud: PointCloud) -> Float[np.ndarray, " v"
 
 
 def _pieces(values: Float[np.ndarray, "g g g"], grid: Grid, smallest: float) -> MeanSurface | None:
-    """The surface of the pieces of at least this area; None if there are none."""
+    """Return the zero set of grid values, only pieces with at least this area; None if there are none."""
     triangles = level_triangles(values, grid)
     if triangles is None:
         return None

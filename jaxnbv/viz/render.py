@@ -1,4 +1,4 @@
-"""A still picture of one view's scene: the ray-traced surface, with points and cameras before and behind it."""
+"""Still pictures of the scene after a view: a ray-traced surface with points and cameras."""
 
 import math
 from collections.abc import Iterable
@@ -27,10 +27,10 @@ from jaxnbv.viz.style import DEVIATION, GHOST, IMAGINED, LINE, NEW, OPEN, PART, 
 _DISTANCE = 11.0
 _SLACK = 0.04  # Noise and the mean's own error must not hide a point behind the surface that it lies on.
 _HIDDEN = 0.18
-# How wide a hollow is darkened, as a share of the picture; how much at most, and how deep a hollow is then.
+# Width of the region for the mean depth (fraction of the picture), largest darkening, and depth at which it is reached.
 _HOLLOW, _DARKEST, _DEEP = 0.05, 0.4, 0.25
 _INSET = 0.24
-# Opacity of what is still open.
+# Opacity of the space that other hypotheses fill.
 _GHOST = 0.3
 _STILL, _SMALL = 640, 280
 # Longest edge of the triangles of a true surface, in scene units.
@@ -38,7 +38,7 @@ _EDGE = 0.05
 
 
 def beside(pose: Pose) -> Float[np.ndarray, "3"]:
-    """A direction 40 degrees beside a camera, from which its scan and the camera itself are visible."""
+    """Return a direction 40 degrees beside a camera, from which its scan and the camera are visible."""
     away = unit(np.asarray(pose.position, dtype=np.float64))
     across = np.cross([0.0, 1.0, 0.0], away)
     across = unit(across) if np.linalg.norm(across) >= 1e-3 else np.array([1.0, 0.0, 0.0])
@@ -48,13 +48,14 @@ def beside(pose: Pose) -> Float[np.ndarray, "3"]:
 class Still:
     """A perspective picture of a surface, with room for all cameras of the scene.
 
-    The picture is clear where there is no surface. The light comes from beside the eye, and hollows are darker. A known
-    shape is coloured by what is measured, imagined and open. Other surfaces are coloured by their standard deviation.
+    The picture is transparent where there is no surface. The light comes from beside the viewer, and hollows are
+    darker. Colours of a known shape say whether it is measured, imagined, or different in other hypotheses. Other
+    surfaces are coloured by their standard deviation.
 
-    - `eye`: direction from the origin to the reader.
+    - `eye`: direction from the origin to the viewer.
     - `size`: pixels along each side.
     - `extent`: radius of the content, in scene units.
-    - `deviation`: range of the colours; None for one plain colour.
+    - `deviation`: range of standard deviations for the colours; None for one plain colour.
     """
 
     def __init__(
@@ -81,8 +82,8 @@ class Still:
     def _traced(
         self, surface: MeanSurface, deviation: LogNorm | None
     ) -> tuple[Bool[np.ndarray, " rays"], Float[np.ndarray, "hits 4"], Float[np.ndarray, " hits"]]:
-        """Mask of rays that hit the surface, with its colour and depth at the hits."""
-        # Not by the camera's compiled rays: of millions of pixels, XLA takes seconds over the constants.
+        """Return which rays of `fine_camera` hit the surface, and the colour and depth of each hit."""
+        # Do not use the camera's compiled rays: for millions of pixels, XLA takes seconds for the constants.
         directions = unit(np.asarray(self.fine_camera.pixel_directions()) @ np.asarray(self.pose.rotation).T)
         origin, vertices = np.asarray(self.pose.position, np.float64), surface.vertices.astype(np.float64)
         rows, distances = first_faces(vertices, surface.faces.astype(np.int64))(
@@ -115,7 +116,7 @@ class Still:
         colours: Float[np.ndarray, "hits 4"],
         depth: Float[np.ndarray, " hits"],
     ) -> tuple[Bool[np.ndarray, " rays"], Float[np.ndarray, "all 4"], Float[np.ndarray, " all"]]:
-        """The same with a translucent surface before it, which hides no point."""
+        """Blend a translucent surface, which hides no points, into the results of `_traced`, and return all."""
         is_ghost, over, ghost_depth = self._traced(ghost, None)
         under, front = np.zeros((len(mask), 4)), np.zeros((len(mask), 4))
         deep, near = np.full(len(mask), np.inf), np.full(len(mask), np.inf)
@@ -132,13 +133,13 @@ class Still:
 
     @property
     def fine_camera(self) -> Camera:
-        """The camera of the picture with four rays per pixel."""
+        """The picture's camera with four rays per pixel."""
         return Camera(self.camera.fov, 2 * self.size, 2 * self.size)
 
     def show(
         self, mask: Bool[np.ndarray, " rays"], colours: Float[np.ndarray, "hits 4"], depth: Float[np.ndarray, " hits"]
     ) -> None:
-        """Make the picture from the colours and depths of the rays of `fine_camera` that hit."""
+        """Make the picture, given which rays of `fine_camera` hit, and colours and depths of the hits."""
         image = np.zeros((len(mask), 4))
         image[mask] = colours
         image[:, :3] *= image[:, 3:]
@@ -150,7 +151,7 @@ class Still:
         self.depth = deep.reshape(self.size, 2, self.size, 2).min(axis=(1, 3))
 
     def project(self, points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
-        """Pixel coordinates of points of the scene, and whether they lie in front of the surface."""
+        """Project points (scene coordinates) to pixels. Also return whether each is in front of the surface."""
         local = (points - np.asarray(self.pose.position)) @ np.asarray(self.pose.rotation)
         pixels = self.camera.to_pixels(local[:, :2] / local[:, 2:])
         column, row = np.clip(pixels.astype(int), 0, self.size - 1).T
@@ -158,7 +159,7 @@ class Still:
 
 
 def _barycentric(points: Float[np.ndarray, "n 3"], corners: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3"]:
-    """Weights of the corners of triangles at points in them."""
+    """Return the weights of a triangle's corners at a point in it, for each row."""
     a, b, p = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], points - corners[:, 0]
     aa, ab, bb, pa, pb = (np.einsum("nd,nd->n", *pair) for pair in ((a, a), (a, b), (b, b), (p, a), (p, b)))
     area = np.maximum(aa * bb - ab**2, 1e-30)
@@ -168,22 +169,24 @@ def _barycentric(points: Float[np.ndarray, "n 3"], corners: Float[np.ndarray, "n
 
 
 def _occlusion(mask: Bool[np.ndarray, "h w"], depth: Float[np.ndarray, " hits"]) -> Float[np.ndarray, " hits"]:
-    """Share by which each hit is darkened: more the deeper it lies below the mean depth about it (Luft, Colditz and
-    Deussen 2006)."""
+    """Return the fraction by which to darken each hit (Luft, Colditz and Deussen 2006).
+
+    It grows with the depth of the hit relative to the mean depth around it.
+    """
     width, deep = round(_HOLLOW * len(mask)), np.zeros(mask.shape)
     deep[mask] = depth
-    # The mean of a mean falls off with distance.
+    # Two filters in a row, so that a pixel's weight falls off with distance.
     sums, shares = (uniform_filter(uniform_filter(image, width), width)[mask] for image in (deep, mask.astype(float)))
     mean = sums / np.maximum(shares, 1e-9)
     return _DARKEST * np.clip((depth - mean) / _DEEP, 0.0, 1.0)
 
 
 def draw_truth(axes: Axes, data: ReportData) -> bool:
-    """Draw the true surface from where the views are drawn; False if it is not known."""
+    """Draw the true surface from the viewpoint of the other pictures. Return False if it is not known."""
     mesh = data.true_surface
     if mesh is None:
         return False
-    # Colours are interpolated between vertices, which must be near each other.
+    # Shading is interpolated between vertices, so they must be near each other.
     vertices, faces = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, _EDGE, max_iter=12)
     fine = trimesh.Trimesh(vertices, faces)
     normals, flat = np.asarray(fine.vertex_normals), np.ones(len(fine.vertices))
@@ -194,7 +197,7 @@ def draw_truth(axes: Axes, data: ReportData) -> bool:
 
 
 def painted(data: ReportData, index: int) -> Still:
-    """A still of the surface after view `index` (from 0), from the direction that all views share."""
+    """Return a picture of the surface after view `index` (from 0), from the viewpoint of all views."""
     stage, norm = data.stage, LogNorm(*data.deviations)
     return Still(stage.eye, data.views[index].surface, _STILL, stage.extent, norm)
 
@@ -204,10 +207,11 @@ def draw_scene(
 ) -> None:
     """Draw the scene after view `index` (from 0) into empty axes: surface, points and cameras so far.
 
-    The emptiest corner shows what the last view saw. The likeliest part is named below.
+    The likeliest part is named at the bottom.
 
-    - `weight`: scales lines, dots and letters.
-    - `aspect`: width over height.
+    - `weight`: factor for the sizes of lines, dots and letters.
+    - `inset`: whether the emptiest corner shows what the last view saw.
+    - `aspect`: width divided by height.
     """
     view, stage = data.views[index], data.stage
     axes.imshow(still.image, interpolation="bilinear", zorder=1)
@@ -232,7 +236,7 @@ def draw_scene(
 
 
 def _free_corner(axes: Axes, extent: list[Float[np.ndarray, "_ 2"]]) -> tuple[int, int]:
-    """The emptiest corner of a framed axes, given groups of pixels: 0 or 1 from the left, and from below."""
+    """Return the corner with the fewest of these pixels: (0, 0) is bottom left, (1, 1) is top right."""
     (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
     places = [(pixels - [left, bottom]) / [right - left, top - bottom] for pixels in extent]
 
@@ -243,7 +247,7 @@ def _free_corner(axes: Axes, extent: list[Float[np.ndarray, "_ 2"]]) -> tuple[in
 
 
 def _extent(data: ReportData, still: Still) -> list[Float[np.ndarray, "_ 2"]]:
-    """The pixels of the content of all views, so that all are cropped alike."""
+    """Return the pixels of the content of all views, so that their pictures can be cropped alike."""
     surfaces = [view.surface.vertices for view in data.views if view.surface is not None]
     shown = [still.project(rows)[0] for rows in (*surfaces, *(view.new for view in data.views)) if len(rows)]
     for view in data.views:
@@ -256,7 +260,7 @@ def _extent(data: ReportData, still: Still) -> list[Float[np.ndarray, "_ 2"]]:
 def draw_items(
     axes: Axes, still: Still, items: Iterable[Points | Cameras], weight: float = 1.0
 ) -> list[Float[np.ndarray, "_ 2"]]:
-    """Draw points that the surface does not hide, and numbered cameras; returns the pixels of all."""
+    """Draw points that the surface does not hide, and numbered cameras. Return the pixels of all items."""
     drawn = []
     for item in items:
         if isinstance(item, Points):
@@ -280,8 +284,8 @@ def draw_items(
 def _draw_segments(
     axes: Axes, still: Still, ends: Float[np.ndarray, "n 2 3"], colour: str, width: float
 ) -> Float[np.ndarray, "m 2"]:
-    """Draw segments of the scene, faint where they stand behind the surface; returns pixels along them."""
-    # Cut fine, so that a part can be hidden.
+    """Draw segments (scene coordinates), faint behind the surface. Return pixels along the segments."""
+    # Divide each segment into short ones, so that a part of it can be hidden.
     steps = np.linspace(0.0, 1.0, 25)[:, None, None]
     fine = ends[:, 0] + steps * (ends[:, 1] - ends[:, 0])
     pixels, in_front = still.project(fine.reshape(-1, 3))
@@ -294,7 +298,7 @@ def _draw_segments(
 
 
 def frame(axes: Axes, still: Still, shown: list[Float[np.ndarray, "_ 2"]], aspect: float = 1.0) -> None:
-    """Crop the picture about these pixels, to a width of `aspect` heights."""
+    """Crop the picture to the region of these pixels, with a width of `aspect` times the height."""
     pixels = np.concatenate(shown)
     (left, top), (right, bottom) = pixels.min(axis=0), pixels.max(axis=0)
     half = 0.53 * max((right - left) / aspect, bottom - top) + 0.03 * still.size

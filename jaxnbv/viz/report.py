@@ -35,7 +35,7 @@ from jaxnbv.viz.sketches import Sketches
 from jaxnbv.viz.space import figures_in_space
 from jaxnbv.viz.style import DEVIATION, GHOST, IMAGINED, OPEN, PART, bar_ticks, gradient
 
-# Inches, small so that letters are legible on a telephone.
+# Sizes in inches: small, so that letters are legible on a phone.
 _SCENE, _SCENE_DPI = (5.2, 4.5), 131
 _TRUTH, _TRUTH_DPI = (1.8, 1.8), 150
 _WHY, _WHY_DPI = (4.2, 3.5), 185
@@ -58,8 +58,8 @@ def write_report(
     - `truth`: points of the true surface in scene coordinates, for the chart of coverage. By default they are sampled
       from the scene if possible. Without truth the chart shows the area that the scans have seen.
     - `title`: name of the object.
-    - `rival`: an episode of another search from the same first view, for comparison.
-    - `sketches`: sketches of the episode's steps. Missing ones are drawn again.
+    - `rival`: an episode of a different search from the same first view, for comparison.
+    - `sketches`: sketches of the episode's steps. Missing ones are made again.
     - `question`: the question in words, such as "What does the truck carry?"; by default that of the task.
 
     **Raises:** `ValueError` if the folder cannot be written, or another process writes in it.
@@ -72,7 +72,7 @@ def write_report(
 
 
 def report_html(data: ReportData, title: str, question: str | None = None) -> str:
-    """The page as text: the template filled with the data, the pictures and plotly's code."""
+    """Return the report as HTML text: the template filled with data, pictures and plotly's code."""
     with mpl.rc_context(STYLE):
         pictures = [(_scene(data, index), _why(data, index)) for index in range(len(data.views))]
         charts = [[_chart(*chart) for chart in drawn(data)] for drawn in (task_charts, other_charts)]
@@ -92,7 +92,7 @@ def report_html(data: ReportData, title: str, question: str | None = None) -> st
         truth=_truth(data),
         question=data.task.question if question is None else question,
         ticks=_deviation_ticks(data),
-        # Plotly writes a figure with its numbers packed.
+        # Plotly's own JSON holds the numbers in packed form.
         space=_zipped(f"[{','.join(str(figure.to_json()) for figure in figures_in_space(data))}]"),
         plotly=_zipped(get_plotlyjs()),
         address=picture_address,
@@ -102,27 +102,30 @@ def report_html(data: ReportData, title: str, question: str | None = None) -> st
 
 
 def picture_address(picture: UInt8[np.ndarray, "h w _"]) -> str:
-    """An image as a data address; lossless if it is small."""
+    """Encode an image as a data URL, lossless if its shorter side has fewer than 64 pixels."""
     file = io.BytesIO()
     Image.fromarray(picture).save(file, format="WEBP", quality=_QUALITY, lossless=min(picture.shape[:2]) < 64)
     return "data:image/webp;base64," + base64.b64encode(file.getvalue()).decode()
 
 
 def _matrix(data: ReportData, index: int) -> str:
-    """Camera to world with OpenCV's axes, as JSON."""
+    """Return the pose of a view as JSON text: a matrix from camera (OpenCV's axes) to world."""
     placed = _world_of(data.episode)[0].to_world(data.views[index].pose)
     return json.dumps(np.asarray(placed.to_matrix(), np.float64).round(6).tolist())
 
 
 def _world_of(episode: Episode) -> tuple[Frame, str]:
-    """Frame of the copied poses, and its units: those of the session, the object's file, or the scene."""
+    """Return the world of the poses that a reader can copy, and its units.
+
+    It is the world of the object's file if there is one, otherwise that of the session or the scene.
+    """
     if episode.scene is not None and (own := episode.scene.world_frame) is not None:
         return own, "the units of the object's file"
     return episode.frame, episode.frame.unit
 
 
 def _deviation_ticks(data: ReportData) -> list[tuple[float, str]]:
-    """Positions in percent of the width, and labels, of the ticks under the bar of deviations."""
+    """Return positions (percent of the width) and labels of the ticks of the colour bar of deviations."""
     low, high = data.deviations
     return [(round(100.0 * math.log(tick / low, high / low), 2), f"{tick:g}") for tick in bar_ticks(low, high)]
 
@@ -132,23 +135,23 @@ def _zipped(text: str) -> bytes:
 
 
 def _scene(data: ReportData, index: int) -> str:
-    """The picture of a view's scene."""
+    """Draw the scene after a view, and return the picture as a data URL."""
     figure = Figure(figsize=_SCENE, facecolor="none")
-    # The frame in the corner is not cut.
+    # Leave a margin, so that the frame of the inset is not cut.
     axes = figure.add_axes((0.002, 0.002, 0.996, 0.996))
     draw_scene(axes, data, index, painted(data, index), weight=1.1, aspect=_SCENE[0] / _SCENE[1])
     return picture_address(_pixels(figure, _SCENE_DPI))
 
 
 def _truth(data: ReportData) -> str | None:
-    """The picture of the true surface; None if it is not known."""
+    """Draw the true surface, and return the picture as a data URL; None if the surface is not known."""
     figure = Figure(figsize=_TRUTH, facecolor="none")
     is_known = draw_truth(figure.add_axes((0.0, 0.0, 1.0, 1.0)), data)
     return picture_address(_pixels(figure, _TRUTH_DPI)) if is_known else None
 
 
 def _why(data: ReportData, index: int) -> str:
-    """The picture of the reasons for a view."""
+    """Draw why a view was chosen (see `draw_choice`), and return the picture as a data URL."""
     figure = Figure(figsize=_WHY, facecolor="none")
     draw_choice(figure, data.views[index].proposal, data.quantity, data.episode.frame)
     return picture_address(_pixels(figure, _WHY_DPI))
@@ -162,7 +165,7 @@ def _pixels(figure: Figure, dpi: int) -> UInt8[np.ndarray, "h w 4"]:
 
 
 def _chart(title: str, figure: Figure) -> tuple[str, bytes, str]:
-    """A chart's name, its drawing, and CSS variables that place the mark of the current view on it."""
+    """Return a chart's title, its SVG file, and CSS variables that place the mark of the current view."""
     file = io.BytesIO()
     with mpl.rc_context({"svg.hashsalt": "jaxnbv"}):
         figure.savefig(file, format="svg", metadata={"Date": None}, transparent=True)

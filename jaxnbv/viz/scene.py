@@ -1,4 +1,4 @@
-"""Contents of the scene after a view, which still pictures, the page in space and the live view all draw."""
+"""Contents of the scene after a view, for still pictures, 3-D figures and the live view."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -23,7 +23,7 @@ class Points(NamedTuple):
 
 
 class Cameras(NamedTuple):
-    """Fields of view of one colour up to a depth, with numbers that start at `first`."""
+    """Cameras of one colour, drawn as fields of view up to a depth, with numbers that start at `first`."""
 
     name: str
     poses: Sequence[Pose]
@@ -41,7 +41,7 @@ def seen_items(
     camera: Camera,
     depth: float = FRUSTUM_DEPTH,
 ) -> tuple[Points | Cameras, ...]:
-    """Points before the last view, points that it added, and the cameras."""
+    """Return what to draw: points before the last view, points that it added, and the cameras."""
     return (
         Points("points before", before, BEFORE, 0.7),
         Points("new points", new, NEW, 1.1),
@@ -51,7 +51,7 @@ def seen_items(
 
 
 def frustum(pose: Pose, camera: Camera, depth: float = FRUSTUM_DEPTH) -> Float[np.ndarray, "lines 2 3"]:
-    """Edges of a camera's field of view up to a depth, as segments in scene coordinates."""
+    """Return the edges of a camera's field of view up to a depth, as segments in scene coordinates."""
     left, top, right, bottom = camera.edges
     corners = depth * np.array([[left, top, 1.0], [right, top, 1.0], [right, bottom, 1.0], [left, bottom, 1.0]])
     corners = corners @ np.asarray(pose.rotation, dtype=np.float64).T + np.asarray(pose.position)

@@ -11,17 +11,17 @@ from jaxnbv.viz.placed_shape import likeliest_part, likeliest_shape
 
 
 def has_bank(sampler: SurfaceSampler) -> bool:
-    """Whether the model knows examples of shapes, so that a surface needs no posterior."""
+    """Return whether the model has a bank of known shapes, so that `shown_surface` needs no posterior."""
     return isinstance(sampler.model, KnownShapes) and sampler.model.bank.solids is not None
 
 
 def shown_surface(sampler: SurfaceSampler, inputs: StepInputs) -> MeanSurface | None:
-    """The likeliest known shape as registered, else the posterior mean where it holds points.
+    """Return the likeliest known shape at its placement, or else the posterior mean's surface near points.
 
-    None if there is no such surface. The mean over several known shapes is the shape of none of them, so it is not
-    shown. If the object is none of them, the mean is that of the model for this case.
+    Return None if there is no such surface. The mean over several known shapes is the shape of none of them, so it is
+    not shown. If the object fits no known shape, the mean is that of the model without the bank.
 
-    - `inputs`: with a posterior, which a model with a bank does not need.
+    - `inputs`: inputs of a step, with a posterior unless `has_bank`.
     """
     observations, posterior, model = inputs.observations, inputs.posterior, sampler.model
     if isinstance(observations.hypotheses, PartHypotheses):
@@ -40,7 +40,7 @@ def shown_surface(sampler: SurfaceSampler, inputs: StepInputs) -> MeanSurface | 
 
 
 def _within_volume(sampler: SurfaceSampler, observations: Observations) -> Observations:
-    """The observations that the model is conditioned on: only empty nodes within the volume count."""
+    """Return the observations for conditioning the model, with only the empty nodes inside the volume."""
     observations = sampler.adapt(observations)
     if sampler.carving is None or observations.empty_nodes is None:
         return observations

@@ -1,4 +1,4 @@
-"""Sketches: the costly parts of an episode's pictures, drawn after each step while its samples are in memory."""
+"""Sketches are the costly parts of an episode's pictures, made while the step's samples are in memory."""
 
 import dataclasses
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -15,11 +15,11 @@ from jaxnbv.viz.unmeasured import Patch, unmeasured
 
 
 class Sketch(NamedTuple):
-    """The state of a step before its view was taken.
+    """Costly parts of the pictures of one step, before its view is taken.
 
     - `surface`: the surface that pictures show, see `shown_surface`.
-    - `imagined`: samples of the step; None for a view that was not chosen, or not taken.
-    - `unmeasured`: patches of the surface that views looked at and did not measure.
+    - `imagined`: pictures of the step's samples; None if its view was given or not taken.
+    - `unmeasured`: patches of the surface that views looked at but did not measure.
     """
 
     surface: MeanSurface | None
@@ -28,17 +28,17 @@ class Sketch(NamedTuple):
 
 
 class Sketches:
-    """Sketches of a running episode: `add` is for `simulate(each=...)`, the object for `write_report`.
+    """Sketches of a running episode. Pass `add` to `simulate(each=...)`, and the object to `write_report`.
 
-    - `episode`: the episode without views.
-    - `held`: sketches by the index of the view, from 0. First and stored views have none.
+    - `episode`: the episode without views. `add` adds the views.
+    - `held`: sketches keyed by the index of the view, from 0. The first view and views read from a file have none.
     """
 
     def __init__(self, episode: Episode):
         self.episode, self.held = episode, dict[int, Sketch]()
 
     def add(self, step: Step) -> None:
-        """Add the step to the next view."""
+        """Add the view of a step to the episode, and the step's sketch to `held`."""
         self.episode = dataclasses.replace(self.episode, views=(*self.episode.views, step.view))
         if step.inputs is not None:
             index = len(self.episode.views) - 1
@@ -48,11 +48,11 @@ class Sketches:
 def sketches_of(
     episode: Episode, replayed: Iterable[Observations], held: Mapping[int, Sketch], imagine: bool
 ) -> Iterator[Sketch]:
-    """The sketch of the step after each view, including the one after the last view.
+    """Yield the sketch of the step after each view, including the step after the last view.
 
     - `replayed`: observations after each view.
-    - `held`: sketches that exist already.
-    - `imagine`: whether the others show what was imagined.
+    - `held`: sketches that exist already, keyed by the index of the step's view.
+    - `imagine`: whether new sketches show what was imagined.
     """
     for index, observations in enumerate(replayed, start=1):
         if index in held:
@@ -67,7 +67,7 @@ def sketches_of(
             continue
         posterior = sampler.posterior(observations)
         inputs = StepInputs(observations, posterior)
-        # The step's own key gives the samples that it imagined, and moments without a closed form.
+        # With the step's own key, the samples are those that it imagined. Other moments need samples too.
         if is_imagined or not posterior.has_closed_forms:
             sample_key, *_ = view_keys(episode.key, index)
             surfaces = sampler.sample(observations, sample_key, posterior)

@@ -1,4 +1,4 @@
-"""The scene in 3-D, which a reader of the page can turn: figures of plotly."""
+"""3-D figures of the scene for the report, which a reader can turn. They are made with plotly."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ from jaxnbv.viz.placed_shape import PlacedShape
 from jaxnbv.viz.scene import Cameras, Points, frustum, seen_items
 from jaxnbv.viz.style import DEVIATION, GHOST, IMAGINED, INK, OPEN, PART, colour_scale
 
-# Limits for all views together, so that a long episode has a small page.
+# Largest numbers of points and vertices of all views together, for a small page, and least vertices of one view.
 _POINTS, _VERTICES, _FEWEST_VERTICES = 18_000, 24_000, 1500
 # Coordinates are rounded to this, in scene units: a power of two, whose multiples pack well.
 _GRAIN = 1 / 256
@@ -21,7 +21,7 @@ _LIGHT = {"ambient": 0.72, "diffuse": 0.45, "specular": 0.04, "roughness": 0.9}
 
 
 def figures_in_space(data: ReportData) -> list[go.Figure]:
-    """One figure per view. What its legend hides stays hidden in the next view."""
+    """Return one plotly figure per view. Items that a reader hides stay hidden in the next figure."""
     stage, count, figures = data.stage, max(len(data.views), 6), []
     points, vertices = _POINTS // count, max(_VERTICES // count, _FEWEST_VERTICES)
     grades = np.log10(data.deviations)
@@ -53,7 +53,7 @@ def _layout(eye: Float[np.ndarray, "3"], extent: float) -> dict[str, Any]:
 
 
 def _placed(places: Float[np.ndarray, "n 3"]) -> dict[str, Any]:
-    """Coordinates by plotly's names. Plotly turns a scene about its own z, which is our y."""
+    """Return coordinates keyed by plotly's axes. Plotly turns scenes about its z axis, which is our y axis."""
     x, y, z = (_GRAIN * np.round(np.asarray(places, np.float64).T / _GRAIN)).astype(np.float32)
     return {"x": z, "y": x, "z": y}
 
@@ -70,7 +70,7 @@ def _points(item: Points, most: int) -> list[dict[str, Any]]:
 
 
 def _cameras(item: Cameras) -> list[dict[str, Any]]:
-    """Their edges, with a gap behind each, and their numbers."""
+    """Return plotly traces of the cameras: their edges, separated by gaps, and their numbers."""
     if not item.poses:
         return []
     edges = np.concatenate([frustum(pose, item.camera, item.depth) for pose in item.poses])
@@ -86,7 +86,12 @@ def _cameras(item: Cameras) -> list[dict[str, Any]]:
 
 
 def _mesh(surface: MeanSurface, limit: int, grades: Float[np.ndarray, "2"]) -> dict[str, Any]:
-    """A coarser mesh, coloured by the logarithm of its deviation; a known shape by what is measured of it."""
+    """Return a plotly trace of a coarser mesh with at most `limit` vertices.
+
+    Colours show the logarithm of the deviation, or which parts of a known shape are measured and agreed.
+
+    - `grades`: decimal logarithms of the deviations at the ends of the colours.
+    """
     if isinstance(surface, PlacedShape):
         # Open, imagined, scanned.
         scale = [[0.0, OPEN], [0.5, IMAGINED], [1.0, PART]]
@@ -102,7 +107,7 @@ def _mesh(surface: MeanSurface, limit: int, grades: Float[np.ndarray, "2"]) -> d
 def _triangles(
     surface: MeanSurface, limit: int, looks: dict[str, Any], grade: Float[np.ndarray, " v"] | None = None
 ) -> dict[str, Any]:
-    """A coarser mesh of at most `limit` vertices, coloured by a grade if there is one."""
+    """Return a plotly trace of a coarser mesh with at most `limit` vertices, coloured by `grade` if given."""
     own, faces = clustered(surface.vertices, surface.faces, limit)
     count = np.bincount(own)
     vertices = np.stack([np.bincount(own, column) / count for column in surface.vertices.T], axis=1)
@@ -121,9 +126,9 @@ def _triangles(
 def clustered(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], limit: int
 ) -> tuple[Int[np.ndarray, " v"], Int[np.ndarray, "g 3"]]:
-    """A coarser mesh of at most `limit` vertices, one per cell of a lattice (Rossignac and Borrel 1993).
+    """Merge vertices in the same cell of a lattice, so that at most `limit` remain.
 
-    Returns the new index of each vertex, and the faces.
+    Returns the new index of each vertex, and the faces (Rossignac and Borrel 1993).
     """
     own = np.arange(len(vertices))
     cell = 0.01
