@@ -1,4 +1,4 @@
-"""Pictures and words: the report of an episode, figures, a live page, and what a notebook shows."""
+"""Reports of episodes, figures, a live page, and pictures for notebooks."""
 
 import lazy_loader
 

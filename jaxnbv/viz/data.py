@@ -111,7 +111,7 @@ class ReportData(eqx.Module):
 
     @property
     def true_surface(self) -> TriangleMesh | None:
-        """The true surface; None if it is not known."""
+        """The mesh of the true surface; None if it is not known."""
         return None if self.episode.scene is None else true_mesh(self.episode.scene)
 
 

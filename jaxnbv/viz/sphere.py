@@ -1,4 +1,4 @@
-"""The sphere of candidates on a map of longitude and latitude in radians: the scene's +z at its centre, y up."""
+"""Maps of the sphere in longitude and latitude (radians). The scene's +z is at the centre, y is up."""
 
 from itertools import pairwise
 
@@ -11,13 +11,13 @@ _ROWS = 90
 
 
 def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-    """Vectors scaled to length 1. Zero vectors stay zero."""
+    """Scale vectors to length 1. Zero vectors stay zero."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors / np.where(length > 0, length, 1.0)
 
 
 def on_map(directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
-    """Longitudes atan2(x, z) and latitudes asin(y) of unit vectors."""
+    """Return the longitudes atan2(x, z) and latitudes asin(y) of unit vectors."""
     x, y, z = directions.T
     return np.stack([np.arctan2(x, z), np.arcsin(np.clip(y, -1.0, 1.0))], axis=1)
 
@@ -25,11 +25,11 @@ def on_map(directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
 def smooth_map(
     directions: Float[np.ndarray, "c 3"], values: Float[np.ndarray, " c"]
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " n"], Float[np.ndarray, "n m"]]:
-    """Interpolate the values of candidates over the map: longitudes, latitudes, and values there.
+    """Interpolate the candidates' values over the map. Return longitudes, latitudes, and values there.
 
-    The interpolant is a spline over the chords of the sphere. It goes through the values (without NaN ones) and stays
-    within their range. It is NaN at places farther from all candidates than 90 % of candidates are from the nearest
-    other one.
+    The interpolant is a spline in the distance between unit vectors. It goes through the values that are not NaN, and
+    stays within their range. It is NaN at places that are far from all candidates: farther than 90 % of candidates are
+    from the nearest other candidate.
     """
     longitudes = np.pi * ((np.arange(2 * _ROWS) + 0.5) / _ROWS - 1.0)
     latitudes = np.pi * ((np.arange(_ROWS) + 0.5) / _ROWS - 0.5)
@@ -45,7 +45,7 @@ def smooth_map(
 
 
 def path(directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 2"]:
-    """A line on the map that joins directions by great circles. NaN where it crosses the map's rim."""
+    """Return a line on the map that joins directions by great circles. NaN rows cut it at the map's rim."""
     steps = np.linspace(0.0, 1.0, 20)[:, None]
     fine = on_map(unit(np.concatenate([a + steps * (b - a) for a, b in pairwise(directions)])))
     leaps = np.flatnonzero(np.abs(np.diff(fine[:, 0])) > np.pi) + 1

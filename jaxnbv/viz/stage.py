@@ -10,8 +10,8 @@ from jaxnbv.planning.episode import Episode
 from jaxnbv.scanning.triangle_rays import first_faces
 from jaxnbv.viz.sphere import unit
 
-# Depth of drawn fields of view in radii of the object; place of their ends in extents of the object in their direction;
-# least value of this extent in radii.
+# Depth of drawn fields of view in radii of the object. Distance from the origin at which they end, in extents of the
+# object in this direction, and least value of this extent in radii.
 _DEPTH, _STAND, _CLOSEST = 0.2, 1.06, 0.35
 _SPREAD, _OUTLINE = 99.0, 1000
 _DIRECTIONS, _HIGHEST = 80, 0.8
@@ -24,10 +24,10 @@ _IN_FRONT = 0.9
 class Stage(eqx.Module):
     """One viewpoint for all pictures, near enough for the object to fill them.
 
-    - `eye`: unit vector from the origin to the reader.
-    - `radius`: of the object about the origin, in scene units.
-    - `outline`: points of the object.
-    - `depth`: of the drawn fields of view, in scene units.
+    - `eye`: unit vector from the origin to the viewer.
+    - `radius`: radius of the object about the origin, in scene units.
+    - `outline`: points on the object.
+    - `depth`: depth to which fields of view are drawn, in scene units.
     """
 
     eye: Float[np.ndarray, "3"]
@@ -37,11 +37,11 @@ class Stage(eqx.Module):
 
     @property
     def extent(self) -> float:
-        """Radius of the picture, with the numbers of the cameras."""
+        """Radius of the pictures' content in scene units, including the numbers of the cameras."""
         return 1.1 * (_STAND * self.radius + self.depth)
 
     def pulled(self, pose: Pose) -> Pose:
-        """The pose at which a camera is drawn, just beyond the object's extent in its direction."""
+        """Return the pose at which to draw a camera: moved toward the origin, until just outside the object."""
         position = np.asarray(pose.position, np.float64)
         distance = max(float(np.linalg.norm(position)), 1e-9)
         extent = max(float((self.outline @ position).max()) / distance, _CLOSEST * self.radius)
@@ -49,7 +49,7 @@ class Stage(eqx.Module):
 
 
 def stage_of(episode: Episode, surfaces: list[trimesh.Trimesh]) -> Stage:
-    """The stage of an episode with these mean surfaces, in the order of views."""
+    """Choose the viewpoint for the pictures of an episode. `surfaces`: surfaces to show, in order of views."""
     outlines = episode.cloud.to_numpy()[0], *(np.asarray(surface.vertices) for surface in surfaces)
     samples = [np.asarray(rows, np.float64)[:: max(1, len(rows) // _OUTLINE)] for rows in outlines]
     distances = [np.linalg.norm(rows, axis=1) for rows in samples]
@@ -67,7 +67,10 @@ def stage_of(episode: Episode, surfaces: list[trimesh.Trimesh]) -> Stage:
 def _shown(
     episode: Episode, surface: trimesh.Trimesh | None, eyes: Float[np.ndarray, "e 3"], clear: float
 ) -> Float[np.ndarray, " e"]:
-    """Share of the chosen views' points that face each eye and are not hidden from it."""
+    """Return, for each viewing direction in `eyes`, the fraction of points that it shows.
+
+    The points are those of the chosen views. They must face the viewer and not be hidden by the surface.
+    """
     first, *chosen = (view.scan.to_numpy() for view in episode.views)
     scans = [scan for scan in chosen if len(scan[0])] or [first]
     points, normals = (np.concatenate(rows).astype(np.float64) for rows in zip(*scans, strict=True))

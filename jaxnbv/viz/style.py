@@ -13,53 +13,53 @@ from jaxnbv.storage.files import write_whole
 
 INK, GREY, LINE = "#1f2733", "#7a8494", "#d9dee6"
 BEFORE, NEW = "#26344d", "#d55e00"
-# A known shape where it was registered: what was scanned, what is imagined, what is still open, and other shapes there.
+# Colours of a known shape: scanned, imagined, different in other hypotheses. Colour of the space that those fill.
 PART, IMAGINED, OPEN, GHOST = "#6cc5a6", "#d7efe6", "#d5d0ec", "#8c7fc0"
-# For several numbers in one chart (Okabe and Ito), apart from NEW, which marks the true one.
+# Colours of several lines in one chart (Okabe and Ito). NEW is not among them, because it marks the true one.
 SERIES = ["#0072b2", "#56b4e9", "#009e73", "#e69f00", "#cc79a7", "#7a8494", "#26344d", "#b8b04a"]
 # Pale where the surface is known, dark where it is not: the scanned points stand out on what is known.
 DEVIATION = LinearSegmentedColormap.from_list("deviation", mpl.colormaps["YlGnBu"](np.linspace(0.04, 0.92, 256)))
-# Another hue for the other scale, and no colour of the marks that lie on it.
+# Values of candidates. The hue differs from that of deviations, and from the marks on the map.
 VALUE = LinearSegmentedColormap.from_list("value", mpl.colormaps["BuPu"](np.linspace(0.03, 0.95, 256)))
 
 
 def colour_scale(colours: Colormap) -> list[list]:
-    """A colour map as plotly writes one."""
+    """Convert a colour map to plotly's format, a list of pairs: position from 0 to 1, and colour."""
     return [[t, mpl.colors.to_hex(colours(t))] for t in np.linspace(0.0, 1.0, 32).tolist()]
 
 
 def gradient(colours: Colormap) -> str:
-    """A colour map as CSS paints it, from left to right."""
+    """Convert a colour map to a CSS gradient from left to right."""
     steps = ", ".join(f"{colour} {100 * at:.0f}%" for at, colour in colour_scale(colours))
     return f"linear-gradient(90deg, {steps})"
 
 
 def middle_range(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
-    """Range of positive values, rounded to 1, 2, 5, without the outer 2 % at either end."""
+    """Return the range of positive values without 2 % at each end, extended to 1, 2 or 5 times 10^n."""
     low, high = np.percentile(values, [2.0, 98.0])
     ticks = log_ticks(low / 10.0, high * 10.0)
     return float(ticks[ticks <= low * 1.0001].max()), float(ticks[ticks >= high * 0.9999].min())
 
 
 def log_ticks(low: float, high: float) -> Float[np.ndarray, " n"]:
-    """1, 2, 5, 10, ... within [low, high]."""
+    """Return the numbers 1, 2 and 5 times a power of ten within [low, high]."""
     decades = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
     ticks = np.outer(decades, [1.0, 2.0, 5.0]).ravel()
     return ticks[(ticks >= low * 0.9999) & (ticks <= high * 1.0001)]
 
 
 def bar_ticks(low: float, high: float) -> list[float]:
-    """Ticks of a logarithmic colour bar: two to five powers of ten, or else both ends."""
+    """Return the ticks of a logarithmic colour bar: two to five powers of ten, or else both ends."""
     decades = [tick for tick in log_ticks(low, high).tolist() if round(np.log10(tick), 9).is_integer()]
     return decades[:: -(-len(decades) // 5)] if len(decades) > 1 else [low, high]
 
 
 def framed(axes: Axes, colour: str, width: float) -> None:
-    """A picture without ticks, in a frame."""
+    """Remove the ticks of axes, and draw a frame around them."""
     axes.set(xticks=[], yticks=[])
     axes.spines[:].set(visible=True, color=colour, linewidth=width)
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure as a PNG file, which is complete or absent."""
+    """Write a figure as a PNG file. The file is never left incomplete."""
     write_whole(path, lambda file: figure.savefig(file, format="png", dpi=200))

@@ -1,4 +1,4 @@
-"""The task by view: what was asked, what was found, when it was sure, and the numbers for its charts."""
+"""The task of an episode for the report: question, answers by view, when they are reliable, and charts."""
 
 import itertools
 import re
@@ -27,7 +27,7 @@ from jaxnbv.viz.answers import Chart, CoverageAnswer, capital, words_of
 
 
 class Rival(NamedTuple):
-    """Another search from the same first view: its name, its result in words, and charts as of a `Task`."""
+    """Result of a different search from the same first view: its name, a sentence, and charts as in `Task`."""
 
     name: str
     words: str
@@ -38,11 +38,12 @@ class Rival(NamedTuple):
 class Task(NamedTuple):
     """The task of an episode, with its answers after each view.
 
-    - `amounts`, `seen`: surface seen after each view, and its chart.
-    - `answers`, `charts`: answers after each view, and their charts. Without a question these are the amounts.
-    - `question`, `asked`, `found`, `sure`: for the head of the report, the question, how views were chosen, the answer,
-      and since when it is reliable.
-    - `rival`: result of another search, or None.
+    - `amounts`, `seen`: amount of surface seen after each view, and its chart.
+    - `answers`, `charts`: answers after each view, and their charts. If the acquisition has no answers, these are the
+      amounts.
+    - `question`, `asked`, `found`, `sure`: texts for the head of the report: the question, how views were chosen, the
+      answer, and from which view on the answer is reliable.
+    - `rival`: result of a different search, or None.
     """
 
     amounts: Sequence[CoverageAnswer]
@@ -57,7 +58,7 @@ class Task(NamedTuple):
 
     @property
     def is_coverage(self) -> bool:
-        """Whether nothing else is asked than how much was seen."""
+        """Whether the only question is how much of the surface was seen."""
         return self.answers is self.amounts
 
 
@@ -67,10 +68,10 @@ def task_of(
     rival: Episode | None = None,
     replayed: Sequence[Observations] | None = None,
 ) -> Task:
-    """The task of an episode's acquisition, or to see all of the surface if the acquisition has no answer.
+    """Return the task of an episode: that of its acquisition, or to see all surface if it has no answers.
 
     - `truth`: points of the true surface, in scene coordinates.
-    - `rival`: an episode of another search from the same first view.
+    - `rival`: an episode of a different search from the same first view.
     - `replayed`: observations after each view, if they are already computed.
     """
     planner = episode.planner
@@ -102,7 +103,7 @@ def _charts(answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...
 
 
 def _answers(episode: Episode, views: Sequence[View]) -> Sequence[Answer]:
-    """The answers of the episode's acquisition after each of some views, in its world; none, where it has none."""
+    """Return the acquisition's answers after these views, in world coordinates; empty if it has none."""
     answers = [view.answer(episode.planner.acquisition) for view in views]
     said = [answer.in_world(episode.frame) for answer in answers if answer is not None]
     return said if len(said) == len(answers) else []
@@ -111,11 +112,11 @@ def _answers(episode: Episode, views: Sequence[View]) -> Sequence[Answer]:
 def seen_after(
     episode: Episode, truth: Float[AnyArray, "n 3"] | None, replayed: Sequence[Observations] | None = None
 ) -> list[CoverageAnswer]:
-    """How much of the surface was seen after each view.
+    """Return how much of the surface was seen after each view.
 
-    With a true surface this is the seen share of it. Without one it is the sum of the new areas that scans show, in
-    world units. New is what `NewSurface` counts as new, with the settings of the acquisition if it is one. An area
-    measured at a slant counts in full here, but for less in the acquisition.
+    Given the true surface, this is the percentage of it that was seen. Otherwise it is the sum of the new areas that
+    scans show, in squared world units. `NewSurface` defines what is new, with the acquisition's settings if it is a
+    `NewSurface`. An area measured at a slant counts in full here, but for less in the acquisition.
 
     - `truth`: points of the true surface, in scene coordinates.
     - `replayed`: observations after each view, if they are already computed.
@@ -141,7 +142,7 @@ def _new_area(of: NewSurface, before: Observations | None, view: ImaginedView) -
 
 
 def true_cloud(scene: Surface, count: int) -> PointCloud | None:
-    """Points with normals, uniform by area, of a known surface. None if it cannot be sampled."""
+    """Sample `count` points with normals, uniform by area, from a known surface; None if it has no mesh."""
     mesh = true_mesh(scene)
     if mesh is None:
         return None
@@ -151,7 +152,7 @@ def true_cloud(scene: Surface, count: int) -> PointCloud | None:
 
 
 def settled_after(episode: Episode, answers: Sequence[Answer]) -> list[bool]:
-    """Whether the answer after each view can be relied on. A rule is asked as the episode would ask it."""
+    """Return, for each view, whether the answer after it is reliable. Rules get the same keys as in a run."""
 
     def holds(rule: Sure, index: int) -> bool:
         key, *_ = view_keys(episode.key, index + 1)
@@ -161,25 +162,25 @@ def settled_after(episode: Episode, answers: Sequence[Answer]) -> list[bool]:
 
 
 def since(settled: Sequence[bool]) -> int | None:
-    """The first view (from 1) from which on all answers can be relied on; None if not even the last can."""
+    """Return the first view (from 1) from which on all answers are reliable; None if the last one is not."""
     return len(settled) - int(np.argmin([*settled[::-1], False]) - 1) if settled[-1] else None
 
 
 def lost_again(settled: Sequence[bool]) -> int | None:
-    """The first view (from 1) whose answer could be relied on, if one after it could not; None otherwise."""
+    """Return the first view (from 1) with a reliable answer, if a later one is not reliable; None otherwise."""
     first = int(np.argmax(settled))
     return first + 1 if settled[first] and not all(settled[first:]) else None
 
 
 def search_name(episode: Episode) -> str:
-    """The kind of an episode's search in words: "farthest view" of `FarthestView`."""
+    """Return the kind of an episode's search in words: "farthest view" for `FarthestView`."""
     return re.sub("(?<!^)(?=[A-Z])", " ", type(episode.planner.search).__name__).lower()
 
 
 def race_words(rival: Episode, episode: Episode) -> str:
-    """A sentence about another search from the same first view: its number of views, and its answer.
+    """Return a sentence about a different search from the same first view: number of views, and answer.
 
-    It says if they were not enough for the rule that ended the episode.
+    It says if these views did not fulfil the stop rule that ended `episode`.
     """
     name, count = search_name(rival).capitalize(), len(rival.views)
     answers = _answers(episode, rival.views)

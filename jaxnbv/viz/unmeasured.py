@@ -14,12 +14,13 @@ from jaxnbv.observations import Observations
 from jaxnbv.scanning import Carving, TriangleMesh
 from jaxnbv.viz.answers import coordinates, number
 
-# Least number of looks, since one may be chance. Least share of the surface in a patch. Most patches to report.
+# Least number of views that looked at a patch, since one may be chance. Least fraction of the surface in a patch.
+# Maximum number of patches.
 _LOOKS, _SHARE, _PATCHES = 2, 0.005, 3
 
 
 class Patch(NamedTuple):
-    """A piece of unmeasured surface: its area and middle in scene units, and the number of looks at it."""
+    """A piece of unmeasured surface: its area and middle in scene units, and the number of views facing it."""
 
     area: float
     middle: Float[np.ndarray, "3"]
@@ -27,9 +28,9 @@ class Patch(NamedTuple):
 
 
 def unmeasured(surface: trimesh.Trimesh, observations: Observations, carving: Carving | None) -> list[Patch]:
-    """The largest patches of a surface that at least two views looked at but did not measure.
+    """Return patches of a surface that at least two views looked at but did not measure.
 
-    The largest comes first. Cuts by the carving volume do not count.
+    At most three patches are returned, the largest first. Cuts by the carving volume do not count.
 
     - `surface`: an estimate from the observations, such as the posterior's mean, in scene coordinates.
     """
@@ -43,7 +44,7 @@ def unmeasured(surface: trimesh.Trimesh, observations: Observations, carving: Ca
         in_vain = np.zeros(times.shape, bool)
         cells_of_view = np.asarray(looks.unmeasured_cells(mesh, index, observations.poses.rows[index]))
         in_vain[tuple(cells_of_view[(cells_of_view < looks.grid.resolution).all(axis=1)].T)] = True
-        # Rays are farther apart than cells.
+        # Include the neighbouring cells, because rays are farther apart than cells.
         times += binary_dilation(in_vain, np.ones((3, 3, 3)))
     of_face = times[tuple(np.minimum(cells, looks.grid.resolution).T)]
     chosen = of_face >= _LOOKS
@@ -58,7 +59,7 @@ def unmeasured(surface: trimesh.Trimesh, observations: Observations, carving: Ca
 
 
 def unmeasured_words(patches: Sequence[Patch], frame: Frame) -> str:
-    """A sentence about the patches, in the world of a frame."""
+    """Return a sentence about the patches, with areas and positions in the world of a frame."""
     parts = [
         f"{number(float(frame.length_to_world(patch.area, 2)))} {frame.unit}² about {coordinates(patch.middle, frame)} "
         f"({patch.looks} looks)"

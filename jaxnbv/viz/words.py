@@ -1,4 +1,4 @@
-"""Words about each view: where it looks from, why it was chosen, what came of it."""
+"""Sentences about each view: where it looks from, why it was chosen, and what it showed."""
 
 from collections.abc import Sequence
 
@@ -21,12 +21,12 @@ def told(
     frame: Frame,
     gain: float | None = None,
 ) -> dict[str, str]:
-    """Sentences about the last of some views, by heading: pose, expectation, other candidates, result.
+    """Return sentences about the last view, by heading: pose, expected value, other candidates, result.
 
-    - `views`: views with the values of their proposals in world units.
+    - `views`: all views up to this one, with the values of their proposals in world units.
     - `seen`: how much was seen after each view.
     - `frame`: frame of the world.
-    - `gain`: what the last view truly gave of its promise, in world units; None if unknown.
+    - `gain`: true gain of the last view, to compare with its expected value, in world units; None if unknown.
     """
     *earlier, view = views
     points, amount = int(view.scan.count), seen[-1].amount
@@ -49,7 +49,7 @@ def told(
 
 
 def _reason(quantity: Quantity, proposal: Proposal, frame: Frame) -> dict[str, str]:
-    """Sentences about the value of a view and those of the other candidates."""
+    """Return sentences, by heading, about the value of a view and the values of the other candidates."""
     value, others, tied = float(proposal.value), best_first(proposal).tolist(), proposal.num_tied
     if not quantity.smooth:
         return {"What it promised": f"It was drawn at random from {len(others)} open candidates."}
@@ -61,7 +61,7 @@ def _reason(quantity: Quantity, proposal: Proposal, frame: Frame) -> dict[str, s
     if climbed and proposal.trajectories is not None:
         starts = len(proposal.trajectories.values)
         how = f"found by gradient ascent from {starts} start{'s' * (starts > 1)}"
-    # A reader knows areas and lengths, but not nats.
+    # Print only areas and lengths, because readers do not know nats.
     amount = f"Its value, {shown_value(quantity, value, frame)}," if quantity.length_power else "Its value"
     said = {"What it promised": f"{amount} was {how}."}
     rest = others if climbed or rank > 1 else others[1:]
@@ -75,7 +75,7 @@ def _reason(quantity: Quantity, proposal: Proposal, frame: Frame) -> dict[str, s
 
 
 def place(pose: Pose, frame: Frame) -> str:
-    """A camera's position in the world of a frame, its elevation, and how far it aims off the origin."""
+    """Describe a camera's pose: world coordinates, elevation, and the angle by which it misses the origin."""
     position, forward = (np.asarray(vector, dtype=np.float64) for vector in (pose.position, pose.forward))
     elevation = np.degrees(np.arcsin(unit(position)[1]))
     side = "above" if elevation >= 0 else "below"
