@@ -143,8 +143,8 @@ class PointCloud(eqx.Module):
         - A pixel that is zero, negative or NaN, or has a depth below the camera's range, is invalid. It gives no
           information.
         - A value that stands for "not measured" is invalid. This is the largest value of an integer type, or a value
-          beyond the camera's range or well beyond the box that fills far more pixels than any value near it. The second
-          kind gives a `UserWarning`.
+          that fills far more pixels than any value near it and lies beyond the camera's range or well beyond the box.
+          The second kind gives a `UserWarning`.
 
         Distortion is undone first (`Camera.from_intrinsics`). Then a plane is fitted to the pixels around each pixel
         that lie on the same surface. The window of these pixels grows with the noise (`geometry/plane_fit.py`). The
@@ -173,7 +173,7 @@ class PointCloud(eqx.Module):
     @property
     @own_settings()
     def count(self) -> Int[Array, "*batch"]:
-        """The number of filled rows."""
+        """The number of filled rows, which is the number of points."""
         return jnp.sum(self.mask, axis=-1)
 
     @own_settings()
@@ -209,7 +209,7 @@ class PointCloud(eqx.Module):
 
 
 def some_rows(cloud: PointCloud, count: int) -> Int[Array, " count"]:
-    """Return the indices of `count` filled rows of a single cloud, evenly spaced among all filled rows.
+    """Return the indices of `count` filled rows (`mask` is True) of a single cloud, evenly spaced among these.
 
     Indices repeat if fewer than `count` rows are filled. All indices are 0 if the cloud is empty.
     """

@@ -170,9 +170,9 @@ def _is_sentinel(
 
 
 def _depths_of(box: Box, pose: Pose) -> tuple[float, float]:
-    """Return the least and greatest depth of a box's corners, seen from a pose.
+    """Return the least and greatest depth of a box's corners along the viewing direction of a pose.
 
-    The least depth is at least a thousandth of the greatest, even if the camera is inside the box.
+    If the least depth is below a thousandth of the greatest depth, it is raised to this value.
 
     **Raises:** `ValueError` if the box lies behind the camera.
     """

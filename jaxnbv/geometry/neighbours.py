@@ -17,7 +17,7 @@ def nearest_squared_distance(x: Float[Array, "n 3"], cloud: PointCloud) -> Float
     """Return min_j |x - y_j|^2 over the filled rows y_j of a cloud; infinite if the cloud is empty.
 
     A loop runs over the rows of the cloud up to the last filled row. So memory is linear in the number of points x, and
-    time does not depend on the capacity. The result can be differentiated repeatedly in x and in the cloud's points.
+    empty rows at the end cost no time. The result can be differentiated repeatedly in x and in the cloud's points.
     """
     return _nearest_squared_distance(x, cloud.points, cloud.mask)
 

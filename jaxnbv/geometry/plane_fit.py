@@ -6,7 +6,8 @@ at (u0, v0), a function with three coefficients a, b and c,
     z0 / z(u, v) = a + b (u - u0) + c (v - v0),     normal along  (b, c, a - b u0 - c v0)
 
 is fitted by least squares to those pixels of a window that can belong to the same surface. If the pixels are a distance
-p apart on the surface and their noise is sigma, a slope fitted to a window of (2 r + 1)^2 pixels has the error
+p apart on the surface and their depth has noise of standard deviation sigma, a slope fitted to (2 r + 1)^2 pixels has
+the error
 
     sqrt(3) sigma / (p r (2 r + 1)).
 
@@ -42,7 +43,7 @@ def fitted_planes(
     least_noise: float | Float[Array, ""],
     gap: int = 1,
 ) -> tuple[Float[Array, "k l"], Float[Array, "k l 3"], Bool[Array, "k l"]]:
-    """Return the plane's depth and normal at every `stride`-th row and column, and whether a plane exists.
+    """Return a fitted plane's depth and normal at every `stride`-th row and column, and whether it exists.
 
     Normals are in the camera's frame and point towards the camera. In an image without gaps, the plane's depth is
     limited to three standard deviations of the noise from the measured depth.
@@ -73,9 +74,9 @@ def fitted_planes(
     width = 2 * jnp.max(jnp.where(has_middle, radius, 1)) + 1
 
     def add(index, sums):
-        """Add one neighbour of each pixel to the sums, if both pixels can belong to the same surface.
+        """Add one neighbour of each pixel to the pixel's normal equations, if both can be on one surface.
 
-        Positions are in units of the window's radius.
+        `index` is the neighbour's index in the window. Positions are in units of the window's radius.
         """
         down, right = index // width - width // 2, index % width - width // 2
         near = padded[(rows + down)[:, None], (columns + right)[None]]

@@ -105,8 +105,7 @@ def normalise(
 ) -> Float[Array, "*batch n"]:
     """Return the unit vector along a vector, or `spare` if the vector is too short.
 
-    A vector is too short if the magnitude of its largest entry does not exceed both `least` and the smallest normal
-    float.
+    A vector is long enough if the magnitude of its largest entry exceeds `least` and the smallest normal float.
     """
     # The vector is divided by its largest entry, so that no square overflows.
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(vector), axis=-1, keepdims=True))

@@ -12,7 +12,7 @@ from jaxnbv.checks import AnyArray
 def on_tensor_grid(
     function: Callable[[Float[Array, "n 3"]], Shaped[Array, "*s n"]], axis: Float[AnyArray, " g"]
 ) -> Shaped[Array, "*s g g g"]:
-    """Return a function's values at the nodes of a grid whose x, y and z coordinates are all in `axis`.
+    """Return a function's values at the nodes of a cubic grid with coordinates `axis` along each axis.
 
     To save memory, the function is evaluated at the nodes of one x coordinate at a time.
     """

@@ -168,8 +168,9 @@ def best_unvisited(
 def best_or_farthest(problem: Problem, candidates: Pose, scores: Float[Array, "samples candidates"]) -> Proposal:
     """Propose the best candidate or, among tied candidates, the one farthest from earlier cameras.
 
-    The distance matters only if a second view from the same pose gains nothing (`Acquisition.gains_once`), and if there
-    is no cost, because a cost already favours near candidates. Otherwise propose as `best_unvisited` does.
+    Ties are those of `Proposal.tied_with_best`. The distance matters only if a second view from the same pose gains
+    nothing (`Acquisition.gains_once`), and if there is no cost, because a cost already favours near candidates.
+    Otherwise propose as `best_unvisited` does.
     """
     proposal = best_unvisited(problem, candidates, jnp.mean(scores, axis=0), scores=scores)
     if not problem.acquisition.gains_once or problem.cost is not None:
@@ -183,7 +184,7 @@ def best_or_farthest(problem: Problem, candidates: Pose, scores: Float[Array, "s
 def preferred(proposal: Proposal, preference: Float[Array, " candidates"]) -> Proposal:
     """Change a proposal to the candidate of the highest `preference` among those tied with the best.
 
-    Candidates that the proposal excludes (value -inf) are not considered.
+    Ties are those of `Proposal.tied_with_best`. Excluded candidates (value -inf) are not considered.
     """
     tied, errors = proposal.tied_with_best(), proposal.standard_errors
     assert tied is not None

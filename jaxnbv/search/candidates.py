@@ -89,7 +89,7 @@ class SphereCandidates(Candidates):
 class Reach(Candidates):
     """Cameras within an arm's reach: between two distances and two elevations, all looking at the origin.
 
-    - `count`: number of cameras. Their directions are a Fibonacci sphere, and their distances are uniform in volume.
+    - `count`: number of cameras. Their directions are a Fibonacci sphere, and they fill the volume evenly.
     - `nearest`, `farthest`: smallest and largest distance from the origin, in scene units.
     - `min_elevation`, `max_elevation`: limits of the elevation in radians, above the plane through the origin that is
       normal to `up`.

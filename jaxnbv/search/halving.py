@@ -25,8 +25,8 @@ class HalvingSearch(CandidateSearch):
 
     All candidates are scored on the first few posterior samples. In each later round, the better half of the remaining
     candidates is scored on further samples, until all samples are used. Each round doubles the number of samples on
-    which the remaining candidates were scored. For 16 samples and `num_first_samples=2`, the mean number of scores for
-    a candidate is 5 instead of 16. The proposal may differ from that of `DiscreteSearch`.
+    which the remaining candidates were scored. For 16 samples and `num_first_samples=2`, a candidate is scored on
+    5 samples on average instead of 16. The proposal may differ from that of `DiscreteSearch`.
 
     - `num_first_samples`: number of posterior samples on which every candidate is scored.
     """

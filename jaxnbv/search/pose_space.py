@@ -165,7 +165,10 @@ class ConstrainedPoses(PoseSpace):
         return Pose(_product(_product(turned, rotation_between(target, to_origin)), about_axis), position)
 
     def check_camera(self, camera: Camera) -> None:
-        """Raise `ValueError` if an edge of the image is less than `off_axis` from the optical axis."""
+        """Raise `ValueError` if an edge of the image is less than `off_axis` from the optical axis.
+
+        The origin could then be outside the image.
+        """
         left, top, right, bottom = camera.edges
         half = math.atan(min(-left, -top, right, bottom))
         require(

@@ -115,7 +115,7 @@ class Problem(eqx.Module):
         return self.inputs.surfaces
 
     def is_excluded(self, poses: Pose) -> Bool[Array, " poses"]:
-        """Return a mask of poses that were visited or proposed before, or are too close to an obstacle or D."""
+        """Return whether each pose was visited or proposed before, or is too close to obstacles or the cloud."""
         excluded = self.observations.poses.contains(poses)
         if self.pending is not None:
             excluded |= self.pending.contains(poses)
