@@ -1,4 +1,4 @@
-"""`python -m jaxnbv`."""
+"""Runs the command `jaxnbv` as `python -m jaxnbv`."""
 
 from jaxnbv.cli import main
 

@@ -2,8 +2,9 @@
 
     alpha(theta) = E alpha(D, scan(theta; f | D)),   estimated by the mean over the step's samples f_1, ..., f_S
 
-All poses use the same samples (common random numbers). An acquisition computes its *context* from the observations once
-per step, and the *score* of each imagined view from the context.
+Here theta is a pose, D the cloud of all scans so far, and f a surface of the posterior given D. All poses use the same
+samples (common random numbers). An acquisition computes its *context* from the observations once per step, and the
+*score* of each imagined view from the context.
 """
 
 from abc import abstractmethod
@@ -38,7 +39,7 @@ from jaxnbv.utility import Answer, AnyUtility, Quantity, Utility, as_utility, de
 
 
 class ImaginedView(eqx.Module):
-    """One imagined scan (masked rows, scene coordinates), its camera and its pose."""
+    """One imagined scan, its camera and its pose, in scene coordinates. `scan.mask` marks the rows with a point."""
 
     scan: PointCloud
     camera: Camera
@@ -51,8 +52,8 @@ class Acquisition(eqx.Module):
     A search maximises the mean score over the samples.
 
     - `needs_posterior`: whether `context` reads the posterior. A planner then puts the posterior into the step inputs.
-    - `cloud_only`: whether `context` reads only D. A planner can then test the acquisition before the first view.
-    - `measurable_only`: whether to drop sampled surface that an earlier view should have measured but did not, see
+    - `cloud_only`: whether `context` reads only the cloud D. A planner can then test the acquisition before any view.
+    - `measurable_only`: whether the samples omit surface that an earlier view should have measured but did not, see
       `Looks`.
     - `needs_hypotheses`: whether `context` reads the hypotheses of a model of known parts, and no posterior. The most
       likely part is then the only sample of the step.
@@ -69,7 +70,7 @@ class Acquisition(eqx.Module):
 
     @abstractmethod
     def context(self, step: StepInputs) -> Any:
-        """Compute everything that does not depend on the view. Called once per step."""
+        """Compute everything that `score` needs besides the view. Called once per step."""
 
     @abstractmethod
     def score(self, context: Any, view: ImaginedView) -> Float[Array, "*values"]:
@@ -92,7 +93,7 @@ class Acquisition(eqx.Module):
         all poses are computed together, and must fit into memory. `batch_size` scans are scored together. The samples
         are divided among devices, or the poses if there are fewer samples than devices.
 
-        - `barrier`: see `scan`.
+        - `barrier`: distance along each ray to an obstacle, see `scan`.
         """
         together = min(samples_at_once(camera, poses), share_of(surfaces.values.shape[0]))
         views = poses, barrier
@@ -116,13 +117,13 @@ class Acquisition(eqx.Module):
         return Quantity(f"acquisition, {type(self).__name__}", "", meaning)
 
     def answer(self, cloud: PointCloud) -> Answer | None:
-        """Return the answer that D gives to the acquisition's question, or None if there is no such answer."""
+        """Return the answer of a cloud to the acquisition's question, or None if there is no such answer."""
         return None
 
     def answer_values(self, cloud: PointCloud) -> Float[Array, " n"] | None:
         """Return the values of `answer`, computed by JAX operations.
 
-        None if there is no answer, or if the answer needs host code.
+        None if there is no answer, or if the answer needs code outside JAX.
         """
         return None
 
@@ -137,16 +138,19 @@ class Acquisition(eqx.Module):
     def check(self, cloud: PointCloud) -> None:
         """Raise `ValueError` if a network or function of the acquisition returns an invalid result.
 
-        This method is called with the first D. It is also called with D and a scan together, if the score of this scan
-        is not finite.
+        This method is called with the first cloud D. It is also called with the union of D and a scan, if the score of
+        this scan is not finite.
         """
         return
 
 
 class ExpectedUtilityImprovement(Acquisition):
-    """max(0, u(D u scan) - u(D)) for any utility u(cloud). Its mean over samples is the paper's alpha^(u).
+    """Acquisition whose score max(0, u(D + scan) - u(D)) is the increase of a utility u by a scan.
 
-    - `utility`: a `Utility`, or a function from a `PointCloud` (masked rows) to a scalar, made of JAX operations.
+    D + scan is the cloud D with the scan's points added. The mean score over samples is the paper's alpha^(u).
+
+    - `utility`: a `Utility`, or a function from a `PointCloud` to a scalar, made of JAX operations. The function must
+      leave out rows whose mask is False.
     - `num_points`: if not None, D is thinned to this number of points by farthest point sampling, once per step, before
       scans are added. Use it for a utility that would otherwise thin D to this number for every scan.
     """
@@ -160,7 +164,7 @@ class ExpectedUtilityImprovement(Acquisition):
         require(self.num_points is None or self.num_points >= 1, f"num_points is {self.num_points}; give at least 1")
 
     def context(self, step: StepInputs) -> tuple[PointCloud, Array]:
-        """Return D, thinned to `num_points`, and u(D)."""
+        """Return the cloud D, thinned to `num_points`, and its utility."""
         cloud = step.observations.cloud
         cloud = cloud if self.num_points is None else limit_capacity(cloud, self.num_points)
         return cloud, self._value(cloud)
@@ -169,7 +173,7 @@ class ExpectedUtilityImprovement(Acquisition):
         return checked_result(self.utility(cloud), f"the {self.utility.name} of a cloud", 0, "a utility is one number")
 
     def score(self, context: tuple[PointCloud, Float[Array, ""]], view: ImaginedView) -> Float[Array, ""]:
-        """Return max(0, u(D u scan) - u(D))."""
+        """Return by how much the view's scan raises the utility of the cloud, or 0 if it lowers the utility."""
         cloud, utility = context
         return zero_if_empty(view.scan, jnp.maximum(0.0, self._value(concatenate(cloud, view.scan)) - utility))
 
@@ -180,16 +184,16 @@ class ExpectedUtilityImprovement(Acquisition):
 
     @property
     def quantity(self) -> Quantity:
-        """The utility's `improvement`."""
+        """Name, unit and meaning of the utility's expected improvement."""
         return self.utility.improvement
 
     def answer(self, cloud: PointCloud) -> Answer:
-        """Return the utility's own answer, or u(D) if the utility has no answer."""
+        """Return the utility's own answer, or the utility of the cloud if there is no such answer."""
         own = self.utility.answer(cloud)
         return Answer((self.utility.name,), np.array([float(context_of(self, cloud)[1])])) if own is None else own
 
     def answer_values(self, cloud: PointCloud) -> Float[Array, " n"] | None:
-        """Return the values of the utility's own answer, or u(D) if the utility has no answer."""
+        """Return the values of the utility's own answer, or the utility of the cloud, see `answer`."""
         own = self.utility.answer_values(cloud)
         if own is None and type(self.utility).answer is Utility.answer:
             return jnp.atleast_1d(context_of(self, cloud)[1])
@@ -201,7 +205,7 @@ class ExpectedUtilityImprovement(Acquisition):
         return self.answer(cloud) if own is None else own
 
     def check(self, cloud: PointCloud) -> None:
-        """**Raises:** `ValueError` if the utility's own `check` does, or if u(D) is not finite."""
+        """Raise `ValueError` if the utility's own `check` does, or if the utility of the cloud is not finite."""
         self.utility.check(cloud)
         _, value = context_of(self, cloud)
         name, count = self.utility.name, int(cloud.count)
@@ -223,8 +227,8 @@ def as_acquisition(value: Any) -> Acquisition:
 class AcquisitionList(Acquisition):
     """Several acquisitions on the same samples and the same scans. Each pose is scanned only once.
 
-    The value is a vector: the members' values, concatenated in order. The value of a member may itself be a vector. Use
-    an `AcquisitionList` with `expected_value` and `Problem.scores`, not in a planner.
+    The value is a vector: the values of `members`, concatenated in order. The value of a member may itself be a vector.
+    Use an `AcquisitionList` with `expected_value` and `Problem.scores`, not in a planner.
     """
 
     members: tuple[Acquisition, ...]
@@ -256,21 +260,21 @@ class AcquisitionList(Acquisition):
         return min(member.batch_size for member in self.members)
 
     def check(self, cloud: PointCloud) -> None:
-        """**Raises:** `ValueError` if the check of any member does."""
+        """Raise `ValueError` if the check of any member does."""
         for member in self.members:
             member.check(cloud)
 
 
 def inputs_of(observations: StepInputs | Observations | PointCloud) -> StepInputs:
-    """Return step inputs unchanged, or make them from observations or a cloud.
+    """Return step inputs unchanged, or convert observations or a cloud to step inputs.
 
-    Step inputs made in this way have no posterior and no samples.
+    Converted step inputs have no posterior and no samples.
     """
     return observations if isinstance(observations, StepInputs) else StepInputs(as_observations(observations))
 
 
 def context_of(acquisition: Acquisition, observations: StepInputs | Observations | PointCloud) -> Any:
-    """Compute the acquisition's context by a compiled function.
+    """Return the acquisition's context of these observations, computed by a compiled function.
 
     **Raises:** `ValueError` if JAX cannot trace a user's function, or if the acquisition needs a posterior and there is
     none.
@@ -309,7 +313,7 @@ def check_traceable(
     - `differentiable`: whether to check that scores have derivatives in the points and normals of a scan.
 
     **Raises:** `ValueError` if JAX cannot trace the acquisition (for example a utility in NumPy), or cannot
-    differentiate it (host code).
+    differentiate it (because it calls code outside JAX).
     """
     if acquisition.needs_posterior or acquisition.needs_hypotheses:
         # This acquisition cannot be tested, because there are no posterior and no hypotheses yet.
@@ -354,7 +358,7 @@ def expected_value(
 
     - `observations`: the observations, or a cloud D. An acquisition that needs the posterior requires `StepInputs`.
     - `surfaces`: the samples along a leading axis.
-    - `barrier`: see `scan`.
+    - `barrier`: distance along each ray to an obstacle, see `scan`.
 
     **Raises:** `ValueError` if the acquisition's `check` does (traced values are not checked), or if JAX cannot trace a
     user's function.
@@ -373,9 +377,9 @@ def scores(
 ) -> Float[Array, "poses *scores"]:
     """Return the scores of a batch of scans, one scan from each pose.
 
-    `batch_size // samples` scans are scored at a time.
+    At a time, `acquisition.batch_size // samples` scans are scored.
 
-    - `samples`: number of samples whose scans are scored together.
+    - `samples`: number of posterior samples for which this function runs at the same time.
     """
     return batched_map(
         lambda rows: acquisition.score(context, ImaginedView(rows[0], camera, rows[1])),

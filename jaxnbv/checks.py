@@ -53,7 +53,7 @@ _LARGEST = float(np.finfo(np.float32).max)
 
 
 def check_device() -> None:
-    """**Raises:** `ValueError` if JAX finds no device of the platform in `JAX_PLATFORMS`."""
+    """Raise `ValueError` if JAX finds no device of the platform in the variable `JAX_PLATFORMS`."""
     try:
         jax.devices()
     # The type of the error depends on the plugins that are installed.
@@ -71,7 +71,7 @@ def require(condition: bool | np.bool_, message: str) -> None:
 
 
 def is_traced(*trees) -> bool:
-    """Whether any leaf is a tracer, which has no value during a JAX transformation."""
+    """Return whether any leaf of the trees is a tracer, which has no value during a JAX transformation."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
 
 
@@ -116,7 +116,11 @@ def checked(function: _F) -> _F:
 
 
 def check_type(value: Any, hint: Any, name: str) -> None:
-    """**Raises:** `ValueError` if the value contradicts a plain type hint. Other type hints are ignored."""
+    """Raise `ValueError` if the value called `name` contradicts a plain type hint.
+
+    Plain are int, float, bool, two or three floats, classes, `Callable`, and each of these or None. Other type hints
+    are ignored.
+    """
     if hint is int:
         whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
         require(whole, f"{name} is {short_text(value)}; it must be a whole number")
@@ -139,7 +143,7 @@ def check_type(value: Any, hint: Any, name: str) -> None:
 
 
 def check_index(index: Any, batch: tuple[int, ...], name: str) -> None:
-    """Check an index of a batch, because JAX clamps an index that is out of range.
+    """Check an index of an array with batch axes of shape `batch`. JAX would clamp an index out of range.
 
     **Raises:** `ValueError` for an integer that is out of range, or if there are no batch axes.
     """
@@ -149,12 +153,12 @@ def check_index(index: Any, batch: tuple[int, ...], name: str) -> None:
 
 
 def check_batch(batch: tuple[int, ...], name: str) -> None:
-    """**Raises:** `ValueError` if there are no batch axes."""
+    """Raise `ValueError` if `batch`, the shape of the leading axes of the object called `name`, is empty."""
     require(len(batch) > 0, f"{name} is a single one, not a batch: it can be neither indexed nor iterated")
 
 
 def check_key(key: Any) -> None:
-    """**Raises:** `ValueError` unless this is a single typed JAX random key."""
+    """Raise `ValueError` unless this is a single typed JAX random key."""
     is_key = isinstance(key, Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.ndim == 0
     require(is_key, f"the key is {short_text(key)}: make one with jax.random.key(seed)")
 

@@ -56,7 +56,7 @@ def keep_compiled(folder: str | Path | None = None) -> str:
 
 
 def _check_writable(folder: Path) -> None:
-    """**Raises:** `ValueError` if the folder cannot be written. JAX would only warn, once for each program."""
+    """Raise `ValueError` if no file can be written to the folder. JAX would only warn, once for each program."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):

@@ -41,7 +41,7 @@ def suggestion(name: str, names: Iterable[str]) -> str:
 
 @contextmanager
 def explained_imports() -> Iterator[None]:
-    """Context manager for imports of modules that need an extra.
+    """Context manager for imports of modules that need an extra (pip's optional dependencies).
 
     **Raises:** `ValueError` with the command that installs a missing extra.
     """

@@ -19,8 +19,8 @@ from jaxnbv.scanning import Carving, Grid, Looks, Obstacles, barrier_of
 
 # A model uses 100 to 200 empty points. The time to choose them grows with the number of points to choose from.
 _POINTS_ALONG_AXIS = 20
-# Largest number of points that are checked for stray points per scan. The time is proportional to this number times the
-# capacity. Further points are checked after the next scan.
+# Largest number of points that are checked after each scan for being stray. The time is proportional to this number
+# times the capacity. Further points are checked after the next scan.
 _MOST_STRAY = 512
 
 
@@ -36,7 +36,7 @@ class Observations(eqx.Module):
 
     Array shapes are fixed, so that views do not recompile programs.
 
-    - `cloud`: D, the kept points.
+    - `cloud`: the kept points, the paper's D.
     - `poses`: the poses of the views.
     - `grid`: the grid of `looks`, `empty_nodes` and `obstacle_nodes`; None if there are none of these.
     - `looks`: the measured surface and the measured ray lengths of each view, see `Looks`.
@@ -79,7 +79,7 @@ class Observations(eqx.Module):
 
     @property
     def empty_points(self) -> EmptyPoints:
-        """Nodes of a coarser subgrid (at most 20 per axis) and the mask of empty nodes, for use by models."""
+        """Nodes of a coarser grid (at most 20 per axis), and which of them were seen to be empty, for models."""
         if self.empty_nodes is None or self.grid is None:
             return EmptyPoints(jnp.zeros((1, 3), self.cloud.points.dtype), jnp.zeros(1, bool))
         stride = -(-self.grid.resolution // _POINTS_ALONG_AXIS)
@@ -88,17 +88,17 @@ class Observations(eqx.Module):
         return EmptyPoints(nodes, self.empty_nodes[::stride, ::stride, ::stride].reshape(-1))
 
     def add_points(self, scan: PointCloud) -> "Observations":
-        """Return a copy with a scan's points added to D.
+        """Return a copy with a scan's points added to the cloud.
 
-        D is thinned to its capacity by farthest point sampling. Then stray points are removed, which are isolated
-        points in space that a view saw to be empty.
+        The cloud is thinned to its capacity by farthest point sampling. Then stray points are removed: isolated points
+        in space that a view saw to be empty.
         """
         return dataclasses.replace(self, cloud=_joined(self.cloud, scan, self.empty_nodes, self.grid))
 
     def add_view(
         self, pose: Pose, scan: PointCloud, camera: Camera, carving: Carving | None, obstacles: Obstacles | None
     ) -> "Observations":
-        """Return a copy with a view's pose, its measured surface, and the nodes that it showed to be empty.
+        """Return a copy with one more view: its pose, measured surface, and nodes that it showed to be empty.
 
         - `carving`: the margin around rays within which nodes count as empty; None leaves `empty_nodes` unchanged.
         - `obstacles`: solids that may hide the object. A ray shows nothing behind them.
@@ -128,10 +128,13 @@ def _joined(cloud: PointCloud, scan: PointCloud, empty: Bool[Array, "g g g"] | N
 
 
 def _is_stray(cloud: PointCloud, empty: Bool[Array, "g g g"], grid: Grid) -> Bool[Array, " n"]:
-    """True for each point that lies in a cell seen to be empty and has no neighbour within twice the spacing.
+    """Return whether each point is stray: alone, and in a grid cell whose nodes were all seen to be empty.
 
-    Points on a connected surface are about one spacing apart in a thinned cloud, so they do have such a neighbour. This
-    keeps points of a thin part that a view missed, and points of images with slightly wrong poses.
+    A point is alone if no other point is within twice the spacing, the median distance between neighbours. Points on a
+    connected surface are about one spacing apart in a thinned cloud, so they are not alone. This keeps points of a thin
+    part that a view missed, and points of images with slightly wrong poses.
+
+    - `empty`: mask of the nodes that were seen to be empty.
     """
     crossed = jax.lax.reduce_window(empty, True, jax.lax.bitwise_and, (2, 2, 2), (1, 1, 1), "VALID")
     cell = tuple(grid.cell_of(cloud.points).T)

@@ -60,7 +60,7 @@ class _Executable(NamedTuple):
 
 
 class _Program:
-    """`eqx.filter_jit` of a function. Its compiled programs are stored on disk after `keep_compiled` was called."""
+    """A function under `eqx.filter_jit`. Its programs are stored on disk after `keep_compiled` was called."""
 
     def __init__(self, function: Callable[..., Any]):
         functools.update_wrapper(self, function)
@@ -92,6 +92,9 @@ class _Program:
         """Load or compile the program for these arguments.
 
         Returns None if the arguments contain code of a module that is not permitted.
+
+        - `static`, `leaves`: the arguments without their arrays, and these arrays in the order of `tree`.
+        - `kinds`: shape and type of each array.
         """
         function = self._function.__module__, self._function.__qualname__
         try:
@@ -113,6 +116,8 @@ class _Program:
 
         If the same lowered code is already stored, for a different entry, the program is loaded. Otherwise it is
         compiled and stored.
+
+        - `entry`: file for these arguments, which names the file of their program. See also `_executable`.
         """
         result = None
 
@@ -162,21 +167,21 @@ def program(function: Callable[..., Any]) -> Any:
 
 
 def _is_plain(leaf: Any) -> bool:
-    """Whether an array is concrete, and either a NumPy array or entirely on the first device."""
+    """Return whether an array is concrete, and either a NumPy array or entirely on the first device."""
     if isinstance(leaf, jax.core.Tracer):
         return False
     return not isinstance(leaf, jax.Array) or leaf.sharding.device_set == {jax.local_devices()[0]}
 
 
 def _is_plain_context() -> bool:
-    """Whether programs run on the first device only, and JAX's debugging options are off."""
+    """Return whether programs run on the first device only, and JAX's debugging options are off."""
     config: Any = jax.config
     debugs = config.jax_disable_jit or config.jax_debug_nans or config.jax_debug_infs
     return not debugs and config.jax_default_device is None and get_abstract_mesh().empty
 
 
 def _settings() -> tuple:
-    """Return JAX's settings, including settings by context managers, but without the settings of its cache."""
+    """Return JAX's settings, including those of context managers, but without those of JAX's cache."""
     names = [name for name in jax.config.values if "cache" not in name]
     return tuple([str(getattr(jax.config, name, jax.config.values[name])) for name in names])
 
@@ -192,7 +197,7 @@ def _source() -> str:
 
 @functools.cache
 def _machine() -> str:
-    """Describe the versions of the libraries and the processor for which programs are compiled."""
+    """Return a text with the versions of the libraries and the processor for which programs are compiled."""
     versions = [importlib.metadata.version(name) for name in _LIBRARIES]
     device, cpu = jax.local_devices()[0], Path("/proc/cpuinfo")
     lines = cpu.read_text().splitlines() if cpu.exists() else []
@@ -202,9 +207,9 @@ def _machine() -> str:
 
 
 class _ForeignCodeError(Exception):
-    """An argument contains code of a module that is not permitted.
+    """An argument contains code of a module that is not permitted, so the program is not stored.
 
-    A stored program could be outdated, because changes of this code do not change the key.
+    A stored program could be outdated, because changes of this code do not change the key that finds it.
     """
 
 
@@ -236,9 +241,9 @@ def _pickled(x: Any) -> bytes:
 
 
 def _without_names(code: str) -> str:
-    """Return lowered code with its functions numbered in order of appearance.
+    """Return lowered code in which numbers in order of appearance replace the names of functions.
 
-    JAX's own names of the functions depend on what the process lowered before.
+    JAX's own names of the functions depend on what the process lowered before, so equal code would differ.
     """
     numbers: dict[str, int] = {}
 
@@ -249,7 +254,7 @@ def _without_names(code: str) -> str:
 
 
 def _without_cache(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
-    """Compile without JAX's cache, because on a CPU a program from this cache cannot be serialized completely."""
+    """Compile without JAX's cache, as programs from this cache cannot be serialized completely on a CPU."""
     with _compiling:
         before = jax.config.values["jax_enable_compilation_cache"]
         jax.config.update("jax_enable_compilation_cache", False)
@@ -294,7 +299,7 @@ def _read(path: Path) -> bytes | None:
 def _write(path: Path, data: bytes) -> None:
     """Write a file atomically, so that other processes never read a part of it.
 
-    Warns if it cannot be written, on a full disk for example: the program itself is compiled and works.
+    Only warns if the file cannot be written (for example on a full disk), because the compiled program works anyway.
     """
     packed = zlib.compress(data, 1)
     part = path.with_name(f"{path.name}.{uuid.uuid4().hex}")

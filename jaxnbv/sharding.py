@@ -23,6 +23,7 @@ def shared_map(function: Callable[..., Any], rows: Any, *common: Any, at_once: i
 
     Each device maps its rows by `jax.lax.map`.
 
+    - `rows`: arrays with a leading axis of rows. `common`: further arguments, the same for all rows.
     - `at_once`: number of rows that a device computes together.
     """
 
@@ -71,7 +72,7 @@ def share_of(count: int) -> int:
 
 
 def on_cpu() -> bool:
-    """Whether programs run on the CPU, according to `jax_default_device` or else JAX's default backend."""
+    """Return whether programs run on the CPU, by `jax_default_device` or else JAX's default backend."""
     device = jax.config.jax_default_device  # type: ignore[attr-defined]
     return (jax.default_backend() if device is None else getattr(device, "platform", device)) == "cpu"
 

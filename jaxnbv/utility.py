@@ -1,4 +1,4 @@
-"""Utilities of a cloud, answers, and names and units of the quantities that are maximised."""
+"""Base classes of utilities and of answers to a task, and names and units of maximised values."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -65,7 +65,7 @@ def default_batch_size() -> int:
 
 
 class Utility(eqx.Module):
-    """Base class of utilities u(D), which give the value of a cloud as one number.
+    """Base class of utilities u(D), which give the value of a cloud D as one number.
 
     Subclasses need to define only `__call__`.
 
@@ -75,7 +75,7 @@ class Utility(eqx.Module):
 
     @abstractmethod
     def __call__(self, cloud: PointCloud) -> Float[Array, ""]:
-        """Return u(D) of a cloud (masked rows), by JAX operations."""
+        """Return the utility of a cloud, by JAX operations. Rows whose mask is False must be left out."""
 
     @property
     def name(self) -> str:
@@ -93,22 +93,22 @@ class Utility(eqx.Module):
         return default_batch_size()
 
     def answer(self, cloud: PointCloud) -> Answer | None:
-        """Return the answer that D gives, or None if u(D) itself is the answer."""
+        """Return the answer that a cloud gives to the task's question, or None if its utility is the answer."""
         return None
 
     def answer_values(self, cloud: PointCloud) -> Float[Array, " n"] | None:
-        """Return the values of `answer`, see `Acquisition.answer_values`."""
+        """Return the values of `answer` by JAX operations. None if there is no answer, or if it needs other code."""
         return None
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> Answer | None:
-        """Return the correct answer, see `Acquisition.true_answer`.
+        """Return the correct answer for the true surface `scene`. `cloud` holds points on all of the surface.
 
-        None means that `answer`, applied to points on the whole surface, gives the correct answer.
+        None means that `answer`, applied to this cloud, gives the correct answer.
         """
         return None
 
     def check(self, cloud: PointCloud) -> None:
-        """Raise `ValueError` if the result of the utility's network or function is impossible."""
+        """Raise `ValueError` if the utility's network or function returns an invalid result for a cloud."""
         return
 
 
