@@ -209,7 +209,7 @@ class PointCloud(eqx.Module):
 
 
 def some_rows(cloud: PointCloud, count: int) -> Int[Array, " count"]:
-    """Return the indices of `count` filled rows (`mask` is True) of a single cloud, evenly spaced among these.
+    """Return the indices of `count` rows of a single cloud, evenly spaced among its filled rows (`mask`).
 
     Indices repeat if fewer than `count` rows are filled. All indices are 0 if the cloud is empty.
     """
