@@ -51,11 +51,11 @@ MODELS = ("screened", "paper")
 
 
 class StepInputs(eqx.Module):
-    """The inputs of one step, computed once.
+    """The inputs of one step, the computation that chooses a view. They are computed once per step.
 
     - `observations`: the observations so far.
     - `posterior`: p(f | observations); None if nothing needs it.
-    - `surfaces`: S samples of the posterior along a leading axis; None if nothing needs them.
+    - `surfaces`: samples of the posterior along a leading axis; None if nothing needs them.
     """
 
     observations: Observations
@@ -68,7 +68,7 @@ class SurfaceSampler(eqx.Module):
 
     - `model`: the prior over surfaces.
     - `grid`: the grid on which samples are evaluated and scanned, and on which empty space is stored.
-    - `num_samples`: S, the number of posterior samples per step.
+    - `num_samples`: number of posterior samples per step.
     - `carving`: removes sampled surface in empty space and outside a volume. A model that can use empty space is also
       conditioned on empty space. With None, samples depend only on D, as in the paper.
 
@@ -179,7 +179,7 @@ class SurfaceSampler(eqx.Module):
     def sample(
         self, observations: Observations | PointCloud, key: PRNGKeyArray, posterior: SurfacePosterior | None = None
     ) -> GridSurface:
-        """Draw S samples of the surface given the observations, on the grid and carved.
+        """Draw `num_samples` samples of the surface given the observations, on the grid and carved.
 
         The samples lie along a leading axis.
 
@@ -203,7 +203,7 @@ class SurfaceSampler(eqx.Module):
 
     @own_settings()
     def step_inputs(self, observations: Observations | PointCloud, key: PRNGKeyArray) -> StepInputs:
-        """Return the observations, their posterior and S samples of the posterior.
+        """Return the observations, their posterior and `num_samples` samples of the posterior.
 
         **Raises:** `ValueError` if `sample` does.
         """
@@ -216,9 +216,9 @@ class SurfaceSampler(eqx.Module):
     def carve(
         self, observations: Observations | PointCloud, values: Float[Array, "*s g g g"]
     ) -> Float[Array, "*s g g g"]:
-        """Carve values of f minus its level at the grid's nodes.
+        """Make values positive where the object cannot be: at empty nodes, outside the volume, in obstacles.
 
-        Values become positive where the object cannot be: at empty nodes, outside the volume, and inside obstacles.
+        - `values`: f minus its level at the grid's nodes.
 
         **Raises:** `ValueError` if the values or the observations have a different grid than the sampler.
         """
@@ -246,8 +246,8 @@ class SurfaceSampler(eqx.Module):
     def probability_inside(self, observations: Observations | PointCloud) -> Float[Array, "g g g"]:
         """Return P(f < level | observations) at the grid's nodes.
 
-        The estimate is the fraction of S carved samples that are below the level, drawn with a fixed key. This works
-        for any model.
+        The estimate is the fraction of `num_samples` carved samples that are below the level, drawn with a fixed key.
+        This works for any model.
 
         **Raises:** `ValueError` if `sample` does.
         """

@@ -1,4 +1,4 @@
-"""Distributions over implicit surfaces: priors p(f) and posteriors p(f | D)."""
+"""Distributions over implicit surfaces f: priors p(f), and posteriors p(f | D) given the cloud D."""
 
 from jaxnbv.surfaces.base import Fields as Fields
 from jaxnbv.surfaces.base import SurfaceModel as SurfaceModel

@@ -1,4 +1,4 @@
-"""The interface of a distribution over implicit surfaces: condition it on observations, and sample it."""
+"""Base classes of distributions over implicit surfaces: the prior, the posterior and its samples."""
 
 import functools
 import math
@@ -26,10 +26,12 @@ _ESTIMATED_BY = 64
 
 
 def _on_torus(has_shape: Callable[[Any], bool], wanted: str) -> Callable[..., Any]:
-    """Decorator: check that a method's arguments are arrays of this shape with coordinates in [-pi, pi].
+    """Make a decorator that checks that a method's arguments are arrays of coordinates in [-pi, pi].
 
-    Functions are periodic, so points outside [-pi, pi]^3 would repeat points inside. The scene is [-pi/2, pi/2]^3, an
-    eighth of this cube, and surfaces lie only in the scene.
+    Sampled functions have the period 2 pi, so points outside [-pi, pi]^3 would only repeat points inside. The scene is
+    [-pi/2, pi/2]^3, an eighth of this cube, and surfaces lie only in the scene.
+
+    - `has_shape`, `wanted`: whether an array has the right shape, and this shape in words for the error message.
     """
 
     def checking(method: Callable[..., Any]) -> Callable[..., Any]:
@@ -60,7 +62,7 @@ on_grid_of_torus = _on_torus(lambda axis: axis.ndim == 1, "the nodes along one a
 
 
 def sampling_method(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Decorator: check the key and the number of samples that a sampling method is called with.
+    """Decorate a sampling method so that it checks its random key and its number of samples.
 
     **Raises:** the method raises `ValueError` if the key is not a JAX random key, or for a number of samples below 1.
     """
@@ -106,9 +108,9 @@ class Fields(eqx.Module):
 class SurfacePosterior(eqx.Module):
     """The posterior p(f | D). The surface is where f equals `level`, and f is greater outside.
 
-    A subclass defines `level` and `sample`. If it has closed forms, it overrides `mean`, `variance` and
-    `probability_inside`. The default methods estimate from S = 64 samples with a fixed key, and evaluate the same
-    samples at all points.
+    A subclass defines `level` and `sample`. If it has closed forms of `mean`, `variance` and `probability_inside`, it
+    overrides these methods. By default they are estimated from 64 samples, drawn with a fixed key. The same samples are
+    evaluated at all points.
     """
 
     level: eqx.AbstractVar[Float[Array, ""]]
@@ -119,11 +121,11 @@ class SurfacePosterior(eqx.Module):
 
     @property
     def has_closed_forms(self) -> bool:
-        """Whether the class overrides `mean`; otherwise moments are estimated from samples."""
+        """Whether the class overrides `mean`. If not, the mean and the variance are estimated from samples."""
         return type(self).mean is not SurfacePosterior.mean
 
     def kinds(self) -> dict[str, float]:
-        """Return the probability of each kind of known shape, most likely first.
+        """Return the probability of each kind of known shape, such as "chair", most likely first.
 
         Models without known shapes return an empty dictionary.
         """
@@ -137,15 +139,15 @@ class SurfacePosterior(eqx.Module):
         return [""] * num_samples
 
     def mean(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
-        """Return E f(x). The default is the mean of S samples, with standard error sqrt(Var f / S)."""
+        """Return E f(x). The default is the mean of 64 samples, with standard error sqrt(Var f(x) / 64)."""
         return jnp.mean(self._kept()(x), axis=0)
 
     def variance(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
-        """Return Var f(x). The default is the variance of S samples, with denominator S - 1."""
+        """Return Var f(x). The default is the variance of 64 samples, with denominator 63."""
         return jnp.var(self._kept()(x), axis=0, ddof=1)
 
     def probability_inside(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
-        """Return P(f(x) < level). The default is the fraction of samples below the level."""
+        """Return P(f(x) < level). The default is the fraction of 64 samples that are below the level at x."""
         return jnp.mean(self._kept()(x) < self.level, axis=0)
 
     @on_grid_of_torus
@@ -172,16 +174,16 @@ class SurfaceModel(eqx.Module):
         """
 
     def add_state(self, observations: Observations) -> Observations:
-        """Return the observations with the state that the model carries from view to view.
+        """Add the state that the model carries from view to view, and return the observations.
 
         The loop calls this method after each view. By default a model carries no state.
         """
         return observations
 
     def in_scene(self, frame: Frame) -> "SurfaceModel":
-        """Return a copy with the model's true sizes converted from a frame's world units to scene units.
+        """Return a copy with the true sizes of known parts converted from a frame's world to scene units.
 
-        A model without true sizes is returned unchanged.
+        A model without known parts at true size is returned unchanged.
         """
         return self
 

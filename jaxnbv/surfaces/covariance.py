@@ -1,14 +1,16 @@
-"""The Matern spectrum on the circle, and prior covariances of the implicit function f and the normal field v.
+"""The Matern spectrum on the circle, and prior covariances of the function f and the normal field v.
 
     cov(v_d(x), v_d(y)) = sum_n s(n) cos(n.(x - y))
     cov(f(x), v_d(y))   = sum_n s(n) n_d / |n|^2 sin(n.(x - y))
     cov(f(x), f(y))     = sum_n s(n) / |n|^2 cos(n.(x - y)),   n != 0
 
-The prior may be a sum of spectra, one for each lengthscale. Each covariance is then a sum over these spectra.
+The sums are over integer frequency vectors n with components from -L to L, and d is a component of v. The spectrum s(n)
+is a product over the axes. The prior may be a sum of such spectra, one for each lengthscale. Each covariance is then a
+sum over these spectra.
 
 For one spectrum, the first covariance is a product over the axes. The other two are short sums of such products, by the
-trapezoidal rule for 1 / r = int exp(-r e^u) e^u du (Beylkin and Monzon 2010). This avoids an array over the (2 L + 1)^3
-frequencies.
+trapezoidal rule for 1 / r = int exp(-r e^u) e^u du with r = |n|^2 (Beylkin and Monzon 2010). This avoids an array over
+the (2 L + 1)^3 frequencies.
 """
 
 import functools
@@ -47,7 +49,7 @@ def circle_spectrum(nu: float, lengthscale: Scalar, variance: Scalar, truncation
 
 
 def _lattice_sum(nu: float, a: Float[Array, ""]) -> Float[Array, ""]:
-    """Return sum_{m in Z} (1 + (2 pi m / a)^2)^-p for p = nu + 1/2.
+    """Return the sum over all integers m of (1 + (2 pi m / a)^2)^-p, where p = nu + 1/2.
 
     For p = 1 the sum is a coth(a/2) / 2. The sums for larger p follow by differentiation with respect to a.
     """
@@ -62,7 +64,7 @@ def _lattice_sum(nu: float, a: Float[Array, ""]) -> Float[Array, ""]:
 
 
 def normal_covariance(x: Float[Array, "n 3"], y: Float[Array, "m 3"], spectrum: Spectra) -> Float[Array, "n m"]:
-    """Return cov(v_d(x), v_d(y)), which is equal for all components d. The components are independent."""
+    """Return the prior covariance of each component of the normal field. The components are independent."""
     return _over_scales(lambda of_scale: _normal_covariance(x, y, of_scale), spectrum)
 
 
@@ -78,7 +80,7 @@ def _normal_covariance(x, y, spectrum: Spectrum):
 def function_normal_covariance(
     x: Float[Array, "n 3"], y: Float[Array, "m 3"], spectrum: Spectra
 ) -> Float[Array, "3 n m"]:
-    """Return cov(f(x), v_d(y)) for d = 1, 2, 3."""
+    """Return the prior cov(f(x), v_d(y)) for each component d = 1, 2, 3 of the normal field v."""
 
     def products(damped):
         odd_spectrum = damped * jnp.arange(damped.size, dtype=damped.dtype)
@@ -90,7 +92,7 @@ def function_normal_covariance(
 
 
 def function_covariance(x: Float[Array, "n 3"], y: Float[Array, "m 3"], spectrum: Spectra) -> Float[Array, "n m"]:
-    """Return cov(f(x), f(y))."""
+    """Return the prior cov(f(x), f(y)) of the implicit function f."""
 
     def of_one(spectrum):
         return _over_squared_frequency(lambda damped: _normal_covariance(x, y, damped) - spectrum[0] ** 3, spectrum)
@@ -99,13 +101,13 @@ def function_covariance(x: Float[Array, "n 3"], y: Float[Array, "m 3"], spectrum
 
 
 def function_variance(spectrum: Spectra) -> Float[Array, ""]:
-    """Return Var f(x) = sum_n s(n) / |n|^2, which is equal for all x."""
+    """Return the prior variance of f, which is the same at all points: sum_n s(n) / |n|^2 for n != 0."""
     origin = jnp.zeros((1, 3), dtype=spectrum.dtype)
     return function_covariance(origin, origin, spectrum)[0, 0]
 
 
 def mode_variance(spectrum: Spectra) -> Float[Array, "a a a"]:
-    """Return the prior variances of the coefficients of a component of v, see `surfaces/trigonometric.py`."""
+    """Return prior variances of the trigonometric coefficients of each component of the normal field."""
 
     def of_one(spectrum):
         variance = basis_variance(spectrum)
@@ -115,16 +117,16 @@ def mode_variance(spectrum: Spectra) -> Float[Array, "a a a"]:
 
 
 def _even(x: Float[Array, " n"], y: Float[Array, " m"], spectrum: Spectrum) -> Float[Array, "n m"]:
-    """Return sum_{n in Z} s1(n) cos(n (x - y))."""
+    """Return the sum over n = -L, ..., L of s1(|n|) cos(n (x - y)), where `spectrum` is s1(0), ..., s1(L)."""
     truncation = spectrum.shape[0] - 1
     weighted = circle_basis(x, truncation) * basis_variance(spectrum)
     return jnp.matmul(weighted, circle_basis(y, truncation).T, precision="highest")
 
 
 def _odd(x: Float[Array, " n"], y: Float[Array, " m"], spectrum: Spectrum) -> Float[Array, "n m"]:
-    """Return sum_{n in Z} s1(|n|) sign(n) sin(n (x - y)).
+    """Return the sum over n = -L, ..., L of s1(|n|) sign(n) sin(n (x - y)).
 
-    It uses sin(n (x - y)) = sin(n x) cos(n y) - cos(n x) sin(n y).
+    Here `spectrum` is s1(0), ..., s1(L). The sum uses sin(n (x - y)) = sin(n x) cos(n y) - cos(n x) sin(n y).
     """
     truncation = spectrum.shape[0] - 1
     sign = jnp.sign(jnp.arange(-truncation, truncation + 1))
@@ -134,9 +136,9 @@ def _odd(x: Float[Array, " n"], y: Float[Array, " m"], spectrum: Spectrum) -> Fl
 
 
 def _over_squared_frequency(products, spectrum: Spectrum):
-    """Divide each term of a sum over frequencies n by |n|^2.
+    """Return a sum over frequency vectors n in which each term is divided by |n|^2.
 
-    - `products`: the sum as a function of a spectrum, built from products over the axes.
+    - `products`: returns the undivided sum for a spectrum s1. Its term n is proportional to s1(n_1) s1(n_2) s1(n_3).
     """
     frequency = jnp.arange(spectrum.shape[0], dtype=spectrum.dtype)
 
@@ -153,7 +155,7 @@ def _over_squared_frequency(products, spectrum: Spectrum):
 def _inverse_quadrature(spectrum: Spectrum) -> tuple[np.ndarray, np.ndarray]:
     """Return rates t_q and weights w_q with 1 / r = sum_q w_q exp(-t_q r) for 1 <= r <= 3 L^2.
 
-    The equation holds to the precision of the spectrum's dtype.
+    Here L is the largest frequency of the spectrum. The equation holds to the precision of the spectrum's dtype.
     """
     tolerance = 10 * float(jnp.finfo(spectrum.dtype).eps)
     largest = 3.0 * (spectrum.shape[0] - 1) ** 2

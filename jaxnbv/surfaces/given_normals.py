@@ -4,7 +4,8 @@
     mean     Poisson(k(., X) A^-1 n)
     sample   Poisson(v + k(., X) A^-1 (n - v(X) - eps)), v and eps from the prior
 
-Symbols are those of `jaxnbv.surfaces.spsr`.
+X are the points of D, n their normals, v the normal field with prior covariance k, and eps the noise of the normals.
+`jaxnbv.surfaces.spsr` defines the prior.
 """
 
 from typing import NamedTuple
@@ -31,7 +32,7 @@ from jaxnbv.surfaces.trigonometric import NonuniformTransform, solve_poisson
 
 
 class NormalDraws(NamedTuple):
-    """Draws from the prior: coefficients of v, and the noisy values v(X) + eps at the data."""
+    """Draws from the prior: coefficients of the normal field v, and v(X) plus noise at the points X of D."""
 
     coefficients: Float[Array, "s 3 a a a"]
     at_data: Float[Array, "s n 3"]
@@ -40,11 +41,11 @@ class NormalDraws(NamedTuple):
 class GeometricSPSRPosterior(TrigonometricPosterior):
     """The posterior p(f | D) under `GeometricSPSR`, in closed form and as pathwise samples.
 
-    - `level`: mean of E f(x_j) over the data. The surface is where f equals the level.
+    - `level`: mean of E f(x_j) over the points x_j of D. The surface is where f equals the level.
     - `mean_coefficients`: coefficients of E f, see `surfaces/trigonometric.py`.
-    - `weights`: A^-1 n.
-    - `solver`: A^-1, with the cloud, spectrum and noise that define A. For more than 16,384 points it uses conjugate
-      gradients, and `covariance` and `log_marginal_likelihood` are not available.
+    - `weights`: A^-1 n, where n are the observed normals and A is their covariance.
+    - `solver`: applies A^-1, and has the cloud, spectrum and noise that define A. For more than 16,384 points it uses
+      conjugate gradients, and `covariance` and `log_marginal_likelihood` are not available.
     """
 
     level: Float[Array, ""]
@@ -54,7 +55,7 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
 
     @property
     def cloud(self) -> PointCloud:
-        """D, with zeros in unfilled rows."""
+        """The cloud D, with zeros in unfilled rows."""
         return self.solver.cloud
 
     @property
@@ -70,10 +71,7 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
     @on_torus
     @program
     def variance(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
-        """Return Var f(x) at points in scene coordinates.
-
-        This is the prior variance minus the variance that the data explain.
-        """
+        """Return Var f(x), the prior variance minus what the data explain, at points in scene coordinates."""
         x = jnp.asarray(x, dtype=self.weights.dtype)
         return jnp.maximum(function_variance(self.spectrum) - self.solver.explained_variance(x), 0.0)
 
@@ -86,27 +84,27 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
         return function_covariance(x, y, self.spectrum) - explained
 
     def log_marginal_likelihood(self) -> Float[Array, ""]:
-        """Return log p(n_1, ..., n_N | x_1, ..., x_N), summed over the three components."""
+        """Return log p(normals | points) of the cloud, summed over the three components of the normals."""
         count = self.cloud.count
         fit = jnp.sum(self.cloud.normals * self.weights)
         return -0.5 * (fit + 3.0 * self.solver.factor.log_determinant + 3.0 * count * jnp.log(2.0 * jnp.pi))
 
     def data_points(self) -> DataPoints:
-        """Return the points of the cloud, both for gradients and for values."""
+        """Return the points of the cloud, both for gradients and for values of mean functions."""
         points = fill_rows(self.cloud.points, self.cloud.mask)
         return DataPoints(points, points)
 
     def level_about(self, means: MeansAtData) -> Float[Array, " s"]:
         """Return the change of the level that each mean function m_s causes.
 
-        The change is the mean of m_s(x_j) over the data, minus the level given grad m_s as normals. The level is linear
-        in the normals, so its slope is computed once for all mean functions.
+        The change is the mean of m_s(x_j) over the data, minus the level if grad m_s(x_j) were the normals. The level
+        is linear in the normals, so its slope is computed once for all mean functions.
         """
         explained = jnp.einsum("snd,nd->s", means.gradients, _level_slope(self), precision="highest")
         return jnp.mean(means.values, axis=1, where=self.cloud.mask) - explained
 
     def prior_draws(self, key: PRNGKeyArray, num_samples: int) -> NormalDraws:
-        """Draw v and eps from the prior."""
+        """Draw the normal field v and the noise of the normals from the prior."""
         scale, dtype = jnp.sqrt(mode_variance(self.spectrum)), self.weights.dtype
         modes, shape = scale.shape[0], self.cloud.points.shape
         transform = NonuniformTransform(self.cloud.points, self.truncation)
@@ -121,21 +119,28 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
         return shared_map(prior, (field_keys, noise_keys), scale, self.solver.noise, transform)
 
     def conditioned(self, draws: NormalDraws, means: MeansAtData) -> Float[Array, "s a a a"]:
-        """Return the coefficients of Poisson(v + k(., X) A^-1 (n - grad m - v(X) - eps))."""
+        """Condition the draws on the normals, and return the coefficients of the samples.
+
+        A sample is Poisson(v + k(., X) A^-1 (n - grad m(X) - v(X) - eps)). Here v and eps are draws of the normal field
+        and of the noise, n are the normals at the points X, m is a mean function, and A is the covariance of n.
+        """
         return self._reconstructed(draws.coefficients, self.solver.solve(self._residual(draws, means)))
 
     def _residual(self, draws: NormalDraws, means: MeansAtData) -> Float[Array, "s n 3"]:
-        """Return n - grad m - v(X) - eps, with zeros in unfilled rows."""
+        """Return the normals minus the means' gradients and the drawn normals, with zeros in unfilled rows."""
         return jnp.where(self.cloud.mask[:, None], self.cloud.normals - means.gradients - draws.at_data, 0.0)
 
     def whitened_residual(self, draws: NormalDraws, means: MeansAtData) -> Float[Array, "s n 3"]:
-        """Return C^-1 (n - grad m - v(X) - eps), with zeros in unfilled rows."""
+        """Return C^-1 times the result of `_residual`, with C the Cholesky factor of the normals' covariance."""
         return self.solver.whiten(self._residual(draws, means))
 
     def updated(
         self, coefficients: Float[Array, "s 3 a a a"], whitened: Float[Array, "s n 3"]
     ) -> Float[Array, "s a a a"]:
-        """Return the coefficients of Poisson(v + k(., X) C^-T z) for each sample's v and whitened residual z."""
+        """Return the coefficients of Poisson(v + k(., X) C^-T z) for each sample.
+
+        `coefficients` are those of the drawn normal field v, and `whitened` is z, the result of `whitened_residual`.
+        """
         return self._reconstructed(coefficients, self.solver.unwhiten(whitened))
 
     def _reconstructed(
@@ -167,9 +172,10 @@ def given_normals(cloud: PointCloud, spectrum: Spectra, noise: Scalar) -> Geomet
 def reconstruct(
     transform: NonuniformTransform, weights: Float[Array, "n 3"], spectrum: Spectra
 ) -> Float[Array, "a a a"]:
-    """Return the coefficients of f = Poisson(k(., X) w), where w are the weights.
+    """Return the coefficients of f = Poisson(k(., X) w), with k the prior covariance of the normal field.
 
     - `transform`: transform at the points X.
+    - `weights`: w.
     """
     return solve_poisson(mode_variance(spectrum) * transform.adjoint(weights))
 
@@ -177,7 +183,7 @@ def reconstruct(
 def mean_at_data(
     transform: NonuniformTransform, coefficients: Float[Array, "a a a"], cloud: PointCloud
 ) -> Float[Array, ""]:
-    """Return the mean of f over the filled rows of a cloud.
+    """Return the mean over a cloud's points of the function that has these coefficients.
 
     - `transform`: transform at the points of the cloud.
     """
@@ -187,7 +193,10 @@ def mean_at_data(
 
 @program
 def _level_slope(posterior: GeometricSPSRPosterior) -> Float[Array, "n 3"]:
-    """Return the derivative of the level with respect to n: A^-1 times the derivative with respect to A^-1 n."""
+    """Return the derivative of the level with respect to the normals n.
+
+    It is A^-1 times the derivative with respect to the weights A^-1 n, where A is the covariance of n.
+    """
     cloud, spectrum = posterior.cloud, posterior.spectrum
     transform = NonuniformTransform(cloud.points, posterior.truncation)
 

@@ -1,13 +1,14 @@
-"""Known shapes as the prior: a mixture over a bank, registered to the scan, with a Gaussian process as the residual.
+"""A mixture prior over a bank of known shapes, registered to the scan, plus a Gaussian process.
 
-    prior      f = m_k(T^-1 x) + g,   k ~ pi over shapes 1..K and 0 for none of these,   g a Gaussian process
-    mean       m_k = h tanh(d_k / h), d_k the signed distance, h half the residual's jump across the surface
+    prior      f = m_k(T^-1 x) + g,   k ~ pi over shapes 1..K and 0 for none of these,   T the placement of the shape,
+               g a Gaussian process, the residual
+    mean       m_k = h tanh(d_k / h), d_k the signed distance of shape k, h half the rise of f across the surface
     weights    w_k proportional to exp(-beta E_k) over distinct fits (`Hypotheses.is_mode`),  w_0 to exp(-beta E_0)
     sample     shapes by systematic resampling of w; then f about the mean m_k, or for k = 0 a sample of the model
                without known shapes
 
-The factor beta tempers the weights. A likelihood that treats thousands of normals as independent would always select a
-single shape. See `surfaces/registration.py` for E.
+E is the misfit of a shape to the scan, see `surfaces/registration.py`. The factor beta keeps several shapes possible. A
+likelihood that treats thousands of normals as independent would always select a single shape.
 """
 
 import dataclasses
@@ -39,7 +40,7 @@ from jaxnbv.surfaces.values import OnSurface
 
 
 def short_ranged(longest_side: float = 2.5, truncation: int = 32) -> ScreenedSPSR:
-    """Return the default residual model for an object of this size.
+    """Return the default model of the difference between an object of this size and a known shape.
 
     - `longest_side`: longest side of the object's bounding box, in scene units.
     - `truncation`: largest frequency along each axis.
@@ -54,7 +55,7 @@ def short_ranged(longest_side: float = 2.5, truncation: int = 32) -> ScreenedSPS
 
 
 class KnownShapes(SurfaceModel):
-    """A mixture prior over known shapes that fit the scan, and a model for "none of these".
+    """A mixture prior of known shapes, registered to the scan, and a model for "none of these".
 
     - `bank`: the shapes.
     - `residual`: the model of the difference between object and shape. Its short lengthscale limits it to the
@@ -62,11 +63,11 @@ class KnownShapes(SurfaceModel):
     - `poses`: the possible placements of shapes in the scene.
     - `box`: a tight box around the object.
     - `model_of_none`: the model for an object that is none of the shapes. With an empty bank this is the whole model.
-    - `num_starts`: total number of placements tried over all shapes.
-    - `noise_scale`: rho, the factor on the residual's standard deviation. With 1, the large prior deviation in unseen
-      space breaks thin parts in samples and adds floating fragments near the parts.
-    - `inverse_temperature`: beta.
-    - `misfit_of_none`: E_0, the misfit at which a shape is as likely as "none of these".
+    - `num_starts`: number of placements tried, all shapes together.
+    - `noise_scale`: factor on the residual's standard deviation. With 1, the large prior deviation in unseen space
+      breaks thin parts in samples and adds floating fragments near the parts.
+    - `inverse_temperature`: beta. The weight of a shape with misfit E is proportional to exp(-beta E).
+    - `misfit_of_none`: the misfit at which a shape is as likely as "none of these".
 
     **Raises:** `ValueError` for a number out of its range.
     """
@@ -99,10 +100,7 @@ class KnownShapes(SurfaceModel):
         return dataclasses.replace(self, bank=self.bank.in_scene(frame))
 
     def add_state(self, observations: Observations) -> Observations:
-        """Return the observations with the `PartHypotheses` of a bank at true size.
-
-        For a bank without true sizes, the observations are returned unchanged.
-        """
+        """Return the observations, with `PartHypotheses` added if the bank has parts at true size."""
         if not self.carries_hypotheses:
             return observations
         previous = observations.hypotheses
@@ -112,7 +110,7 @@ class KnownShapes(SurfaceModel):
         )
 
     def fit(self, observations: Observations) -> tuple[Hypotheses, Float[Array, " h_and_none"]]:
-        """Register the shapes, and return the hypotheses and their weights, the last for "none of these"."""
+        """Register the shapes to the scan. Return hypotheses and weights, the last for "none of these"."""
         fits = register(self.bank, Prior(self.poses, self.box), FitTargets.of(observations), self.num_starts)
         return fits, _weights(fits, self.inverse_temperature, self.misfit_of_none)
 
@@ -147,7 +145,7 @@ def _weights(fits: Hypotheses, inverse_temperature: float, misfit_of_none: float
 
 
 class Hypothesis(NamedTuple):
-    """A possible identity of the object: a shape's name, weight, misfit E and placement.
+    """A possible identity of the object: a shape's name, probability, misfit to the scan and placement.
 
     The placement of "none of these" is None.
     """
@@ -164,8 +162,8 @@ class KnownShapesPosterior(SurfacePosterior):
     - `level`: zero.
     - `fits`: the registered shapes.
     - `weights`: weights of the shapes in `fits`, followed by the weight of "none of these".
-    - `residual`: p(g | D), from which samples about the shapes are drawn.
-    - `of_none`: p(f | D, none of the shapes).
+    - `residual`: posterior of the difference between object and shape, which draws samples about the shapes.
+    - `of_none`: posterior of f if the object is none of the shapes.
     """
 
     level: Float[Array, ""]
@@ -254,7 +252,7 @@ def kind_of(name: str) -> str:
 def systematic_resampling(
     key: PRNGKeyArray, weights: Float[Array, " n"], num_samples: int
 ) -> Int[Array, " num_samples"]:
-    """Draw indices so that each index's count is within one of its expectation (Kitagawa 1996)."""
+    """Draw indices in proportion to weights, each within one of its expected count (Kitagawa 1996)."""
     places = (jnp.arange(num_samples) + jax.random.uniform(key)) / num_samples
     total = jnp.cumsum(weights)
     return jnp.clip(jnp.searchsorted(total / total[-1], places, side="right"), 0, len(weights) - 1)
@@ -265,7 +263,7 @@ class PlacedShapes(Fields):
 
     They are bounded by h, and at the surface their gradient equals that of d.
 
-    - `solids`, `placements`: batches along a leading axis.
+    - `solids`, `placements`: the solids and their placements, both along a leading axis.
     - `width`: h, in scene units.
     """
 
@@ -306,7 +304,7 @@ class MixtureFields(Fields):
     def _merged(self, evaluate: Any, relative: bool = True) -> Array:
         shape = jax.eval_shape(lambda: evaluate(self.of_shapes))
         zero = jnp.zeros(shape.shape, shape.dtype)
-        # Do not evaluate a batch from which no sample comes.
+        # Do not evaluate a batch that contributes no sample.
         from_shapes = jax.lax.cond(jnp.all(self.is_none), lambda: zero, lambda: evaluate(self.of_shapes))
         from_none = jax.lax.cond(jnp.any(self.is_none), lambda: evaluate(self.of_none), lambda: zero)
         is_none = self.is_none.reshape(-1, *(1,) * (zero.ndim - 1))

@@ -1,4 +1,4 @@
-"""Detection of parts of a bank that no scan can distinguish, because they have the same surface and size."""
+"""Detection of parts of a bank that no scan can distinguish: they have the same surface and size."""
 
 import itertools
 import warnings
@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxnbv.surfaces.mesh_shapes import MeshShape
 
-# Number of random points. Signed distances are compared at points within this many grid cells of the surface.
+# Number of random points, and the distance from the surface (in grid cells) within which points are compared.
 _PROBES, _NEAR = 8192, 3.0
 # The rotations of a cube onto itself are tested, because files often store equal parts along different axes.
 _TURNS = Rotation.create_group("O").as_matrix()
@@ -36,7 +36,7 @@ def warn_of_look_alikes(
 
 
 class _Grid:
-    """Signed distances of a shape as NumPy arrays, and half of its side lengths."""
+    """Signed distances of a shape, interpolated on a grid with NumPy, and half the shape's side lengths."""
 
     def __init__(self, shape: MeshShape):
         solid = shape.solid
@@ -49,10 +49,10 @@ class _Grid:
 
 
 def _difference(one: _Grid, other: _Grid, ratio: float) -> float:
-    """Return the largest difference between the signed distances to two centred shapes, near the surface of `one`.
+    """Return the largest difference of signed distances to two centred shapes, near the surface of `one`.
 
-    The result is the smallest over rotations of `other` by right angles. It is infinite if the side lengths differ in
-    every rotation.
+    The shape `other` is rotated by right angles to make this difference smallest. The result is infinite if the side
+    lengths differ in every rotation.
 
     - `ratio`: factor that scales `other` to the units of `one`.
     """

@@ -32,7 +32,7 @@ _T = TypeVar("_T")
 def as_tuple(values: Sequence[_T], name: str) -> tuple[_T, ...]:
     """Return the values as a tuple.
 
-    **Raises:** `ValueError` for values that are not iterable.
+    **Raises:** `ValueError`, which calls the values `name`, if they are not iterable.
     """
     try:
         return tuple(values)
@@ -64,8 +64,8 @@ def mesh_paths(meshes: str | Path | Sequence[str | Path | trimesh.Trimesh]) -> l
 class MeshShape(NamedTuple):
     """A mesh as a shape of a bank, scaled so that its longest side is 2.5.
 
-    - `solid`: signed distance of the shape.
-    - `extremes`: farthest vertices of the shape in evenly spread directions.
+    - `solid`: signed distance of the shape, on a grid.
+    - `extremes`: the farthest vertex of the shape in each of several evenly spread directions.
     - `from_mesh`: the similarity transform from the coordinates of the mesh to the coordinates of the shape.
     """
 
@@ -80,6 +80,8 @@ def shapes_of_meshes(
     """Return the shapes of all usable meshes, and the indices of these meshes.
 
     A `UserWarning` names each unusable mesh and the reason.
+
+    - `num_extremes`: number of `MeshShape.extremes`. See `ShapeBank.from_meshes` for the other settings.
 
     **Raises:** `ValueError` if no mesh can be used.
     """

@@ -1,7 +1,7 @@
 """Evidence of the rays of all views for placed parts, and the weights that follow from this evidence.
 
 A ray passes through empty space and meets the object at x. For a placed part with signed distance d, it gives two
-tests: x should lie on the part's surface, and the ray should not pass through the part before x:
+tests: x should lie on the part's surface, and the ray should not pass through the part before x. They give the misfit
 
     L = sum over rays of  l(d(x)) + l(min over the ray of min(d, 0)),   l(r) = log(1 + r^2 / 2 tau^2)
 
@@ -10,13 +10,13 @@ effect of outliers. tau is twice the noise of the measured ray lengths, but at l
 part's surface on its grid. The noise is estimated from third differences of the lengths between pixels. A sensor may
 miss a surface. So a ray without a return counts only if it passes through the part in space that was seen to be empty.
 Misfits are summed over rays, so the weights become more decisive with more views. Rays that meet the object less than
-0.12 apart have dependent errors, so each counts as less than one ray:
+0.12 apart have dependent errors, so each counts as less than one ray. Each hypothesis h is a placed part:
 
     w_h proportional to exp(-L_h),   w_0 (none of these) to exp(-L_0),   L_0 = sum over rays of e_0 + o
 
 The sum for L_0 is over the rays that met the object. e_0 is a constant. o is the amount by which l(d(x)) exceeds e_0
 for the hypothesis that explains x best. It covers points that belong to a different object, which no hypothesis
-explains. The sum of o is limited, on the assumption that at most a fifth of the points are of this kind.
+explains. The sum of o is limited, on the assumption that at most a fifth of the points belong to a different object.
 """
 
 import math
@@ -36,7 +36,7 @@ from jaxnbv.scanning import Grid
 from jaxnbv.surfaces.registration import Hypotheses
 from jaxnbv.surfaces.shape_bank import ShapeBank
 
-# Smallest tau in scene units, tau in standard deviations of the noise, and the residual with misfit C, in tau.
+# Smallest tau in scene units, tau in standard deviations of the noise, and the multiple of tau at which l is clipped.
 LEAST_TAU, _TAU_OF_NOISE, _FAR = 0.03, 2.0, 4.0
 MOST = math.log1p(_FAR**2 / 2.0)
 # Standard deviation of a normal distribution divided by the lower quartile of its absolute value. A median would
@@ -48,10 +48,10 @@ _STRIDE, _NUM_STRIDES = 0.04, 40
 _NUM_RAYS = 4096
 # Rays closer together than this on the object have dependent errors; scene units.
 _APART = 0.12
-# e_0. The mean misfit per ray is up to 0.15 for the correct part, and at least 0.3 for the best part if the object is
-# none of the parts (in most cases).
+# e_0, the misfit of "none of these" per ray. The mean misfit per ray is up to 0.15 for the correct part, and in most
+# cases at least 0.3 for the best part if the object is none of the parts.
 _NONE_MISFIT = 0.25
-# Largest fraction of points that belong to a different object.
+# Largest fraction of points that is assumed to belong to a different object.
 _STRAY = 0.2
 
 
@@ -63,7 +63,7 @@ class Rays(NamedTuple):
     - `weight`: number of independent rays that the ray counts as. The weight is lower if rays are closer together than
       `_APART`, and higher if the ray also represents rays that were left out.
     - `empty_nodes`: mask of the nodes of `grid` that were seen to be empty.
-    - `tau`: the tau of l, in scene units.
+    - `tau`: scale of residuals in the misfit, in scene units, see `misfit_of`.
     """
 
     origins: Float[Array, "n 3"]
@@ -78,7 +78,7 @@ class Rays(NamedTuple):
     @classmethod
     @program
     def of(cls, observations: Observations, box: Box) -> "Rays | None":
-        """Return the rays that enter a box, or None if the observations have no `looks`."""
+        """Return the rays of all views that enter a box; None if the observations do not store the rays."""
         looks, poses = observations.looks, observations.poses
         if looks is None or observations.empty_nodes is None:
             return None
@@ -140,7 +140,7 @@ def _noise_of(
 
 @program
 def evidence(bank: ShapeBank, hypotheses: Hypotheses, rays: Rays) -> tuple[Float[Array, " h"], Float[Array, ""]]:
-    """Return L of each hypothesis, and L_0 of "none of these"."""
+    """Return the misfit L of each hypothesis, summed over the rays, and the misfit of "none of these"."""
     points = rays.origins + jnp.where(rays.is_object, rays.sight, 0.0)[:, None] * rays.directions
 
     def of_part(one):
@@ -172,17 +172,17 @@ def weight_of(away: Float[Array, ""], camera: Camera) -> Float[Array, ""]:
 
 
 def misfit_of(distance: Float[Array, "*n"], tau: Float[Array, ""]) -> Float[Array, "*n"]:
-    """Return the misfit l of residuals in scene units, clipped at C."""
+    """Return log(1 + d^2 / (2 tau^2)) for distances d in scene units, clipped at its value for d = 4 tau."""
     return jnp.minimum(jnp.log1p(distance**2 / (2.0 * tau**2)), MOST)
 
 
 def _deepest(
     distance: Callable[[Float[Array, "n 3"]], Float[Array, " n"]], rays: Rays
 ) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
-    """Return the smallest signed distance along each ray before its end, and whether this distance counts.
+    """Return the smallest signed distance along each ray before its end, and whether it is evidence.
 
-    The distance is zero if the ray misses the solid. It counts for a ray with a return. For a ray without a return, it
-    counts if the position of the smallest distance was seen to be empty.
+    The distance is zero if the ray misses the solid. It is evidence if the ray has a return. If the ray has no return,
+    it is evidence only if the position of the smallest distance was seen to be empty.
     """
 
     def stride(state, _):

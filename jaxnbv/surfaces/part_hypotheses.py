@@ -20,7 +20,7 @@ from jaxnbv.surfaces.shape_bank import ShapeBank
 NONE = "none of these"
 # Number of placements tried for each part.
 _NUM_STARTS = 1024
-# For a cloud alone, which has no rays: number of rays that its points count as, and the E of "none of these".
+# For a cloud alone, which has no rays: number of rays that its points count as, and the misfit of "none of these".
 _NUM_RAYS, _NONE_MISFIT = 0.3 * NUM_POINTS, 0.6
 
 

@@ -1,4 +1,4 @@
-"""The world pose of the most likely part, its covariance, and the equivalent poses of a symmetric part."""
+"""The world pose of the most likely part, its covariance, and equivalent poses of a symmetric part."""
 
 import equinox as eqx
 import jax
@@ -46,7 +46,7 @@ class ObjectPose(eqx.Module):
 
 
 def object_pose(hypotheses: PartHypotheses, observations: Observations, frame: Frame) -> ObjectPose:
-    """Return the pose of the most likely part in the world of a frame."""
+    """Return the pose of the most likely part in the world that `frame` maps to the scene."""
     part, placement = hypotheses.most_likely
     bank = hypotheses.bank
     shape = bank.shape(jnp.asarray(part))
@@ -61,10 +61,11 @@ def object_pose(hypotheses: PartHypotheses, observations: Observations, frame: F
 
 
 def surface_error(hypotheses: PartHypotheses, observations: Observations) -> float:
-    """Return the expected error of the most likely part's surface: root mean square in scene units.
+    """Return the expected distance of the most likely part's surface from the true one, in scene units.
 
-    The error includes the errors of the points, and the distances to the surfaces of the other hypotheses, weighted by
-    their probabilities.
+    The distance is a root mean square over points of the part's surface. It has two contributions: the uncertainty of
+    the part's pose, due to the errors of the scanned points; and the distance to the surface of each hypothesis,
+    weighted by the probability of the hypothesis.
     """
     part, placement = hypotheses.most_likely
     shape = hypotheses.bank.shape(jnp.asarray(part))
@@ -92,7 +93,7 @@ def symmetries(shape: Shape) -> Float[np.ndarray, "n 3 3"]:
     """Return the rotations about a shape's centre that leave the shape unchanged, the identity first.
 
     The function tests rotations by multiples of five degrees about each axis, and the rotations of a cube onto itself.
-    The result contains all products of a symmetry of the first kind and a symmetry of the second kind.
+    The result contains all products of a symmetry about an axis and a symmetry among the rotations of the cube.
     """
     vectors = [angle * axis for axis in np.eye(3) for angle in np.arange(0.0, 2.0 * np.pi, _STEP)]
     about_axes, of_cube = Rotation.from_rotvec(vectors).as_matrix(), Rotation.create_group("O").as_matrix()

@@ -69,11 +69,12 @@ def search_parts(
 ) -> Hypotheses:
     """Return the 32 placed parts of smallest misfit, best first.
 
-    The misfit is L of the rays (see `part_evidence`), or E without rays. If placements of a part have equal surfaces,
-    for example by symmetry, all but the best get an infinite misfit.
+    The misfit is the L of `part_evidence`, or without rays the E of `registration`. If placements of a part have equal
+    surfaces, for example by symmetry, all but the best get an infinite misfit.
 
     - `bank`: parts at true size, in scene units.
-    - `box`: a box around the object.
+    - `poses`, `box`: the possible placements of the parts, and a box around the object.
+    - `targets`, `rays`: points and rays of the views so far.
     - `previous`: the hypotheses of the previous view, which are refined and kept while they fit.
     - `num_starts`: number of placements tried for each part.
     """
@@ -123,7 +124,7 @@ def _apart(hypotheses: Hypotheses, count: int) -> Hypotheses:
 
 
 def _starts(bank: ShapeBank, prior: Prior, targets: FitTargets, num_starts: int) -> Placement:
-    """Return the start placements of each shape along a second axis: rotations, each at a few positions.
+    """Return start placements of each shape (axis 0): rotations, each at a few positions (axis 1).
 
     At each position the bounding box of the shape contains the scan, if the box is large enough. The first position of
     a rotation centres the scan across the line of sight, and puts it on the shape's front. The other positions are
@@ -162,7 +163,7 @@ def _starts(bank: ShapeBank, prior: Prior, targets: FitTargets, num_starts: int)
 
 
 def _axes_of_sight(targets: FitTargets) -> Float[Array, "3 3"]:
-    """Return two directions across the line of sight, and the direction to the sensor (mean of the normals)."""
+    """Return as rows two directions across the line of sight, and the mean normal, which faces the sensor."""
     mean = jnp.sum(jnp.where(targets.mask[:, None], targets.normals, 0.0), axis=0)
     length = jnp.linalg.norm(mean)
     ahead = jnp.where(length > 0, mean / jnp.where(length > 0, length, 1.0), jnp.eye(3, dtype=mean.dtype)[2])
@@ -172,9 +173,10 @@ def _axes_of_sight(targets: FitTargets) -> Float[Array, "3 3"]:
 
 
 def _distinct(bank: ShapeBank, box: Box, hypotheses: Hypotheses) -> Hypotheses:
-    """Mark each hypothesis for which a better hypothesis of the same part has the same surface.
+    """Mark each hypothesis that has the same surface as a better hypothesis of the same part.
 
-    Returns the hypotheses with `is_mode` false and infinite misfit for these.
+    Returns all hypotheses. Those marked have `is_mode` False and an infinite misfit. The hypotheses must be sorted,
+    best first.
     """
     dtype = hypotheses.misfit.dtype
     low, high = jnp.asarray(box.low, dtype) - _ROOM, jnp.asarray(box.high, dtype) + _ROOM

@@ -1,12 +1,13 @@
 """Gaussian posteriors over band-limited functions: closed forms, and samples by pathwise conditioning.
 
-A sample is a draw of the prior plus a correction at the data (Matheron's rule; Wilson et al. 2020). Samples can have
-mean functions m_1, ..., m_S in place of zero. The prior is then f_s = m_s + g, with g of mean zero:
+A sample is a draw of the prior plus a correction at the data (Matheron's rule; Wilson et al. 2020). The data are
+normals n_j at points x_j and values z_k of f at points y_k. Samples can have mean functions m_1, ..., m_S in place of
+zero. The prior is then f_s = m_s + g, with g of mean zero:
 
-    data     g has the normals n_j - grad m_s(x_j) and the values z_k - m_s(y_k), in place of n_j and z_k
-    scale    the draws of the prior and of the noise are multiplied by rho_s. The posterior mean stays the same, and the
-             posterior covariance is multiplied by rho_s^2
-    sample   f_s = m_s + g_s
+    data     g is conditioned on n_j - grad m_s(x_j) and z_k - m_s(y_k), in place of n_j and z_k
+    scale    the draws of the prior and of the noise are multiplied by the noise scale rho_s. The posterior mean stays
+             the same, and the posterior covariance is multiplied by rho_s^2
+    sample   f_s = m_s + g_s, where g_s is a sample of g
 
 The covariances do not depend on m_s. So all mean functions share one factorisation, and each adds a right-hand side.
 """
@@ -35,17 +36,21 @@ class MeansAtData(NamedTuple):
 
 
 class DataPoints(NamedTuple):
-    """Points at which a posterior needs the gradients and the values of mean functions."""
+    """The data points where `sample_about` evaluates the mean functions of the samples.
+
+    - `gradients`: points where the gradients of the mean functions are subtracted from the observed normals.
+    - `values`: points where the values of the mean functions are used, for observed values of f or for the level.
+    """
 
     gradients: Float[Array, "n 3"]
     values: Float[Array, "m 3"]
 
 
 class FieldsAbout(Fields):
-    """Samples about mean functions, f_s = m_s + r_s.
+    """Samples f_s = m_s + r_s about mean functions m_s.
 
-    - `means`: m_1, ..., m_S.
-    - `residual`: r_1, ..., r_S.
+    - `means`: the mean functions m_1, ..., m_S.
+    - `residual`: the differences r_1, ..., r_S between the samples and their mean functions.
     """
 
     means: Fields
@@ -64,14 +69,14 @@ class FieldsAbout(Fields):
 class TrigonometricPosterior(SurfacePosterior):
     """A Gaussian posterior with a band-limited prior. Its mean and its samples are band-limited too.
 
-    - `mean_coefficients`: coefficients of E f, see `surfaces/trigonometric.py`.
+    - `mean_coefficients`: coefficients of the mean E f in the basis of `surfaces/trigonometric.py`.
     """
 
     mean_coefficients: eqx.AbstractVar[Float[Array, "a a a"]]
 
     @property
     def mean_field(self) -> TrigonometricFields:
-        """E f as a single field."""
+        """The posterior mean E f, as a batch of one field."""
         return TrigonometricFields(self.mean_coefficients[None])
 
     @on_torus
@@ -110,13 +115,13 @@ class TrigonometricPosterior(SurfacePosterior):
     ) -> FieldsAbout:
         """Draw one sample m_s + g_s of f about each of S mean functions.
 
-        g_s is a sample given the normals n - grad m_s and the values z - m_s(y). If all mean functions are zero, the
-        result equals that of `sample` with the same key. For any mean function, the surface of a sample is where
-        `fields(x) == posterior.level`.
+        g_s is a sample of the posterior given the observed normals minus grad m_s, and the observed values minus m_s.
+        If all mean functions are zero, the result equals that of `sample` with the same key. For any mean function, the
+        surface of a sample is where `fields(x) == posterior.level`.
 
         - `means`: the mean functions m_s, which must be differentiable once.
-        - `noise_scale`: rho, a single number or one number for each mean function. Samples have rho times the
-          posterior's standard deviation. With 0, each sample is the posterior mean about m_s, for any key.
+        - `noise_scale`: factor on the standard deviation of the samples about the posterior mean, a single number or
+          one for each mean function. With 0, each sample is the posterior mean about m_s, for any key.
 
         **Raises:** `ValueError` for means that are not `Fields`, a noise scale that is negative or not finite, a number
         of noise scales that differs from the number of mean functions, or means that are not finite at the data.
@@ -150,11 +155,11 @@ class TrigonometricPosterior(SurfacePosterior):
 
     @abstractmethod
     def data_points(self) -> DataPoints:
-        """Return the points at which this posterior needs gradients and values of mean functions."""
+        """Return the data points where `sample_about` needs gradients and values of mean functions."""
 
     @abstractmethod
     def level_about(self, means: MeansAtData) -> Float[Array, " s"]:
-        """Return the difference between the level about each mean function and the level about zero."""
+        """Return, for each mean function, the level of samples about it minus the level about zero."""
 
     @abstractmethod
     def prior_draws(self, key: PRNGKeyArray, num_samples: int) -> Any:
@@ -167,7 +172,7 @@ class TrigonometricPosterior(SurfacePosterior):
     def conditioned(self, draws: Any, means: MeansAtData) -> Float[Array, "s a a a"]:
         """Condition the draws on the data minus the means, and return the coefficients of the samples.
 
-        The result is jointly linear in draws, data and means.
+        The result is jointly linear in the draws, the data and the means. It does not include the means themselves.
         """
 
 
@@ -186,13 +191,13 @@ class _Zeros(Fields):
 def fill_rows(points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Float[Array, "n 3"]:
     """Return the points with the first filled row copied into all unfilled rows.
 
-    Unfilled rows are zero. If a mean function has no gradient at zero, derivatives would not be finite, although the
-    rows are masked.
+    Unfilled rows are zero, and a mean function may have no gradient at zero. Derivatives would then not be finite,
+    although the rows are masked.
     """
     return jnp.where(mask[:, None], points, points[jnp.argmax(mask)])
 
 
-# `sample` and `sample_about` run the same two programs, so that samples about zero are equal bit for bit.
+# `sample` and `sample_about` run the same two programs, so that samples about zero equal `sample` bit for bit.
 
 
 @program

@@ -1,4 +1,4 @@
-"""Placements of known shapes in the scene, and classes of possible placements."""
+"""Placements of known shapes in the scene, and sets of possible placements."""
 
 import math
 from abc import abstractmethod
@@ -32,7 +32,7 @@ class Placement(eqx.Module):
 
     @property
     def factor(self) -> Float[Array, "*batch"]:
-        """Scene units per unit of the shape's distance: the geometric mean of s, exact for equal s."""
+        """Scene units per unit of the shape's distance: the geometric mean of `scale`, exact if all are equal."""
         return jnp.exp(jnp.mean(jnp.log(self.scale), axis=-1))
 
     def to_shape(self, x: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
@@ -47,7 +47,7 @@ class Placement(eqx.Module):
         return self.factor * solid(self.to_shape(x))
 
     def moved(self, step: Float[Array, "9"]) -> "Placement":
-        """Return a copy that is rotated about t, shifted and scaled.
+        """Return a copy that is rotated about the origin of the shape, shifted and scaled.
 
         - `step`: rotation vector (3), shift (3), and logarithms of the scale factors (3).
         """
@@ -61,8 +61,8 @@ class Placement(eqx.Module):
 class ShapePoses(eqx.Module):
     """A set of possible placements of known shapes.
 
-    - `scale`: smallest and largest s, as multiples of the scale at which the shape fills the box around the object. Two
-      equal numbers fix the scale.
+    - `scale`: smallest and largest scale factor, as multiples of the factor at which the shape fills the box around the
+      object. Two equal numbers fix the scale.
     - `by_axis`: whether each axis of a shape is scaled separately.
 
     **Raises:** `ValueError` for scales that are not positive, or a smallest scale above the largest.
@@ -86,12 +86,15 @@ class ShapePoses(eqx.Module):
 
     @property
     def moves(self) -> Float[np.ndarray, "9 k"]:
-        """Basis of the possible steps of `Placement.moved` that keep the scale, as columns."""
+        """Basis, as columns, of the ways in which a placement of fixed scale may change, see `steps`."""
         return scipy.linalg.block_diag(self.turns(), np.eye(3), np.zeros((3, 0)))
 
     @property
     def steps(self) -> Float[np.ndarray, "9 k"]:
-        """Basis of the possible steps of `Placement.moved`, as columns."""
+        """Basis, as columns, of the ways in which a placement may change: rotation, shift and scale.
+
+        Each column is an argument of `Placement.moved`: a rotation vector, a shift, and logarithms of scale factors.
+        """
         least, most = self.scale
         scales = np.zeros((3, 0)) if least == most else np.eye(3) if self.by_axis else np.full((3, 1), 3**-0.5)
         return scipy.linalg.block_diag(self.turns(), np.eye(3), scales)
@@ -137,7 +140,7 @@ class Upright(ShapePoses):
         require(0 < self.within <= math.pi, f"turns are searched within {self.within} rad; give an angle in (0, pi]")
 
     def rotations(self, count: int) -> Float[np.ndarray, "m 3 3"]:
-        """Return rotations by evenly spaced angles that are at least two degrees apart."""
+        """Return at most `count` rotations by evenly spaced angles that are at least two degrees apart."""
         count = max(1, min(count, round(self.within / math.radians(1.0))))
         angles = self.within * ((2.0 * np.arange(count) + 1.0) / count - 1.0)
         return Rotation.from_rotvec(angles[:, None] * self._unit).as_matrix()

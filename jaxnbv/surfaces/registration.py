@@ -5,10 +5,11 @@ A shape with signed distance d and placement T has the misfit
     E = mean_j [ log(1 + d(x_j)^2 / 2 tau^2) + (1 - n_j . grad d(x_j)) / 2 ]
         + 2 mean_i log(1 + min(d(z_i) + margin, 0)^2 / tau^2) + prior(T)
 
-for scanned points x_j with normals n_j, and points z_i that were seen to be empty. Without the points z_i, shapes would
-shrink onto the visible patch. The prior on shift and scale is weak. All shapes are tried in many rotations. The
-hypotheses of smallest E are refined by Gauss-Newton steps (iteratively reweighted least squares, with weights from the
-logarithms in E), while tau falls from 0.12 to 0.03.
+for scanned points x_j with normals n_j, and points z_i that were seen to be empty. Empty points count if they lie
+deeper inside the shape than the margin, 0.05. Without the points z_i, shapes would shrink onto the visible patch. The
+prior on shift and scale is weak. All shapes are tried in many rotations. The hypotheses of smallest E are refined by
+Gauss-Newton steps (iteratively reweighted least squares, with weights from the logarithms in E), while tau, the scale
+of the distances, falls from 0.12 to 0.03.
 """
 
 import dataclasses
@@ -45,7 +46,7 @@ _LARGEST_STEP = 0.3
 class FitTargets(NamedTuple):
     """Data to which shapes are fitted: points with normals, and empty points, in scene coordinates.
 
-    The first rows of each array are spread as evenly as all its rows.
+    The first rows of each array are spread as evenly as all its rows. `mask` and `is_empty` are False for padding.
     """
 
     points: Float[Array, "n 3"]
@@ -81,7 +82,7 @@ def _some_empty(observations: Observations) -> tuple[Float[Array, "m 3"], Bool[A
 def _first_empty(
     empty_nodes: Bool[Array, "g g g"], order: Int[Array, " nodes"]
 ) -> tuple[Int[Array, "m 3"], Bool[Array, " m"]]:
-    """Return the grid indices of the first empty nodes in this order, and a mask of the filled rows."""
+    """Return the grid indices of the first empty nodes in the given order, and a mask of the filled rows."""
     is_empty = empty_nodes.reshape(-1)[order]
     place = jnp.where(is_empty, jnp.cumsum(is_empty) - 1, _NUM_EMPTY)
     chosen = jnp.zeros(_NUM_EMPTY, jnp.int32).at[place].set(order, mode="drop")
@@ -89,13 +90,14 @@ def _first_empty(
 
 
 class Hypotheses(eqx.Module):
-    """Shapes of a bank, each with a placement.
+    """Explanations of a scan: shapes of a bank, each with a placement.
 
     - `shape`: index of each shape in the bank.
     - `placement`: placement of each shape.
-    - `misfit`: E. For parts it may be the L of `surfaces/part_evidence.py`.
-    - `is_mode`: false if a better hypothesis makes this one redundant. `register` tests whether a better hypothesis of
-      the same shape is within 15 degrees. `search_parts` tests whether one has the same surface.
+    - `misfit`: how badly each placed shape fits the scan. It is E (see `surfaces/registration.py`), or for parts it may
+      be L (see `surfaces/part_evidence.py`).
+    - `is_mode`: False for a hypothesis that nearly repeats a better hypothesis of the same shape. For `register`, their
+      rotations then differ by less than 15 degrees. For `search_parts`, they have the same surface.
     """
 
     shape: Int[Array, "*h"]
@@ -123,11 +125,11 @@ class Prior(NamedTuple):
 
     @property
     def steps(self) -> Float[np.ndarray, "9 k"]:
-        """Basis of the possible steps of `Placement.moved`, as columns."""
+        """Basis, as columns, of the ways in which a placement may change, see `ShapePoses.steps`."""
         return self.poses.moves if self.is_true_size else self.poses.steps
 
     def filling(self, shape: Shape, rotation: Float[Array, "3 3"]) -> Placement:
-        """Return the placement with this rotation that centres the shape in the box at the largest scale."""
+        """Return the placement with this rotation that centres the shape in the box, as large as fits."""
         turned = jnp.matmul(shape.extremes, rotation.T, precision="highest")
         low, high = jnp.min(turned, axis=0), jnp.max(turned, axis=0)
         least, most = jnp.asarray(self.box.low, turned.dtype), jnp.asarray(self.box.high, turned.dtype)
@@ -163,6 +165,8 @@ def register(bank: ShapeBank, prior: Prior, targets: FitTargets, num_starts: int
 
     All shapes are tried in many rotations, and the best hypotheses are refined. Then all shapes are tried in the
     placements of a few of the refined hypotheses, and the best of all are refined again.
+
+    - `num_starts`: number of rotations tried, all shapes together.
     """
     few, some = targets.first(_COARSE[1]), targets.first(_FINE[1])
     turned = _turned(bank, prior, few, num_starts)
@@ -176,7 +180,7 @@ def register(bank: ShapeBank, prior: Prior, targets: FitTargets, num_starts: int
 
 
 def _turned(bank: ShapeBank, prior: Prior, targets: FitTargets, num_starts: int) -> Hypotheses:
-    """Evaluate all shapes in several rotations each, scaled to fill the box."""
+    """Compute the misfit of each shape in several rotations, scaled to fill the box."""
     all_of_them = jnp.asarray(prior.poses.rotations(num_starts), targets.points.dtype)
     count = max(1, min(len(all_of_them), num_starts // len(bank)))
     # Each shape gets evenly spaced rotations with its own offset. Together the shapes cover the rotations without gaps.
@@ -191,10 +195,10 @@ def _turned(bank: ShapeBank, prior: Prior, targets: FitTargets, num_starts: int)
 
 
 def _exchanged(bank: ShapeBank, prior: Prior, first: Hypotheses, targets: FitTargets) -> Hypotheses:
-    """Evaluate all shapes in the placements of a few of the best hypotheses with different rotations.
+    """Compute the misfit of each shape in the placements of a few of the best hypotheses.
 
-    Each shape takes the rotation of the hypothesis, and its shift and scale relative to the placement that fills the
-    box.
+    The rotations of these hypotheses differ by more than 15 degrees. Each shape takes the rotation of the hypothesis,
+    and is shifted and scaled like the hypothesis from the placement that fills the box.
     """
     ordered = first.best(len(first.misfit))
     mode = _modes(jnp.zeros_like(ordered.shape), ordered.placement.rotation)
@@ -226,9 +230,9 @@ def evaluate(bank: ShapeBank, prior: Prior, placements: Placement, targets: FitT
 
 
 def refine(bank: ShapeBank, prior: Prior, starts: Hypotheses, targets: FitTargets, num_steps: int) -> Hypotheses:
-    """Refine each start by Gauss-Newton steps with falling tau.
+    """Refine each start by Gauss-Newton steps on the misfit E, while the scale tau of distances falls.
 
-    Returns the iterate for which E, evaluated at the last tau, is smallest.
+    Returns for each start the iterate of smallest E. This comparison evaluates E at the last tau.
     """
     taus = jnp.append(jnp.geomspace(_FIRST_TAU, _LAST_TAU, num_steps), _LAST_TAU)
     basis = jnp.asarray(prior.steps, targets.points.dtype)
@@ -251,7 +255,7 @@ def refine(bank: ShapeBank, prior: Prior, starts: Hypotheses, targets: FitTarget
 
 
 def reevaluate(bank: ShapeBank, prior: Prior, hypotheses: Hypotheses, targets: FitTargets) -> Hypotheses:
-    """Return the hypotheses with E recomputed from all rows of `targets`, at the last tau."""
+    """Return the hypotheses with the misfit E recomputed from all rows of `targets`, at the last tau."""
 
     def judge(one):
         return _misfit(bank.shape(one.shape), prior, one.placement, targets, _LAST_TAU)
@@ -266,7 +270,7 @@ def _mean(values: Float[Array, " n"], mask: Bool[Array, " n"]) -> Float[Array, "
 def _misfit(
     shape: Shape, prior: Prior, placement: Placement, targets: FitTargets, tau: Float[Array, ""] | float
 ) -> Float[Array, ""]:
-    """Return E of a placement of a shape. `jax.jvp` computes n_j . grad d in one pass."""
+    """Return the misfit E of a placed shape. `jax.jvp` computes all n_j . grad d(x_j) in one pass."""
     distance, slope = jax.jvp(lambda x: placement.distance(shape.solid, x), (targets.points,), (targets.normals,))
     empty = placement.distance(shape.solid, targets.empty)
     return _summed(distance, slope, empty, prior.deviation(shape, placement), targets, tau)
@@ -294,9 +298,11 @@ def _newton_step(
     tau: Float[Array, ""],
     basis: Float[Array, "9 k"],
 ) -> tuple[Float[Array, "9"], Float[Array, ""]]:
-    """Return a damped Gauss-Newton step on E, limited in size, and E of `placement` at the last tau.
+    """Return a damped Gauss-Newton step on the misfit E, and E of `placement` at the last tau.
 
-    The step is for the given `tau`. In the step, the normals contribute the term (n - grad d)^2 / 4.
+    The step is limited in size and uses the given `tau`. Its term for the normals n is |n - grad d|^2 / 4.
+
+    - `basis`: the ways in which a placement may change, see `ShapePoses.steps`.
     """
     points = jnp.concatenate([targets.points, targets.empty])
     distance, gradient = values_and_gradients(lambda x: placement.distance(shape.solid, x), points)
@@ -340,7 +346,7 @@ def _newton_step(
 
 
 def _modes(shape: Int[Array, " h"], rotation: Float[Array, "h 3 3"]) -> Bool[Array, " h"]:
-    """True for each hypothesis that is more than 15 degrees from all better modes of its shape.
+    """Return a mask of the modes: hypotheses more than 15 degrees from all better modes of the same shape.
 
     The hypotheses must be sorted, best first.
     """
@@ -348,7 +354,7 @@ def _modes(shape: Int[Array, " h"], rotation: Float[Array, "h 3 3"]) -> Bool[Arr
 
 
 def turned_alike(rotation: Float[Array, "h 3 3"]) -> Bool[Array, "h h"]:
-    """True for each pair of rotations that are within 15 degrees of each other."""
+    """Return for each pair of rotations whether they differ by less than 15 degrees."""
     trace = jnp.einsum("aij,bij->ab", rotation, rotation, precision="highest")
     return 0.5 * (trace - 1.0) > np.cos(np.radians(15.0))
 

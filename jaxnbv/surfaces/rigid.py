@@ -1,4 +1,4 @@
-"""Registration of a partial scan with a triangle mesh of the same size: iterative closest points from many starts.
+"""Registration of a partial scan with a mesh of the same size: iterative closest points, many starts.
 
 A motion x -> R x + t maps the points p and normals n of the scan to the mesh. Let c be the point of the mesh nearest to
 R p + t, and m the normal at c. A Gauss-Newton step reduces
@@ -51,9 +51,9 @@ class Registration(NamedTuple):
     """Result of `register_scan`. Lengths are in the unit of the mesh.
 
     - `matrix`: the motion from the scan to the mesh.
-    - `median`: median distance of the scan from the mesh.
-    - `rival`: mean distance between the mesh as placed by `matrix` and as placed by a clearly different motion that
-      fits nearly as well (the largest over such motions); 0 if there is no such motion.
+    - `median`: median distance of the scan's points from the mesh, after this motion.
+    - `rival`: distance between the mesh placed by `matrix` and the mesh placed by a different motion that fits nearly as
+      well: a mean over the mesh, the largest over such motions. It is 0 if none of them is clearly different.
     """
 
     matrix: Float[np.ndarray, "4 4"]
@@ -70,9 +70,9 @@ class _Motions(NamedTuple):
 
 
 class _Equations(NamedTuple):
-    """Normal equations of one Gauss-Newton step for each motion.
+    """Normal equations of one Gauss-Newton step for each motion: matrix @ step = -vector.
 
-    - `gaps`: distances of the points from the surface.
+    - `gaps`: distances of the moved scan points from the surface.
     - `agreement`: cosines between the normals of the scan and of the mesh, clipped to [0, 1].
     """
 
@@ -86,7 +86,7 @@ class _Equations(NamedTuple):
 
 
 class _Stage(NamedTuple):
-    """The scan points and normals that one stage uses, and the surface to which the stage registers the scan."""
+    """Scan points and normals that one stage uses, and the surface to which the stage registers the scan."""
 
     points: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
@@ -94,7 +94,11 @@ class _Stage(NamedTuple):
     is_solid: bool
 
     def equations(self, motions: _Motions, scale: float | None = None) -> _Equations:
-        """Return the normal equations at a scale. The default scale is twice each motion's median distance."""
+        """Return the normal equations of the next Gauss-Newton step for each motion.
+
+        - `scale`: distance from the surface at which a point's weight halves. The default, for each motion, is twice
+          the median distance of the moved points from the surface.
+        """
         arms = np.einsum("nj,sij->sni", self.points, motions.turns)
         places = arms + motions.shifts[:, None]
         feet, outer = (rows.reshape(places.shape) for rows in self.nearest(places.reshape(-1, 3)))
@@ -109,7 +113,7 @@ class _Stage(NamedTuple):
         return _Equations(matrix, vector, gaps, agreement)
 
     def aligned(self, motions: _Motions, scales: Sequence[float | None] | np.ndarray) -> _Motions:
-        """Return the motions after one damped Gauss-Newton step at each of the scales."""
+        """Return the motions after damped Gauss-Newton steps, one for each entry of `scales`."""
         for scale in scales:
             matrix, vector, *_ = self.equations(motions, scale)
             damping = _DAMPING * np.trace(matrix, axis1=1, axis2=2) + 1e-12
@@ -132,7 +136,7 @@ class _Stage(NamedTuple):
         return motions.at(rows)
 
     def swept(self, motion: _Motions) -> _Motions:
-        """Return a motion followed by rotations about the (screw) axis along which the fit changes least."""
+        """Return copies of a motion, each followed by a turn about the screw axis the scan constrains least."""
         weakest = np.linalg.eigh(self.equations(motion).matrix[0])[1][:, 0]
         twist = np.zeros((4, 4))
         twist[:3, :3], twist[:3, 3] = np.cross(np.eye(3), weakest[:3]), weakest[3:]
@@ -235,7 +239,7 @@ def _nearest_point(vertices: Float[np.ndarray, "v 3"], mesh: trimesh.Trimesh) ->
 def _starts(
     points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], samples: Float[np.ndarray, "m 3"]
 ) -> _Motions:
-    """Return the initial motions: rotations, each with several shifts that put the scan inside the mesh's box.
+    """Return the initial motions: rotations, each with a few shifts that put the scan in the mesh's box.
 
     The first shift centres the scan, and moves it along its mean normal to the front of the mesh. The other shifts are
     random.
@@ -253,6 +257,9 @@ def _starts(
 
 
 def _apart(first: _Motions, second: _Motions, samples: Float[np.ndarray, "m 3"], nearest: Nearest) -> float:
-    """Return the mean distance between the mesh as placed relative to the scan by `first` and by `second`."""
+    """Return the mean distance of the mesh placed by `second` from the mesh placed by `first`.
+
+    Motions map the scan to the mesh, so their inverses place the mesh at the scan. `samples` are points on the mesh.
+    """
     moved = (samples - second.shifts[0]) @ second.turns[0] @ first.turns[0].T + first.shifts[0]
     return float(np.mean(np.linalg.norm(moved - nearest(moved)[0], axis=1)))

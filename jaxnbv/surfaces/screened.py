@@ -1,4 +1,4 @@
-"""Poisson surfaces given normals and values: screened and enveloped stochastic Poisson surface reconstruction.
+"""Stochastic Poisson surface reconstruction from normals and values, screened and enveloped.
 
 This is a second step of Bayes' rule after `GeometricSPSR`, whose posterior given the normals has mean m and
 covariance k:
@@ -8,6 +8,10 @@ covariance k:
     factor   S = k(Y, Y) + tau^2 11^T + Sigma,   k(Y, Y) = K_ff - sum_d K_fd A^-1 K_df
     mean     E g(x) = m(x) + (k(x, Y) + tau^2 1^T) w,   w = S^-1 (h value - m(Y))
     sample   f a sample given the normals, c and e from the prior;   w = S^-1 (h value - f(Y) + c - e)
+
+Here h is half the rise of the mean of f across the scanned surface, Y are the points y_k, 1 is a vector of ones, and
+Sigma is the covariance of e. K_ff is the prior covariance of f(Y), K_df the covariance of component d of the normals
+with f(Y), and A the covariance of the normals.
 
 The values change f by k(., Y) w. This consists of a change u_d = -A^-1 K_df w of the weights of the normals, and of a
 direct change s(n) / |n|^2 sum_k w_k e^{-i n.y_k} of the coefficients of f. The level c changes by -tau^2 1^T w. The
@@ -48,14 +52,14 @@ class ScreenedSPSR(SurfaceModel):
     - `base`: the prior, and the noise of the normals. The default has a short lengthscale for detail, and a long
       lengthscale for the overall shape, which lets values affect f far from their points.
     - `values`: sources of values, see `jaxnbv.surfaces.values`.
-    - `level_deviation`: tau, the prior standard deviation of the level, which is broad compared with the values of f.
-    - `offset`: distance from the data, to both sides, at which h is measured, in scene units. h is half the median over
-      the data of E f(x_j + offset n_j) - E f(x_j - offset n_j) given the normals alone. h is at least half the prior
-      standard deviation of f, because the two sides of a thin sheet cancel.
+    - `level_deviation`: prior standard deviation of the level, which is broad compared with the values of f.
+    - `offset`: distance from the data, to both sides, at which h is measured, in scene units. The unit h of values is
+      half the median rise of f across the surface: of E f(x_j + offset n_j) - E f(x_j - offset n_j), given the normals
+      alone. h is at least half the prior standard deviation of f, because the two sides of a thin sheet cancel.
 
     N normals and M values take 3 N^2 M + M^3 operations in addition to the cost of `base`.
 
-    **Raises:** `ValueError` if there are no values, or if tau or the offset is not positive.
+    **Raises:** `ValueError` if there are no values, or if `level_deviation` or `offset` is not positive.
     """
 
     base: GeometricSPSR = eqx.field(default_factory=lambda: GeometricSPSR((0.01, 0.06), (0.2, 0.25), truncation=32))
@@ -79,13 +83,13 @@ class ScreenedSPSR(SurfaceModel):
         self.base.check(cloud)
 
     def condition(self, observations: Observations | PointCloud) -> "ScreenedSPSRPosterior":
-        """Return the posterior p(g | D, empty space).
+        """Return the posterior of g = f - c, where c is the level of f, given the cloud and empty space.
 
-        The cost is that of the base, plus M triangular solves with the base's factor.
+        The cost is that of the base, plus one triangular solve with the base's factor for each value.
 
         **Raises:** `ValueError` if `GeometricSPSR.condition` does, for a capacity above 16,384, for values that are not
-        finite or at points outside [-pi/2, pi/2]^3, or if S is singular in the dtype's precision. Under `jit` values
-        cannot be checked, and the posterior is NaN instead.
+        finite or at points outside [-pi/2, pi/2]^3, or if the covariance of the values is singular in the dtype's
+        precision. Under `jit` values cannot be checked, and the posterior is NaN instead.
         """
         observations = as_observations(observations)
         capacity = observations.cloud.capacity
@@ -136,9 +140,10 @@ def _condition(
 
 
 def _half_jump(base: GeometricSPSRPosterior, offset: float) -> Float[Array, ""]:
-    """Return h: half the median rise of E f, given the normals, from `offset` behind to `offset` in front of the data.
+    """Return h, half the median rise of E f across the surface, given the normals alone.
 
-    h is at least half the prior standard deviation of f.
+    The rise is from `offset` behind each point to `offset` in front of it, along its normal. h is at least half the
+    prior standard deviation of f.
     """
     chosen = some_rows(base.cloud, _JUMP_POINTS)
     points, step = base.cloud.points[chosen], offset * base.cloud.normals[chosen]
@@ -148,7 +153,7 @@ def _half_jump(base: GeometricSPSRPosterior, offset: float) -> Float[Array, ""]:
 
 
 class ScreenedDraws(NamedTuple):
-    """Draws from the prior: v and eps, the level c, and the noise e of the values."""
+    """Draws from the prior: the normal field and its noise, the level c, and the noise e of the values."""
 
     normals: NormalDraws
     level: Float[Array, " s"]
@@ -161,11 +166,12 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
     - `level`: zero, because g is relative to the level.
     - `mean_coefficients`: coefficients of E g, see `surfaces/trigonometric.py`.
     - `base`: the posterior p(f | normals).
-    - `rows`: the values.
-    - `half_jump`: h, the unit of the values.
-    - `whitened`: C^-1 K_df with A = C C^T.
-    - `factor`: the Cholesky factor of S.
-    - `weights`: w of the posterior mean.
+    - `rows`: the observed values.
+    - `half_jump`: h, the unit of the values: half the rise of the mean of f across the surface.
+    - `whitened`: C^-1 K_df, where A = C C^T is the covariance of the normals, and K_df their covariance with f at the
+      points of `rows`.
+    - `factor`: the Cholesky factor of S, the covariance of the values given the normals.
+    - `weights`: the weights w of the values in the posterior mean.
     """
 
     level: Float[Array, ""]
@@ -196,15 +202,15 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
         return jax.lax.map(at_point, x, batch_size=points_at_once(len(x), self.base.cloud.capacity))
 
     def data_points(self) -> DataPoints:
-        """Return the points of the cloud for gradients, and the points of the value rows for values."""
+        """Return the cloud's points for gradients of mean functions, and the values' points for values."""
         return DataPoints(self.base.data_points().gradients, fill_rows(self.rows.points, self.rows.mask))
 
     def level_about(self, means: MeansAtData) -> Float[Array, " s"]:
-        """Return zeros, because g is measured relative to the level for every mean function."""
+        """Return zero for each mean function, because g is measured relative to the level."""
         return jnp.zeros(len(means.values), self.weights.dtype)
 
     def prior_draws(self, key: PRNGKeyArray, num_samples: int) -> ScreenedDraws:
-        """Draw v and eps, the level c, and the noise e of the values from the prior."""
+        """Draw the normal field and its noise, the level c, and the noise e of the values from the prior."""
         base_key, level_key, noise_key = jax.random.split(key, 3)
         normals = self.base.prior_draws(base_key, num_samples)
         dtype, shape = normals.at_data.dtype, self.rows.noise.shape
@@ -213,18 +219,22 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
         return ScreenedDraws(normals, level, noise)
 
     def conditioned(self, draws: ScreenedDraws, means: MeansAtData) -> Float[Array, "s a a a"]:
-        """Condition the draws on the normals and then on the values, and return the coefficients of g."""
+        """Condition the draws on the normals and then on the values. Return the coefficients of the samples.
+
+        The samples are of g = f - c, where c is the level of f. The gradients of `means` are subtracted from the
+        observed normals, and their values from the observed values.
+        """
         residual = self.base.whitened_residual(draws.normals, means)
         coefficients, level, noise = draws.normals.coefficients, draws.level, draws.noise
         transform = NonuniformTransform(self.rows.points, self.model.base.truncation)
         at_rows = shared_map(_values, coefficients, transform)
-        # Condition f at the value points on the normals: add k(Y, X) A^-1 r = B^T C^-1 r, where B is `whitened`.
+        # Condition f at the values' points Y on the normals. Their residual r adds k(Y, X) A^-1 r, computed whitened.
         at_rows = at_rows + jnp.einsum("dnm,snd->sm", self.whitened, residual, precision="highest") + means.values
         weights = jax.vmap(self.solve)(self.half_jump * self.rows.values - at_rows + level[:, None] - noise)
         return self._updated(coefficients, residual, -level, weights)
 
     def solve(self, residual: Float[Array, " m"]) -> Float[Array, " m"]:
-        """Return the weights w = S^-1 r of a residual r, with zeros in unfilled rows."""
+        """Return the weights S^-1 r of a residual r whose covariance is S, with zeros in unfilled rows."""
         return self.factor.solve(jnp.where(self.rows.mask, residual, 0.0))
 
     def _updated(
@@ -236,10 +246,10 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
     ) -> Float[Array, "s a a a"]:
         """Return the coefficients of g for each sample.
 
-        - `coefficients`: coefficients of v.
+        - `coefficients`: coefficients of the drawn normal field v.
         - `residual`: whitened residual of the normals.
         - `constant`: the level c of the draw, negated.
-        - `weights`: w.
+        - `weights`: the weights w of the values.
         """
         moved = residual - jnp.einsum("dnm,sm->snd", self.whitened, weights, precision="highest")
         fields = self.base.updated(coefficients, moved)
@@ -254,7 +264,7 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
 def _values(normals: Float[Array, "3 a a a"], transform: NonuniformTransform) -> Float[Array, " m"]:
     """Return the values of f = Poisson(v) at the points of the transform.
 
-    - `normals`: coefficients of v.
+    - `normals`: coefficients of the normal field v.
     """
     return transform.evaluate(solve_poisson(normals)[None])[:, 0]
 
@@ -264,6 +274,6 @@ def _reconstructed(
 ) -> Float[Array, "a a a"]:
     """Return the coefficients of -cov(f, f(Y)) w, where Y are the transform's points, and w the weights.
 
-    - `variance`: prior variances of the coefficients of v.
+    - `variance`: prior variances of the coefficients of each component of the normal field.
     """
     return inverse_laplacian(variance * transform.adjoint(weights[:, None])[0])

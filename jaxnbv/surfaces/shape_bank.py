@@ -42,7 +42,7 @@ class ShapeBank(eqx.Module):
 
     - `solids`: all shapes as one batch, whose arrays have a leading axis of shapes; None for an empty bank.
     - `extremes`: extreme points of each shape, as in `Shape`.
-    - `codes`: the names in UTF-8. They are arrays so that compiled programs do not depend on the names.
+    - `codes`: the names in UTF-8, as an array so that compiled programs do not depend on the names.
     - `from_mesh`: (k, 4, 4) similarity transforms from the coordinates of each mesh to the coordinates of its shape;
       None if the shapes do not come from meshes.
     - `is_true_size`: whether the shapes are as large as the real objects, so that placements do not scale them.
@@ -206,7 +206,7 @@ class ShapeBank(eqx.Module):
 
 
 def _metres(scale: float | str) -> float:
-    """Return the length of a named unit in metres, or a number unchanged.
+    """Return the length of a named unit in metres. A number is returned unchanged.
 
     **Raises:** `ValueError` for an unknown unit, or a length that is not positive.
     """
@@ -237,7 +237,7 @@ def encoded(names: Sequence[str]) -> UInt8[Array, "k c"]:
 def _extremes(solids: SignedDistance) -> Float[Array, "k p 3"]:
     """Return points on each solid's surface.
 
-    They start on a large sphere around the solid, and move along the gradient by Newton steps.
+    They start on a large sphere around the solid, and move along the gradient of its signed distance by Newton steps.
     """
     start = fibonacci_sphere(NUM_EXTREMES, _FAR)
 

@@ -1,4 +1,4 @@
-"""Banks of known shapes that ship with jaxnbv: procedural objects of the training scenes, and some real furniture."""
+"""Banks of known shapes that ship with jaxnbv: procedural training objects, and some real furniture."""
 
 from collections.abc import Callable
 from importlib import resources
@@ -23,7 +23,7 @@ _FURNITURE = Upright(by_axis=True)
 class ShippedBank(NamedTuple):
     """Description of a bank that ships with jaxnbv.
 
-    - `form`: returns a solid with the same tree structure as the bank's solids.
+    - `form`: returns a solid with the same PyTree structure as the bank's solids.
     - `poses`: the possible placements of the bank's objects.
     """
 
@@ -80,10 +80,10 @@ def bank_poses(name: str) -> ShapePoses:
 def read_bank(path: Path, like: SignedDistance) -> ShapeBank:
     """Read a bank that `scripts/make_banks.py` wrote.
 
-    The file stores numbers in 16 bits, and integers in 8. Distances on grids are 8-bit differences of neighbours in
-    units of `QUANTUM`.
+    The file stores floating-point numbers in 16 bits, and integers in 8. A distance on a grid is stored as its 8-bit
+    difference from the previous node, in units of `QUANTUM`.
 
-    - `like`: a solid with the same tree structure as the bank's solids.
+    - `like`: a solid with the same PyTree structure as the bank's solids.
     """
     wide = {"f": np.float32, "i": np.int32, "b": np.bool_}
     with np.load(path) as stored:

@@ -4,8 +4,8 @@
     ConjugateGradientSolver   never forms A: A = Phi S Phi^T + noise^2 I, with Phi the basis at the data and S the
                               variances of the modes, so a product is a transform to coefficients and back
 
-If rows of a cloud are unfilled, the corresponding rows of A are rows of the identity, which change neither solves nor
-determinants.
+X are the points of a cloud, and k is the prior covariance of the normal field. If rows of a cloud are unfilled, the
+corresponding rows of A are rows of the identity, which change neither solves nor determinants.
 """
 
 import functools
@@ -56,31 +56,32 @@ class Solver(eqx.Module):
     @property
     @abstractmethod
     def factor(self) -> CholeskyFactor:
-        """C, the Cholesky factor of A.
+        """The Cholesky factor of the covariance A of the normals.
 
         **Raises:** `ValueError` if A is not factorised.
         """
 
     @abstractmethod
     def solve(self, blocks: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
-        """Apply A^-1 to the columns of each block, which must be zero in unfilled rows."""
+        """Apply the inverse covariance A^-1 to the columns of blocks, which must be zero in unfilled rows."""
 
     @abstractmethod
     def explained_variance(self, x: Float[Array, "n 3"]) -> Float[Array, " n"]:
         """Return how much the data reduce Var f(x), at points in scene coordinates."""
 
     def whiten(self, blocks: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
-        """Apply C^-1 to the columns of each block."""
+        """Apply C^-1 to the columns of each block, where C is the Cholesky factor of the covariance."""
         return _of_columns(self.factor.whiten, blocks)
 
     def unwhiten(self, blocks: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
-        """Apply C^-T to the columns of each block."""
+        """Apply C^-T to the columns of each block, where C is the Cholesky factor of the covariance."""
         return _of_columns(self.factor.unwhiten, blocks)
 
     def whitened_cross(self, x: Float[Array, "n 3"]) -> Float[Array, "3 capacity n"]:
-        """Return C^-1 cov(v_d(X), f(x)).
+        """Return C^-1 cov(v_d(X), f(x)) for each component d of the normal field v at the cloud's points X.
 
-        The sum of its squares over d and the data is the part of Var f(x) that the data explain.
+        C is the Cholesky factor of the covariance of the normals. The sum of squares over d and the data is the part of
+        Var f(x) that the data explain.
         """
         capacity, factor = self.cloud.capacity, self.factor
 
@@ -94,7 +95,7 @@ class Solver(eqx.Module):
 
 
 class DenseSolver(Solver):
-    """A solver that uses the Cholesky factor of A. A has one row for each row of the cloud. See `Solver`."""
+    """A solver that factorises the covariance A, with one row for each row of the cloud. See `Solver`."""
 
     cloud: PointCloud
     spectrum: Spectra
@@ -103,7 +104,7 @@ class DenseSolver(Solver):
 
     @classmethod
     def of(cls, cloud: PointCloud, spectrum: Spectra, noise: Scalar) -> "DenseSolver":
-        """Compute the Cholesky factor of A for a cloud."""
+        """Factorise the covariance of the normals of a cloud. See `Solver` for the arguments."""
         capacity = cloud.capacity
 
         def leading(size: int):
@@ -132,10 +133,10 @@ class DenseSolver(Solver):
 
 
 class ConjugateGradientSolver(Solver):
-    """A solver by conjugate gradients, for more points than can be factorised. See `Solver`.
+    """A solver by conjugate gradients, for a covariance A that is too large to factorise. See `Solver`.
 
-    A solve takes about 200 products with A for 50,000 points and L = 50. In float32 the error of the result is at most
-    1e-4 of the largest value. The result is NaN if the solve did not converge.
+    A solve takes about 200 products with A for 50,000 points and a truncation of 50. In float32 the error of the result
+    is at most 1e-4 of the largest value. The result is NaN if the solve did not converge.
     """
 
     cloud: PointCloud
@@ -144,7 +145,7 @@ class ConjugateGradientSolver(Solver):
 
     @property
     def factor(self) -> CholeskyFactor:
-        """**Raises:** `ValueError`, because this solver does not factorise A."""
+        """Not available. **Raises:** `ValueError`, because this solver does not factorise A."""
         raise InputError(
             f"covariances and likelihoods need a factorisation, which is done for at most {MOST_FACTORISED} points: "
             "keep fewer points"
@@ -176,7 +177,7 @@ class ConjugateGradientSolver(Solver):
 
 
 def solver_of(cloud: PointCloud, spectrum: Spectra, noise: Scalar) -> Solver:
-    """Return a dense solver for a capacity of at most `MOST_FACTORISED`, else one by conjugate gradients."""
+    """Return a `DenseSolver` up to a capacity of `MOST_FACTORISED`, else a `ConjugateGradientSolver`."""
     if cloud.capacity > MOST_FACTORISED:
         return ConjugateGradientSolver(cloud, spectrum, noise)
     return DenseSolver.of(cloud, spectrum, noise)
@@ -188,7 +189,7 @@ def points_at_once(count: int, capacity: int) -> int:
 
 
 def _on_filled_rows(cloud: PointCloud, leading: Callable[[int], Float[Array, "*of"]]) -> Float[Array, "*of"]:
-    """Call `leading(size)` with the smallest of a few sizes for which the leading rows include all filled rows.
+    """Call `leading(size)` with the smallest of a few sizes for which the first rows hold all points.
 
     The time thus depends on the number of filled rows, although array shapes are fixed. A small cloud always uses its
     capacity as the size, because each size is compiled separately.
@@ -204,6 +205,6 @@ def _on_filled_rows(cloud: PointCloud, leading: Callable[[int], Float[Array, "*o
 
 
 def _of_columns(function: Callable[[Array], Array], blocks: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
-    """Apply a function, which maps each column of a matrix, to the columns of all blocks at once."""
+    """Apply a function of a matrix's columns to the columns of all blocks in a single call."""
     columns = jnp.moveaxis(blocks, 0, 1)
     return jnp.moveaxis(function(columns.reshape(len(columns), -1)).reshape(columns.shape), 1, 0)

@@ -1,4 +1,4 @@
-"""Geometric stochastic Poisson surface reconstruction (Holalkere et al. 2025), exact for the truncated prior.
+"""Geometric stochastic Poisson reconstruction (Holalkere et al. 2025), exact for the truncated prior.
 
     prior    v_1, v_2, v_3 independent Gaussian processes on the torus of period 2 pi,
              cov(v_d(x), v_d(y)) = sum_{|n|_inf <= L} s(n) cos(n.(x - y)),   s(n) = s1(n_1) s1(n_2) s1(n_3),
@@ -7,6 +7,8 @@
     data     n_j = v(x_j) + eps_j,   eps_j ~ N(0, noise^2 I),   A = k(X, X) + noise^2 I
     sample   v_post = v + k(., X) A^-1 (n - v(X) - eps), v and eps from the prior;   f = Poisson(v_post)
 
+In the prior and in Poisson's equation, n is an integer frequency vector, s1 the Matern spectrum on the circle, and L
+the truncation. In the data and the sample, n are the observed normals at the points X, and k is the covariance of v.
 A sample's prior part, residual at the data and update come from the same draw (Matheron's rule; Wilson et al. 2020), so
 samples have exactly the posterior's distribution.
 """
@@ -46,15 +48,15 @@ def _to_float(value) -> Float[Array, "*scales"]:
 
 
 class GeometricSPSR(SurfaceModel):
-    """Matern prior on the normal field over the torus, with f as its Poisson reconstruction.
+    """Matern prior on the normal field v over the torus, with f as its Poisson reconstruction.
 
     - `lengthscale`: ell, in units of the circumference 2 pi: 0.005 is 0.031 in scene units. Several lengthscales make a
       sum of independent priors: short lengthscales for detail, and long lengthscales for the overall shape.
-    - `variance`: variance per axis, one for each lengthscale. Without truncation, Var v_d = variance^3.
+    - `variance`: variance per axis, one for each lengthscale. Without truncation, Var v_d = variance^3 for each d.
     - `noise`: standard deviation of each component of the observed normals.
     - `nu`: smoothness, 1/2, 3/2 or 5/2.
-    - `truncation`: L, the largest frequency along each axis. Frequencies up to L have `kept_variance` of the prior's
-      variance, which is 49 % for the defaults. The defaults are the paper's values.
+    - `truncation`: L, the largest frequency along each axis. Frequencies up to L hold the fraction `kept_variance` of
+      the prior's variance, which is 49 % for the defaults. The defaults are the paper's values.
 
     `lengthscale`, `variance` and `noise` are array leaves, so the posterior is differentiable in them.
 
@@ -96,7 +98,7 @@ class GeometricSPSR(SurfaceModel):
 
     @property
     def spectrum(self) -> Spectra:
-        """s1(0), ..., s1(L), with a leading axis if there are several lengthscales."""
+        """Matern spectrum of one axis at frequencies 0, ..., L, with a leading axis for several lengthscales."""
         of_one = functools.partial(circle_spectrum, self.nu, truncation=self.truncation)
         if jnp.ndim(self.lengthscale) == 0:
             return of_one(self.lengthscale, self.variance)
@@ -108,10 +110,10 @@ class GeometricSPSR(SurfaceModel):
         return _kept_variance(self)
 
     def check(self, cloud: PointCloud) -> None:
-        """Warn if neighbouring points are more than 2.5 times the longest lengthscale apart (median).
+        """Warn if the median distance between neighbouring points exceeds 2.5 times the longest lengthscale.
 
-        Such points hardly constrain the samples. At 2.5 lengthscales, the standard deviation of f minus its level at
-        the data is 0.9 times its prior standard deviation.
+        Such points hardly constrain the samples. At this distance, the standard deviation of f minus its level at the
+        data is 0.9 times its prior standard deviation.
         """
         points, _ = cloud.to_numpy()
         if len(points) < 2 or is_traced(self):
@@ -133,8 +135,8 @@ class GeometricSPSR(SurfaceModel):
         the cost is a few hundred transforms per solve.
 
         **Raises:** `ValueError` if the cloud is empty, has entries that are not finite, a normal longer than 10 or
-        points outside [-pi/2, pi/2]^3 (scene coordinates), or if A is singular in the dtype's precision. Under `jit`
-        values cannot be checked, and points outside make the posterior NaN.
+        points outside [-pi/2, pi/2]^3 (scene coordinates), or if the covariance of the normals is singular in the
+        dtype's precision. Under `jit` values cannot be checked, and points outside make the posterior NaN.
         """
         cloud = as_observations(observations).cloud
         if not is_traced(cloud):

@@ -1,9 +1,9 @@
 """Band-limited functions on the torus of period 2 pi, in a real tensor basis.
 
-The basis on the circle is phi_a(x) = cos(a x) for a = 0, ..., L and phi_a(x) = sin(-a x) for a = -L, ..., -1. The
-products phi_a(x1) phi_b(x2) phi_c(x3) span the same space as the paper's exponentials, with the same number of real
-coefficients. In this basis evaluation is a chain of real matrix products, and the derivative of a function with
-coefficients C_a has the coefficients a C_{-a}.
+The basis on the circle is phi_a(x) = cos(a x) for a = 0, ..., L and phi_a(x) = sin(-a x) for a = -L, ..., -1, where L
+is the truncation, the largest frequency. The products phi_a(x1) phi_b(x2) phi_c(x3) span the same space as the paper's
+exponentials, with the same number of real coefficients. In this basis evaluation is a chain of real matrix products,
+and the derivative of a function with coefficients C_a has the coefficients a C_{-a}.
 
 All products request full float32 precision, because some GPUs use a lower precision by default.
 """
@@ -25,15 +25,15 @@ _CHUNK_VALUES = 2**24
 
 
 def circle_basis(x: Float[Array, "*n"], truncation: int) -> Float[Array, "*n a"]:
-    """Return phi_a(x) for a = -L, ..., L, along a new last axis of length 2 L + 1."""
+    """Return sin(L x), ..., sin(x), 1, cos(x), ..., cos(L x) along a new last axis; L is `truncation`."""
     angle = x[..., None] * jnp.arange(1, truncation + 1)
     return jnp.concatenate([jnp.sin(angle)[..., ::-1], jnp.ones_like(x)[..., None], jnp.cos(angle)], axis=-1)
 
 
 def basis_variance(spectrum: Float[Array, "l_plus_1"]) -> Float[Array, " a"]:
-    """Return the variances of the coefficients of phi_a for a kernel on the circle.
+    """Return the prior variances of the coefficients of `circle_basis` for a kernel on the circle.
 
-    The kernel is sum_{n in Z} s1(n) cos(n t), and `spectrum` is s1(0), ..., s1(L).
+    The kernel is the sum over n = -L, ..., L of s1(|n|) cos(n t), and `spectrum` is s1(0), ..., s1(L).
     """
     positive = 2.0 * spectrum[1:]
     return jnp.concatenate([positive[::-1], spectrum[:1], positive])
@@ -45,18 +45,18 @@ def differentiate(coefficients: Float[Array, "*s a a a"], axis: int) -> Float[Ar
 
 
 def solve_poisson(vector_field: Float[Array, "*s 3 a a a"]) -> Float[Array, "*s a a a"]:
-    """Return the coefficients of the zero-mean f with Laplacian div v.
+    """Return the coefficients of the zero-mean f whose Laplacian is the divergence of a vector field v.
 
-    f_hat(n) = -i n . v_hat(n) / |n|^2
+    The Fourier coefficients are f_hat(n) = -i n . v_hat(n) / |n|^2.
     """
     x, y, z = (differentiate(vector_field[..., axis, :, :, :], axis) for axis in range(3))
     return inverse_laplacian(x + y + z)
 
 
 def inverse_laplacian(function: Float[Array, "*s a a a"]) -> Float[Array, "*s a a a"]:
-    """Return the coefficients of the zero-mean f whose Laplacian is the function g minus the mean of g.
+    """Return the coefficients of the zero-mean f whose Laplacian is a function g minus the mean of g.
 
-    f_hat(n) = -g_hat(n) / |n|^2
+    The Fourier coefficients are f_hat(n) = -g_hat(n) / |n|^2.
     """
     a, b, c = (_frequency(function, axis) for axis in range(3))
     squared = a**2 + b**2 + c**2
@@ -92,10 +92,7 @@ class TrigonometricFields(Fields):
 
     @on_torus
     def __call__(self, x: Float[AnyArray, "n 3"]) -> Float[Array, "s n"]:
-        """Return the values of all functions at the points x (scene coordinates).
-
-        The sum over the first axis of frequencies is one matrix product.
-        """
+        """Return the values of all functions at the points x (scene coordinates)."""
         x = jnp.asarray(x, dtype=self.coefficients.dtype)
         samples, modes = self.coefficients.shape[0], self.coefficients.shape[-1]
 
@@ -114,10 +111,7 @@ class TrigonometricFields(Fields):
 
     @on_grid_of_torus
     def on_grid(self, axis: Float[AnyArray, " g"]) -> Float[Array, "s g g g"]:
-        """Return the values on the tensor grid axis x axis x axis.
-
-        Functions are evaluated one at a time to bound the memory.
-        """
+        """Return the values on the grid axis x axis x axis, one function at a time to bound the memory."""
         basis = circle_basis(jnp.asarray(axis, dtype=self.coefficients.dtype), self.coefficients.shape[-1] // 2)
         return shared_map(evaluate_on_grid, self.coefficients, basis)
 
@@ -155,12 +149,12 @@ class NonuniformTransform(eqx.Module):
         self.truncation = truncation
 
     def evaluate(self, coefficients: Float[Array, "k a a a"]) -> Float[Array, "n k"]:
-        """Return the values of k functions at the points."""
+        """Return the values at the points of k functions with these coefficients."""
         values = evaluate_on_grid(coefficients, self._node_basis(coefficients.dtype))
         return self._interpolate(jnp.moveaxis(values, 0, -1))
 
     def adjoint(self, values: Float[Array, "n k"]) -> Float[Array, "k a a a"]:
-        """Return sum_j values_j phi_a(x_j1) phi_b(x_j2) phi_c(x_j3): the transpose of `evaluate`."""
+        """Apply the transpose of `evaluate`: the sum over j of values_j phi_a(x_j1) phi_b(x_j2) phi_c(x_j3)."""
         basis = self._node_basis(values.dtype)
         spread = self._spread(values, basis.shape[0])
         return evaluate_on_grid(jnp.moveaxis(spread, -1, 0), basis.T)
@@ -175,7 +169,7 @@ class NonuniformTransform(eqx.Module):
         return jax.lax.map(lambda point: at_point(*point), (self.start, self.weights), batch_size=128)
 
     def _spread(self, values: Float[Array, "n k"], nodes: int) -> Float[Array, "nodes nodes nodes k"]:
-        """Apply the transpose of `_interpolate`."""
+        """Spread values at the points over the nodes of the grid: apply the transpose of `_interpolate`."""
         grid = jnp.zeros((nodes, nodes, nodes, values.shape[1]), values.dtype)
         if not on_cpu():
             return jax.linear_transpose(self._interpolate, grid)(values)[0]
@@ -203,6 +197,6 @@ class NonuniformTransform(eqx.Module):
 
 
 def _window(truncation: int, dtype) -> tuple[int, float, float]:
-    """Return the number of nodes under the window, the window's shape parameter, and the spacing of the grid."""
+    """Return the number of nodes under the window, its shape parameter, and the spacing of the grid."""
     nodes = 8 if dtype == jnp.float32 else 14
     return nodes, 0.75 * math.pi * nodes, HALF_WIDTH / truncation

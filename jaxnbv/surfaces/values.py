@@ -1,4 +1,4 @@
-"""Observed values of f relative to its level, in addition to the normals, which observe the gradient of f.
+"""Observed values of f relative to its level, beside the normals, which observe the gradient of f.
 
 Values are in units of h. Given the normals alone, the mean of f rises across the scanned surface, and h is half this
 rise (see `ScreenedSPSR.offset`). These units are used because the scale of f depends on the prior.
@@ -22,11 +22,13 @@ from jaxnbv.surfaces.base import HALF_WIDTH
 
 
 class ValueRows(eqx.Module):
-    """Observed values, f(y_k) - c = value_k + e_k with e_k ~ N(0, noise_k^2), in units of h.
+    """Observed values of f - c at points, with independent normal noise. The surface is where f = c.
 
-    Rows with a False mask are padding.
+    The unit of values and noise is h, half the rise of the mean of f across the scanned surface.
 
-    - `points`: y_k in scene coordinates, within [-pi/2, pi/2]^3.
+    - `points`: where f is observed, in scene coordinates, within [-pi/2, pi/2]^3.
+    - `values`, `noise`: observed values of f - c, positive outside the object, and their standard deviations.
+    - `mask`: False for rows that are padding.
 
     **Raises:** `ValueError` for arrays whose shapes differ from the annotated shapes.
     """
@@ -69,11 +71,11 @@ class ValueRows(eqx.Module):
 
 
 class ValueSource(eqx.Module):
-    """A source of observed values of f."""
+    """Base class of sources of observed values of f. Subclasses define `rows`."""
 
     @abstractmethod
     def rows(self, observations: Observations) -> ValueRows:
-        """Return the rows that this source adds.
+        """Return the observed values that this source adds.
 
         The method is called under `jit`, so the number of rows may depend only on the capacity of the cloud.
         `condition` of the model raises an error for a filled row outside [-pi/2, pi/2]^3. If the user calls `condition`
@@ -82,13 +84,13 @@ class ValueSource(eqx.Module):
 
 
 class OutsideBoundary(ValueSource):
-    """f(b) - c ~ N(h, s_b^2) at points b on the boundary of the volume that holds the object.
+    """Positive values of f minus its level on the boundary of the volume that holds the object.
 
-    This is the "envelope" of Poisson reconstruction (Kazhdan et al. 2020) as an observation.
+    The boundary is thus observed to be outside: the "envelope" of Poisson reconstruction (Kazhdan et al. 2020).
 
     - `volume`: see `jaxnbv.geometry.volume`; by default the box to which scenes are scaled.
     - `num_points`: number of points, spread evenly as seen from the origin.
-    - `value`, `noise`: mean and standard deviation, in units of h.
+    - `value`, `noise`: observed value and its standard deviation, in units of h, half the rise of f across the surface.
     - `room`: distance by which the points lie outside the boundary, in scene units. Points are clipped to the scene.
       If the volume cuts the object, give a positive distance. Otherwise sampled objects would close at the cut.
 
@@ -134,10 +136,10 @@ class OutsideBoundary(ValueSource):
 
 
 class OnSurface(ValueSource):
-    """f(x_j) - c ~ N(0, s_f^2) at some points x_j of D: the "screening" of Kazhdan and Hoppe (2013).
+    """Value zero of f minus its level at points of the cloud: "screening" (Kazhdan and Hoppe 2013).
 
-    - `num_points`: number of points, chosen by farthest point sampling. If D has fewer points, all are used.
-    - `noise`: standard deviation s_f, in units of h.
+    - `num_points`: number of points, chosen by farthest point sampling. If the cloud has fewer points, all are used.
+    - `noise`: standard deviation of the values, in units of h, half the rise of f across the surface.
 
     **Raises:** `ValueError` for a count below one or noise that is not positive.
     """
@@ -155,13 +157,13 @@ class OnSurface(ValueSource):
 
 
 class EmptySpace(ValueSource):
-    """f(z) - c ~ N(value, s^2) with a positive value, at points z that were seen to be empty.
+    """Positive values of f minus its level at points that were seen to be empty.
 
     The positive value makes unseen space next to empty space likely to be empty too. This assumption holds for thin
     objects such as furniture, but not for a body whose hidden side is as large as its visible side.
 
     - `num_points`: number of points, chosen by farthest point sampling. If there are fewer empty points, all are used.
-    - `value`, `noise`: mean and standard deviation, in units of h.
+    - `value`, `noise`: observed value and its standard deviation, in units of h, half the rise of f across the surface.
 
     **Raises:** `ValueError` for a count below one or noise that is not positive.
     """
