@@ -53,7 +53,7 @@ def _layout(eye: Float[np.ndarray, "3"], extent: float) -> dict[str, Any]:
 
 
 def _placed(places: Float[np.ndarray, "n 3"]) -> dict[str, Any]:
-    """Return coordinates keyed by plotly's axes. Plotly turns a scene about its own z axis, which is our y."""
+    """Return coordinates keyed by plotly's axes. Plotly's vertical axis z is our y."""
     x, y, z = (_GRAIN * np.round(np.asarray(places, np.float64).T / _GRAIN)).astype(np.float32)
     return {"x": z, "y": x, "z": y}
 

@@ -49,7 +49,7 @@ class Stage(eqx.Module):
 
 
 def stage_of(episode: Episode, surfaces: list[trimesh.Trimesh]) -> Stage:
-    """Choose the viewpoint for the pictures of an episode. `surfaces`: surfaces to show, in order of views."""
+    """Choose the viewpoint of an episode's pictures. `surfaces`: surfaces to show, in the order of views."""
     outlines = episode.cloud.to_numpy()[0], *(np.asarray(surface.vertices) for surface in surfaces)
     samples = [np.asarray(rows, np.float64)[:: max(1, len(rows) // _OUTLINE)] for rows in outlines]
     distances = [np.linalg.norm(rows, axis=1) for rows in samples]

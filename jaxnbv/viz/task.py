@@ -1,4 +1,4 @@
-"""The task of an episode for the report: question, answers by view, when they are reliable, and charts."""
+"""The task of an episode for its report: question, answers by view, their reliability, and charts."""
 
 import itertools
 import re
@@ -27,7 +27,7 @@ from jaxnbv.viz.answers import Chart, CoverageAnswer, capital, words_of
 
 
 class Rival(NamedTuple):
-    """Result of a different search from the same first view: its name, a sentence, and charts as in `Task`."""
+    """Result of a different search from the same first view: name, a sentence, and charts as in `Task`."""
 
     name: str
     words: str
@@ -167,7 +167,7 @@ def since(settled: Sequence[bool]) -> int | None:
 
 
 def lost_again(settled: Sequence[bool]) -> int | None:
-    """Return the first view (from 1) with a reliable answer, if a later one is not reliable; None otherwise."""
+    """Return the first view (from 1) with a reliable answer if a later one is unreliable; None otherwise."""
     first = int(np.argmax(settled))
     return first + 1 if settled[first] and not all(settled[first:]) else None
 

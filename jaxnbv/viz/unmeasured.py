@@ -20,7 +20,7 @@ _LOOKS, _SHARE, _PATCHES = 2, 0.005, 3
 
 
 class Patch(NamedTuple):
-    """A piece of unmeasured surface: its area and middle in scene units, and the number of views facing it."""
+    """A piece of unmeasured surface: area and middle in scene units, and number of views that faced it."""
 
     area: float
     middle: Float[np.ndarray, "3"]
