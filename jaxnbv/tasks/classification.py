@@ -1,7 +1,8 @@
 """Classification: to which class does the object belong?
 
-A classifier is any function from a `PointCloud` (masked rows) to log-probabilities, log p = classifier(cloud). It may
-be a network of `jaxnbv.networks`, your own network, or a `HostClassifier`. A `Classifier` may also name its classes.
+A classifier is any function from a `PointCloud` to log-probabilities, log p = classifier(cloud). Rows of the cloud
+whose mask is False hold no point. The classifier may be a network of `jaxnbv.networks`, your own network, or a
+`HostClassifier`. A `Classifier` may also name its classes.
 """
 
 from abc import abstractmethod
@@ -21,7 +22,7 @@ from jaxnbv.scanning import Surface
 from jaxnbv.utility import Answer, Quantity, default_batch_size, plain_function
 
 _LOG_P = "give log-probabilities, one for each of two classes or more"
-# D and log p. `ClassAcquisition.check` checks the shape of log p.
+# The thinned cloud and its log-probabilities, whose shape `ClassAcquisition.check` checks.
 Context: TypeAlias = tuple[PointCloud, Array]
 
 
@@ -33,7 +34,7 @@ class Classifier(eqx.Module):
 
     @abstractmethod
     def __call__(self, cloud: PointCloud) -> Float[Array, " classes"]:
-        """Return log p of one cloud (masked rows)."""
+        """Return the log-probabilities of one cloud. Rows whose mask is False hold no point."""
 
     @property
     def classes(self) -> tuple[str, ...] | None:
@@ -90,8 +91,8 @@ class ClassAcquisition(Acquisition):
     """Base class of acquisitions that compare a classifier's results before and after a simulated scan.
 
     - `classifier`: a `Classifier`, or a function from a cloud to log-probabilities.
-    - `num_points`: number of points to which D is thinned by farthest point sampling. This happens once for each
-      proposal, before scans are added.
+    - `num_points`: number of points to which the cloud is thinned by farthest point sampling. This happens once for
+      each proposal, before scans are added.
     """
 
     cloud_only: ClassVar[bool] = True
@@ -99,7 +100,7 @@ class ClassAcquisition(Acquisition):
     num_points: int = eqx.field(static=True, default=1024)
 
     def context(self, step: StepInputs) -> Context:
-        """Return D, thinned to `num_points`, and the log-probabilities log p^(t) given D."""
+        """Return the cloud, thinned to `num_points`, and the classifier's log-probabilities for it."""
         thinned = limit_capacity(step.observations.cloud, self.num_points)
         return thinned, self._log_p(thinned)
 
@@ -110,12 +111,12 @@ class ClassAcquisition(Acquisition):
     def compare(self, log_p: Float[Array, " classes"], log_q: Float[Array, " classes"]) -> Float[Array, "*values"]:
         """Return the value of a scan in nats.
 
-        - `log_p`: log p^(t), the classifier's result for D.
-        - `log_q`: log p^(t+1), the classifier's result for D with the scan.
+        - `log_p`: the classifier's log-probabilities before the scan.
+        - `log_q`: the classifier's log-probabilities once the scan is added to the cloud.
         """
 
     def score(self, context: Context, view: ImaginedView) -> Float[Array, "*values"]:
-        """Return the result of `compare` for D and D with the scan. An empty scan has the score zero."""
+        """Return the result of `compare` for the cloud without and with the scan; zero for an empty scan."""
         cloud, log_p = context
         return zero_if_empty(view.scan, self.compare(log_p, self._log_p(concatenate(cloud, view.scan))))
 
@@ -125,13 +126,13 @@ class ClassAcquisition(Acquisition):
         return self.classifier.batch_size
 
     def answer(self, cloud: PointCloud) -> "ClassAnswer":
-        """Return the probabilities of the classes given D."""
+        """Return the class probabilities, given the cloud, as an answer."""
         p = np.asarray(self.answer_values(cloud), np.float64)
         names = self.classifier.classes or tuple(f"class {index}" for index in range(len(p)))
         return ClassAnswer(tuple(names), p)
 
     def answer_values(self, cloud: PointCloud) -> Float[Array, " classes"]:
-        """Return the probabilities of the classes given D."""
+        """Return the class probabilities, given the cloud."""
         return jnp.exp(context_of(self, cloud)[1])
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> "ClassAnswer | None":
@@ -162,7 +163,8 @@ class ClassAcquisition(Acquisition):
 class CrossEntropy(ClassAcquisition):
     """Cross-entropy -sum_c p_c^(t) log p_c^(t+1) of the class probabilities before and after a scan.
 
-    This is the paper's alpha^(CE). p^(t) is given D, and p^(t+1) is given D with a simulated scan.
+    This is the paper's alpha^(CE). p^(t) are the probabilities given the cloud D, and p^(t+1) those given D with a
+    simulated scan.
 
     - `classifier`: a function from a cloud to log-probabilities.
     - `num_points`: number of points to which D is thinned by farthest point sampling, once for each proposal.
@@ -179,7 +181,7 @@ class CrossEntropy(ClassAcquisition):
 
 
 class EntropyReduction(ClassAcquisition):
-    """Reduction of the entropy of the class probabilities by a scan, max(0, H(p^(t)) - H(p^(t+1))).
+    """Reduction of the entropy H of the class probabilities by a scan, max(0, H(p^(t)) - H(p^(t+1))).
 
     This is the improvement of the paper's utility u_E(D) = sum_c p_c log p_c. For p^(t) and p^(t+1) see `CrossEntropy`.
 
@@ -200,8 +202,8 @@ class MixedEntropy(ClassAcquisition):
     """Cross-entropy while the class is uncertain, then reduction of entropy, as in the authors' code.
 
     - `classifier`, `num_points`: see `CrossEntropy`.
-    - `threshold`: entropy in nats. If the entropy of p^(t) is above it, the value is that of `CrossEntropy`, otherwise
-      that of `EntropyReduction`.
+    - `threshold`: entropy in nats. If the entropy before the scan is above it, the value is that of `CrossEntropy`,
+      otherwise that of `EntropyReduction`.
     """
 
     threshold: float = eqx.field(static=True, default=0.75)

@@ -33,17 +33,17 @@ def _many() -> int:
 
 
 class Coverage(Acquisition):
-    """Chamfer distance from a simulated scan to D, sum_{x in scan} min_{y in D} |x - y|^2.
+    """Chamfer distance from a simulated scan to the cloud D, sum_{x in scan} min_{y in D} |x - y|^2.
 
     This is the paper's alpha^(CD), in squared scene units.
     """
 
     def context(self, step: StepInputs) -> PointCloud:
-        """Return D."""
+        """Return the cloud D."""
         return step.observations.cloud
 
     def score(self, context: PointCloud, view: ImaginedView) -> Float[Array, ""]:
-        """Return the unidirectional Chamfer distance from the scan to D. It is zero for an empty scan."""
+        """Return the unidirectional Chamfer distance from the scan to D, which is zero for an empty scan."""
         return jnp.sum(jnp.where(view.scan.mask, nearest_squared_distance(view.scan.points, context), 0.0))
 
     @property
@@ -60,8 +60,8 @@ class Coverage(Acquisition):
 class Newness(eqx.Module):
     """Function that returns the newness of surface at a point, given the observations.
 
-    - `distances`: distance field to all hits of earlier views, or to D for observations without looks.
-    - `size`: see `NewSurface`.
+    - `distances`: distance field to all hits of earlier views, or to the cloud for observations without `Looks`.
+    - `size`: the length s of `NewSurface`, in scene units.
     """
 
     distances: Looks | DistanceField
@@ -106,7 +106,7 @@ class NewSurface(Acquisition):
         require(self.size is None or self.size > 0, f"the size is {self.size}; it must be positive, in scene units")
 
     def context(self, step: StepInputs) -> Newness:
-        """Return the newness function, from the looks of the observations or from D."""
+        """Return the newness function, from the `Looks` of the observations, or else from the cloud."""
         cloud, looks = step.observations.cloud, step.observations.looks
         if looks is not None and 2.0 * (self.size or 0.0) <= looks.reach:
             return Newness(looks, jnp.asarray(max(looks.grid.spacing, self.size or 0.0), cloud.points.dtype))
@@ -114,7 +114,7 @@ class NewSurface(Acquisition):
         return Newness(DistanceField.of(cloud, 2.0 * size), size)
 
     def score(self, context: Newness, view: ImaginedView) -> Float[Array, ""]:
-        """Return the new area in one scan. It is zero for an empty scan."""
+        """Return the new area in one scan, in squared scene units. It is zero for an empty scan."""
         return jnp.sum(pixel_area(view.scan, view.camera, view.pose, STEEP) * context(view.scan.points))
 
     @property

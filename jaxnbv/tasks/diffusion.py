@@ -2,9 +2,9 @@
 
     du/dt = Delta u + f,     (M + h L) u_{k+1} = M (u_k + h f)
 
-The Laplacian is that of Sharp and Crane (2020, "A Laplacian for Nonmanifold Triangle Meshes"), which is built on the
-tufted cover of the triangles. For point clouds, the triangles come from a local triangulation of each point's
-neighbours. No heat flows across open edges.
+u is the temperature, f the heating, and h the length of a time step. The matrices L and M of a `Laplacian` are those of
+Sharp and Crane (2020, "A Laplacian for Nonmanifold Triangle Meshes"), built on the tufted cover of the triangles. For
+point clouds, the triangles come from a local triangulation of each point's neighbours. No heat flows across open edges.
 """
 
 from collections.abc import Callable
@@ -86,7 +86,7 @@ class HeatProblem(eqx.Module):
 
 
 class Laplacian(NamedTuple):
-    """The weak Laplacian of n points: Delta u = -u @ weak / mass.
+    """The weak Laplacian of n points: Delta u = -u @ weak / mass for values u at the points.
 
     - `weak`: the matrix L, (n, n), symmetric and positive semidefinite. Its rows sum to zero, so heat is conserved.
     - `mass`: diagonal of the matrix M, which is the positive area of each point.
@@ -132,7 +132,10 @@ def cloud_laplacian(points: Float[np.ndarray, "n 3"]) -> Laplacian:
 
 
 def mesh_laplacian(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Laplacian:
-    """Return the Laplacian of triangles, manifold or not. Heat flows across shared vertices."""
+    """Return the Laplacian of a triangle mesh, which may be non-manifold.
+
+    Heat flows between triangles that share a vertex.
+    """
     return _assemble(lambda: optional("robust_laplacian").mesh_laplacian(vertices, faces), len(vertices))
 
 
@@ -164,13 +167,11 @@ def diffuse(
     duration: float,
     steps: int,
 ) -> Float[np.ndarray, " n"]:
-    """Return u after `duration`, by implicit Euler: (M + h L) u_{k+1} = M (u_k + h f).
+    """Return the temperature after `duration`, by implicit Euler: (M + h L) u_{k+1} = M (u_k + h f).
 
-    The matrix is factorised once. The method is stable for any step length h, and its error is of order h. The total
-    heat, mass @ u, grows by h mass @ f in each step.
-
-    - `initial`: temperature at the start, u_0.
-    - `heating`: f at each point.
+    L and M are the matrices of the Laplacian, u_k is the temperature and f the heating at each point, and the step
+    length is h = duration / steps. The matrix is factorised once. The method is stable for any h, and its error is of
+    order h. The total heat, mass @ u, grows by h mass @ f in each step.
     """
     step = duration / steps
     # The matrix is symmetric positive definite, so no pivoting is needed, and a fill-reducing order can be used.

@@ -33,15 +33,15 @@ _WORKER_ENVIRONMENT = {"JAX_PLATFORMS": "cpu", "OPENBLAS_NUM_THREADS": "1", "OMP
 class ColdestPoint(Utility):
     """Negative lowest temperature, u_H(D) = -min u^(T), a utility for `ExpectedUtilityImprovement`.
 
-    This is the paper's u_H. The heat equation is solved outside JAX, so there is no gradient. Use a search over
-    candidates, as in the paper. The values do not depend on the order of the points or the number of workers, not even
-    in the last bit.
+    This is the paper's u_H. u^(T) are the temperatures of the points of the cloud D after a time T of heating. The heat
+    equation is solved outside JAX, so there is no gradient. Use a search over candidates, as in the paper. The values
+    do not depend on the order of the points or the number of workers, not even in the last bit.
 
     - `heat`: a `HeatProblem`, or only the source (3,) in scene coordinates. The other values are then the authors'.
       Problems that differ only in the source share the same compiled program.
     - `reached_only`: take the minimum only over points that are connected to a heated point. The paper takes the
       minimum over all points. If D or a simulated scan has points that are not connected to the source, that minimum is
-      u0, and no view can improve it.
+      the initial temperature, and no view can improve it.
     - `workers`: number of processes that share the clouds, by default one for each core. With 1, the current process
       does the work.
 
@@ -68,10 +68,10 @@ class ColdestPoint(Utility):
         self.reached_only, self.workers = reached_only, workers
 
     def __call__(self, cloud: PointCloud) -> Float[Array, ""]:
-        """Return u_H of one cloud in degrees. Under `vmap`, all clouds are computed in one call.
+        """Return the negative lowest temperature of one cloud, in degrees.
 
-        If there is no point for the minimum, return the lower bound -(u0 + T max(0, power)). Any point then is an
-        improvement.
+        Under `vmap`, all clouds are computed in one call. If the minimum would be over no points, return the negative
+        of `HeatProblem.highest`, an upper bound of all temperatures. Any point then is an improvement.
         """
         source = jnp.asarray(self.heat.source, cloud.points.dtype)
         # The source may be traced, so it is passed as an array together with the cloud.

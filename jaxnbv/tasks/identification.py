@@ -31,11 +31,11 @@ _Image: TypeAlias = tuple[Float[Array, "..."], Float[Array, "..."], Bool[Array, 
 
 
 class ImaginedParts(eqx.Module):
-    """Context of the acquisition `Identify`.
+    """Context of the acquisition `Identify`: the hypotheses of a step, ready to be scanned.
 
     - `surfaces`: surfaces of the hypotheses, along a leading axis.
     - `weights`: probabilities of the hypotheses, which sum to one without "none of these".
-    - `classes`: class c of each hypothesis h, as one-hot rows.
+    - `classes`: for each hypothesis, the name or group of its part as a one-hot row.
     - `tau`: scale of the distance between a measured point and the surface, in scene units, see `part_evidence`.
     - `pose_weight`: weight of the information about the part's pose, or zero.
     """
@@ -54,16 +54,17 @@ class Identify(Acquisition):
         w_h' | z_h  proportional to  w_h' exp(-L(z_h, z_h'))
 
     The sum is over the hypotheses h of a model with known parts (`KnownShapes` with a bank at true size). A hypothesis
-    is a part with a pose, and w_h is its probability. c is the name of the part, and I(h | c) is the information about
-    h that c does not contain. z_h is the depth image of h from the pose theta. L is the misfit of two images, which the
-    probabilities of the hypotheses also use, see `part_evidence`. Every hypothesis is rendered once for each candidate,
-    and the images are compared in pairs. No posterior of the surface is needed. The name has the larger weight, because
-    a search that first determines the pose needs more views to find the name.
+    is a part with a pose, and w_h is its probability. c is the name of the part, H is entropy, and I(h | c) is the
+    information about h that c does not contain. z_h is the depth image of h from the pose theta, and w_h' | z_h is the
+    probability of h' after this image. L is the misfit of two images, which the probabilities of the hypotheses also
+    use, see `part_evidence`. Every hypothesis is rendered once for each candidate, and the images are compared in
+    pairs. No posterior of the surface is needed. The name has the larger weight, because a search that first determines
+    the pose needs more views to find the name.
 
     - `pose`: whether to include the information about the pose.
     - `group`: a class name for each part of the bank. Then c is the class, for example "left" or "right", instead of
-      the part, and the information about the pose is left out. An example is
-      `[name.split("-")[0] for name in bank.names]`.
+      the part, and the information about the pose is left out. An example is `[name.split("-")[0] for name in
+      bank.names]`.
 
     **Raises:** `ValueError` for a group that is not a list of names.
     """
@@ -152,7 +153,7 @@ def weights_by_name(
 
 
 def _image(surface: GridSurface, camera: Camera, poses: Pose, barrier: Float[Array, "poses rays"] | None) -> _Image:
-    """Render a part from each pose of a batch."""
+    """Render a part from each pose. The image has three values per ray, see `_Image`."""
     scans = scan(surface, camera, poses, barrier)
     offset = scans.points - poses.position[:, None]
     away = jnp.linalg.norm(offset, axis=-1)
@@ -161,7 +162,7 @@ def _image(surface: GridSurface, camera: Camera, poses: Pose, barrier: Float[Arr
 
 
 def _information(images: _Image, context: ImaginedParts, camera: Camera) -> Float[Array, ""]:
-    """Return alpha of one pose, given the images of all hypotheses from this pose."""
+    """Return the expected information of one pose, given the images of all hypotheses from this pose."""
     (reach, _, hits), weights = images, context.weights
     weight = weight_of(jnp.sum(jnp.where(hits, reach, 0.0)) / jnp.maximum(jnp.sum(hits), 1), camera)
 
@@ -180,10 +181,10 @@ def _information(images: _Image, context: ImaginedParts, camera: Camera) -> Floa
 
 
 def _misfits(image: _Image, others: _Image, tau: Float[Array, ""]) -> Float[Array, "h rays"]:
-    """Return, for each ray, the misfit between the image of one hypothesis and the images of all hypotheses.
+    """Return each ray's misfit between the image of one hypothesis and the images of all hypotheses.
 
-    The misfit grows with the distance between the surfaces. It is `MOST`, the bound C of `part_evidence`, if the ray
-    hits only one of the two surfaces.
+    The misfit grows with the distance between the surfaces. It is the upper bound `MOST` if the ray hits only one of
+    the two surfaces.
     """
     (reach, _, hits), (expected, cosine, are_expected) = image, others
     both = hits & are_expected

@@ -1,9 +1,9 @@
 """Semantic parts: have all parts of the object been found?
 
-A segmenter is any function p = segmenter(cloud) from a `PointCloud` (masked rows) to an array (points, parts). p_ic is
-the probability that point i belongs to part c. Rows without a point contain zeros. The array has fewer rows than the
-cloud if the segmenter thins the cloud. `jaxnbv.networks.CloudSegmenter` wraps a network, and `HostSegmenter` wraps a
-function that runs outside JAX. A `Segmenter` may also name its parts.
+A segmenter is any function p = segmenter(cloud) from a `PointCloud` to an array (points, parts). p_ic is the
+probability that point i belongs to part c. Rows without a point (the cloud's mask is False) contain zeros. The array
+has fewer rows than the cloud if the segmenter thins the cloud. `jaxnbv.networks.CloudSegmenter` wraps a network, and
+`HostSegmenter` wraps a function that runs outside JAX. A `Segmenter` may also name its parts.
 """
 
 import dataclasses
@@ -32,12 +32,12 @@ class Segmenter(eqx.Module):
 
     Subclasses must define only `__call__`.
 
-    - `part_names`: dictionary from the index of a part to its name, for all parts to find; None for no names.
+    - `part_names`: names of the parts to find, keyed by the index of the part; None if parts have no names.
     """
 
     @abstractmethod
     def __call__(self, cloud: PointCloud) -> Float[Array, "points parts"]:
-        """Return the probabilities p for one cloud (masked rows), with zeros in rows without a point."""
+        """Return the part probabilities of each point of one cloud, and zeros in rows whose mask is False."""
 
     @property
     def part_names(self) -> Mapping[int, str] | None:
@@ -77,8 +77,9 @@ else:
 class SoftPartCount(Utility):
     """Soft number of detected parts, u_S(D) = sum_c tanh(sum_i p_ic / N_target).
 
-    This is the paper's u_S, a utility for `ExpectedUtilityImprovement`. The term of a part saturates once D has many
-    more than N_target points of this part. Therefore the utility improves most with views that show new parts.
+    This is the paper's u_S, a utility for `ExpectedUtilityImprovement`. p_ic is the probability that point i of the
+    cloud D belongs to part c. The term of a part saturates once D has many more than N_target points of this part.
+    Therefore the utility improves most with views that show new parts.
 
     - `segmenter`: a `Segmenter`, or a function from a cloud to part probabilities of each point.
     - `target`: N_target, a number of points after the segmenter's own thinning. The default is the authors' value.
@@ -92,7 +93,7 @@ class SoftPartCount(Utility):
         require(self.target > 0, f"N_target is {self.target}; it must be positive")
 
     def __call__(self, cloud: PointCloud) -> Float[Array, ""]:
-        """Return u_S(D), which is between zero and the number of parts."""
+        """Return the soft number of detected parts, which is between zero and the number of parts."""
         return jnp.sum(jnp.tanh(jnp.sum(_probabilities(self.segmenter, cloud), axis=0) / self.target))
 
     def check(self, cloud: PointCloud) -> None:
@@ -155,7 +156,7 @@ class PartAnswer(Answer):
     """Number of points that are predicted for each part.
 
     - `parts`: indices of the parts to show.
-    - `target`: N_target of `SoftPartCount`.
+    - `target`: number of points from which a part counts as found.
     """
 
     form: str = "{:.0f}"
@@ -174,9 +175,11 @@ def _counts(segmenter: Segmenter, cloud: PointCloud) -> Int[Array, " parts"]:
 
 
 def part_counts(p: Float[Array, "points parts"]) -> Int[Array, " parts"]:
-    """Return the number of points predicted for each part, N_c = sum_i 1[argmax_c' p_ic' = c].
+    """Return the number of points for which each part has the highest probability.
 
     Rows of zeros do not count.
+
+    - `p`: part probabilities of each point.
     """
     predicted = jax.nn.one_hot(jnp.argmax(p, axis=1), p.shape[1], dtype=jnp.int32)
     return jnp.sum(jnp.where(jnp.any(p > 0, axis=1)[:, None], predicted, 0), axis=0)
