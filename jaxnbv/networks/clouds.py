@@ -19,9 +19,9 @@ from jaxnbv.tasks.segmentation import Segmenter
 class CloudClassifier(Classifier):
     """A classifier made from a network. It maps a `PointCloud` to log-probabilities.
 
-    - `network`: called as `network(points, normals, mask)`.
+    - `network`: called as `network(points, normals, mask)`. It returns log-probabilities of the classes.
     - `num_points`: number of points that the network gets, selected by farthest point sampling. A smaller cloud is
-      padded with masked rows.
+      padded with rows whose mask is False.
     - `scale`: network units per scene unit.
     - `classes`: names of the classes, or None. By default the names that the network has, if any.
 
@@ -62,7 +62,7 @@ class CloudSegmenter(Segmenter):
       of ShapeNet-part.
     - `category`: category of the object, given as its name or as its index in `CATEGORIES`.
     - `num_points`: number of points that the network gets, selected by farthest point sampling. A smaller cloud is
-      padded with masked rows.
+      padded with rows whose mask is False.
     - `scale`: network units per scene unit.
 
     **Raises:** `ValueError` for an unknown category, if `num_points` or `scale` is not positive, or if the network
@@ -104,15 +104,18 @@ class CloudSegmenter(Segmenter):
         return dict(zip(category.labels, category.parts, strict=True))
 
     def __call__(self, cloud: PointCloud) -> Float[Array, "num_points parts"]:
-        """Compute p(part) at the network's input points.
+        """Compute the part probabilities at the points that the network gets, see `num_points`.
 
-        These are the network's probabilities, conditioned on the parts of the category. They are zero for parts of
-        other categories and in masked rows.
+        The network's probabilities are conditioned on the parts of the category. They are zero for parts of other
+        categories and in rows whose mask is False.
         """
         return self._probabilities(farthest_point_subsample(cloud, self.num_points))
 
     def predict(self, cloud: PointCloud) -> tuple[PointCloud, Int[Array, " num_points"]]:
-        """Return the network's input points in scene coordinates, and the most likely part of each."""
+        """Return the points that the network gets, in scene coordinates, and the most likely part of each.
+
+        The part is -1 in rows whose mask is False.
+        """
         inputs = farthest_point_subsample(cloud, self.num_points)
         labels = jnp.argmax(self._probabilities(inputs), axis=-1).astype(jnp.int32)
         return inputs, jnp.where(inputs.mask, labels, -1)

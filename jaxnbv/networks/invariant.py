@@ -19,9 +19,10 @@ _CENTERS, _CHOSEN = 384, 320
 class PairLevel(eqx.Module):
     """One level of grouping: a perceptron on features of pairs and neighbours, then a maximum.
 
-    The maximum is over the neighbours in the group of a centre. The features of a pair of oriented points are
-    (|d|^2, n_i . d, n_j . d, n_i . n_j) with d = (x_j - x_i) / radius. These are the point-pair features of Drost et
-    al. (2010) without the square root and the arc cosines, so derivatives exist everywhere.
+    The maximum is over the neighbours in the group of a centre. The features of a centre with position x_i and normal
+    n_i and a neighbour with x_j and n_j are (|d|^2, n_i . d, n_j . d, n_i . n_j) with d = (x_j - x_i) / radius. These
+    are the point-pair features of Drost et al. (2010) without the square root and the arc cosines, so derivatives exist
+    everywhere.
 
     - `radius`: radius of a group, in the units of the points.
     - `groups`: intended number of centres, which the caller chooses.
@@ -53,7 +54,7 @@ class PairLevel(eqx.Module):
         """Compute the features of each centre.
 
         - `centers`: positions and normals of the centres.
-        - `neighbourhood`: points, normals and features of all rows.
+        - `neighbourhood`: points, normals and features of all rows. Rows whose `mask` is False are ignored.
         """
         points, normals, features = neighbourhood
         index = ball_query(centers[0], points, mask, self.radius, self.neighbours)
@@ -95,7 +96,7 @@ class Focus(eqx.Module):
     def __call__(
         self, points: Float[Array, "n 3"], normals: Float[Array, "n 3"], mask: Bool[Array, " n"]
     ) -> Float[Array, " n"]:
-        """Compute the log-odds that each point is on the cue. The values of masked rows have no meaning."""
+        """Compute the log-odds that each point is on the cue. They mean nothing in rows whose mask is False."""
         edges = self.edge((points, normals), (points, normals, None), mask)
         order = farthest_point_indices(points, mask, self.around.groups)
         around = self.around((points[order], normals[order]), (points, normals, edges), mask)
@@ -106,7 +107,7 @@ class Focus(eqx.Module):
     def select(
         self, points: Float[Array, "n 3"], normals: Float[Array, "n 3"], mask: Bool[Array, " n"]
     ) -> tuple[Float[Array, "few 3"], Float[Array, "few 3"], Bool[Array, " few"]]:
-        """Select the first 320 points with a probability above 0.5 to be on the cue.
+        """Select the first 320 points that are on the cue with a probability above 0.5.
 
         Returns the points, their normals and their mask. If the points are in farthest point order, the selected points
         are farthest point samples of the cue.
@@ -179,7 +180,10 @@ class InvariantClassifier(eqx.Module):
     def __call__(
         self, points: Float[Array, "n 3"], normals: Float[Array, "n 3"], mask: Bool[Array, " n"] | None = None
     ) -> Float[Array, " classes"]:
-        """Compute the log-probabilities of the classes. Normals must have length one. Masked rows are ignored."""
+        """Compute the log-probabilities of the classes. Rows whose mask is False are ignored.
+
+        - `normals`: normals of length one.
+        """
         mask = jnp.ones(len(points), bool) if mask is None else mask
         if self.focus is not None:
             points, normals, mask = self.focus.select(points, normals, mask)

@@ -1,10 +1,11 @@
 """The layers of PointNet++ (Qi et al. 2017).
 
-Set abstraction maps points with features to fewer points,
+Set abstraction maps points x_j with features f_j to features g_i of fewer points, the centres c_i,
 
     g_i = max over j in the ball of c_i of MLP(x_j - c_i, f_j),   c_i by farthest point sampling,
 
-with one MLP per radius. The outputs of these MLPs are concatenated. Feature propagation maps back to more points,
+with one MLP per radius. The outputs of these MLPs are concatenated. Feature propagation interpolates the features f_j
+of coarse points y_j at more points x,
 
     f(x) = sum_j w_j f_j / sum_j w_j,   w_j = 1 / (|x - y_j|^2 + 1e-8),   over the three nearest y_j.
 
@@ -28,7 +29,7 @@ _SOFTENING = 1e-8
 
 
 def product(x: Float[Array, "*rows inputs"], weight: Float[Array, "inputs outputs"]) -> Float[Array, "*rows outputs"]:
-    """Return x W in full precision, computed as one matrix product for all rows."""
+    """Return x @ weight in full precision, computed as one matrix product for all rows."""
     flat = jnp.matmul(x.reshape(-1, x.shape[-1]), weight, precision="highest")
     return flat.reshape(*x.shape[:-1], weight.shape[1])
 
@@ -49,7 +50,7 @@ class Linear(eqx.Module):
 
 
 class PooledMLP(eqx.Module):
-    """PointNet: the same perceptron for all members of a group, then the maximum over the group.
+    """A PointNet: the same perceptron for all members of a group, then the maximum over the group.
 
     - `layers`: two or more layers, each followed by a rectifier. The first three inputs of the first layer are
       coordinates.
@@ -58,12 +59,15 @@ class PooledMLP(eqx.Module):
     layers: tuple[Linear, ...]
 
     def lift(self, points: Float[Array, "n 3"], features: Float[Array, "n inputs"] | None) -> Float[Array, "n outputs"]:
-        """Return [x, f] W of the first layer, without bias. Computed once, as it is the same for all groups."""
+        """Apply the first layer without its bias to points and features. Do this once for all groups."""
         inputs = points if features is None else jnp.concatenate([points, features], axis=-1)
         return product(inputs, self.layers[0].weight)
 
     def pool(self, lifted: Float[Array, "*groups members inputs"]) -> Float[Array, "*groups outputs"]:
-        """Apply everything after `lift`: first bias and rectifier, the other layers, maximum over the members."""
+        """Apply everything after `lift`: the first bias and rectifier, the other layers, and the maximum.
+
+        - `lifted`: results of `lift` for the members of each group.
+        """
         hidden = jax.nn.relu(lifted + self.layers[0].bias)
         for layer in self.layers[1:-1]:
             hidden = jax.nn.relu(layer(hidden))
@@ -89,7 +93,7 @@ class SetAbstraction(eqx.Module):
     def __call__(
         self, points: Float[Array, "n 3"], features: Float[Array, "n inputs"] | None, mask: Bool[Array, " n"]
     ) -> tuple[Float[Array, "centers 3"], Float[Array, "centers outputs"]]:
-        """Return the centres and the features around each. Centres repeat if the cloud has fewer points."""
+        """Return the centres and the features of each. Centres repeat if there are fewer points than centres."""
         centers = points[farthest_point_indices(points, mask, self.centers)]
         outputs = []
         for branch, radius, members in zip(self.branches, self.radii, self.members, strict=True):
@@ -116,7 +120,7 @@ class FeaturePropagation(eqx.Module):
         own: Float[Array, "n inputs"],
         features: Float[Array, "m f"],
     ) -> Float[Array, "n outputs"]:
-        """Compute new features of the points, given their own features and the features of the coarse points."""
+        """Compute new features of the points from their own features and those of the coarse points."""
         first = self.layers[0]
         # Interpolation is linear, so compute the first product at the coarse points. There are fewer coarse points.
         lifted = interpolate(points, coarse, product(features, first.weight[own.shape[1] :]))

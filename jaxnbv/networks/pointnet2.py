@@ -35,7 +35,10 @@ PARTS_SCALES = SINGLE_SCALE, (Level(512, (0.1, 0.2, 0.4), (32, 64, 128)), Level(
 def _filled(
     points: Float[Array, "n 3"], normals: Float[Array, "n 3"], mask: Bool[Array, " n"] | None
 ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Bool[Array, " n"]]:
-    """Return points and normals with zeros in masked rows, and the mask."""
+    """Return points and normals with zeros in rows whose mask is False, and the mask.
+
+    **Raises:** `ValueError` if points and normals are not both (n, 3), or there are no rows.
+    """
     require(
         points.ndim == 2 and points.shape[1] == 3 and points.shape[0] > 0 and normals.shape == points.shape,
         f"points and normals must both be (n, 3) with n > 0, got {points.shape} and {normals.shape}: "
@@ -48,7 +51,7 @@ def _filled(
 def _down(network: Any, rows: Any, mask: Bool[Array, " n"]) -> tuple[list[Any], Float[Array, " outputs"]]:
     """Compute the centres and features of each level of a network, and the features of the whole cloud.
 
-    - `rows`: points and their features.
+    - `rows`: points and their features, or None for no features.
     """
     levels = []
     for level in network.levels:
@@ -67,7 +70,7 @@ class PointNet2Classifier(eqx.Module):
     points.
 
     - `levels`: the set abstractions.
-    - `whole`: the PointNet over the last level's centres, coordinates and features.
+    - `whole`: the PointNet over the coordinates and features of the last level's centres.
     - `hidden`: layers of the perceptron, each followed by a rectifier.
     - `last`: last layer of the perceptron, with one output for each class.
     """
@@ -85,11 +88,11 @@ class PointNet2Classifier(eqx.Module):
     def __call__(
         self, points: Float[Array, "n 3"], normals: Float[Array, "n 3"], mask: Bool[Array, " n"] | None = None
     ) -> Float[Array, " classes"]:
-        """Compute log p(class) of one cloud. All rows are points if `mask` is None.
+        """Compute the log-probabilities of the classes for one cloud. Without a mask, all rows are points.
 
-        Masked rows do not affect the result. The order of the other rows does: the first row is the first centre, and a
-        ball with too many points keeps only its first rows. A cloud without points is treated as one point at the
-        origin.
+        Rows whose mask is False do not affect the result. The order of the other rows does: the first row is the first
+        centre, and a ball with too many points keeps only its first rows. A cloud without points is treated as one
+        point at the origin.
 
         **Raises:** `ValueError` if points and normals are not both (n, 3), or there are no rows.
         """
@@ -109,7 +112,7 @@ class PointNet2PartSegmenter(eqx.Module):
     neighbours of points.
 
     - `levels`: the set abstractions.
-    - `whole`: the PointNet over the last level's centres, coordinates and features.
+    - `whole`: the PointNet over the coordinates and features of the last level's centres.
     - `propagations`: the feature propagations, the coarsest level first.
     - `hidden`: first layer of the perceptron, followed by a rectifier.
     - `last`: last layer of the perceptron, with one output for each part.
@@ -140,9 +143,9 @@ class PointNet2PartSegmenter(eqx.Module):
         category: int | Int[AnyArray, ""],
         mask: Bool[Array, " n"] | None = None,
     ) -> Float[Array, "n parts"]:
-        """Compute log p(part) at each point, over the parts of all categories.
+        """Compute the log-probabilities of the parts of all categories, at each point.
 
-        Masked rows do not affect the other rows, and the values of masked rows have no meaning. The order of the other
+        Rows whose mask is False do not affect the other rows, and have values without a meaning. The order of the other
         rows affects the result: the first row is the first centre, and a ball with too many points keeps only its first
         rows.
 

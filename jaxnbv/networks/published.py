@@ -1,4 +1,4 @@
-"""Makes networks from the tensors of the widely used PyTorch code of PointNet++. The names of the tensors are:
+"""Makes networks from tensors of the widely used PyTorch code of PointNet++. The tensors' names are:
 
     sa1, sa2     mlp_convs.<layer>, mlp_bns.<layer>              one radius
                  conv_blocks.<radius>.<layer>, bn_blocks. ...    several radii
@@ -8,8 +8,9 @@
     conv1, bn1, conv2                                            its perceptron
 
 The shapes of the tensors determine the channels, layers, classes, parts and the use of normals. The radii are the
-published ones, for networks with one radius per level or with several. Batch normalisation is merged into the weights,
-W' = W g / sqrt(v + eps), b' = (b - m) g / sqrt(v + eps) + h, with scale g, shift h, running mean m, running variance v.
+published ones, for networks with one radius per level or with several. Batch normalisation is merged into the weights W
+and the bias b of a layer: W' = W g / sqrt(v + eps), b' = (b - m) g / sqrt(v + eps) + h, with the scale g, the shift h,
+the running mean m and the running variance v of the normalisation, and eps = 1e-5.
 """
 
 from collections.abc import Mapping, Sequence
@@ -69,10 +70,11 @@ def _part_segmenter(state: "_State") -> PointNet2PartSegmenter:
 def _encoder(
     state: "_State", scales: tuple[tuple[Level, ...], tuple[Level, ...]], kinds: dict[int, str]
 ) -> tuple[tuple[SetAbstraction, ...], PooledMLP, list[int]]:
-    """Make the set abstractions and the PointNet over all points, and return the numbers of features too.
+    """Make the set abstractions and the PointNet over all points, and count features.
 
-    The numbers of features are those of the points, then of each level.
+    Also return the number of features of the points, then of each level.
 
+    - `scales`: sizes of the levels for networks with one radius per level, and with several.
     - `kinds`: allowed numbers of inputs, and the meaning of each.
     """
     multi = "sa1.conv_blocks.0.0.weight" in state.tensors
@@ -97,9 +99,9 @@ class _State:
         self.left = set(self.tensors)
 
     def take(self, name: str, *shape: int | None) -> np.ndarray:
-        """Return a tensor as float64, after a check of its shape.
+        """Check the shape of a tensor, and return the tensor as float64.
 
-        The shape must be `shape`, where None is any length, possibly followed by 1s.
+        - `shape`: required shape, where None is any length. The tensor may have further axes of length 1.
         """
         require(name in self.tensors, f"the tensor {name} is missing")
         actual = self.tensors[name].shape

@@ -39,7 +39,7 @@ _TYPES = {
 }
 _STREAM_MAGIC = 0x1950A86A20F9469CFC6C
 _STATE_NAMES = ("model_state_dict", "state_dict")
-# Loads a storage, given its key, type and number of entries.
+# Function that loads a storage (the numbers of a tensor), given its key, type and number of entries.
 _Load = Callable[[str, str, int], np.ndarray]
 
 
@@ -127,7 +127,7 @@ def _read_stream(file: BufferedIOBase, size: int) -> Any:
 
 
 def _unpickled(file: BytesIO | mmap.mmap, size: int, load: _Load) -> Any:
-    """Load the object in the next pickle of a file."""
+    """Load the object in the next pickle of a file. `load`: function that loads a storage."""
     start = file.tell()
     skip_pickle(file, size)
     end = file.tell()
@@ -136,7 +136,7 @@ def _unpickled(file: BytesIO | mmap.mmap, size: int, load: _Load) -> Any:
 
 
 class _Tensors(pickle.Unpickler):
-    """Python's own unpickler, restricted to the names of tensors and dictionaries."""
+    """Unpickler that only creates tensors and dictionaries, and puts a `_Nothing` for everything else."""
 
     def __init__(self, file: BytesIO, load: _Load):
         super().__init__(file)
@@ -144,7 +144,7 @@ class _Tensors(pickle.Unpickler):
         self._items = len(file.getbuffer())
 
     def find_class(self, module: str, name: str) -> Any:
-        """Return the replacement for a name in the pickle."""
+        """Return the object that stands for a global name in the pickle. Nothing is imported."""
         if module in ("torch", "torch.cuda") and name in _TYPES:
             return _TYPES[name]
         if (module, name) == ("collections", "OrderedDict"):
@@ -184,7 +184,7 @@ class _Nothing:
 
 
 def _tensor(storage: np.ndarray, offset: int, shape: tuple[int, ...], strides: tuple[int, ...], *_: Any) -> np.ndarray:
-    """Return a view of a storage. NumPy raises an error for a view beyond the end of the storage."""
+    """Return a tensor as a view of a storage. NumPy raises an error for a view beyond the storage's end."""
     size = storage.itemsize
     tensor = np.ndarray(shape, storage.dtype, storage, offset * size, tuple(stride * size for stride in strides))
     require(tensor.size <= storage.size, f"stretches {storage.size} numbers to a tensor of shape {shape}: save a copy")
