@@ -31,7 +31,7 @@ KnownOption = Annotated[
 
 
 def by_task(of: Callable[[type[Task]], T]) -> dict[T, str]:
-    """Group the names of tasks by the value of a function: maps each value to the names joined by "/"."""
+    """Group tasks by the value of a function. Returns their names, joined by "/", keyed by the value."""
     names: dict[T, list[str]] = {}
     for name, task in TASKS.items():
         names.setdefault(of(task), []).append(name)

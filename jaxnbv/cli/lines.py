@@ -31,12 +31,12 @@ class Lines:
 
 
 def _print(line: str) -> None:
-    """Print above the progress bar."""
+    """Print a line above the progress bar."""
     tqdm.write(line, file=sys.stdout)
 
 
 def _why(planner: Planner, view: View) -> str:
-    """Return the value of the chosen view and the rank of this value among the candidates, as text."""
+    """Return why a view was chosen, as text: its value, and the rank of this value among the candidates."""
     if view.proposal is None:
         return "given"
     value, values = float(view.proposal.value), np.asarray(view.proposal.values, np.float64)

@@ -25,7 +25,7 @@ planning = partial(typer.Option, rich_help_panel="Planner")
 
 
 def listed(choices: Iterable[tuple[str, str]]) -> str:
-    """Join names and their meanings to one sentence for the help."""
+    """Join names and their meanings to one sentence, "name: meaning; ...", for the help."""
     return "; ".join(f"{name}: {about}" for name, about in choices) + "."
 
 
@@ -72,7 +72,7 @@ def command(options: type[T], more: Mapping[str, Any] = {}) -> Callable[[Callabl
 class Command(TyperCommand):
     """A command that reads `--option A B` as `--option A --option B` if the option's metavar ends in dots.
 
-    So the option also takes a pattern of files, which a shell expands to several words.
+    An option can then be given a pattern of files, which a shell expands to several words.
     """
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:

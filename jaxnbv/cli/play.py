@@ -47,7 +47,7 @@ class Sizes(NamedTuple):
 
     - `samples`: number of posterior samples.
     - `candidates`: number of candidates, or None for the number in the sensor's setting.
-    - `capacity`: number of points to keep in D.
+    - `capacity`: number of points to keep in the cloud.
     - `grid`: grid of the samples, or None for the grid of the task.
     - `rays`: number of rays along each side of an image, or None for the sensor's own numbers.
     """
@@ -98,8 +98,9 @@ def search_of(name: str, radius: float, count: int) -> Search:
 
 
 def imagined(model: str, quick: bool, known: str | ShapeBank | None) -> SurfaceSampler:
-    """Make the sampler of the model with this name, one of `MODELS`, with a bank of known shapes if given.
+    """Make the sampler of imagined surfaces, with a bank of known shapes if given.
 
+    - `model`: name of the model, one of `MODELS`.
     - `known`: name of a shipped bank, a folder of upright meshes, or a bank of parts in any rotation. None or "none"
       for no bank.
 
@@ -122,7 +123,7 @@ def imagined(model: str, quick: bool, known: str | ShapeBank | None) -> SurfaceS
 def planner_of(
     setting: Setting, acquisition: Acquisition, search: str, sampler: SurfaceSampler, sizes: Sizes
 ) -> Planner:
-    """Make the planner of a task."""
+    """Make the planner of a task, with the search of this name (one of `SEARCHES`)."""
     grid = sizes.grid or sampler.grid
     sampler = dataclasses.replace(sampler, grid=grid, num_samples=sizes.samples)
     searcher = search_of(search, setting.radius, sizes.candidates or setting.num_candidates)
@@ -141,9 +142,12 @@ def first_pose(place: Position, surface: Surface) -> Pose:
 
 
 def play(options: EpisodeOptions, subject: Subject, setting: Setting, sizes: Sizes, until: Sequence[str] = ()) -> None:
-    """Simulate an episode into a folder, print each view when it is finished, and write the report.
+    """Simulate an episode, print each view when it is finished, and write the episode and a report.
 
-    - `until`: default of `--until`. If it is not empty, the baseline farthest view also runs from the same first view.
+    - `subject`: the object, the acquisition and the first pose.
+    - `setting`: the camera, and the distance and number of candidates.
+    - `until`: texts of stop rules, the default of `--until`. If there are any, the baseline farthest view runs from the
+      same first view for comparison.
     """
     began = time.perf_counter()
     if options.quick:

@@ -63,6 +63,6 @@ STOPS = {
 
 
 def resolve(text: str) -> Any:
-    """Import the object that a text "module:name" names."""
+    """Import and return the object that a text "module:name" names."""
     module, _, name = text.partition(":")
     return getattr(importlib.import_module(module), name)

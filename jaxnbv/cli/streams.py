@@ -57,7 +57,7 @@ def write_readable() -> None:
 
 @contextmanager
 def each_warning_once() -> Iterator[None]:
-    """Context manager: print each warning once, and at the end the numbers of repeated warnings.
+    """Context manager: print each warning once, and at its end how often each repeated warning occurred.
 
     Python's own filter is not enough: whenever a library changes the filters, Python forgets which warnings it printed.
     """

@@ -39,9 +39,9 @@ class ClassTask(Task):
 
     @classmethod
     def demo(cls, scene: int, seed: int) -> Subject:
-        """Return a truck, whose class is its cargo, and a first view from above that does not show the cargo.
+        """Return a truck, and a first view from above that does not show the truck's cargo.
 
-        The grid is the one on which surfaces were sampled for the training of the classifier.
+        The class to find is that of the cargo. Surfaces are imagined on the grid that was used to train the classifier.
         """
         import jax
         import numpy as np
