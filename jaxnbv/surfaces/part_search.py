@@ -124,7 +124,7 @@ def _apart(hypotheses: Hypotheses, count: int) -> Hypotheses:
 
 
 def _starts(bank: ShapeBank, prior: Prior, targets: FitTargets, num_starts: int) -> Placement:
-    """Return start placements of each shape (axis 0): rotations, each at a few positions (axis 1).
+    """Return start placements (axis 1) of each shape (axis 0): rotations, each at a few positions.
 
     At each position the bounding box of the shape contains the scan, if the box is large enough. The first position of
     a rotation centres the scan across the line of sight, and puts it on the shape's front. The other positions are

@@ -96,8 +96,8 @@ class Hypotheses(eqx.Module):
     - `placement`: placement of each shape.
     - `misfit`: how badly each placed shape fits the scan. It is E (see `surfaces/registration.py`), or for parts it may
       be L (see `surfaces/part_evidence.py`).
-    - `is_mode`: False for a hypothesis that nearly repeats a better hypothesis of the same shape. For `register`, their
-      rotations then differ by less than 15 degrees. For `search_parts`, they have the same surface.
+    - `is_mode`: False for a hypothesis that nearly repeats a better hypothesis of the same shape. For `register`, the
+      rotations of the two differ by less than 15 degrees. For `search_parts`, the two have the same surface.
     """
 
     shape: Int[Array, "*h"]
@@ -195,10 +195,10 @@ def _turned(bank: ShapeBank, prior: Prior, targets: FitTargets, num_starts: int)
 
 
 def _exchanged(bank: ShapeBank, prior: Prior, first: Hypotheses, targets: FitTargets) -> Hypotheses:
-    """Compute the misfit of each shape in the placements of a few of the best hypotheses.
+    """Compute the misfit of each shape in the placements of some good hypotheses of different rotation.
 
-    The rotations of these hypotheses differ by more than 15 degrees. Each shape takes the rotation of the hypothesis,
-    and is shifted and scaled like the hypothesis from the placement that fills the box.
+    Each shape takes the rotation of the hypothesis. Its shift and scale, relative to the placement that fills the box,
+    are also those of the hypothesis.
     """
     ordered = first.best(len(first.misfit))
     mode = _modes(jnp.zeros_like(ordered.shape), ordered.placement.rotation)

@@ -52,8 +52,8 @@ class Registration(NamedTuple):
 
     - `matrix`: the motion from the scan to the mesh.
     - `median`: median distance of the scan's points from the mesh, after this motion.
-    - `rival`: distance between the mesh placed by `matrix` and the mesh placed by a different motion that fits nearly as
-      well: a mean over the mesh, the largest over such motions. It is 0 if none of them is clearly different.
+    - `rival`: distance between the mesh placed by `matrix` and the mesh placed by a motion that fits nearly as well:
+      a mean over the mesh, the largest over such motions. It is 0 if none of them is clearly different.
     """
 
     matrix: Float[np.ndarray, "4 4"]

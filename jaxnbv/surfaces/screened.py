@@ -53,9 +53,9 @@ class ScreenedSPSR(SurfaceModel):
       lengthscale for the overall shape, which lets values affect f far from their points.
     - `values`: sources of values, see `jaxnbv.surfaces.values`.
     - `level_deviation`: prior standard deviation of the level, which is broad compared with the values of f.
-    - `offset`: distance from the data, to both sides, at which h is measured, in scene units. The unit h of values is
-      half the median rise of f across the surface: of E f(x_j + offset n_j) - E f(x_j - offset n_j), given the normals
-      alone. h is at least half the prior standard deviation of f, because the two sides of a thin sheet cancel.
+    - `offset`: distance from the points x_j, to both sides, over which the rise of f across the surface is measured, in
+      scene units. The unit h of values is half the median of E f(x_j + offset n_j) - E f(x_j - offset n_j), given the
+      normals alone, but at least half the prior standard deviation of f, because the two sides of a thin sheet cancel.
 
     N normals and M values take 3 N^2 M + M^3 operations in addition to the cost of `base`.
 

@@ -205,6 +205,6 @@ def _on_filled_rows(cloud: PointCloud, leading: Callable[[int], Float[Array, "*o
 
 
 def _of_columns(function: Callable[[Array], Array], blocks: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
-    """Apply a function of a matrix's columns to the columns of all blocks in a single call."""
+    """Apply a function that maps the columns of a matrix to the columns of all blocks, in a single call."""
     columns = jnp.moveaxis(blocks, 0, 1)
     return jnp.moveaxis(function(columns.reshape(len(columns), -1)).reshape(columns.shape), 1, 0)

@@ -154,7 +154,7 @@ class NonuniformTransform(eqx.Module):
         return self._interpolate(jnp.moveaxis(values, 0, -1))
 
     def adjoint(self, values: Float[Array, "n k"]) -> Float[Array, "k a a a"]:
-        """Apply the transpose of `evaluate`: the sum over j of values_j phi_a(x_j1) phi_b(x_j2) phi_c(x_j3)."""
+        """Apply `evaluate` transposed: sum over points j of values_j phi_a(x_j1) phi_b(x_j2) phi_c(x_j3)."""
         basis = self._node_basis(values.dtype)
         spread = self._spread(values, basis.shape[0])
         return evaluate_on_grid(jnp.moveaxis(spread, -1, 0), basis.T)

@@ -136,7 +136,7 @@ class OutsideBoundary(ValueSource):
 
 
 class OnSurface(ValueSource):
-    """Value zero of f minus its level at points of the cloud: "screening" (Kazhdan and Hoppe 2013).
+    """Values of zero for f minus its level at points of the cloud: "screening" (Kazhdan and Hoppe 2013).
 
     - `num_points`: number of points, chosen by farthest point sampling. If the cloud has fewer points, all are used.
     - `noise`: standard deviation of the values, in units of h, half the rise of f across the surface.
