@@ -70,11 +70,11 @@ class Words:
         return f"{capital(' and '.join(self.answer.names[index] for index in self.shown))}?"
 
     def value(self, answer: Answer, index: int) -> str:
-        """Return the number of an answer with this index, as text."""
+        """Return number `index` of an answer as text."""
         return answer.form.format(answer.values[index])
 
     def said(self, before: Answer | None = None) -> str:
-        """Return each shown number as text. Given the answer `before` this one, add its value there."""
+        """Return the shown numbers as text, with their values in the answer `before` this one if given."""
 
         def one(index: int) -> str:
             was = "" if before is None else f" (was {self.value(before, index)})"
@@ -144,7 +144,7 @@ class _ClassWords(Words):
     def settled(self, answers: Sequence[Answer], holds: Holds) -> list[bool]:
         """Return, for each view, whether the rule `Sure` held.
 
-        A view does not count if the rule also held after the previous view, but for a different class.
+        The result is also False if the rule held after the previous view for a different class.
         """
         sure = [holds(self.rule, index) for index in range(len(answers))]
         best = [int(np.argmax(answer.values)) for answer in answers]
@@ -168,7 +168,7 @@ class _IdentityWords(_ClassWords):
     settled_means = f"probability {least} or more"
 
     def settled(self, answers: Sequence[Answer], holds: Holds) -> list[bool]:
-        """Return the same as `_ClassWords.settled`, for the rule that a probability is at least `least`."""
+        """Return the same as `_ClassWords.settled`, for the rule that the highest probability reaches `least`."""
         return super().settled(answers, lambda _, index: bool(answers[index].values.max() >= self.least))
 
     def charts(self, answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...]:
@@ -274,7 +274,7 @@ class _CoverageWords(Words):
 
 
 def label_of(quantity: Quantity, frame: Frame = Frame()) -> str:  # noqa: B008
-    """Return a quantity's name, with its unit in the world of a frame in parentheses."""
+    """Return a quantity's name with its unit in world units, such as "expected new area (m²)"."""
     unit = quantity.unit_in(frame)
     return f"{quantity.name} ({unit})" if unit else quantity.name
 

@@ -26,8 +26,8 @@ _BELOW: dict[str, Any] = {"loc": "outside lower center", "frameon": False, "font
 def shown_names(chart: Chart) -> dict[int, int]:
     """Return the indices of the numbers to draw, each with the number of other lines that its line hides.
 
-    A line that nearly coincides with a drawn line is hidden. At most six lines are drawn: those with the largest
-    values, where the true values count too.
+    A line that nearly coincides with a drawn line is hidden. At most six lines are drawn: those whose largest value, or
+    true value, is highest.
     """
     reached = chart.values.max(axis=0)
     reached = reached if chart.true is None else np.maximum(reached, chart.true)
@@ -47,7 +47,7 @@ def shown_names(chart: Chart) -> dict[int, int]:
 def draw_chart(axes: Axes, chart: Chart, rival: Chart | None = None, rival_name: str = "") -> list[Line2D]:
     """Draw the numbers and their true values as lines over the views, and return the entries of a legend.
 
-    - `rival`: chart of a different search. Only its line of the true name is drawn, or its only line.
+    - `rival`: chart of a different search. One of its lines is drawn: that of the true name, or the only one.
     - `rival_name`: name of this search in the legend.
     """
     views, is_one = np.arange(1, len(chart.values) + 1), len(chart.names) == 1
@@ -89,7 +89,7 @@ def over_views(axes: Axes, count: int) -> None:
 
 
 def draw_values(axes: Axes, data: ReportData) -> list[Line2D]:
-    """Draw the chosen views' values with errors, and the median candidates. Return entries of a legend."""
+    """Draw values of chosen views with standard errors, and of median candidates. Return legend entries."""
     for view, shown in enumerate(data.views, start=1):
         if shown.proposal is None:
             axes.annotate("given", (view, 0), (0, 4), textcoords="offset points", ha="center", color=GREY, fontsize=8)
@@ -111,14 +111,14 @@ def draw_values(axes: Axes, data: ReportData) -> list[Line2D]:
 
 
 def task_charts(data: ReportData) -> list[tuple[str, Figure]]:
-    """Draw the charts of the task, and return the title and figure of each."""
+    """Return the charts of the task with their titles."""
     task, size = data.task, _LARGE if len(data.task.charts) == 1 else _SMALL
     others = [None] * len(task.charts) if task.rival is None else task.rival.charts
     return [_drawn(data, chart, other, size) for chart, other in zip(task.charts, others, strict=True)]
 
 
 def other_charts(data: ReportData) -> list[tuple[str, Figure]]:
-    """Draw the surface seen (unless it is the task) and the chosen views' values; return titles, figures."""
+    """Return charts with titles: surface seen (unless that is the task), and values of the chosen views."""
     task, charts = data.task, []
     if not task.is_coverage:
         charts.append(_drawn(data, task.seen, None if task.rival is None else task.rival.seen, _LARGE))

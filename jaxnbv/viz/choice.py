@@ -62,8 +62,7 @@ def marks(*proposals: Proposal) -> list[str]:
 def draw_choice(figure: Figure, proposal: Proposal | None, quantity: Quantity, frame: Frame) -> None:
     """Draw a map of the candidates, and below it the candidates by value over a colour bar.
 
-    A given view has no proposal. Then only the grid of the map is drawn.
-
+    - `proposal`: None for a given view. Then only the grid of the map is drawn.
     - `frame`: frame of the world. The values are in its units.
     """
     colours = draw_acquisition(figure.add_axes((0.06, 0.4, 0.88, 0.58)), proposal, quantity)
@@ -81,7 +80,7 @@ def draw_choice(figure: Figure, proposal: Proposal | None, quantity: Quantity, f
 
 
 def draw_candidates(axes: Axes, proposal: Proposal) -> None:
-    """Draw value and standard error of each candidate in a row, and the chosen pose's value above (star)."""
+    """Draw each candidate's value and standard error in its own row, below a star for the chosen pose."""
     best = best_first(proposal)
     order = np.argsort(-open_values(proposal))[: len(best)]
     rows = -np.arange(len(best))

@@ -37,7 +37,7 @@ class ViewData(eqx.Module):
     - `view`: the view, with the values of its proposal in world units.
     - `before`: points of the cloud before the view, in scene coordinates.
     - `surface`: the surface after the view: the likeliest known shape, or else the pieces of the posterior mean's
-      surface near points. None if the grid holds no surface. The deviation is in world units, and larger far from
+      surface near points. None if the grid holds no surface. Its deviation (world units) grows with the distance from
       points.
     - `seen`: amount of surface seen after the view.
     - `told`: sentences about the view, keyed by heading.

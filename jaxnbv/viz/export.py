@@ -82,7 +82,7 @@ class Region(NamedTuple):
 def missing_regions(episode: Episode, smallest: float = 0.0) -> list[Region]:
     """Return the connected parts of the expected surface that no view measured, the largest first.
 
-    Surface near an obstacle, on which the object may stand, cannot be measured, and does not count as missing.
+    Surface near an obstacle, such as the table under the object, cannot be measured, and does not count as missing.
 
     - `smallest`: area that a region must exceed, in squared world units.
 

@@ -157,7 +157,7 @@ class LiveView:
 def _surfaces(
     sampler: SurfaceSampler, observations: Observations, key: PRNGKeyArray
 ) -> tuple[MeanSurface | None, list[tuple[str, Triangles]], Kinds]:
-    """Return the surface to show, some imagined surfaces by name, and the kinds of known shapes.
+    """Return the surface to show, some imagined surfaces with names, and the kinds of known shapes.
 
     With known parts, the imagined surfaces are the likeliest parts.
     """

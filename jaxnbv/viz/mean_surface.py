@@ -33,7 +33,7 @@ class MeanSurface(eqx.Module):
 
     - `normals`: outward unit normal at each vertex.
     - `deviation`: standard deviation of the surface's position along its normal, in scene units. To first order, this
-      is the deviation of f divided by the slope of its mean, sd f(x) / |grad E f(x)|.
+      is sd f(x) / |grad E f(x)|, where f is the posterior's function.
     """
 
     vertices: Float[np.ndarray, "v 3"]
@@ -122,7 +122,7 @@ def _spread(features: np.ndarray, count: int) -> np.ndarray:
 
 
 def _interpolate(features: np.ndarray, anchors: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Interpolate positive values from anchors to all rows: a weighted mean of logarithms at near anchors."""
+    """Interpolate positive values from anchor rows to all rows, as a weighted mean of their logarithms."""
     distance, near = cKDTree(features[anchors]).query(features, k=min(8, len(anchors)))
     width = 0.5 * distance[:, -1:] + 1e-12
     weight = np.exp(-0.5 * (distance / width) ** 2) + 1e-12

@@ -76,7 +76,7 @@ class _Fits(NamedTuple):
 
     @classmethod
     def of(cls, bank: ShapeBank, placed: Hypotheses, weights: Float[np.ndarray, " h"], rows: list[int]) -> "_Fits":
-        """Select these rows of `placed`, whose weights are `weights`, and normalise the weights."""
+        """Select the shapes in these rows, and normalise their weights, which are in the order of the rows."""
         chosen = np.asarray(rows)
         return cls(bank, jax.tree.map(lambda leaf: leaf[chosen], placed), weights / max(weights.sum(), 1e-30))
 
@@ -219,7 +219,7 @@ def _measured(surface: MeanSurface, cloud: PointCloud) -> Float[np.ndarray, " v"
 
 
 def _pieces(values: Float[np.ndarray, "g g g"], grid: Grid, smallest: float) -> MeanSurface | None:
-    """Return the zero set of grid values, only pieces with at least this area; None if there are none."""
+    """Return the pieces of the zero set of grid values with at least this area; None if there are none."""
     triangles = level_triangles(values, grid)
     if triangles is None:
         return None

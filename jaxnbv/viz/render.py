@@ -116,7 +116,7 @@ class Still:
         colours: Float[np.ndarray, "hits 4"],
         depth: Float[np.ndarray, " hits"],
     ) -> tuple[Bool[np.ndarray, " rays"], Float[np.ndarray, "all 4"], Float[np.ndarray, " all"]]:
-        """Blend a translucent surface, which hides no points, into the results of `_traced`, and return all."""
+        """Blend a translucent surface into results of `_traced`, and return the new ones. It hides no points."""
         is_ghost, over, ghost_depth = self._traced(ghost, None)
         under, front = np.zeros((len(mask), 4)), np.zeros((len(mask), 4))
         deep, near = np.full(len(mask), np.inf), np.full(len(mask), np.inf)
@@ -209,6 +209,7 @@ def draw_scene(
 
     The likeliest part is named at the bottom.
 
+    - `still`: picture of the surface, see `painted`.
     - `weight`: factor for the sizes of lines, dots and letters.
     - `inset`: whether the emptiest corner shows what the last view saw.
     - `aspect`: width divided by height.

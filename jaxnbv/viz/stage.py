@@ -70,6 +70,8 @@ def _shown(
     """Return, for each viewing direction in `eyes`, the fraction of points that it shows.
 
     The points are those of the chosen views. They must face the viewer and not be hidden by the surface.
+
+    - `clear`: distance in front of a point at which the ray to the viewer starts.
     """
     first, *chosen = (view.scan.to_numpy() for view in episode.views)
     scans = [scan for scan in chosen if len(scan[0])] or [first]

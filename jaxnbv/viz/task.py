@@ -152,7 +152,7 @@ def true_cloud(scene: Surface, count: int) -> PointCloud | None:
 
 
 def settled_after(episode: Episode, answers: Sequence[Answer]) -> list[bool]:
-    """Return, for each view, whether the answer after it is reliable. Rules get the same keys as in a run."""
+    """Return, for each view, whether its answer is reliable. Stop rules get the episode's random keys."""
 
     def holds(rule: Sure, index: int) -> bool:
         key, *_ = view_keys(episode.key, index + 1)

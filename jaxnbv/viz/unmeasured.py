@@ -30,7 +30,7 @@ class Patch(NamedTuple):
 def unmeasured(surface: trimesh.Trimesh, observations: Observations, carving: Carving | None) -> list[Patch]:
     """Return patches of a surface that at least two views looked at but did not measure.
 
-    At most three patches are returned, the largest first. Cuts by the carving volume do not count.
+    At most three are returned, the largest first. Planes where the carving volume cuts the surface do not count.
 
     - `surface`: an estimate from the observations, such as the posterior's mean, in scene coordinates.
     """
