@@ -180,10 +180,7 @@ class InvariantClassifier(eqx.Module):
     def __call__(
         self, points: Float[Array, "n 3"], normals: Float[Array, "n 3"], mask: Bool[Array, " n"] | None = None
     ) -> Float[Array, " classes"]:
-        """Compute the log-probabilities of the classes. Rows whose mask is False are ignored.
-
-        - `normals`: normals of length one.
-        """
+        """Compute class log-probabilities. Normals have unit length. Rows whose mask is False are ignored."""
         mask = jnp.ones(len(points), bool) if mask is None else mask
         if self.focus is not None:
             points, normals, mask = self.focus.select(points, normals, mask)

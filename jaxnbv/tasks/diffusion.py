@@ -69,7 +69,7 @@ class HeatProblem(eqx.Module):
 
     @property
     def highest(self) -> float:
-        """Upper bound of the temperature by the maximum principle, u0 + T max(0, power)."""
+        """Upper bound of the temperature by the maximum principle, initial + duration * max(0, power)."""
         return self.initial + self.duration * max(0.0, self.power)
 
     def heating(self, points: Float[np.ndarray, "n 3"], areas: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
@@ -97,7 +97,7 @@ class Laplacian(NamedTuple):
 
 
 class Temperature(NamedTuple):
-    """The solution of a `HeatProblem` at time T.
+    """The solution of a `HeatProblem` after its duration.
 
     - `values`: temperature u of each point, in degrees.
     - `reached`: mask of the points that are connected to a heated point. All others keep the initial temperature.
@@ -132,10 +132,7 @@ def cloud_laplacian(points: Float[np.ndarray, "n 3"]) -> Laplacian:
 
 
 def mesh_laplacian(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Laplacian:
-    """Return the Laplacian of a triangle mesh, which may be non-manifold.
-
-    Heat flows between triangles that share a vertex.
-    """
+    """Return the Laplacian of a mesh, even a non-manifold one. Heat flows across shared vertices."""
     return _assemble(lambda: optional("robust_laplacian").mesh_laplacian(vertices, faces), len(vertices))
 
 

@@ -21,8 +21,8 @@ from jaxnbv.tasks.segmentation import Segmenter
 class HostClassifier(Classifier):
     """A classifier that runs outside JAX, for example a PyTorch model. Gradient searches cannot use it.
 
-    - `function`: function that returns the log-probabilities (b, num_classes) of b clouds, given their points (b, n,
-      3), unit normals (b, n, 3) and mask (b, n) as NumPy arrays. b is at most 128.
+    - `function`: function that returns the log-probabilities (b, num_classes) of b clouds, given their points
+      (b, n, 3), unit normals (b, n, 3) and mask (b, n) as NumPy arrays. b is at most 128.
     - `num_classes`: number of classes.
     - `version`: a text or number, such as "2026-11", that you change whenever the function changes. A stored run needs
       a version unless the function's source code and all variables that it reads can be described. The weights of a

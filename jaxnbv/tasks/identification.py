@@ -62,9 +62,8 @@ class Identify(Acquisition):
     the pose needs more views to find the name.
 
     - `pose`: whether to include the information about the pose.
-    - `group`: a class name for each part of the bank. Then c is the class, for example "left" or "right", instead of
-      the part, and the information about the pose is left out. An example is `[name.split("-")[0] for name in
-      bank.names]`.
+    - `group`: a class name for each part of the bank, such as `[name.split("-")[0] for name in bank.names]`. Then c is
+      the class, for example "left" or "right", instead of the part, and the information about the pose is left out.
 
     **Raises:** `ValueError` for a group that is not a list of names.
     """

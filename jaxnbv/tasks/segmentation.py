@@ -177,9 +177,7 @@ def _counts(segmenter: Segmenter, cloud: PointCloud) -> Int[Array, " parts"]:
 def part_counts(p: Float[Array, "points parts"]) -> Int[Array, " parts"]:
     """Return the number of points for which each part has the highest probability.
 
-    Rows of zeros do not count.
-
-    - `p`: part probabilities of each point.
+    Rows of zeros in the part probabilities `p` do not count.
     """
     predicted = jax.nn.one_hot(jnp.argmax(p, axis=1), p.shape[1], dtype=jnp.int32)
     return jnp.sum(jnp.where(jnp.any(p > 0, axis=1)[:, None], predicted, 0), axis=0)
