@@ -146,8 +146,9 @@ def play(options: EpisodeOptions, subject: Subject, setting: Setting, sizes: Siz
 
     - `subject`: the object, the acquisition and the first pose.
     - `setting`: the camera, and the distance and number of candidates.
-    - `until`: texts of stop rules, the default of `--until`. If there are any, the baseline farthest view runs from the
-      same first view for comparison.
+    - `sizes`: sizes of the planner, unless `--quick` replaces them.
+    - `until`: texts of stop rules, the default of `--until`. If there are any, the baseline farthest view also runs
+      from the same first view for comparison.
     """
     began = time.perf_counter()
     if options.quick:

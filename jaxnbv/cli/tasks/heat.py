@@ -62,7 +62,7 @@ def _heated_at(source: "Float[np.ndarray, '3']") -> "Acquisition":
 
 
 def _source(place: Position | None, mesh: "TriangleMesh", camera: "Camera", first: "Pose") -> "Float[np.ndarray, '3']":
-    """Return the object's point nearest to `place`, or the point in the middle of the first view."""
+    """Return the object's point nearest to `place`, or else the point in the middle of the first view."""
     import jax
     import numpy as np
 
