@@ -98,7 +98,7 @@ class SetAbstraction(eqx.Module):
         outputs = []
         for branch, radius, members in zip(self.branches, self.radii, self.members, strict=True):
             index = ball_query(centers, points, mask, radius, members)
-            # [x_j - c_i, f_j] W = [x_j, f_j] W - c_i W_x
+            # [x_j - c_i, f_j] W = [x_j, f_j] W - c_i W_x, where W_x are the rows of W for the coordinates.
             at_center = product(centers, branch.layers[0].weight[:3])
             outputs.append(branch.pool(branch.lift(points, features)[index] - at_center[:, None]))
         return centers, jnp.concatenate(outputs, axis=-1)
