@@ -86,17 +86,21 @@ def _saturated(record: Record, method: str) -> dict[int, float]:
 
 
 def _measures(estimate: str) -> tuple[Measure, ...]:
-    def measure(name: str, title: str, of: Callable, unit: str) -> Measure:
-        return Measure(f"{name}, {estimate}", f"{title}: {ESTIMATES[estimate]}", of, unit=unit, less=True)
+    def measure(name: str, title: str, compute: Callable, unit: str) -> Measure:
+        return Measure(
+            f"{name}, {estimate}", f"{title}: {ESTIMATES[estimate]}", compute, unit=unit, lower_is_better=True
+        )
 
-    def of(quantity: str, record: Record, method: str) -> list[float]:
+    def estimate_values(quantity: str, record: Record, method: str) -> list[float]:
         return record["methods"][method]["estimates"][estimate][quantity]
 
     def error(record: Record, method: str) -> Float[np.ndarray, " views"]:
-        return np.abs(np.array(of("temperatures", record, method)) - record["truth"]["temperature"])
+        return np.abs(np.array(estimate_values("temperatures", record, method)) - record["truth"]["temperature"])
 
     return (
-        measure("distance", "Distance to the coldest points", functools.partial(of, "distances"), "scene units"),
+        measure(
+            "distance", "Distance to the coldest points", functools.partial(estimate_values, "distances"), "scene units"
+        ),
         measure("error", "Error of the lowest temperature", error, "degrees"),
     )
 
@@ -128,7 +132,7 @@ class HeatStudy(Study):
     measures: ClassVar[tuple[Measure, ...]] = (
         *_measures("all"),
         *_measures("reached"),
-        Measure("saturated", "Saturated steps", _saturated, unit="%", less=True),
+        Measure("saturated", "Saturated steps", _saturated, unit="%", lower_is_better=True),
         SECONDS,
     )
     claims: ClassVar[tuple[Claim, ...]] = (

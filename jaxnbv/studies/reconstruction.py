@@ -40,11 +40,11 @@ _DENSE = 200_000
 
 
 def _distances(name: str, title: str) -> Measure:
-    def of(record: Record, method: str) -> dict[str, float | None]:
+    def compute(record: Record, method: str) -> dict[str, float | None]:
         surfaces = record["methods"][method]["reconstructions"]
         return {way: None if distances is None else distances[name] for way, distances in surfaces.items()}
 
-    return Measure(name, title, of, "reconstruction", "scene units", less=True)
+    return Measure(name, title, compute, "reconstruction", "scene units", lower_is_better=True)
 
 
 class ReconstructionStudy(Study):

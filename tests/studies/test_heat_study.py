@@ -149,7 +149,7 @@ def test_measures_are_of_the_estimates():
         },
     }
     record = {"truth": {"temperature": 0.1}, "methods": {"heat": run, "random": run}}
-    of = {measure.name: measure.of for measure in HeatStudy.measures}
+    of = {measure.name: measure.compute for measure in HeatStudy.measures}
     assert of["distance, all"](record, "heat") == [1.0, 0.4]
     assert of["distance, reached"](record, "heat") == pytest.approx([0.9, 0.3])
     # An error counts in either direction.

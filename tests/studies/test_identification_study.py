@@ -195,8 +195,8 @@ def test_a_record_is_json_and_holds_what_is_measured(record):
     assert list(record["methods"]) == list(RUN)
     for method in RUN:
         for measure in IdentificationStudy.measures:
-            values = measure.of(record, method)
-            if measure.by == "view":
+            values = measure.compute(record, method)
+            if measure.key_name == "view":
                 assert len(values) == 2
                 assert all(0 <= value <= 1 for value in values)
         run = record["methods"][method]

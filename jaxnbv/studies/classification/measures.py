@@ -44,11 +44,11 @@ def _hit(by_view: Callable) -> Callable[[Record, str], Float[np.ndarray, " views
     - `by_view`: `first_hits` or `stable_hits`.
     """
 
-    def of(record: Record, method: str) -> Float[np.ndarray, " views"]:
+    def compute(record: Record, method: str) -> Float[np.ndarray, " views"]:
         guesses = np.argmax(record["methods"][method]["log_p"], axis=-1)
         return by_view(guesses == record["label"]).mean(axis=0)
 
-    return of
+    return compute
 
 
 def _seen(record: Record, method: str) -> Float[np.ndarray, " views"] | list:
@@ -104,7 +104,7 @@ MEASURES = (
     Measure("stable", "Stable hit", _hit(stable_hits), unit="%"),
     Measure("seen", "Cue seen", _seen, unit="%"),
     Measure("rank_correlation", "Rank correlation", lambda r, m: r["methods"][m]["rank_correlation"], digits=2),
-    Measure("roughness", "Roughness", lambda r, m: r["methods"][m]["roughness"], digits=2, less=True),
+    Measure("roughness", "Roughness", lambda r, m: r["methods"][m]["roughness"], digits=2, lower_is_better=True),
     Measure("value", "Expected cross-entropy", _value, unit="nats"),
     SECONDS,
 )

@@ -68,7 +68,7 @@ def chart(table: pd.DataFrame, study: type[Study]) -> bytes:
             _draw(axes, rows[rows["quantity"] == measure.name], measure, rows["method"].unique().tolist())
             # The label does not say what the percentage is of, because the title does.
             unit = f"%, mean of {scenes} scenes" if measure.unit == "%" else measure.unit
-            axes.set(title=measure.title, xlabel=measure.by, ylabel=unit)
+            axes.set(title=measure.title, xlabel=measure.key_name, ylabel=unit)
         for axes in panels[len(shown) :]:
             axes.axis("off")
         lines = {line.get_label(): line for axes in panels for line in axes.containers}

@@ -16,21 +16,21 @@ class Measure(NamedTuple):
     """One quantity of a study, shown as a table and as a panel of the chart.
 
     - `name`: name in files; `title`: name in tables and charts.
-    - `of`: function that takes the record of a scene and the name of a method, and returns the method's values: either
-      a sequence, one per view from the first view on, or a mapping from keys. An undefined value is None or NaN.
-    - `by`: name of the keys, such as "view".
+    - `compute`: function that takes the record of a scene and the name of a method, and returns the method's values:
+      either a sequence, one per view from the first view on, or a mapping from keys. An undefined value is None or NaN.
+    - `key_name`: name of the keys, such as "view".
     - `unit`: unit of the values; "%" for fractions in [0, 1], which are shown in percent.
     - `digits`: decimal places in tables.
-    - `less`: True if lower values are better.
+    - `lower_is_better`: True if lower values are better.
     """
 
     name: str
     title: str
-    of: Callable[[Record, str], Sequence[float | None] | Float[np.ndarray, " views"] | Mapping[Any, float | None]]
-    by: str = "view"
+    compute: Callable[[Record, str], Sequence[float | None] | Float[np.ndarray, " views"] | Mapping[Any, float | None]]
+    key_name: str = "view"
     unit: str = ""
     digits: int = 3
-    less: bool = False
+    lower_is_better: bool = False
 
 
 class Claim(NamedTuple):
@@ -58,4 +58,6 @@ def _seconds(record: Record, method: str) -> dict[str, float]:
     return {"median": float(np.median(seconds))} if seconds else {}
 
 
-SECONDS = Measure("seconds", "Time of a proposal", _seconds, by="step", unit="seconds", digits=1, less=True)
+SECONDS = Measure(
+    "seconds", "Time of a proposal", _seconds, key_name="step", unit="seconds", digits=1, lower_is_better=True
+)

@@ -33,9 +33,9 @@ def results(records: Sequence[Record], study: type[Study]) -> pd.DataFrame:
     for record in records:
         for measure in study.measures:
             for method in record["methods"]:
-                values = measure.of(record, method)
+                values = measure.compute(record, method)
                 by_key = values if isinstance(values, Mapping) else dict(enumerate(values, start=1))
-                labels = record["scene"], study.group(record), measure.name, measure.by, method
+                labels = record["scene"], study.group(record), measure.name, measure.key_name, method
                 rows += [(*labels, at, value) for at, value in by_key.items()]
     every = pd.DataFrame(rows, columns=["scene", "group", "quantity", "by", "method", "at", "value"])
     every["value"] = every["value"].astype(float)
@@ -88,17 +88,20 @@ def tables(table: pd.DataFrame, study: type[Study], group: str = _ALL) -> list[t
     for measure in study.measures:
         part = table[(table["group"] == group) & (table["quantity"] == measure.name)]
         unit = f" ({measure.unit})" if measure.unit else ""
-        others = part[(part["method"] != study.reference) & ~((measure.by == "view") & (part["at"] == 1))]
+        others = part[(part["method"] != study.reference) & ~((measure.key_name == "view") & (part["at"] == 1))]
         others = others.dropna(subset="lead")
-        best = part.groupby("at", sort=False)["mean"].transform("min" if measure.less else "max") == part["mean"]
+        best = (
+            part.groupby("at", sort=False)["mean"].transform("min" if measure.lower_is_better else "max")
+            == part["mean"]
+        )
         for title, rows, cells in (
-            (f"{measure.title}{unit}, by {measure.by}", part, _means(part, measure, best)),
+            (f"{measure.title}{unit}, by {measure.key_name}", part, _means(part, measure, best)),
             (f"{measure.title}{unit}: {study.reference} minus another method", others, _leads(others, measure)),
         ):
             if len(rows):
                 pivoted = rows.assign(text=cells).pivot(index="method", columns="at", values="text")
                 ordered = pivoted.reindex(index=rows["method"].unique(), columns=rows["at"].unique()).fillna("-")
-                texts.append((title, ordered.rename_axis(index=None, columns=measure.by)))
+                texts.append((title, ordered.rename_axis(index=None, columns=measure.key_name)))
     return texts
 
 
@@ -177,7 +180,7 @@ def verdicts(table: pd.DataFrame, study: type[Study]) -> list[Verdict]:
         by_place: dict[str, list[str]] = {place: [] for place in _WHERE}
         for row, text in zip(rows.itertuples(), _leads(rows, measure), strict=True):
             level = row.lead_low <= 0 <= row.lead_high
-            better = (row.lead < 0) == measure.less
+            better = (row.lead < 0) == measure.lower_is_better
             by_place[_WHERE[1 if level else 0 if better else 2]].append(f"{row.method} ({text.rstrip('* ')})")
         if len(rows):
             num_held = sum(len(by_place[place]) for place in _WHERE[: 1 if claim.must_be_better else 2])

@@ -147,7 +147,7 @@ class PartDiscoveryStudy(Study):
     pictured: ClassVar[tuple[str, ...]] = ("discrete", "gradient-2dof", "farthest", "uncertainty")
     reference: ClassVar[str] = "discrete"
     measures: ClassVar[tuple[Measure, ...]] = (
-        Measure("time", "Views until all parts are found", _times, "N_target", "views", digits=2, less=True),
+        Measure("time", "Views until all parts are found", _times, "N_target", "views", digits=2, lower_is_better=True),
         Measure("found", "Objects whose parts were all found", _found, "N_target", "%"),
         Measure("found_by_view", f"All parts found, N_target = {TARGET}", _found_by_view, unit="%"),
     )

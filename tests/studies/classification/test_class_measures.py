@@ -47,7 +47,7 @@ def made(method, log_p, pixels):
 def measured(record, name):
     (measure,) = (one for one in PyramidStudy.measures if one.name == name)
     (method,) = record["methods"]
-    return measure.of(record, method)
+    return measure.compute(record, method)
 
 
 def test_measures_of_a_hand_made_record():

@@ -96,7 +96,7 @@ def test_tables_show_shares_errors_and_leads():
 
 
 def test_less_can_be_better():
-    less = measuring(POINTS._replace(less=True))
+    less = measuring(POINTS._replace(lower_is_better=True))
     cells = dict(tables(results(RECORDS, less), less))["Points, by view"]
     assert [cells.loc[method, 3].endswith("*") for method in ("farthest", "random")] == [False, True]
 
@@ -134,7 +134,7 @@ def test_a_claim_holds_where_the_interval_lies_on_its_side():
     data are left out."""
     said = measuring(
         Measure("right", "Right", lambda record, method: [], unit="%"),
-        Measure("away", "Away", lambda record, method: [], less=True, digits=1),
+        Measure("away", "Away", lambda record, method: [], lower_is_better=True, digits=1),
         claims=(
             Claim("More are right.", "right", 2, ("a", "b", "c", "absent")),
             Claim("As near.", "away", 2, ("a", "b", "c"), must_be_better=False),

@@ -27,12 +27,12 @@ TIMES = {"discrete": [[1, 2, 2, 3, 3], [1, 1, 1, 1, 1]], "farthest": [[2, 3, 4, 
 def test_discovery_times_by_hand():
     for method, times in TIMES.items():
         for record, expected in zip(RECORDS, times, strict=True):
-            assert TIME.of(record, method) == dict(zip(TARGETS, expected, strict=True))
+            assert TIME.compute(record, method) == dict(zip(TARGETS, expected, strict=True))
 
 
 def test_the_share_by_view_is_of_the_middle_target():
-    assert [BY_VIEW.of(record, "discrete") for record in RECORDS] == [[0, 1, 1], [1, 1, 1]]
-    assert [BY_VIEW.of(record, "farthest") for record in RECORDS] == [[0, 0, 0], [0, 0, 1]]
+    assert [BY_VIEW.compute(record, "discrete") for record in RECORDS] == [[0, 1, 1], [1, 1, 1]]
+    assert [BY_VIEW.compute(record, "farthest") for record in RECORDS] == [[0, 0, 0], [0, 0, 1]]
 
 
 @given(st.lists(st.lists(st.integers(0, 130), min_size=3, max_size=3), min_size=1, max_size=6), st.integers(1, 120))
