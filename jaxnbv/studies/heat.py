@@ -26,7 +26,7 @@ from jaxnbv.studies.engine.measures import SECONDS, Claim, Measure, Record
 from jaxnbv.studies.engine.run import replay
 from jaxnbv.studies.engine.searches import BASELINES
 from jaxnbv.studies.engine.study import Scene, Study
-from jaxnbv.studies.engine.tiles import Tiles, caption_tile, draw_on, opposite_direction, still_of
+from jaxnbv.studies.engine.tiles import ScenePicture, caption_tile, draw_on, opposite_direction, render_mesh
 from jaxnbv.studies.scenes import heat_scene
 from jaxnbv.studies.sensors import HEAT_SETTING
 from jaxnbv.tasks import ColdestPoint, Coverage, body_temperature
@@ -225,32 +225,34 @@ class HeatStudy(Study):
                 into["distances"].append(float(tree.query(points[coldest])[0]))
         return {"reached": shares, "estimates": estimates}
 
-    def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
+    def scene_picture(self, record: Record, methods: Sequence[str], pixels: int) -> ScenePicture:
         """Return images of the cloud's visible points, coloured by temperature, over the object in grey.
 
         Markers show the object's coldest point and the coldest point of the cloud.
         """
         scene, runs = self.scene(record["scene"]), record["methods"]
         truth, heat = self.truth(scene), heat_problem(scene)
-        still = still_of(truth.mesh, opposite_direction(record), pixels)
+        rendering = render_mesh(truth.mesh, opposite_direction(record), pixels)
         colours = ScalarMappable(Normalize(0.0, float(truth.temperatures.max())), _HEAT)
-        clouds = {method: [after.cloud for _, after in replay(self, scene, runs[method])] for method in methods}
+        clouds = {
+            method: [observations.cloud for _, observations in replay(self, scene, runs[method])] for method in methods
+        }
 
         def draw_truth(axes: Axes) -> None:
-            draw_on(axes, still, truth.points, colours.to_rgba(truth.temperatures))
-            _mark(axes, still, np.asarray(heat.source, np.float64), "heat source")
-            _mark(axes, still, truth.coldest, "coldest point of the object")
+            draw_on(axes, rendering, truth.points, colours.to_rgba(truth.temperatures))
+            _mark(axes, rendering, np.asarray(heat.source, np.float64), "heat source")
+            _mark(axes, rendering, truth.coldest, "coldest point of the object")
 
         def tile(axes: Axes, method: str, view: int) -> None:
             points, temperature = body_temperature(clouds[method][view], heat)
-            draw_on(axes, still, points, colours.to_rgba(temperature.values))
+            draw_on(axes, rendering, points, colours.to_rgba(temperature.values))
             estimate = runs[method]["estimates"]["all"]
-            _mark(axes, still, truth.coldest, "coldest point of the object")
-            _mark(axes, still, np.array(estimate["points"][view]), "coldest point of the cloud")
+            _mark(axes, rendering, truth.coldest, "coldest point of the object")
+            _mark(axes, rendering, np.array(estimate["points"][view]), "coldest point of the cloud")
             caption_tile(axes, f"{estimate['distances'][view]:.2f}")
 
         caption = "Scanned points, coloured by the temperature simulated on them. Beneath: error of the estimate."
-        return Tiles(caption, tile, draw_truth, marks=_MARKS, scale=(colours, "temperature (degrees)"))
+        return ScenePicture(caption, tile, draw_truth, marks=_MARKS, scale=(colours, "temperature (degrees)"))
 
 
 def heat_problem(scene: Scene) -> HeatProblem:
@@ -258,8 +260,8 @@ def heat_problem(scene: Scene) -> HeatProblem:
     return HeatProblem(np.asarray(scene.task))
 
 
-def _mark(axes: Axes, still: Still, point: Float[np.ndarray, "3"], name: str) -> None:
+def _mark(axes: Axes, rendering: Still, point: Float[np.ndarray, "3"], name: str) -> None:
     """Draw the marker `name` at a point. The marker is hollow if the object hides the point."""
-    pixels, in_front = still.project(point[None])
+    pixels, in_front = rendering.project(point[None])
     look = _MARKS[name] if in_front[0] else _MARKS[name] | {"mfc": "white", "mec": _MARKS[name]["color"]}
     axes.plot(pixels[0, 0], pixels[0, 1], zorder=6, **look)

@@ -32,7 +32,7 @@ from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.search import Search, SphereCandidates
 from jaxnbv.studies.engine.measures import KNOWN, SECONDS, Claim, Measure, Record
 from jaxnbv.studies.engine.study import Scene, Study
-from jaxnbv.studies.engine.tiles import Tiles, caption_tile, opposite_direction, still_of
+from jaxnbv.studies.engine.tiles import ScenePicture, caption_tile, opposite_direction, render_mesh
 from jaxnbv.studies.scenes.framing import Setup
 from jaxnbv.studies.scenes.placed_parts import PlacedPart, confusable_parts, parts_in, place_part
 from jaxnbv.surfaces.part_hypotheses import NONE, PartHypotheses
@@ -251,7 +251,7 @@ class IdentificationStudy(Study):
             "most_likely": {"part": part, "rotation": rotation.tolist(), "shift": shift.tolist()},
         }
 
-    def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
+    def scene_picture(self, record: Record, methods: Sequence[str], pixels: int) -> ScenePicture:
         """Return images of the most likely part after each view, in its most likely pose.
 
         The part is coloured by its distance to the true part.
@@ -264,12 +264,12 @@ class IdentificationStudy(Study):
             run = runs[method]
             at = run["most_likely"][view]
             mesh = task.placed(at["part"], np.asarray(at["rotation"]), np.asarray(at["shift"]))
-            axes.imshow(still_of(mesh, eye, pixels, lambda points: tree.query(points)[0], _ERRORS).image)
-            caption_tile(axes, f"{run['named'][view]}, {run['p_true'][view]:.2f}", right=run["right"][view] == 1)
+            axes.imshow(render_mesh(mesh, eye, pixels, lambda points: tree.query(points)[0], _ERRORS).image)
+            caption_tile(axes, f"{run['named'][view]}, {run['p_true'][view]:.2f}", is_correct=run["right"][view] == 1)
 
         scale = ScalarMappable(_ERRORS, DEVIATION), "distance to the true part\n(scene units)"
         caption = "The likeliest part as placed, its name, and the probability of the true name."
-        return Tiles(caption, tile, lambda axes: axes.imshow(still_of(true, eye, pixels).image), scale=scale)
+        return ScenePicture(caption, tile, lambda axes: axes.imshow(render_mesh(true, eye, pixels).image), scale=scale)
 
 
 @program

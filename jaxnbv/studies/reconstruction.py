@@ -26,7 +26,7 @@ from jaxnbv.studies.engine.measures import Claim, Measure, Record
 from jaxnbv.studies.engine.run import replay
 from jaxnbv.studies.engine.searches import BASELINES
 from jaxnbv.studies.engine.study import Scene, Study
-from jaxnbv.studies.engine.tiles import Tiles, caption_tile, opposite_direction, still_of
+from jaxnbv.studies.engine.tiles import ScenePicture, caption_tile, opposite_direction, render_mesh
 from jaxnbv.studies.scenes import Split, part_scene
 from jaxnbv.tasks import Coverage, NewSurface
 from jaxnbv.viz.style import DEVIATION
@@ -138,7 +138,7 @@ class ReconstructionStudy(Study):
         distance = surface_distance(mesh.sample_points(self.key(index, "measure"), SURFACE_POINTS), truth)
         return {"chamfer": distance.chamfer, **distance._asdict()}
 
-    def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
+    def scene_picture(self, record: Record, methods: Sequence[str], pixels: int) -> ScenePicture:
         """Return images of each reconstruction after the last view, coloured by distance to the true surface.
 
         **Raises:** `ValueError` if the record has a Poisson reconstruction but `pymeshlab` is not installed.
@@ -147,21 +147,23 @@ class ReconstructionStudy(Study):
         truth = cast(TriangleMesh, true_mesh(scene.surface))
         tree = cKDTree(truth.sample_points(jax.random.key(0), _DENSE))
         eye, sampler = opposite_direction(record), self.mesher(scene).sampler
-        last = {method: replay(self, scene, runs[method])[-1][1] for method in methods}
+        last_observations = {method: replay(self, scene, runs[method])[-1][1] for method in methods}
         results = {method: runs[method]["reconstructions"] for method in methods}
         names = tuple(name for name in RECONSTRUCTIONS if all(run[name] is not None for run in results.values()))
 
         def tile(axes: Axes, method: str, column: int) -> None:
-            mesh = reconstruct(sampler, last[method], names[column])
+            mesh = reconstruct(sampler, last_observations[method], names[column])
             if mesh is None:
                 raise InputError(f"the records hold {names[column]}: to draw it again, {install('poisson')}")
-            still = still_of(mesh, eye, pixels, lambda points: tree.query(points)[0], _ERRORS)
-            axes.imshow(still.image, interpolation="antialiased")
+            rendering = render_mesh(mesh, eye, pixels, lambda points: tree.query(points)[0], _ERRORS)
+            axes.imshow(rendering.image, interpolation="antialiased")
             distances = results[method][names[column]]
             caption_tile(axes, f"CD {distances['chamfer']:.3f}, HD {distances['hausdorff']:.3f}")
 
         scale = ScalarMappable(_ERRORS, DEVIATION), "distance to the true surface\n(scene units)"
-        return Tiles("", tile, lambda axes: axes.imshow(still_of(truth, eye, pixels).image), names, scale=scale)
+        return ScenePicture(
+            "", tile, lambda axes: axes.imshow(render_mesh(truth, eye, pixels).image), names, scale=scale
+        )
 
 
 def reconstruct(sampler: SurfaceSampler, observations: Observations, name: str) -> TriangleMesh | None:

@@ -32,7 +32,7 @@ from jaxnbv.search.base import Baseline
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
 from jaxnbv.studies.engine.searches import BASELINES
 from jaxnbv.studies.engine.study import Scene, Study
-from jaxnbv.studies.engine.tiles import Tiles, caption_tile
+from jaxnbv.studies.engine.tiles import ScenePicture, caption_tile
 from jaxnbv.tasks import Coverage, NewSurface
 from jaxnbv.utility import Quantity
 from jaxnbv.viz.style import GREY, INK, LINE, NEW
@@ -268,7 +268,7 @@ class RecordedStudy(Study):
         is_shown = np.logical_or.accumulate(truth[frames], axis=0)
         return {"frames": frames, "covered": is_shown.mean(axis=1).tolist()}
 
-    def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
+    def scene_picture(self, record: Record, methods: Sequence[str], pixels: int) -> ScenePicture:
         """Return images of the box's voxels after each view, projected along the shortest side of the box.
 
         Voxels that a chosen frame shows are coloured. The line is the path of the recorded camera, and the numbers mark
@@ -290,7 +290,7 @@ class RecordedStudy(Study):
             axes.set_aspect("equal")
             caption_tile(axes, f"{runs[method]['covered'][view]:.0%}")
 
-        return Tiles("Coloured: voxels that the frames show. Numbers: their camera positions, in order.", tile)
+        return ScenePicture("Coloured: voxels that the frames show. Numbers: their camera positions, in order.", tile)
 
     def frame_of(self, pose: Pose) -> int:
         """Return the index of the frame whose pose is nearest to `pose`."""

@@ -31,7 +31,7 @@ from jaxnbv.studies.engine.known import study_sampler
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
 from jaxnbv.studies.engine.searches import BASELINES
 from jaxnbv.studies.engine.study import Scene, Study
-from jaxnbv.studies.engine.tiles import Tiles, caption_tile
+from jaxnbv.studies.engine.tiles import ScenePicture, caption_tile
 from jaxnbv.studies.scenes import ClassObject, ClassSet, FirstView, Framing, Split
 from jaxnbv.studies.scenes.class_object import ClassMesh, scan_cue, surface_of
 from jaxnbv.tasks import Coverage, CrossEntropy, EntropyReduction, MixedEntropy
@@ -298,7 +298,7 @@ class ClassificationStudy(Study):
             lists["roughness"].append(rough)
         return lists | {"log_p": [lists["log_p"]], "pixels": [lists["pixels"]] if self.cue else []}
 
-    def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
+    def scene_picture(self, record: Record, methods: Sequence[str], pixels: int) -> ScenePicture:
         """Return images of the true surface as seen from each view. The cue (what tells the class) is tinted.
 
         The text below an image gives the class predicted after the view, and the probability of this class.
@@ -316,7 +316,8 @@ class ClassificationStudy(Study):
             caption_tile(axes, f"{names[guess]} {np.exp(log_p[guess]):.0%}", guess == record["label"])
 
         framing = f"Framed: at least {CUE_PIXELS} {self.cue} pixels. " if self.cue else ""
-        return Tiles(f"{framing}Beneath: prediction; true: {names[record['label']]}. All methods share view 1.", tile)
+        caption = f"{framing}Beneath: prediction; true: {names[record['label']]}. All methods share view 1."
+        return ScenePicture(caption, tile)
 
 
 @program

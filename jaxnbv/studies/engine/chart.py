@@ -58,18 +58,18 @@ def chart(table: pd.DataFrame, study: type[Study]) -> bytes:
     """
     (group, scenes), *_ = groups_of(table).items()
     rows = table[table["group"] == group]
-    shown = [measure for measure in study.measures if (rows["quantity"] == measure.name).any()]
-    tall, wide = -(-len(shown) // _PANELS_A_ROW), min(len(shown), _PANELS_A_ROW)
+    measures = [measure for measure in study.measures if (rows["quantity"] == measure.name).any()]
+    num_rows, num_columns = -(-len(measures) // _PANELS_A_ROW), min(len(measures), _PANELS_A_ROW)
     file = io.BytesIO()
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(8.4, 0.4 + 2.5 * tall), layout="constrained")
-        panels = figure.subplots(tall, wide, squeeze=False).ravel()
-        for axes, measure in zip(panels, shown, strict=False):
+        figure = Figure(figsize=(8.4, 0.4 + 2.5 * num_rows), layout="constrained")
+        panels = figure.subplots(num_rows, num_columns, squeeze=False).ravel()
+        for axes, measure in zip(panels, measures, strict=False):
             _draw(axes, rows[rows["quantity"] == measure.name], measure, rows["method"].unique().tolist())
             # The label does not say what the percentage is of, because the title does.
             unit = f"%, mean of {scenes} scenes" if measure.unit == "%" else measure.unit
             axes.set(title=measure.title, xlabel=measure.key_name, ylabel=unit)
-        for axes in panels[len(shown) :]:
+        for axes in panels[len(measures) :]:
             axes.axis("off")
         lines = {line.get_label(): line for axes in panels for line in axes.containers}
         figure.legend(lines.values(), lines, loc="outside right center", frameon=False, handlelength=2.6)
@@ -81,11 +81,11 @@ def _draw(axes: Axes, rows: pd.DataFrame, measure: Measure, methods: list[str]) 
     columns = rows["at"].unique().tolist()
     scale = 100.0 if measure.unit == "%" else 1.0
     for index, method in enumerate(methods):
-        own = scale * rows[rows["method"] == method].set_index("at")[["mean", "low", "high"]].reindex(columns)
+        statistics = scale * rows[rows["method"] == method].set_index("at")[["mean", "low", "high"]].reindex(columns)
         x = np.arange(len(columns)) + _DODGE * (index - 0.5 * (len(methods) - 1))
-        bars = np.abs(own[["low", "high"]].sub(own["mean"], axis=0)).T.to_numpy()
-        if own["mean"].notna().any():
-            axes.errorbar(x, own["mean"], bars, label=method, zorder=2 + (index == 0), **_look(method, index))
+        bars = np.abs(statistics[["low", "high"]].sub(statistics["mean"], axis=0)).T.to_numpy()
+        if statistics["mean"].notna().any():
+            axes.errorbar(x, statistics["mean"], bars, label=method, zorder=2 + (index == 0), **_look(method, index))
     axes.set_xticks(range(len(columns)), [str(column).replace(" ", "\n") for column in columns])
     axes.set_xlim(-0.5, len(columns) - 0.5)
     if measure.unit == "%":

@@ -12,14 +12,14 @@ from matplotlib.lines import Line2D
 from jaxnbv.storage.files import make_folder
 from jaxnbv.studies.engine.measures import Record
 from jaxnbv.studies.engine.study import Study
-from jaxnbv.studies.engine.tiles import Tiles
+from jaxnbv.studies.engine.tiles import ScenePicture
 from jaxnbv.viz.figures import STYLE
 from jaxnbv.viz.style import LINE, framed, save_figure
 
 # Inches: size of a tile, and the margins beside and above the grid.
-_TILE, _BESIDE, _ABOVE = (1.75, 1.95), 0.35, 0.75
+_TILE_SIZE, _SIDE_MARGIN, _TOP_MARGIN = (1.75, 1.95), 0.35, 0.75
 # Largest number of tiles in a row if there is one tile per method, and the least width of such a picture, in tiles.
-_MOST_A_ROW, _FEWEST_WIDE = 5, 3
+_MAX_TILES_PER_ROW, _MIN_WIDTH = 5, 3
 
 
 def write_pictures(
@@ -28,7 +28,7 @@ def write_pictures(
     """Write pictures `scene_<number>.png` of the first scenes into a folder, and return their paths.
 
     The pictures show the methods `study.pictured`, or all methods of a record that has none of these. No picture is
-    written if `study.tiles` returns None.
+    written if `study.scene_picture` returns None.
 
     - `scenes`: number of pictures; `pixels`: width and height of each small image in a picture.
     """
@@ -36,75 +36,81 @@ def write_pictures(
     for record in sorted(records, key=lambda record: record["scene"])[:scenes]:
         by_method = record["methods"]
         methods = [method for method in study.pictured if method in by_method] or list(by_method)
-        tiles = study.tiles(record, methods, pixels)
-        if tiles is not None:
+        picture = study.scene_picture(record, methods, pixels)
+        if picture is not None:
             paths.append(folder / f"scene_{record['scene']:04d}.png")
             with mpl.rc_context(STYLE):
-                save_figure(_drawn(tiles, record, methods), paths[-1])
+                save_figure(_draw_picture(picture, record, methods), paths[-1])
     return paths
 
 
-def _drawn(tiles: Tiles, record: Record, methods: Sequence[str]) -> Figure:
+def _draw_picture(picture: ScenePicture, record: Record, methods: Sequence[str]) -> Figure:
     runs = [record["methods"][method] for method in methods]
-    columns = tiles.columns or tuple(f"view {view + 1}" for view in range(max(len(run["views"]) for run in runs)))
+    columns = picture.columns or tuple(f"view {view + 1}" for view in range(max(len(run["views"]) for run in runs)))
     if len(columns) == 1:
-        return _of_one_column(tiles, record, methods, columns[0])
-    start, tall = int(tiles.truth is not None), len(methods)
-    wide = start + len(columns)
-    size = wide * _TILE[0] + _BESIDE * (3 if tiles.scale else 1), tall * _TILE[1] + _ABOVE
+        return _draw_one_tile_per_method(picture, record, methods, columns[0])
+    start, num_rows = int(picture.truth is not None), len(methods)
+    num_columns = start + len(columns)
+    size = (
+        num_columns * _TILE_SIZE[0] + _SIDE_MARGIN * (3 if picture.scale else 1),
+        num_rows * _TILE_SIZE[1] + _TOP_MARGIN,
+    )
     figure = Figure(figsize=size, layout="constrained")
     figure.suptitle(f"Scene {record['scene']}: {record['name']}", x=0.01, ha="left", fontsize=10, fontweight="bold")
-    grid = figure.subplots(tall, wide, squeeze=False)
+    grid = figure.subplots(num_rows, num_columns, squeeze=False)
     for axes, title in zip(grid[0], ("truth", *columns)[1 - start :], strict=True):
         axes.set_title(title, fontsize=9, loc="center", pad=4)
     for row, (method, run) in enumerate(zip(methods, runs, strict=True)):
         for axes in grid[row]:
             framed(axes, LINE, 0.8)
-        if tiles.truth is not None:
-            tiles.truth(grid[row, 0]) if row == 0 else grid[row, 0].axis("off")
+        if picture.truth is not None:
+            picture.truth(grid[row, 0]) if row == 0 else grid[row, 0].axis("off")
         for column, axes in enumerate(grid[row, start:]):
-            if tiles.columns or column < len(run["views"]):
-                tiles.tile(axes, method, column)
+            if picture.columns or column < len(run["views"]):
+                picture.tile(axes, method, column)
             else:
                 axes.axis("off")
         grid[row, start].set_ylabel(method, fontsize=9, fontweight="bold")
-    _explain(figure, tiles, grid)
+    _draw_legend(figure, picture, grid)
     return figure
 
 
-def _of_one_column(tiles: Tiles, record: Record, methods: Sequence[str], column: str) -> Figure:
+def _draw_one_tile_per_method(picture: ScenePicture, record: Record, methods: Sequence[str], column: str) -> Figure:
     """Draw a picture with one tile per method, several in a row. Its title ends in `column`."""
-    cells = ([("truth", None)] if tiles.truth is not None else []) + [(method, method) for method in methods]
-    wide = min(len(cells), _MOST_A_ROW)
-    tall = -(-len(cells) // wide)
-    size = max(wide, _FEWEST_WIDE) * _TILE[0] + _BESIDE * (3 if tiles.scale else 1), tall * _TILE[1] + _ABOVE
+    cells = ([("truth", None)] if picture.truth is not None else []) + [(method, method) for method in methods]
+    num_columns = min(len(cells), _MAX_TILES_PER_ROW)
+    num_rows = -(-len(cells) // num_columns)
+    size = (
+        max(num_columns, _MIN_WIDTH) * _TILE_SIZE[0] + _SIDE_MARGIN * (3 if picture.scale else 1),
+        num_rows * _TILE_SIZE[1] + _TOP_MARGIN,
+    )
     figure = Figure(figsize=size, layout="constrained")
     title = f"Scene {record['scene']}: {record['name']}, {column}"
     figure.suptitle(title, x=0.01, ha="left", fontsize=10, fontweight="bold")
-    grid = figure.subplots(tall, wide, squeeze=False)
+    grid = figure.subplots(num_rows, num_columns, squeeze=False)
     for axes in grid.ravel()[len(cells) :]:
         axes.axis("off")
     for axes, (name, method) in zip(grid.ravel(), cells, strict=False):
         framed(axes, LINE, 0.8)
         axes.set_title(name, fontsize=9, loc="center", pad=4)
         if method is not None:
-            tiles.tile(axes, method, 0)
-        elif tiles.truth is not None:
-            tiles.truth(axes)
-    _explain(figure, tiles, grid)
+            picture.tile(axes, method, 0)
+        elif picture.truth is not None:
+            picture.truth(axes)
+    _draw_legend(figure, picture, grid)
     return figure
 
 
-def _explain(figure: Figure, tiles: Tiles, grid: np.ndarray) -> None:
+def _draw_legend(figure: Figure, picture: ScenePicture, grid: np.ndarray) -> None:
     """Draw the legend with the caption, and the colour bar."""
-    tall = len(grid)
-    handles = [Line2D([], [], ls="none", label=name, **look) for name, look in tiles.marks.items()]
+    num_rows = len(grid)
+    handles = [Line2D([], [], ls="none", label=name, **look) for name, look in picture.marks.items()]
     legend = figure.legend(handles=handles, loc="outside lower left", ncols=max(len(handles), 1), frameon=False)
-    legend.set_title(tiles.caption, prop=FontProperties(size=8))
+    legend.set_title(picture.caption, prop=FontProperties(size=8))
     legend.set_alignment("left")
-    if tiles.scale:
-        colours, label = tiles.scale
-        bar = figure.colorbar(colours, ax=grid, location="right", shrink=min(1.0, 2.0 / tall), aspect=25)
+    if picture.scale:
+        colours, label = picture.scale
+        bar = figure.colorbar(colours, ax=grid, location="right", shrink=min(1.0, 2.0 / num_rows), aspect=25)
         bar.set_label(label, fontsize=8)
         bar.ax.tick_params(labelsize=7, length=2)
         bar.outline.set_visible(False)

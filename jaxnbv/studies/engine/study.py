@@ -25,7 +25,7 @@ from jaxnbv.studies.engine.episodes import random_first_view, simulated_sensor
 from jaxnbv.studies.engine.known import study_sampler, without_own_shape
 from jaxnbv.studies.engine.measures import WITHOUT_BANK, Claim, Measure, Record
 from jaxnbv.studies.engine.searches import search_of
-from jaxnbv.studies.engine.tiles import Tiles
+from jaxnbv.studies.engine.tiles import ScenePicture
 
 _PURPOSES = ("first", "episode", "scene", "measure")
 
@@ -209,7 +209,7 @@ class Study(eqx.Module):
         """
         return {"name": scene.name}
 
-    def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles | None:
+    def scene_picture(self, record: Record, methods: Sequence[str], pixels: int) -> ScenePicture | None:
         """Return the picture of a scene as a grid of small images; None if the study has no pictures.
 
         - `methods`: methods to show, one row each; `pixels`: width and height of each image.

@@ -16,13 +16,13 @@ from jaxnbv.viz.mean_surface import MeanSurface
 from jaxnbv.viz.render import Still
 from jaxnbv.viz.style import GREY
 
-_RIGHT = "#00734f"
+_CORRECT_COLOUR = "#00734f"
 # Longest edge of the triangles in a rendered image, which is short because colours are set at vertices, and radius of
 # the ball that the image shows, both in scene units.
-_EDGE, _REACH = 0.05, 1.6
+_MAX_EDGE, _IMAGE_RADIUS = 0.05, 1.6
 
 
-class Tiles(NamedTuple):
+class ScenePicture(NamedTuple):
     """The picture of a scene: a grid of small images (tiles), with one row per method.
 
     - `caption`: text below the picture.
@@ -41,10 +41,10 @@ class Tiles(NamedTuple):
     scale: tuple[ScalarMappable, str] | None = None
 
 
-def caption_tile(axes: Axes, text: str, right: bool = False) -> None:
-    """Write a line of text below an image. If `right` (correct), it is bold and green, with a tick."""
-    colour, weight = (_RIGHT, "bold") if right else (GREY, "normal")
-    axes.set_xlabel(f"{'✓ ' if right else ''}{text}", fontsize=9, color=colour, fontweight=weight)
+def caption_tile(axes: Axes, text: str, is_correct: bool = False) -> None:
+    """Write a line of text below an image. If `is_correct`, it is bold and green, with a tick."""
+    colour, weight = (_CORRECT_COLOUR, "bold") if is_correct else (GREY, "normal")
+    axes.set_xlabel(f"{'✓ ' if is_correct else ''}{text}", fontsize=9, color=colour, fontweight=weight)
 
 
 def opposite_direction(record: Record) -> Float[np.ndarray, "3"]:
@@ -54,13 +54,13 @@ def opposite_direction(record: Record) -> Float[np.ndarray, "3"]:
     """
     run = next(iter(record["methods"].values()))
     position = np.asarray(run["views"][0]["position"])
-    away = -position[[0, 2]]
-    length = np.linalg.norm(away)
-    away = away / length if length > 1e-3 else np.array([0.6, 0.8])
-    return np.array([away[0], 0.55, away[1]])
+    direction = -position[[0, 2]]
+    length = np.linalg.norm(direction)
+    direction = direction / length if length > 1e-3 else np.array([0.6, 0.8])
+    return np.array([direction[0], 0.55, direction[1]])
 
 
-def still_of(
+def render_mesh(
     mesh: TriangleMesh,
     eye: Float[np.ndarray, "3"],
     size: int,
@@ -73,26 +73,29 @@ def still_of(
       as 1e-6; default: one colour.
     - `norm`: colour scale of the values.
     """
-    vertices, faces = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, _EDGE, max_iter=12)
+    vertices, faces = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, _MAX_EDGE, max_iter=12)
     fine = trimesh.Trimesh(vertices, faces)
     values = np.ones(len(fine.vertices)) if value is None else np.maximum(value(fine.vertices), 1e-6)
     surface = MeanSurface(np.asarray(fine.vertices), np.asarray(fine.faces), np.asarray(fine.vertex_normals), values)
-    return Still(eye, surface, size, _REACH, norm)
+    return Still(eye, surface, size, _IMAGE_RADIUS, norm)
 
 
 def draw_on(
     axes: Axes,
-    still: Still,
+    rendering: Still,
     points: Float[np.ndarray, "n 3"],
     colours: Float[np.ndarray, "n channels"],
 ) -> None:
     """Draw a rendered image and the points that its surface does not hide. Near points cover far ones."""
-    axes.imshow(still.image, interpolation="antialiased", zorder=1)
-    pixels, in_front = still.project(points)
-    depth = (points - np.asarray(still.pose.position)) @ np.asarray(still.pose.forward)
+    axes.imshow(rendering.image, interpolation="antialiased", zorder=1)
+    pixels, in_front = rendering.project(points)
+    depth = (points - np.asarray(rendering.pose.position)) @ np.asarray(rendering.pose.forward)
     order = np.argsort(-depth)
     order = order[in_front[order]]
     axes.scatter(pixels[order, 0], pixels[order, 1], s=2.5, c=colours[order], linewidths=0, zorder=2)
-    shown = np.argwhere(still.image[..., 3] > 0)
-    middle, half = 0.5 * (shown.min(axis=0) + shown.max(axis=0)), 0.55 * np.ptp(shown, axis=0).max()
+    object_pixels = np.argwhere(rendering.image[..., 3] > 0)
+    middle, half = (
+        0.5 * (object_pixels.min(axis=0) + object_pixels.max(axis=0)),
+        0.55 * np.ptp(object_pixels, axis=0).max(),
+    )
     axes.set(xlim=middle[1] + [-half, half], ylim=middle[0] + [half, -half])

@@ -26,7 +26,7 @@ from jaxnbv.studies.engine.measures import Claim, Measure, Record
 from jaxnbv.studies.engine.run import replay
 from jaxnbv.studies.engine.searches import BASELINES
 from jaxnbv.studies.engine.study import Scene, Study
-from jaxnbv.studies.engine.tiles import Tiles, caption_tile, draw_on, opposite_direction, still_of
+from jaxnbv.studies.engine.tiles import ScenePicture, caption_tile, draw_on, opposite_direction, render_mesh
 from jaxnbv.studies.sensors import PART_SETTING
 from jaxnbv.tasks import Coverage, Segmenter, SoftPartCount, part_counts
 from jaxnbv.viz.style import GREY, SERIES
@@ -201,7 +201,7 @@ class PartDiscoveryStudy(Study):
                 break
         return {"counts": counts}
 
-    def tiles(self, record: Record, methods: Sequence[str], pixels: int) -> Tiles:
+    def scene_picture(self, record: Record, methods: Sequence[str], pixels: int) -> ScenePicture:
         """Return images of the cloud over the true shape. The points are coloured by their predicted part.
 
         The text below an image gives the number of parts that have at least 60 points. The images of a method end once
@@ -216,19 +216,21 @@ class PartDiscoveryStudy(Study):
         mesh = cast(TriangleMesh, true_mesh(scene.surface))
         points = mesh.sample_points(jax.random.key(0), _DENSE)
         labels_of_points = np.asarray(self.true_parts(scene, jnp.asarray(points, jnp.float32)))
-        still = still_of(mesh, opposite_direction(record), pixels)
+        rendering = render_mesh(mesh, opposite_direction(record), pixels)
         replays = {method: replay(self, scene, runs[method]) for method in methods}
 
         def tile(axes: Axes, method: str, view: int) -> None:
             fed, predicted = segmenter.predict(replays[method][view][1].cloud)
             mask = np.asarray(fed.mask)
-            draw_on(axes, still, np.asarray(fed.points)[mask], colours[np.asarray(predicted)[mask]])
+            draw_on(axes, rendering, np.asarray(fed.points)[mask], colours[np.asarray(predicted)[mask]])
             num_found = sum(count >= TARGET for count in runs[method]["counts"][view])
             caption_tile(axes, f"{num_found} of {len(parts)} parts", num_found == len(parts))
 
         marks = {name: {"marker": "o", "color": colour} for name, colour in zip(record["parts"], palette, strict=True)}
         caption = f"Points: predicted parts. Beneath: parts with {TARGET} points. All methods share view 1."
-        return Tiles(caption, tile, lambda axes: draw_on(axes, still, points, colours[labels_of_points]), marks=marks)
+        return ScenePicture(
+            caption, tile, lambda axes: draw_on(axes, rendering, points, colours[labels_of_points]), marks=marks
+        )
 
 
 @program
