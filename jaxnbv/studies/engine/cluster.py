@@ -74,7 +74,7 @@ class Cluster(Executor):
 
         Consecutive calls of one function send the function once.
         """
-        require(self._client.status == "running", self._lost())
+        require(self._client.status == "running", self._lost_message())
         if function is not self._pickled[0]:
             # The function is pickled here so that a worker can compare versions before it imports the function's
             # modules.
@@ -118,7 +118,7 @@ class Cluster(Executor):
         if not answer.set_running_or_notify_cancel():
             return
         if task.status == "cancelled":
-            answer.set_exception(InputError(self._lost()))
+            answer.set_exception(InputError(self._lost_message()))
             return
         try:
             answer.set_result(task.result())
@@ -133,7 +133,7 @@ class Cluster(Executor):
         # Release the result. Otherwise Dask would compute it again if the worker that holds it dies.
         task.release()
 
-    def _lost(self) -> str:
+    def _lost_message(self) -> str:
         return (
             f"the Dask scheduler at {self.address} is gone: start it, then the same command again. Scenes that have a "
             "record are kept"
@@ -157,8 +157,8 @@ def _call(
         worker.state.nthreads == 1,
         f"the worker {worker.address} runs {worker.state.nthreads} calls at a time: start it with --nthreads 1",
     )
-    own = _prepare()
-    changes = differences({name: own[name] for name in client_versions}, client_versions)
+    worker_versions = _prepare()
+    changes = differences({name: worker_versions[name] for name in client_versions}, client_versions)
     require(
         not changes,
         f"the worker {worker.address} is unlike this process ({'; '.join(changes)}): install the same versions, and "

@@ -24,9 +24,9 @@ def simulated_sensor(surface: Surface, camera: Camera) -> Sensor:
 
 
 def random_first_view(
-    enough: Callable[[PointCloud], bool], poses: Pose, sensor: Sensor, key: PRNGKeyArray, episode_key: PRNGKeyArray
+    is_enough: Callable[[PointCloud], bool], poses: Pose, sensor: Sensor, key: PRNGKeyArray, episode_key: PRNGKeyArray
 ) -> int | None:
-    """Return the index of a random pose whose scan satisfies `enough`, or None if there is no such pose.
+    """Return the index of a random pose whose scan satisfies `is_enough`, or None if there is no such pose.
 
     - `poses`: the candidates, with one leading axis.
     - `key`: random key for the order in which the poses are tried.
@@ -34,7 +34,7 @@ def random_first_view(
     """
     *_, noise_key = view_keys(episode_key, 0)
     order = jax.random.permutation(key, poses.position.shape[0]).tolist()
-    return next((index for index in order if enough(sensor(poses[index], noise_key))), None)
+    return next((index for index in order if is_enough(sensor(poses[index], noise_key))), None)
 
 
 def episode_record(
@@ -57,7 +57,7 @@ def episode_record(
     poses: list[dict[str, list]] = []
     searches: list[dict[str, float]] = []
 
-    def noted() -> Iterator[Step]:
+    def recorded_steps() -> Iterator[Step]:
         for step in itertools.islice(Loop(planner, key, camera=camera).steps(sensor, first), views):
             pose, proposal = step.view.pose, step.view.proposal
             poses.append({"position": pose.position.tolist(), "rotation": pose.rotation.tolist()})
@@ -66,8 +66,8 @@ def episode_record(
             yield step
 
     # `follow` runs the steps, which fill the lists.
-    followed = follow(noted())
-    return {"views": poses, "steps": searches, **followed}
+    record = follow(recorded_steps())
+    return {"views": poses, "steps": searches, **record}
 
 
 def replay_views(
@@ -79,7 +79,7 @@ def replay_views(
     - `key`: random key of the episode.
     """
     views = [(pose, sensor(pose, view_keys(key, index)[2])) for index, pose in enumerate(poses)]
-    return [(scan, after) for (_, scan), after in zip(views, planner.replay(views, camera), strict=True)]
+    return [(scan, observations) for (_, scan), observations in zip(views, planner.replay(views, camera), strict=True)]
 
 
 def poses_of(run: Record) -> list[Pose]:

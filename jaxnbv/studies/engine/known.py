@@ -10,7 +10,7 @@ from jaxnbv.studies.engine.measures import KNOWN
 from jaxnbv.surfaces import KnownShapes, ShapeBank, Upright, bank_poses, shape_bank
 
 # Largest number of characters of a mesh's name in a shape's name, which also holds the index of the mesh.
-_LONGEST = 50
+_MAX_NAME_LENGTH = 50
 
 
 def study_sampler(
@@ -32,23 +32,25 @@ def study_sampler(
     """
     if model != KNOWN:
         return SurfaceSampler.preset(model, longest_side, quick, solid=solid)
-    plain = SurfaceSampler.preset("screened", longest_side, quick, solid=solid)
+    sampler = SurfaceSampler.preset("screened", longest_side, quick, solid=solid)
     if files:
         names = [_name(files, index) for index in range(len(files))]
-        return plain.with_bank(ShapeBank.from_meshes([file.path for file in files], names=names), Upright(by_axis=True))
+        return sampler.with_bank(
+            ShapeBank.from_meshes([file.path for file in files], names=names), Upright(by_axis=True)
+        )
     require(bool(bank), "there are no known shapes for this study: give another model")
-    return plain.with_bank(shape_bank(bank), bank_poses(bank))
+    return sampler.with_bank(shape_bank(bank), bank_poses(bank))
 
 
-def keep_shapes(sampler: SurfaceSampler, wanted: Callable[[str], bool]) -> SurfaceSampler:
-    """Return a copy of the sampler that keeps only the known shapes whose names satisfy `wanted`.
+def keep_shapes(sampler: SurfaceSampler, is_selected: Callable[[str], bool]) -> SurfaceSampler:
+    """Return a copy of the sampler that keeps only the known shapes whose names satisfy `is_selected`.
 
     A sampler without known shapes is returned unchanged.
     """
     model = sampler.model
     if not isinstance(model, KnownShapes):
         return sampler
-    rows = [row for row, name in enumerate(model.bank.names) if wanted(name)]
+    rows = [row for row, name in enumerate(model.bank.names) if is_selected(name)]
     if len(rows) == len(model.bank):
         return sampler
     return dataclasses.replace(sampler, model=dataclasses.replace(model, bank=model.bank.select(rows)))
@@ -63,4 +65,4 @@ def without_own_shape(sampler: SurfaceSampler, files: Sequence[MeshFile], index:
 
 
 def _name(files: Sequence[MeshFile], index: int) -> str:
-    return f"{files[index].name[:_LONGEST]} {index}"
+    return f"{files[index].name[:_MAX_NAME_LENGTH]} {index}"

@@ -11,7 +11,7 @@ from jaxnbv.storage.files import make_folder, write_text
 from jaxnbv.storage.folders import read_record
 from jaxnbv.studies.engine.chart import CHART, chart
 from jaxnbv.studies.engine.records import read_records
-from jaxnbv.studies.engine.results import Verdict, count_of, explained, groups_of, results, tables, verdicts
+from jaxnbv.studies.engine.results import Verdict, groups_of, results, table_legend, tables, verdicts, with_plural
 from jaxnbv.studies.engine.study import Study
 from jaxnbv.studies.registry import studies
 from jaxnbv.version import __version__
@@ -79,20 +79,20 @@ def chapters(folder: str | Path) -> list[Chapter]:
 
 def _kinds() -> dict[str, type[Study]]:
     """Return the classes of studies by name. The classes of the registry come before other subclasses of `Study`."""
-    named = {kind.__qualname__: kind for kind in (entry.load() for entry in studies().values())}
+    kinds = {kind.__qualname__: kind for kind in (entry.load() for entry in studies().values())}
     todo = [Study]
     while todo:
         for kind in todo.pop().__subclasses__():
-            named.setdefault(kind.__qualname__, kind)
+            kinds.setdefault(kind.__qualname__, kind)
             todo.append(kind)
-    return named
+    return kinds
 
 
-def _chapter(path: Path, inside: Path, record: dict[str, Any], kind: type[Study]) -> Chapter:
+def _chapter(path: Path, subfolder: Path, record: dict[str, Any], kind: type[Study]) -> Chapter:
     records = read_records(path)
     table = results(records, kind)
     parts = {
-        f"{group}: {count_of(scenes, 'scene')}": [
+        f"{group}: {with_plural(scenes, 'scene')}": [
             (title, cells.to_html(border=0)) for title, cells in tables(table, kind, group)
         ]
         for group, scenes in groups_of(table).items()
@@ -100,11 +100,11 @@ def _chapter(path: Path, inside: Path, record: dict[str, Any], kind: type[Study]
     images = [(CHART, chart(table, kind))]
     images += [(file.stem, file.read_bytes()) for file in sorted(path.glob("*.png")) if file.name != CHART]
     seconds = sum(scene["seconds"] for scene in records)
-    made_by = ", ".join(f"{name} {version}" for name, version in record.get("versions", {}).items())
+    versions_text = ", ".join(f"{name} {version}" for name, version in record.get("versions", {}).items())
     facts = [
         f"{seconds / len(records):.0f} seconds per scene with all methods, {seconds / 3600:.2f} hours in all.",
-        f"Made with {made_by}.",
+        f"Made with {versions_text}.",
     ]
-    title = kind.title if inside == Path() else f"{kind.title}: {inside}"
-    body = f"{kind.explanation} {explained(kind)}", verdicts(table, kind), parts, images
+    title = kind.title if subfolder == Path() else f"{kind.title}: {subfolder}"
+    body = f"{kind.explanation} {table_legend(kind)}", verdicts(table, kind), parts, images
     return Chapter(title, len(records), facts, *body, json.dumps(record["config"], indent=1))

@@ -20,9 +20,9 @@ from jaxnbv.storage.folders import ResultFolder, check_format, differences, read
 from jaxnbv.studies.engine.measures import Record
 from jaxnbv.studies.engine.trials import Failure, Trial, outcomes
 
-_FAILED = ".failed"
+_FAILURE_SUFFIX = ".failed"
 _FORMAT = 2
-_NONE: Mapping[str, np.ndarray] = MappingProxyType({})
+_NO_ARRAYS: Mapping[str, np.ndarray] = MappingProxyType({})
 
 
 class RecordFolder(ResultFolder):
@@ -42,7 +42,7 @@ class RecordFolder(ResultFolder):
         path: str | Path,
         config: dict[str, Any],
         executor: Executor | None = None,
-        arrays: Mapping[str, np.ndarray] = _NONE,
+        arrays: Mapping[str, np.ndarray] = _NO_ARRAYS,
     ):
         self.executor = executor
         super().__init__(path, config, arrays)
@@ -63,8 +63,8 @@ class RecordFolder(ResultFolder):
             if missing:
                 self.set_versions(versions() if self.executor is None else self.executor.submit(versions).result())
             bar = progress_bar(None, progress, True, total=len(scenes), initial=len(records), desc=self.path.name)
-            with bar, closing(outcomes(run, missing, self.executor)) as ended:
-                for index, outcome in ended:
+            with bar, closing(outcomes(run, missing, self.executor)) as pairs:
+                for index, outcome in pairs:
                     if isinstance(outcome, Failure):
                         self._write_failure(index, outcome)
                     else:
@@ -97,31 +97,33 @@ class RecordFolder(ResultFolder):
         )
         self.set_versions(record.get("versions", {}))
         for index, file in _files(folder):
-            other, own = _read(file, index), self._file(index)
-            if not own.exists():
+            other, target = _read(file, index), self._file(index)
+            if not target.exists():
                 self._write(index, other)
-            elif changes := differences(_without_seconds(other), _without_seconds(_read(own, index))):
-                raise InputError(f"{file} and {own} differ in {'; '.join(changes[:3])}: delete the one that is wrong")
+            elif changes := differences(_without_seconds(other), _without_seconds(_read(target, index))):
+                raise InputError(
+                    f"{file} and {target} differ in {'; '.join(changes[:3])}: delete the one that is wrong"
+                )
 
     def failures(self, scenes: Sequence[int]) -> dict[int, str]:
         """Return the error of each failed scene as one line. Tracebacks are in the files scene_*.failed."""
-        files = {index: self._file(index).with_suffix(_FAILED) for index in scenes}
+        files = {index: self._file(index).with_suffix(_FAILURE_SUFFIX) for index in scenes}
         return {index: file.read_text().partition("\n")[0] for index, file in files.items() if os.path.isfile(file)}
 
     def _file(self, index: int) -> Path:
         return self.path / f"scene_{index:04d}.json"
 
     def _write_failure(self, index: int, failure: Failure) -> None:
-        write_text(self._file(index).with_suffix(_FAILED), f"{failure.error}\n\n{failure.traceback}")
+        write_text(self._file(index).with_suffix(_FAILURE_SUFFIX), f"{failure.error}\n\n{failure.traceback}")
 
     def _write(self, index: int, record: Record) -> Record:
         """Write a record, and return the record as `_read` would return it."""
         # Turn number keys into text, as the file does, because the checksum depends on the order of sorted keys.
         record = json.loads(json.dumps(record))
         self.bind()
-        sealed = {"format": _FORMAT, "index": index, "sha256": _checksum(index, record), "record": record}
-        write_text(self._file(index), json.dumps(sealed))
-        self._file(index).with_suffix(_FAILED).unlink(missing_ok=True)
+        content = {"format": _FORMAT, "index": index, "sha256": _checksum(index, record), "record": record}
+        write_text(self._file(index), json.dumps(content))
+        self._file(index).with_suffix(_FAILURE_SUFFIX).unlink(missing_ok=True)
         return record
 
 

@@ -14,7 +14,7 @@ from jaxnbv.studies.engine.study import Study
 
 LEVEL = 0.90
 _ALL = "all"
-_WHERE = ("ahead of", "level with", "behind")
+_POSITIONS = ("ahead of", "level with", "behind")
 
 
 def results(records: Sequence[Record], study: type[Study]) -> pd.DataFrame:
@@ -37,25 +37,25 @@ def results(records: Sequence[Record], study: type[Study]) -> pd.DataFrame:
                 by_key = values if isinstance(values, Mapping) else dict(enumerate(values, start=1))
                 labels = record["scene"], study.group(record), measure.name, measure.key_name, method
                 rows += [(*labels, at, value) for at, value in by_key.items()]
-    every = pd.DataFrame(rows, columns=["scene", "group", "quantity", "by", "method", "at", "value"])
-    every["value"] = every["value"].astype(float)
-    groups = every[every["group"] != ""].sort_values("group", kind="stable")
+    all_values = pd.DataFrame(rows, columns=["scene", "group", "quantity", "by", "method", "at", "value"])
+    all_values["value"] = all_values["value"].astype(float)
+    groups = all_values[all_values["group"] != ""].sort_values("group", kind="stable")
     keys = ["group", "quantity", "by", "at"]
-    parts = pd.concat([every.assign(group=_ALL), groups]).groupby(keys, sort=False)
-    tables = [_compared(part, study.reference).assign(**dict(zip(keys, key, strict=True))) for key, part in parts]
+    parts = pd.concat([all_values.assign(group=_ALL), groups]).groupby(keys, sort=False)
+    tables = [_statistics(part, study.reference).assign(**dict(zip(keys, key, strict=True))) for key, part in parts]
     return pd.concat(tables, ignore_index=True)[[*keys, *tables[0].columns.drop(keys)]]
 
 
-def _compared(part: pd.DataFrame, reference: str) -> pd.DataFrame:
-    """Return the rows of `results` for one measure at one key, from its values (column `value` of `part`)."""
-    values = part.pivot(index="scene", columns="method", values="value")[part["method"].unique()]
-    values = values.dropna(axis="columns", how="all").dropna()
-    values = values if len(values) else values[[]]
-    row = pd.DataFrame({"scenes": values.count(), "mean": values.mean(), "standard_error": values.sem()})
-    row[["low", "high"]] = interval(values.to_numpy()).T
+def _statistics(values: pd.DataFrame, reference: str) -> pd.DataFrame:
+    """Return the rows of `results` for one measure at one key, from the column `value` of `values`."""
+    table = values.pivot(index="scene", columns="method", values="value")[values["method"].unique()]
+    table = table.dropna(axis="columns", how="all").dropna()
+    table = table if len(table) else table[[]]
+    row = pd.DataFrame({"scenes": table.count(), "mean": table.mean(), "standard_error": table.sem()})
+    row[["low", "high"]] = interval(table.to_numpy()).T
     row[["lead", "lead_low", "lead_high"]] = np.nan
-    if reference in values:
-        lead = values.rsub(values[reference], axis=0)
+    if reference in table:
+        lead = table.rsub(table[reference], axis=0)
         row["lead"] = lead.mean()
         row[["lead_low", "lead_high"]] = interval(lead.to_numpy()).T
     return row.rename_axis("method").reset_index()
@@ -137,13 +137,13 @@ def _star(is_marked: bool) -> str:
 
 def summary(table: pd.DataFrame, study: type[Study]) -> str:
     """Return the tables of a study over all scenes as text."""
-    title = f"{study.title}: {count_of(groups_of(table)[_ALL], 'scene')}"
-    sections = [f"{title}\n{'=' * len(title)}\n\n{study.explanation}\n{explained(study)}\n"]
+    title = f"{study.title}: {with_plural(groups_of(table)[_ALL], 'scene')}"
+    sections = [f"{title}\n{'=' * len(title)}\n\n{study.explanation}\n{table_legend(study)}\n"]
     sections += [f"{title}\n{cells.to_string()}\n" for title, cells in tables(table, study)]
     return "\n".join(sections)
 
 
-def explained(study: type[Study]) -> str:
+def table_legend(study: type[Study]) -> str:
     """Return the text that explains the cells of the tables."""
     return (
         f"Mean over scenes +- its standard error, or in percent; in [ ] the {LEVEL:.0%} bootstrap interval over\n"
@@ -172,24 +172,28 @@ def verdicts(table: pd.DataFrame, study: type[Study]) -> list[Verdict]:
     The comparison includes the runs of these methods without known shapes. The reference is "level with" a method if
     the interval of its lead over the method includes zero. A claim is left out if none of its methods was run.
     """
-    judged = []
+    checks = []
     for claim in study.claims:
         (measure,) = (candidate for candidate in study.measures if candidate.name == claim.measure)
-        at = table[(table["group"] == _ALL) & (table["quantity"] == claim.measure) & (table["at"] == claim.at)]
-        rows = at[at["method"].str.removesuffix(WITHOUT_BANK).isin(claim.others)].dropna(subset="lead")
-        by_place: dict[str, list[str]] = {place: [] for place in _WHERE}
+        claim_rows = table[(table["group"] == _ALL) & (table["quantity"] == claim.measure) & (table["at"] == claim.at)]
+        rows = claim_rows[claim_rows["method"].str.removesuffix(WITHOUT_BANK).isin(claim.others)].dropna(subset="lead")
+        by_position: dict[str, list[str]] = {position: [] for position in _POSITIONS}
         for row, text in zip(rows.itertuples(), _leads(rows, measure), strict=True):
-            level = row.lead_low <= 0 <= row.lead_high
-            better = (row.lead < 0) == measure.lower_is_better
-            by_place[_WHERE[1 if level else 0 if better else 2]].append(f"{row.method} ({text.rstrip('* ')})")
+            is_level = row.lead_low <= 0 <= row.lead_high
+            is_better = (row.lead < 0) == measure.lower_is_better
+            by_position[_POSITIONS[1 if is_level else 0 if is_better else 2]].append(
+                f"{row.method} ({text.rstrip('* ')})"
+            )
         if len(rows):
-            num_held = sum(len(by_place[place]) for place in _WHERE[: 1 if claim.must_be_better else 2])
-            parts = "; ".join(f"{place} {', '.join(methods)}" for place, methods in by_place.items() if methods)
+            num_held = sum(len(by_position[position]) for position in _POSITIONS[: 1 if claim.must_be_better else 2])
+            parts = "; ".join(
+                f"{position} {', '.join(methods)}" for position, methods in by_position.items() if methods
+            )
             sentence = f"Holds against {num_held} of {len(rows)}: {parts}."
-            judged.append(Verdict(claim.text, num_held, len(rows), sentence))
-    return judged
+            checks.append(Verdict(claim.text, num_held, len(rows), sentence))
+    return checks
 
 
-def count_of(count: int, thing: str) -> str:
+def with_plural(count: int, noun: str) -> str:
     """Return the count with its noun, such as "1 scene" or "2 scenes"."""
-    return f"{count} {thing}{'s' if count != 1 else ''}"
+    return f"{count} {noun}{'s' if count != 1 else ''}"

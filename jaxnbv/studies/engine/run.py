@@ -41,7 +41,7 @@ def run_scene(
     names = study.methods if methods is None else methods_of(type(study), methods, KNOWN)
     start = time.perf_counter()
     scene = study.scene(index)
-    planners = {name: _own_planner(study, scene, name, make) for name, make in (own or {}).items()}
+    planners = {name: _user_planner(study, scene, name, make) for name, make in (own or {}).items()}
     first, truth = study.first_view(scene), study.truth(scene)
     sensor, pose = study.sensor(scene), study.candidates.poses()[first]
     record = {"scene": index, **study.scene_record(scene, truth, first), "first": first, "study_views": study.views}
@@ -73,17 +73,17 @@ def methods_of(study: type[Study], names: Sequence[str] | None, model: str) -> t
 
     **Raises:** `ValueError` for an unknown method.
     """
-    twice = [name for name in study.without_bank if name in study.methods] if model == KNOWN else []
-    again = tuple(f"{name}{WITHOUT_BANK}" for name in twice)
+    names_without_bank = [name for name in study.without_bank if name in study.methods] if model == KNOWN else []
+    screened_names = tuple(f"{name}{WITHOUT_BANK}" for name in names_without_bank)
     if names is None:
-        return (*study.methods, *again)
-    available = (*study.methods, *again, *study.extra_methods)
+        return (*study.methods, *screened_names)
+    available = (*study.methods, *screened_names, *study.extra_methods)
     unknown = sorted({*names} - {*available})
     require(not unknown, f"unknown methods: {', '.join(unknown)}; choose from {', '.join(available)}")
     return tuple(name for name in available if name in names)
 
 
-def _own_planner(study: Study, scene: Scene, name: str, make: Factory) -> Planner:
+def _user_planner(study: Study, scene: Scene, name: str, make: Factory) -> Planner:
     try:
         planner = make(study, scene)
     except Exception as error:
