@@ -40,7 +40,7 @@ _OTHERS = ("coverage", *BASELINES)
 ESTIMATES = {"all": "of all points", "reached": "of the warmed points"}
 # Points count as coldest if their temperature exceeds the lowest by at most this fraction of the range from the lowest
 # to the highest. Several points must count, because objects have symmetries and a mug's inner floor is equally cold.
-_NEARLY = 0.01
+_MAX_RELATIVE_EXCESS = 0.01
 # Matplotlib's inferno without its palest colours, which would not stand out against grey, the colour of unscanned
 # surface.
 _HEAT = LinearSegmentedColormap.from_list("heat", mpl.colormaps["inferno"](np.linspace(0.0, 0.9, 256)))
@@ -72,10 +72,10 @@ class Truth(NamedTuple):
     def region(self) -> Float[np.ndarray, "m 3"]:
         """All points whose temperature exceeds the lowest by at most 1 % of the temperature range."""
         low, high = self.temperatures.min(), self.temperatures.max()
-        return self.points[self.temperatures <= low + _NEARLY * (high - low)]
+        return self.points[self.temperatures <= low + _MAX_RELATIVE_EXCESS * (high - low)]
 
 
-def _saturated(record: Record, method: str) -> dict[int, float]:
+def _saturation(record: Record, method: str) -> dict[int, float]:
     """Return, for each view after the first, 1.0 if the chosen view has value zero, else 0.0.
 
     A search chooses the highest value, so all candidates then have value zero. The result of a method that is not in
@@ -132,7 +132,7 @@ class HeatStudy(Study):
     measures: ClassVar[tuple[Measure, ...]] = (
         *_measures("all"),
         *_measures("reached"),
-        Measure("saturated", "Saturated steps", _saturated, unit="%", lower_is_better=True),
+        Measure("saturated", "Saturated steps", _saturation, unit="%", lower_is_better=True),
         SECONDS,
     )
     claims: ClassVar[tuple[Claim, ...]] = (
@@ -165,10 +165,10 @@ class HeatStudy(Study):
 
     def scene(self, index: int) -> Scene:
         """Return a scene with an object. The task of the scene is the point where the object is heated."""
-        file = self.file(index)
+        file = self.mesh_file(index)
         if file is None:
-            heated = heat_scene(index)
-            return Scene(index, heated.name, heated.surface, heated.source)
+            scene = heat_scene(index)
+            return Scene(index, scene.name, scene.surface, scene.source)
         mesh = file.read()
         (source,) = mesh.sample_points(self.key(index, "scene"), 1)
         return Scene(index, file.name, mesh, jnp.asarray(source, jnp.result_type(float)))
@@ -212,18 +212,18 @@ class HeatStudy(Study):
         cloud. The second is the coldest of the warmed points, or of all points if none is warmed. Each estimate has a
         position, a temperature, and a distance to the nearest of the object's coldest points.
         """
-        tree, heat, shares = cKDTree(truth.region), heat_problem(scene), []
-        lists = ("points", "temperatures", "distances")
-        estimates: dict[str, dict[str, list]] = {name: {key: [] for key in lists} for name in ESTIMATES}
+        tree, heat, fractions = cKDTree(truth.region), heat_problem(scene), []
+        quantities = ("points", "temperatures", "distances")
+        estimates: dict[str, dict[str, list]] = {name: {key: [] for key in quantities} for name in ESTIMATES}
         for step in episode:
             points, temperature = body_temperature(step.observations.cloud, heat)
-            shares.append(float(temperature.reached.mean()))
-            for name, into in estimates.items():
+            fractions.append(float(temperature.reached.mean()))
+            for name, lists in estimates.items():
                 coldest = temperature.coldest(name == "reached" and bool(temperature.reached.any()))
-                into["points"].append(points[coldest].tolist())
-                into["temperatures"].append(float(temperature.values[coldest]))
-                into["distances"].append(float(tree.query(points[coldest])[0]))
-        return {"reached": shares, "estimates": estimates}
+                lists["points"].append(points[coldest].tolist())
+                lists["temperatures"].append(float(temperature.values[coldest]))
+                lists["distances"].append(float(tree.query(points[coldest])[0]))
+        return {"reached": fractions, "estimates": estimates}
 
     def scene_picture(self, record: Record, methods: Sequence[str], pixels: int) -> ScenePicture:
         """Return images of the cloud's visible points, coloured by temperature, over the object in grey.

@@ -41,21 +41,21 @@ from jaxnbv.tasks import Identify, NewSurface
 from jaxnbv.viz.style import DEVIATION
 
 IDENTIFY, BY_NAME = "identify", "identify-name"
-_SIZE = 2.5
+_LONGEST_SIDE = 2.5
 # Sensor noise: 0.6 % of the size per coordinate of a point, six degrees for a normal.
-_NOISE = SensorNoise(0.006 * _SIZE, 0.1)
+_NOISE = SensorNoise(0.006 * _LONGEST_SIDE, 0.1)
 # Lowest elevation of the cameras around a table.
-_ELEVATION = math.radians(10.0)
+_MIN_ELEVATION = math.radians(10.0)
 # A first view shows the part in at least this fraction of its pixels.
-_ENOUGH = 0.01
+_MIN_SHOWN_FRACTION = 0.01
 # Rows and columns of rays of an imagined scan.
 _RAYS = (28, 28)
 # Distances are measured from _POINTS points on the true surface to _DENSE points on the surface of the placed part.
-_POINTS, _DENSE = 500, 20_000
+_NUM_POINTS, _NUM_DENSE_POINTS = 500, 20_000
 # A pose is right if its error is below this fraction of the part's size.
-_RIGHT = 0.01
+_MAX_POSE_ERROR = 0.01
 # Names of parts whose weights are at least this fraction of the largest weight count as tied.
-_LEVEL = 0.99
+_TIE_RATIO = 0.99
 # Colour scale of distances to the true part, in scene units.
 _ERRORS = LogNorm(0.01, 0.5)
 _Truth = tuple[PlacedPart, Float[np.ndarray, "n 3"], float]
@@ -65,8 +65,8 @@ def _by_view(name: str) -> Any:
     return lambda record, method: [float(value) for value in record["methods"][method][name]]
 
 
-def _below(share: float) -> Any:
-    return lambda record, method: [float(value < share) for value in record["methods"][method]["add_s"]]
+def _below(fraction: float) -> Any:
+    return lambda record, method: [float(value < fraction) for value in record["methods"][method]["add_s"]]
 
 
 class IdentificationStudy(Study):
@@ -150,7 +150,7 @@ class IdentificationStudy(Study):
             "meshes": () if parts is None else cls.files_in(parts),
         }
         settings |= (dict(cls.quick) if quick else {}) | options
-        return {one.value: cls(views=views, setup=one, **settings) for one in ((setup,) if setup else Setup)}
+        return {choice.value: cls(views=views, setup=choice, **settings) for choice in ((setup,) if setup else Setup)}
 
     @property
     def num_scenes(self) -> int | None:
@@ -159,7 +159,7 @@ class IdentificationStudy(Study):
 
     @property
     def candidates(self) -> SphereCandidates:
-        lowest = _ELEVATION if self.setup.is_resting else -0.5 * math.pi
+        lowest = _MIN_ELEVATION if self.setup.is_resting else -0.5 * math.pi
         return SphereCandidates(self.num_candidates, self.setup.radius, lowest)
 
     @property
@@ -177,8 +177,8 @@ class IdentificationStudy(Study):
             part = parts.choose(index)
         else:
             _, parts, part = confusable_parts(index)
-        placed = place_part(parts, part, self.setup, self.key(index, "scene"))
-        return Scene(index, parts.bank.names[part], placed.mesh, placed)
+        placed_part = place_part(parts, part, self.setup, self.key(index, "scene"))
+        return Scene(index, parts.bank.names[part], placed_part.mesh, placed_part)
 
     def sensor(self, scene: Scene) -> Sensor:
         """Return a depth camera whose points, normals and ranges (distances along the rays) are noisy.
@@ -194,7 +194,7 @@ class IdentificationStudy(Study):
         return observe
 
     def shows_enough(self, scene: Scene, scan: PointCloud) -> bool:
-        return int(scan.count) >= _ENOUGH * self.camera.num_rays
+        return int(scan.count) >= _MIN_SHOWN_FRACTION * self.camera.num_rays
 
     def sampler_of(self, scene: Scene) -> SurfaceSampler:
         """Return a sampler whose bank holds the parts in scene units. If there is a table, they rest on it."""
@@ -213,11 +213,15 @@ class IdentificationStudy(Study):
         """Return the placed part, points on its surface, and its diameter (scene units)."""
         mesh = scene.task.mesh
         corners = mesh.to_trimesh().convex_hull.vertices
-        return scene.task, mesh.sample_points(self.key(scene.index, "measure"), _POINTS), float(pdist(corners).max())
+        return (
+            scene.task,
+            mesh.sample_points(self.key(scene.index, "measure"), _NUM_POINTS),
+            float(pdist(corners).max()),
+        )
 
     def scene_record(self, scene: Scene, truth: _Truth, first: int) -> Record:
-        alike = "" if self.meshes else scene.name.rpartition(" ")[0]
-        return {"name": scene.name, "setup": self.setup.value, "set": alike, "part": truth[0].part}
+        set_name = "" if self.meshes else scene.name.rpartition(" ")[0]
+        return {"name": scene.name, "setup": self.setup.value, "set": set_name, "part": truth[0].part}
 
     @classmethod
     def group(cls, record: Record) -> str:
@@ -233,21 +237,21 @@ class IdentificationStudy(Study):
         assert isinstance(hypotheses, PartHypotheses)
         (task, points, diameter), bank = truth, hypotheses.bank
         weights = np.append(np.asarray(hypotheses.shape_weights), hypotheses.weights[-1])
-        named, (part, placement) = int(np.argmax(weights)), hypotheses.most_likely
+        name_index, (part, placement) = int(np.argmax(weights)), hypotheses.most_likely
         # Parts that the scans do not distinguish yet are tied. Otherwise their order in the bank would decide.
-        is_tied = weights >= _LEVEL * weights.max()
-        right = float(is_tied[task.part] / is_tied.sum())
+        is_tied = weights >= _TIE_RATIO * weights.max()
+        correctness = float(is_tied[task.part] / is_tied.sum())
         rotation, shift = np.asarray(placement.rotation, np.float64), np.asarray(placement.shift, np.float64)
-        off = _distances(placement, bank.shape(jnp.asarray(part)).solid, jnp.asarray(points, jnp.float32))
-        fit = float(np.mean(np.abs(np.asarray(off)))) / _SIZE
-        dense = task.placed(part, rotation, shift).sample_points(jax.random.key(0), _DENSE)
+        distances = _distances(placement, bank.shape(jnp.asarray(part)).solid, jnp.asarray(points, jnp.float32))
+        pose_error = float(np.mean(np.abs(np.asarray(distances)))) / _LONGEST_SIDE
+        dense_points = task.placed_mesh(part, rotation, shift).sample_points(jax.random.key(0), _NUM_DENSE_POINTS)
         return {
-            "named": NONE if named == len(bank) else bank.names[named],
-            "right": right,
+            "named": NONE if name_index == len(bank) else bank.names[name_index],
+            "right": correctness,
             "p_true": float(weights[task.part]),
-            "fit": fit,
-            "placed": right if fit < _RIGHT else 0.0,
-            "add_s": float(np.mean(cKDTree(dense).query(points)[0])) / diameter,
+            "fit": pose_error,
+            "placed": correctness if pose_error < _MAX_POSE_ERROR else 0.0,
+            "add_s": float(np.mean(cKDTree(dense_points).query(points)[0])) / diameter,
             "most_likely": {"part": part, "rotation": rotation.tolist(), "shift": shift.tolist()},
         }
 
@@ -257,19 +261,23 @@ class IdentificationStudy(Study):
         The part is coloured by its distance to the true part.
         """
         task, runs, eye = self.scene(record["scene"]).task, record["methods"], opposite_direction(record)
-        true = task.mesh
-        tree = cKDTree(true.sample_points(jax.random.key(0), 10 * _DENSE))
+        true_mesh = task.mesh
+        tree = cKDTree(true_mesh.sample_points(jax.random.key(0), 10 * _NUM_DENSE_POINTS))
 
         def tile(axes: Axes, method: str, view: int) -> None:
             run = runs[method]
-            at = run["most_likely"][view]
-            mesh = task.placed(at["part"], np.asarray(at["rotation"]), np.asarray(at["shift"]))
+            placement = run["most_likely"][view]
+            mesh = task.placed_mesh(
+                placement["part"], np.asarray(placement["rotation"]), np.asarray(placement["shift"])
+            )
             axes.imshow(render_mesh(mesh, eye, pixels, lambda points: tree.query(points)[0], _ERRORS).image)
             caption_tile(axes, f"{run['named'][view]}, {run['p_true'][view]:.2f}", is_correct=run["right"][view] == 1)
 
         scale = ScalarMappable(_ERRORS, DEVIATION), "distance to the true part\n(scene units)"
         caption = "The likeliest part as placed, its name, and the probability of the true name."
-        return ScenePicture(caption, tile, lambda axes: axes.imshow(render_mesh(true, eye, pixels).image), scale=scale)
+        return ScenePicture(
+            caption, tile, lambda axes: axes.imshow(render_mesh(true_mesh, eye, pixels).image), scale=scale
+        )
 
 
 @program

@@ -36,13 +36,16 @@ RECONSTRUCTIONS = (POISSON, MEAN)
 # Colour scale of distances to the true surface (scene units), from the sensor noise to 1/5 of the object's size.
 _ERRORS = LogNorm(0.01, 0.5)
 # Number of points on the true surface to which pictures measure distances.
-_DENSE = 200_000
+_NUM_DENSE_POINTS = 200_000
 
 
-def _distances(name: str, title: str) -> Measure:
+def _distance_measure(name: str, title: str) -> Measure:
     def compute(record: Record, method: str) -> dict[str, float | None]:
         surfaces = record["methods"][method]["reconstructions"]
-        return {way: None if distances is None else distances[name] for way, distances in surfaces.items()}
+        return {
+            reconstruction: None if distances is None else distances[name]
+            for reconstruction, distances in surfaces.items()
+        }
 
     return Measure(name, title, compute, "reconstruction", "scene units", lower_is_better=True)
 
@@ -67,10 +70,10 @@ class ReconstructionStudy(Study):
     methods: ClassVar[tuple[str, ...]] = ("coverage", "new-surface", *BASELINES)
     reference: ClassVar[str] = "coverage"
     measures: ClassVar[tuple[Measure, ...]] = (
-        _distances("chamfer", "Chamfer distance"),
-        _distances("hausdorff", "Hausdorff distance"),
-        _distances("accuracy", "Accuracy"),
-        _distances("completeness", "Completeness"),
+        _distance_measure("chamfer", "Chamfer distance"),
+        _distance_measure("hausdorff", "Hausdorff distance"),
+        _distance_measure("accuracy", "Accuracy"),
+        _distance_measure("completeness", "Completeness"),
         Measure("covered", "Surface covered", lambda r, m: r["methods"][m]["coverage"], unit="%"),
     )
     claims: ClassVar[tuple[Claim, ...]] = (
@@ -87,7 +90,7 @@ class ReconstructionStudy(Study):
 
     def scene(self, index: int) -> Scene:
         """Return the scene with this index. Its object is a mesh if the study has `meshes`, else procedural."""
-        file = self.file(index)
+        file = self.mesh_file(index)
         if file is not None:
             return Scene(index, file.name, file.read())
         part = part_scene(Split.TEST, index)
@@ -129,8 +132,8 @@ class ReconstructionStudy(Study):
             name: self._distances(reconstruct(mesher.sampler, observations, name), truth, scene.index)
             for name in RECONSTRUCTIONS
         }
-        covered = coverage(views, truth)
-        return {"coverage": covered, "points": int(observations.cloud.count), "reconstructions": distances}
+        fractions = coverage(views, truth)
+        return {"coverage": fractions, "points": int(observations.cloud.count), "reconstructions": distances}
 
     def _distances(self, mesh: TriangleMesh | None, truth: Float[np.ndarray, "n 3"], index: int) -> Record | None:
         if mesh is None:
@@ -145,7 +148,7 @@ class ReconstructionStudy(Study):
         """
         scene, runs = self.scene(record["scene"]), record["methods"]
         truth = cast(TriangleMesh, true_mesh(scene.surface))
-        tree = cKDTree(truth.sample_points(jax.random.key(0), _DENSE))
+        tree = cKDTree(truth.sample_points(jax.random.key(0), _NUM_DENSE_POINTS))
         eye, sampler = opposite_direction(record), self.mesher(scene).sampler
         last_observations = {method: replay(self, scene, runs[method])[-1][1] for method in methods}
         results = {method: runs[method]["reconstructions"] for method in methods}

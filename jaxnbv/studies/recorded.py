@@ -39,14 +39,14 @@ from jaxnbv.viz.style import GREY, INK, LINE, NEW
 
 NEW_AREA, COVERAGE, EVEN, ORACLE = "new surface", "coverage", "evenly spaced", "oracle"
 # Number of frames that must show a voxel. A voxel that fewer frames show may be noise.
-_SEEN_BY = 3
+_MIN_FRAMES = 3
 _VOXELS_ALONG_BOX = 80
 # A first view shows at least this fraction of the box's voxels.
-_ENOUGH = 0.05
+_MIN_SHOWN_FRACTION = 0.05
 # Rows and columns of rays of an imagined scan.
 _RAYS = (24, 32)
 # Pixel stride with which the default box is computed, and the margin of the box as a fraction of its longest side.
-_COARSE, _ROOM = 16, 0.05
+_BOUNDS_STRIDE, _MARGIN = 16, 0.05
 
 
 class Recording(NamedTuple):
@@ -65,7 +65,7 @@ class Recording(NamedTuple):
     camera_positions: Float[np.ndarray, "frames 3"]
 
 
-class _Unknown(Surface):
+class _UnknownSurface(Surface):
     """Placeholder for the true surface of a recording, which is unknown."""
 
     in_jit: ClassVar[bool] = False
@@ -78,15 +78,15 @@ class _Unknown(Surface):
 class FixedOrder(Baseline):
     """Baseline that visits candidates in a fixed order.
 
-    - `turns`: index of the candidate for each view, including the first view.
+    - `order`: index of the candidate for each view, including the first view.
     """
 
-    turns: Int[Array, " views"] = eqx.field(kw_only=True)
+    order: Int[Array, " views"] = eqx.field(kw_only=True)
 
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
         """Return 1 for the next candidate in the order, and 0 for all other candidates. The key is not used."""
-        chosen = jnp.arange(candidates.position.shape[0]) == self.turns[problem.observations.num_views]
-        return chosen.astype(candidates.position.dtype)
+        is_next = jnp.arange(candidates.position.shape[0]) == self.order[problem.observations.num_views]
+        return is_next.astype(candidates.position.dtype)
 
 
 class MostNewVoxels(Baseline):
@@ -107,7 +107,7 @@ class MostNewVoxels(Baseline):
         return gain.astype(candidates.position.dtype)
 
 
-def _gains(record: Record, method: str) -> dict[int, float | None]:
+def _gain_over_oracle(record: Record, method: str) -> dict[int, float | None]:
     """Return, for each view after the first, the ratio of voxels added by a method and by the oracle.
 
     Both count the voxels that views 2 to this view have added to those of view 1. The ratio is None if the oracle has
@@ -115,9 +115,12 @@ def _gains(record: Record, method: str) -> dict[int, float | None]:
     """
     if ORACLE not in record["methods"]:
         return {}
-    own, best = (record["methods"][name]["covered"] for name in (method, ORACLE))
-    added = enumerate(zip(own[1:], best[1:], strict=True), start=2)
-    return {view: (a - own[0]) / (b - best[0]) if b > best[0] else None for view, (a, b) in added}
+    fractions, oracle_fractions = (record["methods"][name]["covered"] for name in (method, ORACLE))
+    pairs = enumerate(zip(fractions[1:], oracle_fractions[1:], strict=True), start=2)
+    return {
+        view: (a - fractions[0]) / (b - oracle_fractions[0]) if b > oracle_fractions[0] else None
+        for view, (a, b) in pairs
+    }
 
 
 class RecordedStudy(Study):
@@ -146,7 +149,7 @@ class RecordedStudy(Study):
     reference: ClassVar[str] = NEW_AREA
     measures: ClassVar[tuple[Measure, ...]] = (
         Measure("covered", "Voxels seen", lambda r, m: r["methods"][m]["covered"], unit="%"),
-        Measure("gain", "Gain over the first view, of the oracle's", _gains, unit="%"),
+        Measure("gain", "Gain over the first view, of the oracle's", _gain_over_oracle, unit="%"),
     )
     claims: ClassVar[tuple[Claim, ...]] = (
         Claim(
@@ -210,16 +213,16 @@ class RecordedStudy(Study):
     def recording(self) -> Recording:
         """The recording, which is read once per process."""
         carving, frame = self.sampler.carving, frame_of_box(self.box)
-        kept = self.box if carving is None else carving.with_room(self.box, self.grid, frame)
+        scan_box = self.box if carving is None else carving.with_room(self.box, self.grid, frame)
         sensor = self.up, self.intrinsics, self.depth_scale
-        return _recording((self.folder, *sensor), self.box, self.voxel, kept)
+        return _recording((self.folder, *sensor), self.box, self.voxel, scan_box)
 
     @property
     def candidates(self) -> GivenPoses:
         return GivenPoses(self.recording.poses)
 
     def scene(self, index: int) -> Scene:
-        return Scene(index, f"{Path(self.folder).name}, start {index}", _Unknown())
+        return Scene(index, f"{Path(self.folder).name}, start {index}", _UnknownSurface())
 
     def sensor(self, scene: Scene) -> Sensor:
         return lambda pose, key: self.recording.scans[self.frame_of(pose)]
@@ -231,10 +234,10 @@ class RecordedStudy(Study):
 
         **Raises:** `ValueError` if there is no such frame.
         """
-        enough = np.flatnonzero(self.recording.is_shown.mean(axis=1) >= _ENOUGH)
-        require(len(enough) > 0, f"no frame of {self.folder} shows 5 % of the voxels in {self.box}: give a smaller box")
-        order = jax.random.permutation(jax.random.key(self.seed), len(enough))
-        return int(enough[order[scene.index % len(enough)]])
+        frames = np.flatnonzero(self.recording.is_shown.mean(axis=1) >= _MIN_SHOWN_FRACTION)
+        require(len(frames) > 0, f"no frame of {self.folder} shows 5 % of the voxels in {self.box}: give a smaller box")
+        order = jax.random.permutation(jax.random.key(self.seed), len(frames))
+        return int(frames[order[scene.index % len(frames)]])
 
     @property
     def imagined_camera(self) -> Camera:
@@ -246,9 +249,9 @@ class RecordedStudy(Study):
     def search(self, method: str, scene: Scene) -> Search:
         if method == EVEN:
             # Frames are evenly spaced over the recording, start at the first view, and wrap around at the end.
-            apart = np.round(np.arange(self.views) * self.num_candidates / self.views).astype(int)
-            turns = (self.first_view(scene) + apart) % self.num_candidates
-            return FixedOrder(self.candidates, turns=jnp.asarray(turns))
+            offsets = np.round(np.arange(self.views) * self.num_candidates / self.views).astype(int)
+            order = (self.first_view(scene) + offsets) % self.num_candidates
+            return FixedOrder(self.candidates, order=jnp.asarray(order))
         if method == ORACLE:
             return MostNewVoxels(self.candidates, is_shown=jnp.asarray(self.recording.is_shown))
         return super().search(method, scene)
@@ -275,18 +278,18 @@ class RecordedStudy(Study):
         the chosen frames in their order.
         """
         recording, runs = self.recording, record["methods"]
-        kept = np.sort(np.argsort(self.box.high - self.box.low)[1:])
-        voxels, places = recording.voxels[:, kept], recording.camera_positions[:, kept]
+        plane_axes = np.sort(np.argsort(self.box.high - self.box.low)[1:])
+        voxels, positions = recording.voxels[:, plane_axes], recording.camera_positions[:, plane_axes]
 
         def tile(axes: Axes, method: str, view: int) -> None:
             frames = runs[method]["frames"][: view + 1]
             is_shown = recording.is_shown[frames].any(axis=0)
             for mask, colour in ((~is_shown, LINE), (is_shown, NEW)):
                 axes.scatter(voxels[mask, 0], voxels[mask, 1], s=2.0, c=colour, linewidths=0)
-            axes.plot(places[:, 0], places[:, 1], color=GREY, lw=0.6)
-            axes.scatter(places[frames, 0], places[frames, 1], s=14.0, c=INK, zorder=3)
-            for number, place in enumerate(places[frames], start=1):
-                axes.annotate(str(number), place, textcoords="offset points", xytext=(3, 3), fontsize=8, zorder=4)
+            axes.plot(positions[:, 0], positions[:, 1], color=GREY, lw=0.6)
+            axes.scatter(positions[frames, 0], positions[frames, 1], s=14.0, c=INK, zorder=3)
+            for number, position in enumerate(positions[frames], start=1):
+                axes.annotate(str(number), position, textcoords="offset points", xytext=(3, 3), fontsize=8, zorder=4)
             axes.set_aspect("equal")
             caption_tile(axes, f"{runs[method]['covered'][view]:.0%}")
 
@@ -295,8 +298,10 @@ class RecordedStudy(Study):
     def frame_of(self, pose: Pose) -> int:
         """Return the index of the frame whose pose is nearest to `pose`."""
         poses = self.recording.poses
-        off = jnp.abs(poses.position - pose.position).sum(-1) + jnp.abs(poses.rotation - pose.rotation).sum((-1, -2))
-        return int(jnp.argmin(off))
+        distances = jnp.abs(poses.position - pose.position).sum(-1) + jnp.abs(poses.rotation - pose.rotation).sum(
+            (-1, -2)
+        )
+        return int(jnp.argmin(distances))
 
 
 def _points(frames: RecordedFrames, index: int, stride: int) -> Float[np.ndarray, "n 3"]:
@@ -316,11 +321,11 @@ def bounds_of(frames: RecordedFrames) -> list[float]:
 
     **Raises:** `ValueError` if no frame has a valid depth.
     """
-    points = np.concatenate([_points(frames, index, _COARSE) for index in range(len(frames))])
+    points = np.concatenate([_points(frames, index, _BOUNDS_STRIDE) for index in range(len(frames))])
     require(len(points) > 0, f"no frame of {frames.folder} has a valid depth")
     low, high = np.percentile(points, [1, 99], axis=0)
-    room = _ROOM * float((high - low).max())
-    return [*(low - room).tolist(), *(high + room).tolist()]
+    margin = _MARGIN * float((high - low).max())
+    return [*(low - margin).tolist(), *(high + margin).tolist()]
 
 
 def frame_of_box(box: Box) -> Frame:
@@ -329,33 +334,37 @@ def frame_of_box(box: Box) -> Frame:
 
 
 @functools.cache
-def _recording(source: tuple[Any, ...], box: Box, voxel: float, kept: Box) -> Recording:
+def _recording(source: tuple[Any, ...], box: Box, voxel: float, scan_box: Box) -> Recording:
     """Read a recording.
 
     - `source`: the arguments of `RecordedFrames`.
     - `box`: the box whose voxels are counted; `voxel`: side of a voxel, both in the recording's units.
-    - `kept`: the box to which scans are cropped.
+    - `scan_box`: the box to which scans are cropped.
     """
     frames, frame = RecordedFrames(*source), frame_of_box(box)
     poses, stride = Pose.from_matrix(frames.matrices), stride_of(frames.camera)
     count = frames.camera.strided(stride).num_rays
-    nowhere, none = jnp.zeros((count, 3)), jnp.zeros(count, bool)
+    zeros, is_point = jnp.zeros((count, 3)), jnp.zeros(count, bool)
     scans, cells_of_frames = [], []
     for index in progress_bar(range(len(frames)), desc="reading frames"):
         # Use all pixels, although scans use every `stride`-th. Fewer pixels would miss voxels that the frame shows.
         points = _points(frames, index, 1)
         points = points[np.all((points >= box.low) & (points <= box.high), axis=1)]
         # A frame without points in the box gives an empty scan. Its rays are not used for carving either.
-        scan = PointCloud(nowhere, nowhere, none, none, jnp.zeros(count))
+        scan = PointCloud(zeros, zeros, is_point, is_point, jnp.zeros(count))
         if len(points) > 0:
             image = frames.depth(index), frames.camera, poses[index], frames.depth_scale, stride
-            scan = PointCloud.from_depth(*image, kept)
+            scan = PointCloud.from_depth(*image, scan_box)
         scans.append(frame.to_scene(scan))
         cells_of_frames.append(np.unique(np.floor(points / voxel).astype(int), axis=0))
-    cells, which, counts = np.unique(np.concatenate(cells_of_frames), axis=0, return_inverse=True, return_counts=True)
-    shown = np.zeros((len(frames), len(counts)), bool)
-    shown[np.repeat(np.arange(len(frames)), [len(rows) for rows in cells_of_frames]), which] = True
-    often = counts >= _SEEN_BY
-    require(bool(often.any()), f"no voxel of {box} shows in {_SEEN_BY} frames of {frames.folder}: give another box")
-    voxels, places = voxel * (cells[often] + 0.5), frames.matrices[:, :3, 3]
-    return Recording(frame.to_scene(poses), tuple(scans), shown[:, often], voxels, places)
+    cells, cell_indices, counts = np.unique(
+        np.concatenate(cells_of_frames), axis=0, return_inverse=True, return_counts=True
+    )
+    is_shown = np.zeros((len(frames), len(counts)), bool)
+    is_shown[np.repeat(np.arange(len(frames)), [len(rows) for rows in cells_of_frames]), cell_indices] = True
+    is_counted = counts >= _MIN_FRAMES
+    require(
+        bool(is_counted.any()), f"no voxel of {box} shows in {_MIN_FRAMES} frames of {frames.folder}: give another box"
+    )
+    voxels, positions = voxel * (cells[is_counted] + 0.5), frames.matrices[:, :3, 3]
+    return Recording(frame.to_scene(poses), tuple(scans), is_shown[:, is_counted], voxels, positions)

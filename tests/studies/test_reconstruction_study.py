@@ -149,7 +149,7 @@ def test_mesh_files_are_sorted_and_what_cannot_be_read_is_named(meshes, tmp_path
 
 
 def test_the_pictures_show_something(record, meshes, tmp_path, monkeypatch):
-    monkeypatch.setattr(reconstruction, "_DENSE", 2000)
+    monkeypatch.setattr(reconstruction, "_NUM_DENSE_POINTS", 2000)
     folder = tmp_path / "pictures"
     (picture,) = write_pictures([record], small_study(meshes), folder, pixels=80)
     assert picture.name == "scene_0001.png"

@@ -36,22 +36,22 @@ def stable_hits(correct: Bool[np.ndarray, "runs views"]) -> Bool[np.ndarray, "ru
     return np.logical_and.accumulate(correct[:, ::-1], axis=1)[:, ::-1]
 
 
-def _hit(by_view: Callable) -> Callable[[Record, str], Float[np.ndarray, " views"]]:
+def _hit_fraction(hits: Callable) -> Callable[[Record, str], Float[np.ndarray, " views"]]:
     """Return a function that computes the fraction of a method's runs with a hit at each view.
 
     Only random search has several runs.
 
-    - `by_view`: `first_hits` or `stable_hits`.
+    - `hits`: `first_hits` or `stable_hits`.
     """
 
     def compute(record: Record, method: str) -> Float[np.ndarray, " views"]:
         guesses = np.argmax(record["methods"][method]["log_p"], axis=-1)
-        return by_view(guesses == record["label"]).mean(axis=0)
+        return hits(guesses == record["label"]).mean(axis=0)
 
     return compute
 
 
-def _seen(record: Record, method: str) -> Float[np.ndarray, " views"] | list:
+def _cue_seen(record: Record, method: str) -> Float[np.ndarray, " views"] | list:
     """Return, for each view, the fraction of runs that showed the cue by this view; [] without a cue."""
     pixels = record["methods"][method]["pixels"]
     return first_hits(np.array(pixels) >= CUE_PIXELS).mean(axis=0) if pixels else []
@@ -74,35 +74,35 @@ def roughness(sampler: SurfaceSampler, inputs: StepInputs) -> float:
     posterior, surfaces = inputs.posterior, inputs.surfaces
     assert posterior is not None
     assert surfaces is not None
-    values, closed = np.asarray(surfaces.values), posterior.has_closed_forms
-    mean = np.asarray(sampler.mean(inputs.observations, posterior)) if closed else values.mean(axis=0)
-    samples = [crossed_cells(sample) for sample in values]
-    return float(np.mean(samples)) / max(crossed_cells(mean), 1)
+    values, has_closed_form = np.asarray(surfaces.values), posterior.has_closed_forms
+    mean = np.asarray(sampler.mean(inputs.observations, posterior)) if has_closed_form else values.mean(axis=0)
+    counts = [crossed_cells(sample) for sample in values]
+    return float(np.mean(counts)) / max(crossed_cells(mean), 1)
 
 
 def crossed_cells(values: Float[np.ndarray, "g g g"]) -> int:
     """Return the number of grid cells whose eight corners do not all have the same sign."""
-    inside = values < 0
-    size = inside.shape[0] - 1
-    corners = [inside[i : i + size, j : j + size, k : k + size] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+    is_inside = values < 0
+    size = is_inside.shape[0] - 1
+    corners = [is_inside[i : i + size, j : j + size, k : k + size] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
     return int(np.sum(np.any(corners, axis=0) & ~np.all(corners, axis=0)))
 
 
 def rank_correlation(
-    values: Float[AnyArray, " c"], true_values: Real[AnyArray, " c"], compared: Bool[np.ndarray, " c"]
+    values: Float[AnyArray, " c"], true_values: Real[AnyArray, " c"], is_compared: Bool[np.ndarray, " c"]
 ) -> float | None:
     """Return Spearman's rank correlation between expected and true values, or None if either is constant.
 
-    - `compared`: True for the candidates to include.
+    - `is_compared`: True for the candidates to include.
     """
-    a, b = np.asarray(values)[compared], np.asarray(true_values)[compared]
+    a, b = np.asarray(values)[is_compared], np.asarray(true_values)[is_compared]
     return None if np.ptp(a) == 0 or np.ptp(b) == 0 else float(spearmanr(a, b).statistic)
 
 
 MEASURES = (
-    Measure("first", "First hit", _hit(first_hits), unit="%"),
-    Measure("stable", "Stable hit", _hit(stable_hits), unit="%"),
-    Measure("seen", "Cue seen", _seen, unit="%"),
+    Measure("first", "First hit", _hit_fraction(first_hits), unit="%"),
+    Measure("stable", "Stable hit", _hit_fraction(stable_hits), unit="%"),
+    Measure("seen", "Cue seen", _cue_seen, unit="%"),
     Measure("rank_correlation", "Rank correlation", lambda r, m: r["methods"][m]["rank_correlation"], digits=2),
     Measure("roughness", "Roughness", lambda r, m: r["methods"][m]["roughness"], digits=2, lower_is_better=True),
     Measure("value", "Expected cross-entropy", _value, unit="nats"),

@@ -55,8 +55,8 @@ class PyramidStudy(ClassificationStudy):
     @classmethod
     def group(cls, record: Record) -> str:
         """Return a group name that says in which range the first view's angle from the base's normal lies."""
-        least = max(angle for angle in _ANGLES if angle <= record["angle"])
-        return f"first view at {least:03d}° or more from the base's normal"
+        min_angle = max(angle for angle in _ANGLES if angle <= record["angle"])
+        return f"first view at {min_angle:03d}° or more from the base's normal"
 
     def scene_record(self, scene: Scene, truth: Truth, first: int) -> Record:
         """Return the facts about the scene, with the angle between first view and base's normal in degrees.
@@ -65,8 +65,8 @@ class PyramidStudy(ClassificationStudy):
         """
         direction = np.asarray(self.candidates.poses().position[first])
         # In the pyramid's own frame, the outward normal of the base is -z.
-        assert isinstance(truth.thing, Pyramid)
-        outward = -np.asarray(truth.thing.solid.rotation)[:, 2]
+        assert isinstance(truth.class_object, Pyramid)
+        outward = -np.asarray(truth.class_object.solid.rotation)[:, 2]
         cosine = np.clip(direction @ outward / np.linalg.norm(direction), -1.0, 1.0)
         return super().scene_record(scene, truth, first) | {"angle": float(np.degrees(np.arccos(cosine)))}
 
@@ -76,9 +76,9 @@ class PyramidStudy(ClassificationStudy):
         **Raises:** `ValueError` if no candidate shows enough, or if none that shows enough hides the pattern.
         """
         scans = scene.task.scans
-        enough = [self.shows_enough(scene, scans[index]) for index in range(self.num_candidates)]
-        require(any(enough), f"none of {self.num_candidates} candidates shows enough of {scene.name}: ask for more")
-        return choose_hidden(np.where(enough, scene.task.pixels, 1), scans, self.key(scene.index, "first"))
+        is_enough = [self.shows_enough(scene, scans[index]) for index in range(self.num_candidates)]
+        require(any(is_enough), f"none of {self.num_candidates} candidates shows enough of {scene.name}: ask for more")
+        return choose_hidden(np.where(is_enough, scene.task.cue_pixels, 1), scans, self.key(scene.index, "first"))
 
 
 class TruckStudy(ClassificationStudy):
@@ -165,11 +165,11 @@ class OmniObject3DStudy(ClassificationStudy):
 
         **Raises:** `ValueError` as `ClassificationStudy` does, or if `meshes` or `classifier` is missing.
         """
-        needed = {
+        option_texts = {
             "meshes": f"--meshes FOLDER, a folder with a folder of meshes for each of {', '.join(cls.objects.classes)}",
             "classifier": "--classifier FILE, the checkpoint of a network trained on these classes, such as a "
             "PointNet++ from PyTorch",
         }
-        missing = [text for name, text in needed.items() if name not in options]
+        missing = [text for name, text in option_texts.items() if name not in options]
         require(not missing, f"nothing ships for the study omniobject3d: give {', and '.join(missing)}")
         return super().configured(model, views, quick, **options)

@@ -39,7 +39,7 @@ from jaxnbv.tasks.classification import AnyClassifier, ClassAcquisition, Classif
 from jaxnbv.viz.style import NEW, framed
 
 # Number of runs of random search in each scene.
-_RUNS = 8
+_NUM_RANDOM_RUNS = 8
 OTHERS = ("coverage", *BASELINES)
 _GRADIENT = ("gradient-2dof", "gradient-constrained")
 # Methods without an entry here maximise cross-entropy and differ in their searches. None stands for `Coverage`.
@@ -49,21 +49,21 @@ _ACQUISITIONS: dict[str, type[ClassAcquisition] | None] = {
     "mixed": MixedEntropy,
 }
 _BACKGROUND = np.array(mpl.colors.to_rgb("#f3f5f8"))
-_PLAIN, _TINTED = np.array([0.68, 0.72, 0.78]), np.array(mpl.colors.to_rgb(NEW))
+_BASE_COLOUR, _CUE_COLOUR = np.array([0.68, 0.72, 0.78]), np.array(mpl.colors.to_rgb(NEW))
 
 
 class Truth(eqx.Module):
     """The class of a scene's object, and what the candidates show of the object.
 
-    - `label`: index of the class; `thing`: the object.
+    - `label`: index of the class; `class_object`: the object.
     - `scans`: noisy scan of the true object from each candidate.
-    - `pixels`: number of rays of each candidate that hit the cue, the part of the object that tells its class.
+    - `cue_pixels`: number of rays of each candidate that hit the cue, the part of the object that tells its class.
     """
 
     label: int
     scans: PointCloud
-    thing: ClassObject | ClassMesh
-    pixels: Int[Array, " candidates"]
+    class_object: ClassObject | ClassMesh
+    cue_pixels: Int[Array, " candidates"]
 
 
 class OracleView(CandidateSearch):
@@ -114,7 +114,8 @@ class ClassificationStudy(Study):
     reference: ClassVar[str] = "cross-entropy"
     explanation: ClassVar[str] = (
         "First hit: at least one prediction up to this view is right. Stable hit: all predictions from this view on\n"
-        f"are right. For random search, both are means over {_RUNS} runs. Cue seen: this view or an earlier one shows\n"
+        f"are right. For random search, both are means over {_NUM_RANDOM_RUNS} runs. Cue seen: this view or an earlier "
+        "one shows\n"
         f"at least {CUE_PIXELS} pixels of the part that differs by class. Rank correlation and roughness at a view\n"
         "belong to the search that proposed this view."
     )
@@ -211,13 +212,18 @@ class ClassificationStudy(Study):
         **Raises:** `ValueError` if there is no mesh with this index, or if the mesh cannot be read.
         """
         keys = jax.random.split(jax.random.fold_in(jax.random.key(3), index), self.num_candidates)
-        name, thing = self.object_of(index)
-        pixels, scans = scan_cue(thing, self.camera, self.candidates.poses())
-        return Scene(index, name, surface_of(thing), Truth(int(thing.label), _noisy(scans, keys), thing, pixels))
+        name, class_object = self.object_of(index)
+        cue_pixels, scans = scan_cue(class_object, self.camera, self.candidates.poses())
+        return Scene(
+            index,
+            name,
+            surface_of(class_object),
+            Truth(int(class_object.label), _noisy(scans, keys), class_object, cue_pixels),
+        )
 
     def object_of(self, index: int) -> tuple[str, ClassObject | ClassMesh]:
         """Return the name and the object of the scene with this index."""
-        file = self.file(index)
+        file = self.mesh_file(index)
         if file is None:
             assert self.objects.scene is not None
             return f"{self.network} {index}", self.objects.scene(self.split, index, self.framing)
@@ -240,9 +246,9 @@ class ClassificationStudy(Study):
 
         With `FirstView.MISCLASSIFIED`, the classifier must be wrong about the scan.
         """
-        shows = super().shows_enough(scene, scan)
-        if self.first is FirstView.ANY or not shows:
-            return shows
+        is_enough = super().shows_enough(scene, scan)
+        if self.first is FirstView.ANY or not is_enough:
+            return is_enough
         return int(_classify(self.classifier, scan).argmax()) != scene.task.label
 
     def acquisition(self, method: str, scene: Scene) -> Acquisition:
@@ -258,19 +264,19 @@ class ClassificationStudy(Study):
 
     def sensor(self, scene: Scene) -> Sensor:
         """Return a sensor whose scan from a candidate is the same for all methods and views."""
-        anywhere, poses = super().sensor(scene), self.candidates.poses()
+        base_sensor, poses = super().sensor(scene), self.candidates.poses()
 
         def look(pose, key):
-            apart = [np.asarray(poses.position) - pose.position, np.asarray(poses.forward) - pose.forward]
-            away = np.linalg.norm(np.concatenate(apart, axis=1), axis=1)
-            return scene.task.scans[int(away.argmin())] if away.min() < 1e-3 else anywhere(pose, key)
+            differences = [np.asarray(poses.position) - pose.position, np.asarray(poses.forward) - pose.forward]
+            distances = np.linalg.norm(np.concatenate(differences, axis=1), axis=1)
+            return scene.task.scans[int(distances.argmin())] if distances.min() < 1e-3 else base_sensor(pose, key)
 
         return look
 
     def episode_keys(self, method: str, scene: Scene) -> list[PRNGKeyArray]:
         """Return the random keys of a method's episodes: several for random search, and one for other methods."""
         keys = super().episode_keys(method, scene)
-        return [jax.random.fold_in(keys[0], run) for run in range(_RUNS)] if method == "random" else keys
+        return [jax.random.fold_in(keys[0], run) for run in range(_NUM_RANDOM_RUNS)] if method == "random" else keys
 
     def merge_runs(self, runs: Sequence[Record]) -> Record:
         """Return the record of the first run, with the predictions and cue pixels of all runs."""
@@ -287,11 +293,11 @@ class ClassificationStudy(Study):
         for view, _, inputs, _ in episode:
             lists["log_p"].append(np.asarray(_classify(self.classifier, view.cloud)).tolist())
             pose = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], view.pose)
-            lists["pixels"].append(int(scan_cue(truth.thing, self.camera, pose)[0][0]))
+            lists["pixels"].append(int(scan_cue(truth.class_object, self.camera, pose)[0][0]))
             rank, rough = None, None
             if self.cue and view.proposal is not None and len(view.proposal.values) == self.num_candidates:
                 values = np.asarray(view.proposal.values)
-                rank = rank_correlation(values, truth.pixels, np.isfinite(values))
+                rank = rank_correlation(values, truth.cue_pixels, np.isfinite(values))
             if inputs is not None:
                 rough = roughness(planner.sampler, inputs)
             lists["rank_correlation"].append(rank)
@@ -331,13 +337,13 @@ def _classify(classifier: Classifier, cloud: PointCloud) -> Float[Array, " class
     return classifier(cloud)
 
 
-def _image(scene: Scene, camera: Camera, pose: Pose, tinted: bool) -> Float[np.ndarray, "h w 3"]:
-    """Return an image of the scene from a pose, lit from the camera. If `tinted`, the cue has its own colour."""
+def _image(scene: Scene, camera: Camera, pose: Pose, is_tinted: bool) -> Float[np.ndarray, "h w 3"]:
+    """Return an image of the scene from a pose, lit from the camera. If `is_tinted`, the cue has its own colour."""
     cloud = scan(scene.surface, camera, jax.tree.map(jnp.asarray, pose))
-    on_cue = np.asarray(scene.task.thing.on_cue(cloud.points)) & tinted
-    points, normals, hit = (np.asarray(array) for array in (cloud.points, cloud.normals, cloud.mask))
+    is_on_cue = np.asarray(scene.task.class_object.on_cue(cloud.points)) & is_tinted
+    points, normals, is_hit = (np.asarray(array) for array in (cloud.points, cloud.normals, cloud.mask))
     rays = pose.position - points
-    facing = np.where(hit, np.sum(rays * normals, axis=-1) / np.linalg.norm(rays, axis=-1), 0.0)
-    colours = np.where(on_cue[:, None], _TINTED, _PLAIN) * (0.4 + 0.65 * facing)[:, None]
-    image = np.where(hit[:, None], np.clip(colours, 0.0, 1.0), _BACKGROUND)
+    cosines = np.where(is_hit, np.sum(rays * normals, axis=-1) / np.linalg.norm(rays, axis=-1), 0.0)
+    colours = np.where(is_on_cue[:, None], _CUE_COLOUR, _BASE_COLOUR) * (0.4 + 0.65 * cosines)[:, None]
+    image = np.where(is_hit[:, None], np.clip(colours, 0.0, 1.0), _BACKGROUND)
     return image.reshape(camera.height, camera.width, 3)

@@ -158,7 +158,7 @@ class Study(eqx.Module):
         **Raises:** `ValueError` if there is no scene with this index, or if its file cannot be read.
         """
 
-    def file(self, index: int) -> MeshFile | None:
+    def mesh_file(self, index: int) -> MeshFile | None:
         """Return the mesh file of the scene with this index, or None if the scenes are procedural.
 
         **Raises:** `ValueError` if there is no scene with this index.
@@ -179,8 +179,8 @@ class Study(eqx.Module):
 
     def search(self, method: str, scene: Scene) -> Search:
         """Return the search of a method, see `search_of`."""
-        climbs = self.num_starts, self.iterations, self.learning_rate
-        return search_of(method, self.candidates, self.num_candidates, self.radius, *climbs)
+        gradient_settings = self.num_starts, self.iterations, self.learning_rate
+        return search_of(method, self.candidates, self.num_candidates, self.radius, *gradient_settings)
 
     def planner(self, method: str, scene: Scene) -> Planner:
         """Return the planner of a method. If the name ends in "-screened", the planner has no known shapes."""
@@ -255,8 +255,8 @@ class Study(eqx.Module):
         """Return a planner with the study's settings and the sampler of the scene."""
         base = self.sampler_of(scene)
         sampler = dataclasses.replace(base, grid=self.grid, num_samples=self.num_samples)
-        planned = acquisition, search, self.imagined_camera, sampler
-        return Planner(*planned, capacity=self.capacity, max_views=self.views)
+        settings = acquisition, search, self.imagined_camera, sampler
+        return Planner(*settings, capacity=self.capacity, max_views=self.views)
 
     def key(self, index: int, purpose: str) -> PRNGKeyArray:
         """Return the random key for a purpose in the scene with this index.
@@ -285,11 +285,11 @@ class Study(eqx.Module):
         **Raises:** `ValueError` if no candidate shows enough.
         """
 
-        def enough(scan: PointCloud) -> bool:
+        def is_enough(scan: PointCloud) -> bool:
             return self.shows_enough(scene, scan)
 
         keys = self.key(scene.index, "first"), self.key(scene.index, "episode")
-        first = random_first_view(enough, self.candidates.poses(), self.sensor(scene), *keys)
+        first = random_first_view(is_enough, self.candidates.poses(), self.sensor(scene), *keys)
         if first is None:
             raise InputError(f"none of {self.num_candidates} candidates shows enough of {scene.name}: ask for more")
         return first

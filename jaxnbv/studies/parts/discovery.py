@@ -40,9 +40,9 @@ _OTHERS = (*BASELINES, "coverage")
 # The width w of `NearestPart`, which is twice the standard deviation of the sensor noise.
 _WIDTH = 0.02
 # Distance that stands for an absent part. At this distance, the part's probability and all derivatives are zero.
-_NOWHERE = 100.0
+_ABSENT_DISTANCE = 100.0
 # Number of points that pictures show on the true surface.
-_DENSE = 8000
+_NUM_DENSE_POINTS = 8000
 
 
 class NearestPart(Segmenter):
@@ -64,22 +64,22 @@ class NearestPart(Segmenter):
     num_points: int = eqx.field(static=True)
 
     @classmethod
-    def of(cls, parts: MeshParts, room: int, grid: Grid, num_points: int) -> "NearestPart":
-        """Make the oracle of a mesh. Absent parts are added until there are `room` parts."""
+    def of(cls, parts: MeshParts, max_parts: int, grid: Grid, num_points: int) -> "NearestPart":
+        """Make the oracle of a mesh. Absent parts are added until there are `max_parts` parts."""
         distances = parts.distances(grid)
-        absent = ((0, room - len(distances)), (0, 0), (0, 0), (0, 0))
-        return cls(jnp.pad(distances, absent, constant_values=_NOWHERE), grid, num_points)
+        padding = ((0, max_parts - len(distances)), (0, 0), (0, 0), (0, 0))
+        return cls(jnp.pad(distances, padding, constant_values=_ABSENT_DISTANCE), grid, num_points)
 
     def __call__(self, cloud: PointCloud) -> Float[Array, "num_points parts"]:
         """Return the probability that each point belongs to each part; zeros in rows without a point."""
-        fed = farthest_point_subsample(cloud, self.num_points)
-        p = jax.nn.softmax(-0.5 * (self.distances_at(fed.points) / _WIDTH) ** 2, axis=-1)
-        return jnp.where(fed.mask[:, None], p, 0.0)
+        subsample = farthest_point_subsample(cloud, self.num_points)
+        p = jax.nn.softmax(-0.5 * (self.distances_at(subsample.points) / _WIDTH) ** 2, axis=-1)
+        return jnp.where(subsample.mask[:, None], p, 0.0)
 
     def predict(self, cloud: PointCloud) -> tuple[PointCloud, Int[Array, " num_points"]]:
         """Return the segmented points and the index of the part nearest to each; -1 in rows without a point."""
-        fed = farthest_point_subsample(cloud, self.num_points)
-        return fed, jnp.where(fed.mask, self.nearest(fed.points), -1)
+        subsample = farthest_point_subsample(cloud, self.num_points)
+        return subsample, jnp.where(subsample.mask, self.nearest(subsample.points), -1)
 
     def nearest(self, points: Float[Array, "n 3"]) -> Int[Array, " n"]:
         """Return the index of the part nearest to each point."""
@@ -90,8 +90,10 @@ class NearestPart(Segmenter):
 
         A point outside the grid gets the value at the border of the grid.
         """
-        at = (points.T + self.grid.half_extent) / self.grid.spacing
-        interpolate = jax.vmap(lambda values: map_coordinates(values, list(at), order=1, mode="nearest"), out_axes=-1)
+        coordinates = (points.T + self.grid.half_extent) / self.grid.spacing
+        interpolate = jax.vmap(
+            lambda values: map_coordinates(values, list(coordinates), order=1, mode="nearest"), out_axes=-1
+        )
         return interpolate(self.distances)
 
 
@@ -110,20 +112,20 @@ def discovery_time(counts: Int[np.ndarray, "views parts"], target: int) -> int |
     return int(np.argmax(is_complete)) + 1 if is_complete.any() else None
 
 
-def _times(record: Record, method: str) -> dict[int, float]:
+def _discovery_times(record: Record, method: str) -> dict[int, float]:
     """Return `discovery_time` for each of `TARGETS`, or the number of views plus one if it is None."""
     counts = np.asarray(record["methods"][method]["counts"])
     times = {target: discovery_time(counts, target) for target in TARGETS}
     return {target: float(record["study_views"] + 1 if time is None else time) for target, time in times.items()}
 
 
-def _found(record: Record, method: str) -> dict[int, float]:
+def _all_parts_found(record: Record, method: str) -> dict[int, float]:
     """Return, for each of `TARGETS`, 1.0 if all parts had as many points by the last view, else 0.0."""
-    return {target: float(time <= record["study_views"]) for target, time in _times(record, method).items()}
+    return {target: float(time <= record["study_views"]) for target, time in _discovery_times(record, method).items()}
 
 
-def _found_by_view(record: Record, method: str) -> list[float]:
-    time = _times(record, method)[TARGET]
+def _all_parts_found_by_view(record: Record, method: str) -> list[float]:
+    time = _discovery_times(record, method)[TARGET]
     return [float(time <= view) for view in range(1, record["study_views"] + 1)]
 
 
@@ -147,9 +149,17 @@ class PartDiscoveryStudy(Study):
     pictured: ClassVar[tuple[str, ...]] = ("discrete", "gradient-2dof", "farthest", "uncertainty")
     reference: ClassVar[str] = "discrete"
     measures: ClassVar[tuple[Measure, ...]] = (
-        Measure("time", "Views until all parts are found", _times, "N_target", "views", digits=2, lower_is_better=True),
-        Measure("found", "Objects whose parts were all found", _found, "N_target", "%"),
-        Measure("found_by_view", f"All parts found, N_target = {TARGET}", _found_by_view, unit="%"),
+        Measure(
+            "time",
+            "Views until all parts are found",
+            _discovery_times,
+            "N_target",
+            "views",
+            digits=2,
+            lower_is_better=True,
+        ),
+        Measure("found", "Objects whose parts were all found", _all_parts_found, "N_target", "%"),
+        Measure("found_by_view", f"All parts found, N_target = {TARGET}", _all_parts_found_by_view, unit="%"),
     )
     claims: ClassVar[tuple[Claim, ...]] = tuple(
         Claim(f"The utility finds {target} points of every part in fewer views.", "time", target, _OTHERS)
@@ -210,19 +220,19 @@ class PartDiscoveryStudy(Study):
         scene, runs = self.scene(record["scene"]), record["methods"]
         parts, segmenter = np.asarray(self.truth(scene)), self.segmenter_of(scene)
         palette, point = [SERIES[part % len(SERIES)] for part in range(len(parts))], jnp.zeros((1, 3))
-        labels = jax.eval_shape(segmenter, PointCloud(point, point, jnp.zeros(1, bool))).shape[1]
-        colours = np.tile(mpl.colors.to_rgb(GREY), (labels, 1))
+        num_labels = jax.eval_shape(segmenter, PointCloud(point, point, jnp.zeros(1, bool))).shape[1]
+        colours = np.tile(mpl.colors.to_rgb(GREY), (num_labels, 1))
         colours[parts] = mpl.colors.to_rgba_array(palette)[:, :3]
         mesh = cast(TriangleMesh, true_mesh(scene.surface))
-        points = mesh.sample_points(jax.random.key(0), _DENSE)
+        points = mesh.sample_points(jax.random.key(0), _NUM_DENSE_POINTS)
         labels_of_points = np.asarray(self.true_parts(scene, jnp.asarray(points, jnp.float32)))
         rendering = render_mesh(mesh, opposite_direction(record), pixels)
         replays = {method: replay(self, scene, runs[method]) for method in methods}
 
         def tile(axes: Axes, method: str, view: int) -> None:
-            fed, predicted = segmenter.predict(replays[method][view][1].cloud)
-            mask = np.asarray(fed.mask)
-            draw_on(axes, rendering, np.asarray(fed.points)[mask], colours[np.asarray(predicted)[mask]])
+            cloud, labels = segmenter.predict(replays[method][view][1].cloud)
+            mask = np.asarray(cloud.mask)
+            draw_on(axes, rendering, np.asarray(cloud.points)[mask], colours[np.asarray(labels)[mask]])
             num_found = sum(count >= TARGET for count in runs[method]["counts"][view])
             caption_tile(axes, f"{num_found} of {len(parts)} parts", num_found == len(parts))
 

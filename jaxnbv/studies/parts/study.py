@@ -80,7 +80,7 @@ class MeshPartStudy(PartDiscoveryStudy):
 
     def scene(self, index: int) -> Scene:
         """Return a scene with a mesh. The task of the scene is its `PartMesh`."""
-        file = self.file(index)
+        file = self.mesh_file(index)
         assert file is not None
         parts = load_parts(file.path)
         oracle = NearestPart.of(parts, self.room, _GRID, NETWORK_POINTS)
@@ -100,11 +100,11 @@ class MeshPartStudy(PartDiscoveryStudy):
         **Raises:** `ValueError` if no part can be found.
         """
         scans = scan(scene.surface, self.imagined_camera, self.candidates.poses())
-        joined = PointCloud(scans.points.reshape(-1, 3), scans.normals.reshape(-1, 3), scans.mask.reshape(-1))
-        counts = part_counts(scene.task.oracle(joined))
-        visible = [int(part) for part in np.flatnonzero(np.asarray(counts) >= max(TARGETS))]
-        require(len(visible) > 0, f"{scene.name} has no part that shows {max(TARGETS)} points: leave it out")
-        return visible
+        cloud = PointCloud(scans.points.reshape(-1, 3), scans.normals.reshape(-1, 3), scans.mask.reshape(-1))
+        counts = part_counts(scene.task.oracle(cloud))
+        visible_parts = [int(part) for part in np.flatnonzero(np.asarray(counts) >= max(TARGETS))]
+        require(len(visible_parts) > 0, f"{scene.name} has no part that shows {max(TARGETS)} points: leave it out")
+        return visible_parts
 
     def scene_record(self, scene: Scene, truth: list[int], first: int) -> Record:
         names = scene.task.parts.names

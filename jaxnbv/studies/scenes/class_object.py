@@ -77,44 +77,50 @@ class ClassMesh(eqx.Module):
     """A mesh that belongs to one of several classes.
 
     - `label`: index of the class.
-    - `part`: the triangles of `mesh` that are the cue (they tell the class); default: all triangles.
+    - `cue`: the triangles of `mesh` that are the cue (they tell the class); default: all triangles.
     """
 
     mesh: TriangleMesh
     label: int
-    part: TriangleMesh | None = None
+    cue: TriangleMesh | None = None
 
     def on_cue(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[np.ndarray, "*n"]:
         """Return whether each point lies on the cue, see `ClassObject.on_cue`. Runs on the host."""
-        if self.part is None:
+        if self.cue is None:
             return np.ones(x.shape[:-1], bool)
         points = np.asarray(x, np.float64).reshape(-1, 3)
-        distance = distance_to_triangles(points, self.part.vertices, self.part.faces)
+        distance = distance_to_triangles(points, self.cue.vertices, self.cue.faces)
         return (distance <= tolerance).reshape(x.shape[:-1])
 
 
-def surface_of(thing: ClassObject | ClassMesh) -> Surface:
+def surface_of(class_object: ClassObject | ClassMesh) -> Surface:
     """Return the surface of an object for ray tracing."""
-    return thing.mesh if isinstance(thing, ClassMesh) else SDFSurface(thing)
+    return class_object.mesh if isinstance(class_object, ClassMesh) else SDFSurface(class_object)
 
 
-def scan_cue(thing: ClassObject | ClassMesh, camera: Camera, poses: Pose) -> tuple[Int[Array, " poses"], PointCloud]:
-    """Return how many rays of each pose hit the cue (the part that tells the class), and noiseless scans."""
-    return _scan_telling(thing, camera, poses) if isinstance(thing, ClassMesh) else _compiled(thing, camera, poses)
-
-
-def _scan_telling(
-    thing: ClassObject | ClassMesh, camera: Camera, poses: Pose
+def scan_cue(
+    class_object: ClassObject | ClassMesh, camera: Camera, poses: Pose
 ) -> tuple[Int[Array, " poses"], PointCloud]:
-    scans = scan(surface_of(thing), camera, poses)
-    return jnp.sum(thing.on_cue(scans.points) & scans.mask, axis=-1), scans
+    """Return how many rays of each pose hit the cue (the part that tells the class), and noiseless scans."""
+    return (
+        _scan_cue(class_object, camera, poses)
+        if isinstance(class_object, ClassMesh)
+        else _scan_cue_compiled(class_object, camera, poses)
+    )
 
 
-_compiled = program(_scan_telling)
+def _scan_cue(
+    class_object: ClassObject | ClassMesh, camera: Camera, poses: Pose
+) -> tuple[Int[Array, " poses"], PointCloud]:
+    scans = scan(surface_of(class_object), camera, poses)
+    return jnp.sum(class_object.on_cue(scans.points) & scans.mask, axis=-1), scans
+
+
+_scan_cue_compiled = program(_scan_cue)
 
 
 def hidden_view(
-    thing: ClassObject | ClassMesh, key: PRNGKeyArray, camera: Camera = Camera(), poses: Pose | None = None
+    class_object: ClassObject | ClassMesh, key: PRNGKeyArray, camera: Camera = Camera(), poses: Pose | None = None
 ) -> Pose:
     """Return a random pose that shows the object but not its cue (the part that tells the class).
 
@@ -123,7 +129,7 @@ def hidden_view(
     **Raises:** `ValueError` if there is no such pose.
     """
     poses = sphere_candidates(120) if poses is None else poses
-    return poses[choose_hidden(*scan_cue(thing, camera, poses), key)]
+    return poses[choose_hidden(*scan_cue(class_object, camera, poses), key)]
 
 
 def choose_hidden(cue_pixels: Int[AnyArray, " poses"], scans: PointCloud, key: PRNGKeyArray) -> int:
@@ -134,6 +140,6 @@ def choose_hidden(cue_pixels: Int[AnyArray, " poses"], scans: PointCloud, key: P
 
     **Raises:** `ValueError` if there is no such pose.
     """
-    hidden = np.flatnonzero((np.asarray(cue_pixels) == 0) & (np.asarray(scans.count) > 0))
-    require(len(hidden) > 0, f"the cue of the class shows from all {len(cue_pixels)} candidates: ask for more of them")
-    return int(jax.random.choice(key, hidden))
+    indices = np.flatnonzero((np.asarray(cue_pixels) == 0) & (np.asarray(scans.count) > 0))
+    require(len(indices) > 0, f"the cue of the class shows from all {len(cue_pixels)} candidates: ask for more of them")
+    return int(jax.random.choice(key, indices))

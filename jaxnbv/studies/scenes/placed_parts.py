@@ -115,9 +115,9 @@ class PlacedPart(eqx.Module):
     @property
     def mesh(self) -> TriangleMesh:
         """The mesh of the placed part, in scene coordinates."""
-        return self.placed(self.part, self.rotation, self.shift)
+        return self.placed_mesh(self.part, self.rotation, self.shift)
 
-    def placed(self, part: int, rotation: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"]) -> TriangleMesh:
+    def placed_mesh(self, part: int, rotation: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"]) -> TriangleMesh:
         """Return the mesh of a part with a given placement, in scene coordinates.
 
         - `part`: index of the part in the bank, which need not be the scene's part.

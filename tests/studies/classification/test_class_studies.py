@@ -33,7 +33,7 @@ def test_the_first_view_can_be_one_after_which_the_classifier_is_wrong(kind):
         first = study.first_view(scene)
         assert int(study.classifier(scene.task.scans[first]).argmax()) != scene.task.label
         if kind is PyramidStudy:
-            assert int(scene.task.pixels[first]) == 0
+            assert int(scene.task.cue_pixels[first]) == 0
     always_right = lambda cloud: jnp.log(jnp.eye(len(kind.objects.classes))[scene.task.label])  # noqa: E731
     with pytest.raises(InputError, match="shows enough of"):
         dataclasses.replace(study, classifier=always_right).first_view(scene)

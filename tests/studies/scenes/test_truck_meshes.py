@@ -55,7 +55,7 @@ def test_the_cargo_stands_on_the_bed_and_tells_the_class(seed):
     corners = thing.mesh.vertices
     np.testing.assert_allclose(np.ptp(corners, axis=0).max(), 2.5)
     own, others = corners[len(truck.vertices) :], corners[: len(truck.vertices)]
-    np.testing.assert_allclose(own, thing.part.vertices, atol=1e-9)
+    np.testing.assert_allclose(own, thing.cue.vertices, atol=1e-9)
     # Truck and cargo are rotated and scaled together: all distances change by the same factor.
     for before, after in ((truck.vertices, others), (cargo.vertices, own)):
         ratio = np.linalg.norm(after[1:] - after[0], axis=1) / np.linalg.norm(before[1:] - before[0], axis=1)
@@ -87,7 +87,7 @@ def test_the_study_counts_the_rays_that_hit_the_cargo(tmp_path):
     nearer = np.linalg.norm(np.asarray(both.points) - np.asarray(empty.points), axis=-1) > 3e-3
     counts = (np.asarray(both.mask) & (nearer | ~np.asarray(empty.mask))).sum(axis=1)
     # Where cargo meets the floor a ray may hit either.
-    np.testing.assert_allclose(scene.task.pixels, counts, atol=8)
+    np.testing.assert_allclose(scene.task.cue_pixels, counts, atol=8)
     assert counts.max() > 150
     with pytest.raises(InputError, match=r"there is no folder .*trucks"):
         TruckStudy.configured("screened", 2, False, meshes=tmp_path / "table")
