@@ -51,7 +51,7 @@ class ClassTask(Task):
         from jaxnbv.search.candidates import sphere_candidates
         from jaxnbv.studies.scenes import HOUSEHOLD, Framing, Split, hidden_view, truck_scene
 
-        truck = truck_scene(Split.TEST, scene, turned=False)
+        truck = truck_scene(Split.TEST, scene, is_rotated=False)
         around = sphere_candidates(120)
         first = hidden_view(truck, jax.random.key(seed), poses=around[np.asarray(around.position[:, 1]) > 0])
         side = Framing.CLOSE_UP.longest_side

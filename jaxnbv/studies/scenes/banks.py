@@ -31,16 +31,16 @@ class BankRecipe(NamedTuple):
         return ShapeBank.of([self.shape(index) for index in range(self.number)], names)
 
 
-def _heated(index: int) -> SignedDistance:
-    surface: Any = heat_scene(FIRST_TRAINING + index, turned=False).surface
+def _heat_solid(index: int) -> SignedDistance:
+    surface: Any = heat_scene(FIRST_TRAINING + index, is_rotated=False).surface
     return surface.sdf
 
 
 RECIPES = {
-    "pyramid": BankRecipe(1024, PATTERNS, lambda i: pyramid_scene(Split.TRAIN, i, turned=False).solid),
-    "truck": BankRecipe(512, HOUSEHOLD, lambda i: truck_scene(Split.TRAIN, i, turned=False).solid),
-    "household": BankRecipe(512, HOUSEHOLD, lambda i: household_scene(Split.TRAIN, i, turned=False).solid),
+    "pyramid": BankRecipe(1024, PATTERNS, lambda i: pyramid_scene(Split.TRAIN, i, is_rotated=False).solid),
+    "truck": BankRecipe(512, HOUSEHOLD, lambda i: truck_scene(Split.TRAIN, i, is_rotated=False).solid),
+    "household": BankRecipe(512, HOUSEHOLD, lambda i: household_scene(Split.TRAIN, i, is_rotated=False).solid),
     "parts": BankRecipe(520, PART_CATEGORIES, lambda i: part_scene(Split.TRAIN, i).solid),
-    "heat": BankRecipe(256, HEAT_OBJECTS, _heated),
+    "heat": BankRecipe(256, HEAT_OBJECTS, _heat_solid),
 }
 """The recipe of each shipped bank, by the name of the bank."""

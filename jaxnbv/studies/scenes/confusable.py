@@ -24,7 +24,7 @@ _BANK_GRID, _MESH_GRID = Grid(64, 1.5), Grid(100, 1.4)
 _PADDING = 0.15
 # The pocket of the housing: x of its centre, height of its floor, and height of the floor for housings with holes. The
 # second floor is higher, because a deep floor would hide the holes.
-_ACROSS, _FLOOR, _SHALLOW = 0.15, 0.05, 0.45
+_POCKET_X, _POCKET_FLOOR, _SHALLOW_FLOOR = 0.15, 0.05, 0.45
 
 
 def _box(half_size: Sequence[float], center: Sequence[float]) -> SignedDistance:
@@ -35,7 +35,7 @@ def _pin(radius: float, half_height: float, center: Sequence[float]) -> SignedDi
     return Translated(Cylinder(radius, half_height), np.asarray(center))
 
 
-def _housing(side: float = 1.0, floor: float = _FLOOR) -> SignedDistance:
+def _housing(side: float = 1.0, floor: float = _POCKET_FLOOR) -> SignedDistance:
     """Make a housing: a block with a deep pocket that is open above, and a notch at one corner.
 
     The notch breaks the block's symmetry.
@@ -43,7 +43,7 @@ def _housing(side: float = 1.0, floor: float = _FLOOR) -> SignedDistance:
     - `side`: 1, or -1 for the mirror image; `floor`: height of the pocket's floor.
     """
     block = Cuboid(np.array([0.75, 1.25, 0.55]))
-    pocket = _box([0.42, 0.7, 0.3], [side * _ACROSS, floor + 0.7, 0.0])
+    pocket = _box([0.42, 0.7, 0.3], [side * _POCKET_X, floor + 0.7, 0.0])
     return Difference(Difference(block, pocket), _box([0.2, 0.2, 0.2], [side * 0.75, -1.25, 0.55]))
 
 
@@ -59,7 +59,7 @@ def _bosses() -> list[SignedDistance]:
         (0.0, 0.0, 0.22, 0.25),
         (-0.25, 0.15, 0.1, 0.4),
     ]
-    return [Union(_housing(), _pin(r, h, [_ACROSS + x, _FLOOR + h - 0.05, z])) for x, z, r, h in variants]
+    return [Union(_housing(), _pin(r, h, [_POCKET_X + x, _POCKET_FLOOR + h - 0.05, z])) for x, z, r, h in variants]
 
 
 def _bores() -> list[SignedDistance]:
@@ -67,21 +67,23 @@ def _bores() -> list[SignedDistance]:
     places = [(-0.25, 0.0), (0.25, 0.0), (0.0, 0.15), (0.0, -0.15), (0.0, 0.0), (0.0, 0.0), (-0.25, 0.15), (0.25, 0.15)]
     radii = [0.12, 0.12, 0.12, 0.12, 0.12, 0.22, 0.12, 0.12]
     return [
-        Difference(_housing(floor=_SHALLOW), _pin(r, 0.35, [_ACROSS + x, _SHALLOW - 0.25, z]))
+        Difference(_housing(floor=_SHALLOW_FLOOR), _pin(r, 0.35, [_POCKET_X + x, _SHALLOW_FLOOR - 0.25, z]))
         for (x, z), r in zip(places, radii, strict=True)
     ]
 
 
 def _ribs() -> list[SignedDistance]:
     """Make blocks with a pocket. The position and direction of a rib on the pocket's floor differ."""
-    along = [(-0.28, 0.0, 90.0), (0.0, 0.0, 90.0), (0.28, 0.0, 90.0)]
-    across = [(0.0, -0.2, 0.0), (0.0, 0.0, 0.0), (0.0, 0.2, 0.0)]
-    aslant = [(0.0, 0.0, 45.0), (0.0, 0.0, -45.0)]
+    lengthwise = [(-0.28, 0.0, 90.0), (0.0, 0.0, 90.0), (0.28, 0.0, 90.0)]
+    crosswise = [(0.0, -0.2, 0.0), (0.0, 0.0, 0.0), (0.0, 0.2, 0.0)]
+    diagonal = [(0.0, 0.0, 45.0), (0.0, 0.0, -45.0)]
     rib = Cuboid(np.array([0.28, 0.15, 0.06]))
     up = np.array([0.0, 1.0, 0.0])
     return [
-        Union(_housing(), Translated(rib.rotate(up, np.radians(angle)), np.array([_ACROSS + x, _FLOOR + 0.1, z])))
-        for x, z, angle in (*along, *across, *aslant)
+        Union(
+            _housing(), Translated(rib.rotate(up, np.radians(angle)), np.array([_POCKET_X + x, _POCKET_FLOOR + 0.1, z]))
+        )
+        for x, z, angle in (*lengthwise, *crosswise, *diagonal)
     ]
 
 
@@ -98,7 +100,8 @@ def _connectors() -> list[SignedDistance]:
         (0.16, 0.1, 0.22, -0.15),
     ]
     return [
-        Union(_housing(), _box([half, 0.2, deep], [_ACROSS + x, _FLOOR + 0.15, z])) for half, deep, x, z in variants
+        Union(_housing(), _box([half, 0.2, deep], [_POCKET_X + x, _POCKET_FLOOR + 0.15, z]))
+        for half, deep, x, z in variants
     ]
 
 
@@ -109,8 +112,8 @@ def _pins() -> list[SignedDistance]:
 
     def part(pattern: str) -> SignedDistance:
         # An absent pin is placed inside the block, because all parts of a set need the same structure.
-        heights = [_FLOOR + (0.2 if digit == "1" else -0.6) for digit in pattern]
-        pins = [_pin(0.1, 0.25, [_ACROSS + x, y, z]) for (x, z), y in zip(places, heights, strict=True)]
+        heights = [_POCKET_FLOOR + (0.2 if digit == "1" else -0.6) for digit in pattern]
+        pins = [_pin(0.1, 0.25, [_POCKET_X + x, y, z]) for (x, z), y in zip(places, heights, strict=True)]
         return functools.reduce(Union, pins, _housing())
 
     return [part(pattern) for pattern in patterns]
@@ -125,10 +128,10 @@ def _channels() -> list[SignedDistance]:
 
 
 def _cup(floor: float, size: float = 1.0) -> SignedDistance:
-    wall, high = 0.12 * size, 1.25 * size
+    wall, half_height = 0.12 * size, 1.25 * size
     top = 1.5
     inside = _pin(0.7 * size - wall, 0.5 * (top - floor), [0.0, 0.5 * (top + floor), 0.0])
-    return Difference(Cylinder(0.7 * size, high), inside)
+    return Difference(Cylinder(0.7 * size, half_height), inside)
 
 
 def _cups() -> list[SignedDistance]:
@@ -158,7 +161,7 @@ def _mirrored() -> list[SignedDistance]:
     """Make four blocks with a boss in a pocket, and the mirror image of each."""
     places = [(-0.25, 0.0), (0.25, 0.0), (0.0, 0.15), (0.0, -0.15)]
     return [
-        Union(_housing(side), _pin(0.12, 0.25, [side * (_ACROSS + x), _FLOOR + 0.2, z]))
+        Union(_housing(side), _pin(0.12, 0.25, [side * (_POCKET_X + x), _POCKET_FLOOR + 0.2, z]))
         for side in (1.0, -1.0)
         for x, z in places
     ]

@@ -36,21 +36,21 @@ class HeatScene(eqx.Module):
     source: Float[Array, "3"]
 
 
-def heat_scene(index: int, turned: bool = True) -> HeatScene:
+def heat_scene(index: int, is_rotated: bool = True) -> HeatScene:
     """Return the heated scene with this index. Its kind of object is `HEAT_OBJECTS[index % 4]`.
 
-    Proportions and heat source are random. If `turned`, the object is also rotated about y by a random angle. Indices
-    from `FIRST_TRAINING` on are reserved for training, so reported results never include them.
+    Proportions and heat source are random. If `is_rotated`, the object is also rotated about y by a random angle.
+    Indices from `FIRST_TRAINING` on are reserved for training, so reported results never include them.
 
     **Raises:** `ValueError` if the index is negative.
     """
     require(index >= 0, f"the scene's number is {index}; it must not be negative")
     name = HEAT_OBJECTS[index % len(HEAT_OBJECTS)]
     rng = generator(jax.random.fold_in(jax.random.key(1), index))
-    primitives, place = _BUILDERS[name](rng)
-    solid = assemble(primitives, rng.uniform(-np.pi, np.pi) if turned else 0.0)
+    primitives, position = _BUILDERS[name](rng)
+    solid = assemble(primitives, rng.uniform(-np.pi, np.pi) if is_rotated else 0.0)
     source = solid.centre[0] + jnp.matmul(
-        solid.rotation[0], solid.half_size[0] * jnp.asarray(place), precision="highest"
+        solid.rotation[0], solid.half_size[0] * jnp.asarray(position), precision="highest"
     )
     return HeatScene(SDFSurface(solid), name, source)
 
@@ -62,10 +62,10 @@ def source_view(scene: HeatScene, key: PRNGKeyArray, num_candidates: int = 100, 
     """
     poses = sphere_candidates(num_candidates, radius)
     scans = scan(scene.surface, Camera(), poses)
-    near = jnp.linalg.norm(scans.points - scene.source, axis=-1) < 0.05
-    (shown,) = np.nonzero(jnp.any(near & scans.mask, axis=-1))
-    require(len(shown) > 0, f"none of {num_candidates} candidates sees the heat source: ask for more of them")
-    return poses[int(jax.random.choice(key, shown))]
+    is_near = jnp.linalg.norm(scans.points - scene.source, axis=-1) < 0.05
+    (indices,) = np.nonzero(jnp.any(is_near & scans.mask, axis=-1))
+    require(len(indices) > 0, f"none of {num_candidates} candidates sees the heat source: ask for more of them")
+    return poses[int(jax.random.choice(key, indices))]
 
 
 # Each function below returns the primitives of an object and the position of the heat source. The first primitive is
@@ -104,9 +104,9 @@ def _chair(rng):
         y = rng.uniform(0.2, 0.5) * height
         parts.append(rod((-x, y, b), (x, y, b), 0.04))
     parts += [bar((-x, height, b), (-x - 0.12, height + rise, b), 0.05, 0.05) for b in (-z, z)]
-    for share in (0.45, 0.85):
-        at = -x - 0.12 * share, height + rise * share
-        parts.append(box((*at, 0), (0.04, 0.1, z)))
+    for fraction in (0.45, 0.85):
+        position = -x - 0.12 * fraction, height + rise * fraction
+        parts.append(box((*position, 0), (0.04, 0.1, z)))
     return parts, _on_top(rng)
 
 
@@ -129,8 +129,8 @@ def _fins(rng):
     count, half_depth, half_width = int(rng.integers(6, 10)), rng.uniform(0.6, 0.9), rng.uniform(1.0, 1.2)
     rise, thick = rng.uniform(0.6, 1.0), rng.uniform(0.06, 0.1)
     parts = [box((0, 0, 0), (half_depth, thick, half_width))]
-    places = np.linspace(-half_width + 0.06, half_width - 0.06, count)
-    for z in places:
+    positions = np.linspace(-half_width + 0.06, half_width - 0.06, count)
+    for z in positions:
         height = rise * rng.uniform(0.7, 1.0)
         parts.append(box((0, 0.5 * height, z), (half_depth - 0.02, 0.5 * height, 0.035)))
     return parts, (rng.uniform(-0.7, 0.7), -1.0, rng.uniform(-0.7, 0.7))

@@ -19,10 +19,12 @@ ball, bar, box, ring, rod = (
 path = partial(labelled.path, 1)
 
 
-def household_scene(split: Split, index: int, framing: Framing = Framing.CLOSE_UP, turned: bool = True) -> SolidObject:
+def household_scene(
+    split: Split, index: int, framing: Framing = Framing.CLOSE_UP, is_rotated: bool = True
+) -> SolidObject:
     """Return the random household object with this index in a split, of class `HOUSEHOLD[index % 10]`.
 
-    The object stands upright along y. If `turned`, it is rotated about y by a random angle, else it faces x. Its
+    The object stands upright along y. If `is_rotated`, it is rotated about y by a random angle, else it faces x. Its
     bounding box is centred. At a longest side of 2.5, no primitive is thinner than 0.05. The object is built on the
     host, so the function does not run under `jit`.
 
@@ -30,7 +32,7 @@ def household_scene(split: Split, index: int, framing: Framing = Framing.CLOSE_U
     """
     label, rng = index % len(HOUSEHOLD), generator(scene_key(6, split, index))
     primitives = list(BUILDERS[HOUSEHOLD[label]](rng))
-    solid = assemble(primitives, rng.uniform(-np.pi, np.pi) if turned else 0.0, framing.longest_side)
+    solid = assemble(primitives, rng.uniform(-np.pi, np.pi) if is_rotated else 0.0, framing.longest_side)
     return SolidObject(solid=solid, label=jnp.asarray(label))
 
 
@@ -135,9 +137,9 @@ def _monitor(rng):
     rim = 0.05
     front = thick + 0.02
     for side in (-1, 1):
-        along = np.array([-np.sin(tilt), np.cos(tilt), 0.0]) * side * (height - rim)
+        offset = np.array([-np.sin(tilt), np.cos(tilt), 0.0]) * side * (height - rim)
         out = np.array([np.cos(tilt), np.sin(tilt), 0.0]) * front
-        yield box(np.array([0, level, 0]) + out + along, (0.03, rim, z), 0.02, lean)
+        yield box(np.array([0, level, 0]) + out + offset, (0.03, rim, z), 0.02, lean)
         centre = np.array([0, level, side * (z - rim)]) + out
         yield box(centre, (0.03, height, rim), 0.02, lean)
     if rng.random() < 0.5:

@@ -20,7 +20,7 @@ from jaxnbv.scanning.sdf import UNUSED, LabelledSolid
 # Number of slots for primitives in a solid. Larger solids use a multiple of this number.
 CAPACITY = 24
 
-_UNTURNED, _UNMOVED = np.eye(3), np.zeros(3)
+_IDENTITY, _NO_OFFSET = np.eye(3), np.zeros(3)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,14 +50,15 @@ class Primitive:
         return self.centre + np.array([[-1.0], [1.0]]) * reach
 
 
-def box(label: int, centre, half_size, rounding: float = 0.02, turn: tuple | None = None) -> Primitive:
+def box(label: int, centre, half_size, rounding: float = 0.02, axis_angle: tuple | None = None) -> Primitive:
     """Return a box with rounded edges.
 
     - `rounding`: radius of the edges, at most the smallest half size.
-    - `turn`: axis and angle (radians) of a right-handed rotation of the box about its centre; None for no rotation.
+    - `axis_angle`: axis and angle (radians) of a right-handed rotation of the box about its centre; None for no
+      rotation.
     """
     half_size = np.asarray(half_size, dtype=float)
-    rotation = np.eye(3) if turn is None else rotation_about(*turn)
+    rotation = np.eye(3) if axis_angle is None else rotation_about(*axis_angle)
     return Primitive(label, np.asarray(centre, dtype=float), rotation, half_size, min(rounding, half_size.min()))
 
 
@@ -113,8 +114,8 @@ def path(label: int, points, radius: float) -> list[Primitive]:
     points = np.asarray(points, dtype=float)
     rods = []
     for start, end in itertools.pairwise(points):
-        over = radius * (end - start) / np.linalg.norm(end - start)
-        rods.append(rod(label, start - over, end + over, radius, rounding=radius))
+        extension = radius * (end - start) / np.linalg.norm(end - start)
+        rods.append(rod(label, start - extension, end + extension, radius, rounding=radius))
     return rods
 
 
@@ -123,7 +124,7 @@ def ball(label: int, centre, radius: float) -> Primitive:
     return ring(label, centre, (0.0, 1.0, 0.0), 0.0, radius, radius, radius)
 
 
-def shifted(point, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Float[np.ndarray, "3"]:
+def shift(point, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Float[np.ndarray, "3"]:
     """Return a point moved by x, y and z along the coordinate axes."""
     return np.asarray(point, dtype=float) + np.array([x, y, z])
 
@@ -143,16 +144,16 @@ def _upright(axis):
     return np.stack([np.cross(axis, level), axis, level], axis=1)
 
 
-def assemble(primitives: list[Primitive], turn: float = 0.0, longest_side: float = 2.5) -> LabelledSolid:
-    """Return the union of primitives, rotated about the y axis by `turn` (radians), then moved and scaled.
+def assemble(primitives: list[Primitive], rotation_angle: float = 0.0, longest_side: float = 2.5) -> LabelledSolid:
+    """Return the union of primitives, rotated about the y axis by `rotation_angle` (radians), then moved and scaled.
 
     The bounding box of the result is centred in the scene, and its longest side is `longest_side`.
     """
-    turned = rotation_about((0.0, 1.0, 0.0), turn)
-    return united(fitted([moved(p, rotation=turned) for p in primitives], longest_side))
+    rotation = rotation_about((0.0, 1.0, 0.0), rotation_angle)
+    return union(fit([move(p, rotation=rotation) for p in primitives], longest_side))
 
 
-def moved(p: Primitive, scale: float = 1.0, rotation=_UNTURNED, offset=_UNMOVED) -> Primitive:
+def move(p: Primitive, scale: float = 1.0, rotation=_IDENTITY, offset=_NO_OFFSET) -> Primitive:
     """Return a primitive moved by x -> scale rotation x + offset."""
     return dataclasses.replace(
         p,
@@ -170,14 +171,14 @@ def bounds(primitives: list[Primitive]) -> Float[np.ndarray, "2 3"]:
     return np.stack([np.min(lows, axis=0), np.max(highs, axis=0)])
 
 
-def fitted(primitives: list[Primitive], longest_side: float) -> list[Primitive]:
+def fit(primitives: list[Primitive], longest_side: float) -> list[Primitive]:
     """Move and scale primitives so that their joint bounding box is centred, with this longest side."""
     low, high = bounds(primitives)
     scale = longest_side / (high - low).max()
-    return [moved(p, scale, offset=-0.5 * scale * (low + high)) for p in primitives]
+    return [move(p, scale, offset=-0.5 * scale * (low + high)) for p in primitives]
 
 
-def united(primitives: list[Primitive], capacity: int = CAPACITY) -> LabelledSolid:
+def union(primitives: list[Primitive], capacity: int = CAPACITY) -> LabelledSolid:
     """Return the union of primitives without moving them.
 
     - `capacity`: number of slots for primitives in the solid. Spare slots stay unused.

@@ -31,7 +31,7 @@ _BUILDERS = {
 PART_CATEGORIES = tuple(_BUILDERS)
 
 # All objects face along x, as in ShapeNet, up to this rotation about the y axis.
-_LARGEST_TURN = np.radians(10.0)
+_MAX_ROTATION = np.radians(10.0)
 
 
 class PartScene(eqx.Module):
@@ -58,6 +58,6 @@ def part_scene(split: Split, index: int) -> PartScene:
     """
     category, rng = PART_CATEGORIES[index % len(PART_CATEGORIES)], generator(scene_key(0, split, index))
     primitives = list(_BUILDERS[category](rng))
-    solid = assemble(primitives, rng.uniform(-_LARGEST_TURN, _LARGEST_TURN))
+    solid = assemble(primitives, rng.uniform(-_MAX_ROTATION, _MAX_ROTATION))
     parts = np.isin(np.arange(NUM_PARTS), np.asarray(solid.labels))
     return PartScene(solid, jnp.asarray(category_index(category)), jnp.asarray(parts))

@@ -22,9 +22,9 @@ from jaxnbv.surfaces import FreeRotation, Resting, ShapeBank, ShapePoses
 _LONGEST_SIDE = 2.5
 # The box beside a part, in scene units: gap between box and part, half the thickness of the box, and length by which
 # the box extends beyond the part.
-_GAP, _THIN, _BEYOND = 0.3, 0.15, 0.2
+_GAP, _HALF_THICKNESS, _OVERHANG = 0.3, 0.15, 0.2
 # Seed of the order of parts, which does not depend on the seed of the study.
-_ORDER = 123
+_ORDER_SEED = 123
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -48,7 +48,7 @@ class Parts:
         One half of the parts is for scenes with even indices, and the other half for odd indices. In each half, every
         part comes once before any part repeats.
         """
-        half = np.random.default_rng(_ORDER).permutation(len(self.meshes))[index % 2 :: 2]
+        half = np.random.default_rng(_ORDER_SEED).permutation(len(self.meshes))[index % 2 :: 2]
         return int(half[index // 2 % len(half)])
 
 
@@ -67,8 +67,8 @@ def parts_in(files: tuple[MeshFile, ...]) -> Parts:
         names.append(file.name if counts[file.name] == 1 else f"{file.name} {counts[file.name]}")
     bank = ShapeBank.from_meshes([file.path for file in files], names=names, scale=1.0, up=files[0].up)
     require(len(bank) > 1, f"there is only one part, {bank.names[0]}: give a folder of at least two parts")
-    used = {name.encode()[:64].decode(errors="ignore"): file for name, file in zip(names, files, strict=True)}
-    return Parts(bank, tuple(_at_true_size(used[name].read()) for name in bank.names))
+    file_of_name = {name.encode()[:64].decode(errors="ignore"): file for name, file in zip(names, files, strict=True)}
+    return Parts(bank, tuple(_at_true_size(file_of_name[name].read()) for name in bank.names))
 
 
 def _at_true_size(mesh: TriangleMesh) -> TriangleMesh:
@@ -80,10 +80,10 @@ def confusable_parts(index: int) -> tuple[str, Parts, int]:
 
     - `index`: index of the scene. The set is `CONFUSABLE_SETS[index % 10]`.
     """
-    turn, set_index = divmod(index, len(CONFUSABLE_SETS))
+    cycle, set_index = divmod(index, len(CONFUSABLE_SETS))
     name = CONFUSABLE_SETS[set_index]
-    order = np.random.default_rng(_ORDER + set_index).permutation(PARTS_OF_SET)
-    return name, Parts(confusable_bank(name), confusable_meshes(name)), int(order[turn % PARTS_OF_SET])
+    order = np.random.default_rng(_ORDER_SEED + set_index).permutation(PARTS_OF_SET)
+    return name, Parts(confusable_bank(name), confusable_meshes(name)), int(order[cycle % PARTS_OF_SET])
 
 
 class PlacedPart(eqx.Module):
@@ -134,8 +134,8 @@ def place_part(parts: Parts, part: int, setup: Setup, key: PRNGKeyArray) -> Plac
     random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     vertices = parts.meshes[part].vertices
     rotation = _resting(vertices, random) if setup.is_resting else Rotation.random(rng=random).as_matrix()
-    turned = vertices @ rotation.T
-    low, high = turned.min(axis=0), turned.max(axis=0)
+    rotated_vertices = vertices @ rotation.T
+    low, high = rotated_vertices.min(axis=0), rotated_vertices.max(axis=0)
     scale = _LONGEST_SIDE / float((high - low).max())
     obstacles = _obstacles(0.5 * scale * (high - low), setup is Setup.HIDDEN, random) if setup.is_resting else None
     return PlacedPart(part, parts, scale, rotation, -0.5 * scale * (low + high), obstacles)
@@ -147,11 +147,11 @@ def _resting(vertices: Float[np.ndarray, "v 3"], random: np.random.Generator) ->
     A pose is drawn with the probability that a dropped part comes to rest in this pose.
     """
     hull = trimesh.Trimesh(vertices, process=False).convex_hull
-    matrices, shares = trimesh.poses.compute_stable_poses(hull)
-    resting = matrices[random.choice(len(shares), p=shares / shares.sum())][:3, :3]
+    matrices, probabilities = trimesh.poses.compute_stable_poses(hull)
+    rest_rotation = matrices[random.choice(len(probabilities), p=probabilities / probabilities.sum())][:3, :3]
     upright = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
     spin = Rotation.from_rotvec([0.0, random.uniform(0.0, 2.0 * np.pi), 0.0]).as_matrix()
-    return spin @ upright @ resting
+    return spin @ upright @ rest_rotation
 
 
 def _obstacles(half: Float[np.ndarray, "3"], has_box: bool, random: np.random.Generator) -> Obstacles:
@@ -162,11 +162,14 @@ def _obstacles(half: Float[np.ndarray, "3"], has_box: bool, random: np.random.Ge
     table = HalfSpace(np.array([0.0, -half[1], 0.0]), np.array([0.0, 1.0, 0.0]))
     if not has_box:
         return Obstacles((table,))
-    ahead, aside = random.permutation([0, 2])
+    normal_axis, side_axis = random.permutation([0, 2])
     size, center = np.zeros(3), np.zeros(3)
-    size[ahead], center[ahead] = _THIN, random.choice([-1.0, 1.0]) * (half[ahead] + _GAP + _THIN)
-    size[aside] = 0.5 * (half[aside] + _BEYOND)
-    center[aside] = random.choice([-1.0, 1.0]) * size[aside]
-    size[1] = half[1] + _BEYOND
+    size[normal_axis], center[normal_axis] = (
+        _HALF_THICKNESS,
+        random.choice([-1.0, 1.0]) * (half[normal_axis] + _GAP + _HALF_THICKNESS),
+    )
+    size[side_axis] = 0.5 * (half[side_axis] + _OVERHANG)
+    center[side_axis] = random.choice([-1.0, 1.0]) * size[side_axis]
+    size[1] = half[1] + _OVERHANG
     center[1] = size[1] - half[1]
     return Obstacles((table, Cuboid(size).translate(center)))

@@ -12,51 +12,51 @@ from jaxnbv.studies.scenes.labelled import (
     Primitive,
     bounds,
     box,
-    fitted,
+    fit,
     generator,
-    moved,
+    move,
     rod,
     rotation_about,
-    united,
+    union,
 )
 from jaxnbv.studies.scenes.splits import Split, scene_key
 
 # Label of the truck's primitives, which do not tell the class. Primitives of the cargo have labels above 0.
-_TRUCK = 0
+_TRUCK_LABEL = 0
 
 
-def truck_scene(split: Split, index: int, framing: Framing = Framing.CLOSE_UP, turned: bool = True) -> SolidObject:
+def truck_scene(split: Split, index: int, framing: Framing = Framing.CLOSE_UP, is_rotated: bool = True) -> SolidObject:
     """Return the loaded truck with this index in a split. The cargo's class is `HOUSEHOLD[index % 10]`.
 
     The cargo is rotated about the vertical by a random angle and scaled to fill the bed. The loaded truck has a random
-    rotation if `turned`, else it stands upright along y and faces x. Its bounding box is centred in the scene. The
+    rotation if `is_rotated`, else it stands upright along y and faces x. Its bounding box is centred in the scene. The
     truck is built on the host, so the function does not run under `jit`.
 
     **Raises:** `ValueError` if the index is negative.
     """
     label, rng = index % len(HOUSEHOLD), generator(scene_key(5, split, index))
     truck, low, high = _truck(rng)
-    turn = rotation_about((0.0, 1.0, 0.0), rng.uniform(-np.pi, np.pi))
-    cargo = [moved(p, rotation=turn) for p in BUILDERS[HOUSEHOLD[label]](rng)]
-    scale, offset = stowed(np.stack([low, high]), bounds(cargo), rng)
-    cargo = [moved(p, scale, offset=offset) for p in cargo]
-    rotation = random_rotation(rng) if turned else np.eye(3)
-    both = fitted([moved(p, rotation=rotation) for p in truck + cargo], framing.longest_side)
-    return SolidObject(solid=united(both, 2 * CAPACITY), label=jnp.asarray(label))
+    cargo_rotation = rotation_about((0.0, 1.0, 0.0), rng.uniform(-np.pi, np.pi))
+    cargo = [move(p, rotation=cargo_rotation) for p in BUILDERS[HOUSEHOLD[label]](rng)]
+    scale, offset = placement_on_bed(np.stack([low, high]), bounds(cargo), rng)
+    cargo = [move(p, scale, offset=offset) for p in cargo]
+    rotation = random_rotation(rng) if is_rotated else np.eye(3)
+    primitives = fit([move(p, rotation=rotation) for p in truck + cargo], framing.longest_side)
+    return SolidObject(solid=union(primitives, 2 * CAPACITY), label=jnp.asarray(label))
 
 
-def stowed(
-    room: Float[np.ndarray, "2 3"], cargo: Float[np.ndarray, "2 3"], rng: np.random.Generator
+def placement_on_bed(
+    bed: Float[np.ndarray, "2 3"], cargo: Float[np.ndarray, "2 3"], rng: np.random.Generator
 ) -> tuple[float, Float[np.ndarray, "3"]]:
     """Compute a scale and a shift that place a cargo at a random position on the floor of a bed.
 
     The scale is a random 85 to 95 % of the largest scale at which the cargo fits into the space above the bed.
 
-    - `room`, `cargo`: bounding boxes (lowest and highest corner) of the space above the bed and of the cargo.
+    - `bed`, `cargo`: bounding boxes (lowest and highest corner) of the space above the bed and of the cargo.
     """
-    side, size = np.diff(room, axis=0)[0], np.diff(cargo, axis=0)[0]
+    side, size = np.diff(bed, axis=0)[0], np.diff(cargo, axis=0)[0]
     scale = float((rng.uniform(0.85, 0.95) * side / size).min())
-    corner = room[0] + (side - scale * size) * np.array([rng.random(), 0.0, rng.random()])
+    corner = bed[0] + (side - scale * size) * np.array([rng.random(), 0.0, rng.random()])
     return scale, corner - scale * cargo[0]
 
 
@@ -81,23 +81,26 @@ def _truck(rng: np.random.Generator) -> tuple[list[Primitive], Float[np.ndarray,
     middle, half_rail = 0.5 * (floor + top), 0.5 * rail
     roof = top + rng.uniform(0.15, 0.35)
     parts = [
-        box(_TRUCK, (-0.5 * bed, floor - 0.04, 0), (0.5 * bed, 0.04, half_width)),
-        *(box(_TRUCK, (-0.5 * bed, middle, b * (half_width - wall)), (0.5 * bed, half_rail, wall)) for b in (-1, 1)),
-        box(_TRUCK, (-bed + wall, middle, 0), (wall, half_rail, half_width)),
-        box(_TRUCK, (0.5 * cab, 0.5 * (low + roof), 0), (0.5 * cab, 0.5 * (roof - low), half_width), 0.06),
+        box(_TRUCK_LABEL, (-0.5 * bed, floor - 0.04, 0), (0.5 * bed, 0.04, half_width)),
+        *(
+            box(_TRUCK_LABEL, (-0.5 * bed, middle, b * (half_width - wall)), (0.5 * bed, half_rail, wall))
+            for b in (-1, 1)
+        ),
+        box(_TRUCK_LABEL, (-bed + wall, middle, 0), (wall, half_rail, half_width)),
+        box(_TRUCK_LABEL, (0.5 * cab, 0.5 * (low + roof), 0), (0.5 * cab, 0.5 * (roof - low), half_width), 0.06),
     ]
     if hood:
         half = np.array([0.5 * hood + 0.05, 0.5 * (floor + rng.uniform(0.5, 0.8) * rail - low), half_width - 0.03])
-        parts.append(box(_TRUCK, (cab + half[0] - 0.1, low + half[1], 0), half, 0.06))
+        parts.append(box(_TRUCK_LABEL, (cab + half[0] - 0.1, low + half[1], 0), half, 0.06))
     front = cab + hood
-    parts.append(box(_TRUCK, (0.5 * (front - bed), low, 0), (0.5 * (front + bed) - 0.03, 0.05, 0.5 * half_width)))
+    parts.append(box(_TRUCK_LABEL, (0.5 * (front - bed), low, 0), (0.5 * (front + bed) - 0.03, 0.05, 0.5 * half_width)))
     axles = [-bed + rng.uniform(1.2, 1.6) * wheel, front - rng.uniform(1.2, 1.4) * wheel]
     if rng.random() < 0.4:
         axles.append(axles[0] + 2.2 * wheel)
     thick = rng.uniform(0.06, 0.1)
     for x in axles:
-        parts.append(rod(_TRUCK, (x, wheel, -half_width), (x, wheel, half_width), 0.04))
+        parts.append(rod(_TRUCK_LABEL, (x, wheel, -half_width), (x, wheel, half_width), 0.04))
         for b in (-half_width + thick, half_width - thick):
-            parts.append(rod(_TRUCK, (x, wheel, b - thick), (x, wheel, b + thick), wheel, rounding=0.04))
+            parts.append(rod(_TRUCK_LABEL, (x, wheel, b - thick), (x, wheel, b + thick), wheel, rounding=0.04))
     lowest = np.array([-bed + 2 * wall, floor, -half_width + 2 * wall])
     return parts, lowest, np.array([-0.02, floor + rng.uniform(1.5, 2.1) * rail, half_width - 2 * wall])

@@ -10,12 +10,12 @@ from jaxnbv.checks import require
 from jaxnbv.scanning import TriangleMesh
 from jaxnbv.studies.scenes.class_object import ClassMesh
 from jaxnbv.studies.scenes.labelled import generator, rotation_about
-from jaxnbv.studies.scenes.truck import random_rotation, stowed
+from jaxnbv.studies.scenes.truck import placement_on_bed, random_rotation
 
 # Number of rows and of columns of rays that are traced down onto the truck.
-_LINES = 96
+_NUM_LINES = 96
 # Fractions of a truck's height: lowest and highest possible floor of a bed, and range of heights within one floor.
-_LOWEST, _HIGHEST, _EVEN = 0.15, 0.85, 0.02
+_MIN_FLOOR, _MAX_FLOOR, _MAX_UNEVENNESS = 0.15, 0.85, 0.02
 
 
 def bed_of(truck: TriangleMesh) -> Float[np.ndarray, "2 3"]:
@@ -27,22 +27,22 @@ def bed_of(truck: TriangleMesh) -> Float[np.ndarray, "2 3"]:
     **Raises:** `ValueError` if no such rectangle covers 10 % of the truck's bounding rectangle as seen from above.
     """
     low, high = truck.vertices.min(axis=0), truck.vertices.max(axis=0)
-    across = [np.linspace(low[axis], high[axis], 2 * _LINES + 1)[1::2] for axis in (0, 2)]
-    x, z = np.meshgrid(*across, indexing="ij")
-    above = np.stack([x, np.full_like(x, high[1] + 1.0), z], axis=-1).reshape(-1, 3)
-    hits = truck.trace(above, np.tile([0.0, -1.0, 0.0], (len(above), 1)))
-    heights = np.where(hits.mask, np.asarray(hits.points)[:, 1], -np.inf).reshape(_LINES, _LINES)
-    tall = high[1] - low[1]
-    step = 0.5 * _EVEN * tall
-    levels = np.arange(low[1] + _LOWEST * tall, low[1] + _HIGHEST * tall, step)
+    coordinates = [np.linspace(low[axis], high[axis], 2 * _NUM_LINES + 1)[1::2] for axis in (0, 2)]
+    x, z = np.meshgrid(*coordinates, indexing="ij")
+    origins = np.stack([x, np.full_like(x, high[1] + 1.0), z], axis=-1).reshape(-1, 3)
+    hits = truck.trace(origins, np.tile([0.0, -1.0, 0.0], (len(origins), 1)))
+    heights = np.where(hits.mask, np.asarray(hits.points)[:, 1], -np.inf).reshape(_NUM_LINES, _NUM_LINES)
+    truck_height = high[1] - low[1]
+    step = 0.5 * _MAX_UNEVENNESS * truck_height
+    levels = np.arange(low[1] + _MIN_FLOOR * truck_height, low[1] + _MAX_FLOOR * truck_height, step)
     rectangles = (each for level in levels for each in _rectangles(np.abs(heights - level) <= step))
     area, rows, columns = max(rectangles, key=operator.itemgetter(0), default=(0, slice(0), slice(0)))
     require(
-        area >= 0.1 * _LINES**2,
-        f"the largest level area of the truck covers {area / _LINES**2:.0%} of its outline: give a truck that stands "
-        "upright and has an open bed",
+        area >= 0.1 * _NUM_LINES**2,
+        f"the largest level area of the truck covers {area / _NUM_LINES**2:.0%} of its outline: give a truck that "
+        "stands upright and has an open bed",
     )
-    half, x, z = 0.5 * (high - low) / _LINES, across[0][rows], across[1][columns]
+    half, x, z = 0.5 * (high - low) / _NUM_LINES, coordinates[0][rows], coordinates[1][columns]
     floor = float(heights[rows, columns].max())
     return np.array([[x[0] - half[0], floor, z[0] - half[2]], [x[-1] + half[0], high[1], z[-1] + half[2]]])
 
@@ -50,10 +50,10 @@ def bed_of(truck: TriangleMesh) -> Float[np.ndarray, "2 3"]:
 def _rectangles(flags: Bool[np.ndarray, "m n"]) -> Iterator[tuple[int, slice, slice]]:
     """Yield the widest all-True rectangle for each first and last row, as its area, rows and columns."""
     for top in range(len(flags)):
-        whole = np.ones(flags.shape[1], bool)
+        is_whole = np.ones(flags.shape[1], bool)
         for bottom in range(top, len(flags)):
-            whole &= flags[bottom]
-            edges = np.flatnonzero(np.diff(np.concatenate([[0], whole.astype(np.int8), [0]])))
+            is_whole &= flags[bottom]
+            edges = np.flatnonzero(np.diff(np.concatenate([[0], is_whole.astype(np.int8), [0]])))
             if len(edges) == 0:
                 break
             widths = edges[1::2] - edges[::2]
@@ -73,11 +73,13 @@ def loaded_truck(truck: TriangleMesh, cargo: TriangleMesh, label: int, key: PRNG
     **Raises:** `ValueError` as `bed_of` does.
     """
     rng = generator(key)
-    turned = cargo.vertices @ rotation_about((0.0, 1.0, 0.0), rng.uniform(-np.pi, np.pi)).T
-    scale, offset = stowed(bed_of(truck), np.stack([turned.min(axis=0), turned.max(axis=0)]), rng)
-    placed = scale * turned + offset
+    rotated_vertices = cargo.vertices @ rotation_about((0.0, 1.0, 0.0), rng.uniform(-np.pi, np.pi)).T
+    scale, offset = placement_on_bed(
+        bed_of(truck), np.stack([rotated_vertices.min(axis=0), rotated_vertices.max(axis=0)]), rng
+    )
+    cargo_vertices = scale * rotated_vertices + offset
     rotation = random_rotation(rng)
-    vertices = np.concatenate([truck.vertices, placed]) @ rotation.T
-    whole = TriangleMesh.from_arrays(vertices, np.concatenate([truck.faces, cargo.faces + len(truck.vertices)]))
-    part = TriangleMesh(whole.frame.to_scene(placed @ rotation.T), cargo.faces, whole.frame)
-    return ClassMesh(whole, label, part)
+    vertices = np.concatenate([truck.vertices, cargo_vertices]) @ rotation.T
+    mesh = TriangleMesh.from_arrays(vertices, np.concatenate([truck.faces, cargo.faces + len(truck.vertices)]))
+    cue = TriangleMesh(mesh.frame.to_scene(cargo_vertices @ rotation.T), cargo.faces, mesh.frame)
+    return ClassMesh(mesh, label, cue)

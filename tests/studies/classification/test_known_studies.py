@@ -26,7 +26,7 @@ METHODS = ("cross-entropy", "coverage", "uncertainty", "coverage-screened", "unc
 
 def knowing_study():
     plain = small_study()
-    bank = nbv.ShapeBank.of([pyramid_scene(Split.TRAIN, index, turned=False) for index in range(5)])
+    bank = nbv.ShapeBank.of([pyramid_scene(Split.TRAIN, index, is_rotated=False) for index in range(5)])
     residual = ScreenedSPSR(GeometricSPSR(0.05, truncation=8), (OnSurface(),))
     model = KnownShapes(bank, residual, model_of_none=plain.sampler.model, num_starts=60)
     return dataclasses.replace(plain, sampler=dataclasses.replace(plain.sampler, model=model))

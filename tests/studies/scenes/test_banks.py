@@ -56,7 +56,7 @@ def test_real_shapes_are_named_by_their_class_and_stand_upright():
 @pytest.mark.parametrize(("scene", "axis"), [(pyramid_scene, 2), (truck_scene, 1)])
 def test_scenes_of_a_split_are_those_of_the_bank_turned(scene, axis):
     """A scene and its level twin are one object: after rotation, translation and scaling their distances agree."""
-    turned, level = scene(Split.TRAIN, 3), scene(Split.TRAIN, 3, turned=False)
+    turned, level = scene(Split.TRAIN, 3), scene(Split.TRAIN, 3, is_rotated=False)
     one, other = (np.reshape(thing.solid.rotation, (-1, 3, 3))[0] for thing in (turned, level))
     rotation = one @ other.T
     np.testing.assert_allclose(Rotation.from_matrix(rotation).as_matrix(), rotation, atol=1e-5)

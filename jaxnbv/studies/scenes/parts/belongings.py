@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from jaxnbv.networks.categories import CATEGORIES, category_index
-from jaxnbv.studies.scenes.labelled import Primitive, bar, box, path, ring, rod, shifted
+from jaxnbv.studies.scenes.labelled import Primitive, bar, box, path, ring, rod, shift
 
 BAG_HANDLE, BAG_BODY = CATEGORIES[category_index("bag")].labels
 CUP, BAND, WIRE = CATEGORIES[category_index("earphone")].labels
@@ -29,9 +29,9 @@ def bag(rng: np.random.Generator) -> Iterator[Primitive]:
         yield box(BAG_BODY, (half_depth, -0.3 * half_height, 0), half, 0.06)
     rise, span, radius = rng.uniform(0.5, 0.8), rng.uniform(0.4, 0.7) * half_width, rng.uniform(0.06, 0.09)
     angle = np.linspace(0, np.pi, 7)
-    for place in [0.0] if handles == 1 else [-0.5 * half_depth, 0.5 * half_depth]:
+    for x in [0.0] if handles == 1 else [-0.5 * half_depth, 0.5 * half_depth]:
         root = half_height - 0.02 if handles == 1 else 0.85 * half_height
-        points = np.stack([np.full(7, place), root + rise * np.sin(angle) ** 0.7, span * np.cos(angle)], axis=-1)
+        points = np.stack([np.full(7, x), root + rise * np.sin(angle) ** 0.7, span * np.cos(angle)], axis=-1)
         yield from path(BAG_HANDLE, points, radius)
 
 
@@ -58,8 +58,8 @@ def guitar(rng: np.random.Generator) -> Iterator[Primitive]:
     tilt, length = rng.uniform(0.0, 0.1), rng.uniform(0.3, 0.4)
     crown = (front - tilt, top + neck + length, 0)
     yield bar(HEAD, (front, top + neck, 0), crown, rng.uniform(0.11, 0.15), 0.05)
-    for place in (0.25, 0.55, 0.85):
-        x, y = front - place * tilt, top + neck + place * length
+    for fraction in (0.25, 0.55, 0.85):
+        x, y = front - fraction * tilt, top + neck + fraction * length
         yield rod(HEAD, (x, y, -0.22), (x, y, 0.22), 0.035)
 
 
@@ -101,11 +101,11 @@ def pistol(rng: np.random.Generator) -> Iterator[Primitive]:
         yield rod(BARREL, (-0.25, 0, 0), (0.25, 0, 0), rng.uniform(1.3, 1.5) * half, rounding=0.04)
     slope, grip = rng.uniform(0.1, 0.35), rng.uniform(0.16, 0.2)
     top = np.array([-length + 0.3, 0.0, 0.0])
-    yield bar(GRIP, top, shifted(top, -slope, -drop), 0.8 * half, grip, 0.05)
+    yield bar(GRIP, top, shift(top, -slope, -drop), 0.8 * half, grip, 0.05)
     guard = rng.uniform(0.18, 0.22)
-    centre = shifted(top, grip + guard - 0.02, -half - guard + 0.06)
+    centre = shift(top, grip + guard - 0.02, -half - guard + 0.06)
     yield ring(TRIGGER, centre, (0, 0, 1), guard, 0.035, 0.05)
-    yield bar(TRIGGER, shifted(centre, 0.02, guard), shifted(centre, 0.06, -0.3 * guard), 0.035, 0.035)
+    yield bar(TRIGGER, shift(centre, 0.02, guard), shift(centre, 0.06, -0.3 * guard), 0.035, 0.035)
 
 
 def mug(rng: np.random.Generator) -> Iterator[Primitive]:

@@ -36,8 +36,8 @@ def _chair_legs(rng, half_width, half_depth, height):
     corners = [(a, b) for a in (-1, 1) for b in (-1, 1)]
     if kind == "star":
         yield rod(LEG, (0, 0.12, 0), (0, height + 0.02, 0), rng.uniform(0.06, 0.1))
-        reach, turn = rng.uniform(0.5, 0.62), rng.uniform(0, 2 * np.pi)
-        for angle in turn + 2 * np.pi * np.arange(5) / 5:
+        reach, start_angle = rng.uniform(0.5, 0.62), rng.uniform(0, 2 * np.pi)
+        for angle in start_angle + 2 * np.pi * np.arange(5) / 5:
             tip = (reach * np.cos(angle), 0.06, reach * np.sin(angle))
             yield bar(LEG, (0, 0.14, 0), tip, 0.05, 0.045)
         return
@@ -55,30 +55,38 @@ def _chair_legs(rng, half_width, half_depth, height):
     yield from (rod(LEG, foot, top, max(0.04, taper * radius), radius) for foot, top in zip(feet, tops, strict=True))
     if rng.random() < 0.4:
         y = rng.uniform(0.25, 0.5) * height
-        at = x + splay * (1 - y / height), z + splay * (1 - y / height)
-        yield from (rod(LEG, (-at[0], y, b * at[1]), (at[0], y, b * at[1]), 0.04) for b in (-1, 1))
+        half_spans = x + splay * (1 - y / height), z + splay * (1 - y / height)
+        yield from (
+            rod(LEG, (-half_spans[0], y, b * half_spans[1]), (half_spans[0], y, b * half_spans[1]), 0.04)
+            for b in (-1, 1)
+        )
 
 
 def _chair_back(rng, half_width, half_depth, height, rise, lean):
     x, thick = -half_depth + 0.06, rng.uniform(0.04, 0.06)
 
-    def at(level, z):
+    def point_at(level, z):
         return (x - lean * level, height + rise * level, z)
 
     if rng.random() < 0.5:
         gap = rng.choice([0.0, 0.25])
-        yield bar(BACK, at(gap, 0.0), at(1.0, 0.0), half_width - 0.02, thick, 0.03)
+        yield bar(BACK, point_at(gap, 0.0), point_at(1.0, 0.0), half_width - 0.02, thick, 0.03)
         if gap:
-            yield from (bar(BACK, at(0.0, z), at(0.4, z), 0.05, thick) for z in (-0.5 * half_width, 0.5 * half_width))
+            yield from (
+                bar(BACK, point_at(0.0, z), point_at(0.4, z), 0.05, thick)
+                for z in (-0.5 * half_width, 0.5 * half_width)
+            )
         return
     z = half_width - 0.06
-    yield from (bar(BACK, at(0.0, side * z), at(1.0, side * z), 0.06, 0.05) for side in (-1, 1))
+    yield from (bar(BACK, point_at(0.0, side * z), point_at(1.0, side * z), 0.06, 0.05) for side in (-1, 1))
     if rng.random() < 0.5:
-        yield bar(BACK, at(0.85, 0.0), at(1.0, 0.0), z, thick)
-        places = np.linspace(-1, 1, int(rng.integers(2, 4)) + 2)[1:-1]
-        yield from (bar(BACK, at(0.0, place * z), at(0.9, place * z), 0.05, 0.035) for place in places)
+        yield bar(BACK, point_at(0.85, 0.0), point_at(1.0, 0.0), z, thick)
+        fractions = np.linspace(-1, 1, int(rng.integers(2, 4)) + 2)[1:-1]
+        yield from (
+            bar(BACK, point_at(0.0, fraction * z), point_at(0.9, fraction * z), 0.05, 0.035) for fraction in fractions
+        )
         return
-    yield from (bar(BACK, at(c - 0.08, 0.0), at(c + 0.08, 0.0), z, 0.035) for c in (0.4, 0.65, 0.92))
+    yield from (bar(BACK, point_at(c - 0.08, 0.0), point_at(c + 0.08, 0.0), z, 0.035) for c in (0.4, 0.65, 0.92))
 
 
 def table(rng: np.random.Generator) -> Iterator[Primitive]:
@@ -109,8 +117,8 @@ def table(rng: np.random.Generator) -> Iterator[Primitive]:
         yield box(DRAWER, (0, y, 0), (half_depth - 0.12, 0.045, half_width - 0.12))
     elif extra != "none":
         half = np.array([0.7 * half_depth, rng.uniform(0.12, 0.2), rng.uniform(0.25, 0.35)])
-        places = [0.0] if extra == "drawer" else [-0.5 * half_width, 0.5 * half_width]
-        for z in places:
+        positions = [0.0] if extra == "drawer" else [-0.5 * half_width, 0.5 * half_width]
+        for z in positions:
             y = height - thick - half[1] + 0.02
             yield box(DRAWER, (0.15 * half_depth, y, z), half)
             yield box(DRAWER, (0.85 * half_depth + 0.02, y, z), (0.05, 0.035, 0.09))

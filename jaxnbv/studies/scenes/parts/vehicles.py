@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from jaxnbv.networks.categories import CATEGORIES, category_index
-from jaxnbv.studies.scenes.labelled import Primitive, ball, bar, box, path, ring, rod, rotation_about, shifted
+from jaxnbv.studies.scenes.labelled import Primitive, ball, bar, box, path, ring, rod, rotation_about, shift
 
 BODY, WING, TAIL, ENGINE = CATEGORIES[category_index("airplane")].labels
 HULL, FIN, NOSE = CATEGORIES[category_index("rocket")].labels
@@ -27,8 +27,8 @@ def airplane(rng: np.random.Generator) -> Iterator[Primitive]:
         root, tip = np.array([0.15, height, 0.0]), np.array([0.15 - sweep, height + dihedral, side * span])
         yield bar(WING, root, 0.45 * tip + 0.55 * root, 1.2 * chord, 0.04)
         yield bar(WING, 0.35 * tip + 0.65 * root, tip, 0.8 * chord, 0.033)
-        for place in {"two": (0.35,), "four": (0.3, 0.6), "tail": ()}[kind]:
-            x, y, z = (1 - place) * root + place * tip
+        for fraction in {"two": (0.35,), "four": (0.3, 0.6), "tail": ()}[kind]:
+            x, y, z = (1 - fraction) * root + fraction * tip
             y -= size + 0.05
             yield rod(ENGINE, (x - 0.1, y, z), (x + 0.3, y, z), 0.85 * size, size)
             yield box(ENGINE, (x + 0.05, y + size, z), (0.12, 0.06, 0.03))
@@ -52,11 +52,11 @@ def rocket(rng: np.random.Generator) -> Iterator[Primitive]:
     yield rod(HULL, (0, -0.15, 0), (0, 0.05, 0), 0.75 * radius, 0.5 * radius)
     yield rod(NOSE, (0, 1.72, 0), (0, 1.75 + nose, 0), 0.85 * radius, 0.15 * radius, rounding=0.02)
     count = int(rng.integers(3, 5))
-    reach, boosters, turn = radius + rng.uniform(0.25, 0.45), rng.random() < 0.4, rng.uniform(0, 2 * np.pi)
+    reach, boosters, start_angle = radius + rng.uniform(0.25, 0.45), rng.random() < 0.4, rng.uniform(0, 2 * np.pi)
     height = rng.uniform(0.2, 0.3)
-    for angle in turn + 2 * np.pi * np.arange(count) / count:
-        turned = rotation_about((0, 1, 0), angle)
-        root, tip = turned @ [0.5 * radius, 0.35, 0], turned @ [reach, 0.05, 0]
+    for angle in start_angle + 2 * np.pi * np.arange(count) / count:
+        rotation = rotation_about((0, 1, 0), angle)
+        root, tip = rotation @ [0.5 * radius, 0.35, 0], rotation @ [reach, 0.05, 0]
         yield bar(FIN, root, tip, 0.035, height)
         if boosters:
             x, _, z = rotation_about((0, 1, 0), angle + np.pi / count) @ [radius + 0.09, 0, 0]
@@ -69,18 +69,18 @@ def motorbike(rng: np.random.Generator) -> Iterator[Primitive]:
     rear, front = np.array([-base, 0.0, 0.0]), np.array([base, 0.0, 0.0])
     for hub in (rear, front):
         yield ring(WHEEL, hub, (0, 0, 1), radius - tyre, tyre, tyre, 0.8 * tyre)
-        yield rod(WHEEL, shifted(hub, z=-0.035), shifted(hub, z=0.035), radius - tyre)
+        yield rod(WHEEL, shift(hub, z=-0.035), shift(hub, z=0.035), radius - tyre)
     # The steering head is above the front wheel and behind it, because the fork is raked.
-    head = shifted(front, -rng.uniform(0.28, 0.4), rng.uniform(0.78, 0.86))
-    apart = tyre + 0.05
+    head = shift(front, -rng.uniform(0.28, 0.4), rng.uniform(0.78, 0.86))
+    half_gap = tyre + 0.05
     for joint in (rear, front, head):
-        yield rod(FRAME, shifted(joint, z=-apart), shifted(joint, z=apart), 0.04)
+        yield rod(FRAME, shift(joint, z=-half_gap), shift(joint, z=half_gap), 0.04)
     for side in (-1, 1):
-        yield rod(FRAME, shifted(front, z=side * apart), shifted(head, z=side * apart), 0.04)
-        yield rod(FRAME, shifted(rear, z=side * apart), (-0.1, 0.1, side * apart), 0.04)
+        yield rod(FRAME, shift(front, z=side * half_gap), shift(head, z=side * half_gap), 0.04)
+        yield rod(FRAME, shift(rear, z=side * half_gap), (-0.1, 0.1, side * half_gap), 0.04)
     yield box(FRAME, (0.0, 0.12, 0), (0.3, 0.2, 0.15), 0.08)
     yield box(FRAME, (0.05, 0.36, 0), (0.16, 0.12, 0.11), 0.04, ((0, 0, 1), rng.uniform(-0.3, 0.3)))
-    yield bar(FRAME, (-0.5, 0.42, 0), shifted(head, y=-0.05), 0.06, 0.06)
+    yield bar(FRAME, (-0.5, 0.42, 0), shift(head, y=-0.05), 0.06, 0.06)
     side = rng.choice([-1, 1])
     exhaust = rng.uniform(0.05, 0.25)
     yield rod(FRAME, (0.1, 0.0, side * 0.2), (-base - 0.15, exhaust, side * 0.2), 0.05, 0.08)
@@ -88,15 +88,15 @@ def motorbike(rng: np.random.Generator) -> Iterator[Primitive]:
     yield box(SEAT, (-0.36, 0.54, 0), (0.28, 0.08, 0.14), 0.06)
     end = np.array([-0.95, rng.uniform(0.62, 0.75), 0])
     yield bar(SEAT, (-0.55, 0.56, 0), end, 0.12, 0.07, 0.06)
-    grip = shifted(head, -rng.uniform(0.05, 0.25), rng.uniform(0.12, 0.3))
+    grip = shift(head, -rng.uniform(0.05, 0.25), rng.uniform(0.12, 0.3))
     reach = rng.uniform(0.4, 0.46)
     for across in (-1, 1):
-        points = [head, shifted(grip, 0.05, 0.0, 0.2 * across), shifted(grip, -0.1, -0.02, reach * across)]
+        points = [head, shift(grip, 0.05, 0.0, 0.2 * across), shift(grip, -0.1, -0.02, reach * across)]
         yield from path(HANDLE, points, 0.04)
     lamp = rng.uniform(0.12, 0.15)
-    yield rod(LIGHT, shifted(head, y=0.02), shifted(head, 0.22, 0.02), 0.75 * lamp, lamp, 0.04)
+    yield rod(LIGHT, shift(head, y=0.02), shift(head, 0.22, 0.02), 0.75 * lamp, lamp, 0.04)
     if rng.random() < 0.6:
-        yield ball(LIGHT, shifted(end, -0.02, -0.03), rng.uniform(0.08, 0.1))
+        yield ball(LIGHT, shift(end, -0.02, -0.03), rng.uniform(0.08, 0.1))
 
 
 def skateboard(rng: np.random.Generator) -> Iterator[Primitive]:
