@@ -44,12 +44,12 @@ class Bench:
         self.scene = nbv.load_mesh(mesh) if mesh else demo_object()
         self.rows: dict[str, dict[str, float]] = {}
 
-    def take(self, stage: str, function, **beside: float) -> float:
-        """Time a function and record it. `beside`: seconds of what it is compared to, by name."""
-        return self.note(stage, least_time(function), **beside)
+    def take(self, stage: str, function, **comparisons: float) -> float:
+        """Time a function and record it. `comparisons`: seconds of what it is compared to, by name."""
+        return self.note(stage, least_time(function), **comparisons)
 
-    def note(self, stage: str, seconds: float, **beside: float) -> float:
-        self.rows[stage] = {"seconds": seconds} | {name: seconds / other for name, other in beside.items()}
+    def note(self, stage: str, seconds: float, **comparisons: float) -> float:
+        self.rows[stage] = {"seconds": seconds} | {name: seconds / other for name, other in comparisons.items()}
         print(f"{stage}: {seconds:.3g} s", flush=True)
         return seconds
 
@@ -94,7 +94,7 @@ def coverage(bench: Bench) -> None:
     @jax.jit
     def values(cloud, scans):
         context = planner.acquisition.context(inputs_of(cloud))
-        score = lambda of: scores(planner.acquisition, context, of, planner.camera, bench.candidates)  # noqa: E731
+        score = lambda scan: scores(planner.acquisition, context, scan, planner.camera, bench.candidates)  # noqa: E731
         return jnp.mean(jax.lax.map(score, scans, batch_size=samples_at_once(planner.camera, bench.candidates)), axis=0)
 
     # The parts that are timed must give the values of a real step.
@@ -123,8 +123,8 @@ def cross_entropy(bench: Bench) -> None:
     sampler = nbv.SurfaceSampler.preset("paper")
     planner = nbv.Planner(nbv.CrossEntropy(classifier), sampler=sampler)
     first = hidden_view(pyramid, bench.key)
-    seen = observe_scene(nbv.SDFSurface(pyramid), planner.camera, first, nbv.SensorNoise(), bench.key)
-    observations = planner.init(first, seen)
+    cloud = observe_scene(nbv.SDFSurface(pyramid), planner.camera, first, nbv.SensorNoise(), bench.key)
+    observations = planner.init(first, cloud)
     step = bench.take("cross-entropy: a step", lambda: planner.propose(observations, bench.key))
     halving = nbv.Planner(planner.acquisition, nbv.HalvingSearch(), sampler=sampler)
     bench.take("cross-entropy: a step by halving", lambda: halving.propose(observations, bench.key), step=step)
@@ -132,22 +132,22 @@ def cross_entropy(bench: Bench) -> None:
     surfaces = planner.sampler.sample(observations, bench.key)
     scans = lambda: nbv.scanning.scan_samples(surfaces, planner.camera, bench.candidates)  # noqa: E731
     bench.take("cross-entropy: 16 samples scanned from 120 candidates", scans, step=step)
-    seen = jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), scans())
+    scan_rows = jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), scans())
     context_cloud = planner.acquisition.context(inputs_of(observations))[0]
 
     @jax.jit
-    def thinned(seen):
+    def subsample_all(scan_rows):
         def join(scan):
             return nbv.geometry.farthest_point_subsample(
                 nbv.geometry.concatenate(context_cloud, scan), classifier.num_points
             )
 
-        return jax.lax.map(join, seen)
+        return jax.lax.map(join, scan_rows)
 
-    bench.take("cross-entropy: farthest points of 1,920 clouds", lambda: thinned(seen), step=step)
-    fed = thinned(seen)
-    network = jax.jit(lambda fed: jax.lax.map(lambda c: classifier.network(c.points, c.normals, c.mask), fed))
-    bench.take("cross-entropy: the network on 1,920 clouds", lambda: network(fed), step=step)
+    bench.take("cross-entropy: farthest points of 1,920 clouds", lambda: subsample_all(scan_rows), step=step)
+    clouds = subsample_all(scan_rows)
+    network = jax.jit(lambda clouds: jax.lax.map(lambda c: classifier.network(c.points, c.normals, c.mask), clouds))
+    bench.take("cross-entropy: the network on 1,920 clouds", lambda: network(clouds), step=step)
 
 
 def gradient(bench: Bench) -> None:
@@ -200,16 +200,18 @@ def episodes(bench: Bench) -> None:
         return lambda: nbv.episodes(planner, count * [demo_object()], bench.first, 5, keys, batch_size=batch_size)
 
     def loop():
-        return [nbv.simulate(planner, demo_object(), bench.first, 5, own, progress=False) for own in keys]
+        return [
+            nbv.simulate(planner, demo_object(), bench.first, 5, episode_key, progress=False) for episode_key in keys
+        ]
 
     keys = jax.random.split(key, 8)
-    one = bench.note("an episode of five views as a program", least_time(program(1), repeats=1))
-    alone = bench.note("eight episodes, by simulate in a loop", least_time(loop, repeats=1), one=one)
-    bench.note("eight episodes as a program", least_time(program(8), repeats=1), one=one, loop=alone)
+    one_episode = bench.note("an episode of five views as a program", least_time(program(1), repeats=1))
+    loop_seconds = bench.note("eight episodes, by simulate in a loop", least_time(loop, repeats=1), one=one_episode)
+    bench.note("eight episodes as a program", least_time(program(8), repeats=1), one=one_episode, loop=loop_seconds)
     if jax.default_backend() == "cpu":
-        bench.note("eight episodes as a program, four at once", least_time(program(8, 4), repeats=1), loop=alone)
+        bench.note("eight episodes as a program, four at once", least_time(program(8, 4), repeats=1), loop=loop_seconds)
     else:
-        bench.note("64 episodes as a program", least_time(program(64), repeats=1), one=one)
+        bench.note("64 episodes as a program", least_time(program(64), repeats=1), one=one_episode)
 
 
 def yardstick() -> float:

@@ -22,7 +22,7 @@ sys.path.append(str(Path(__file__).resolve().parents[1] / "examples"))
 from arm_simulator import Arm, on_a_table
 from mujoco_arm import box_about, distances_mm, hand_eye_error, scan_object
 
-_NEAR, _POINTS = 0.003, 4000
+_MAX_DISTANCE, _NUM_POINTS = 0.003, 4000
 
 
 def planner_of(search: nbv.DiscreteSearch | nbv.FarthestView) -> nbv.Planner:
@@ -39,15 +39,15 @@ def row_of(mesh: trimesh.Trimesh, views: int, search, error: np.ndarray, correct
 
     scan = scan_object(arm, box_about(mesh), planner_of(search), views, None, corrects, reachable)
     points = nbv.viz.scanned_cloud(scan.session.episode).to_numpy()[0]
-    surface = trimesh.sample.sample_surface(mesh, _POINTS, seed=0)[0]
-    is_covered = trimesh.PointCloud(points).kdtree.query(surface)[0] < _NEAR
-    refused = sum(scan.refusals.values())
-    few = np.random.default_rng(0).choice(len(points), min(len(points), _POINTS), replace=False)
+    surface = trimesh.sample.sample_surface(mesh, _NUM_POINTS, seed=0)[0]
+    is_covered = trimesh.PointCloud(points).kdtree.query(surface)[0] < _MAX_DISTANCE
+    num_refused = sum(scan.refusals.values())
+    rows = np.random.default_rng(0).choice(len(points), min(len(points), _NUM_POINTS), replace=False)
     return [
-        scan.proposals / (scan.proposals + refused),
+        scan.proposals / (scan.proposals + num_refused),
         arm.seconds,
         is_covered.mean(),
-        *distances_mm(points[few], mesh),
+        *distances_mm(points[rows], mesh),
     ]
 
 
@@ -62,13 +62,13 @@ def main() -> None:
     # Sessions warn of the table that they detect, and of the error in the mount, which is on purpose.
     warnings.simplefilter("ignore", UserWarning)
     nbv.keep_compiled()
-    exact, off = np.eye(4), hand_eye_error(options.degrees, options.millimetres)
-    new, farthest = (kind(nbv.Reach(160)) for kind in (nbv.DiscreteSearch, nbv.FarthestView))
+    no_error, mount_error = np.eye(4), hand_eye_error(options.degrees, options.millimetres)
+    discrete, farthest = (kind(nbv.Reach(160)) for kind in (nbv.DiscreteSearch, nbv.FarthestView))
     columns = {
-        "new surface": (new, exact, False, True),
-        "farthest": (farthest, exact, False, False),
-        "mount off": (new, off, False, True),
-        "corrected": (new, off, True, True),
+        "new surface": (discrete, no_error, False, True),
+        "farthest": (farthest, no_error, False, False),
+        "mount off": (discrete, mount_error, False, True),
+        "corrected": (discrete, mount_error, True, True),
     }
     print(f"{'':24}", *(f"{name:^37}" for name in columns))
     print(f"{'':24}", *(f"{'reached':>8}{'s':>7}{'seen':>7}{'mm':>7}{'90 %':>7} " for _ in columns))
@@ -81,7 +81,7 @@ def main() -> None:
 
 
 def _print(name: str, row: list) -> None:
-    cells = (f"{share:8.0%}{s:7.1f}{seen:7.0%}{mm:7.2f}{most:7.2f} " for share, s, seen, mm, most in row)
+    cells = (f"{fraction:8.0%}{s:7.1f}{seen:7.0%}{mm:7.2f}{quantile:7.2f} " for fraction, s, seen, mm, quantile in row)
     print(f"{name:24}", *cells, flush=True)
 
 

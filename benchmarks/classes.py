@@ -38,7 +38,7 @@ from jaxnbv.surfaces import Upright
 
 # The longest side of an object in scene units. The object fits into the box at any angle about the vertical.
 _SIDE = 1.6
-_ORDER = 7
+_ORDER_SEED = 7
 
 
 @functools.cache
@@ -46,12 +46,12 @@ def objects_in(files: tuple[MeshFile, ...]) -> tuple[nbv.ShapeBank, tuple[str, .
     """A bank of the meshes at equal sizes, the class of each, and the meshes themselves."""
     meshes, names = [], []
     for number, file in enumerate(files):
-        read = file.read()
-        meshes.append(trimesh.Trimesh(_SIDE / 2.5 * read.vertices, read.faces, process=False))
+        mesh = file.read()
+        meshes.append(trimesh.Trimesh(_SIDE / 2.5 * mesh.vertices, mesh.faces, process=False))
         names.append(f"{number} {file.name}")
     bank = nbv.ShapeBank.from_meshes(meshes, names=names, scale=1.0)
-    used = [int(name.split()[0]) for name in bank.names]
-    return bank, tuple(Path(files[one].path).parent.name for one in used), [meshes[one] for one in used]
+    indices = [int(name.split()[0]) for name in bank.names]
+    return bank, tuple(Path(files[index].path).parent.name for index in indices), [meshes[index] for index in indices]
 
 
 def _by_view(name: str) -> Any:
@@ -76,16 +76,16 @@ class ClassStudy(Study):
     @functools.cached_property
     def order(self) -> np.ndarray:
         """Random order of the objects, since the files list one of each class in turn."""
-        return np.random.default_rng(_ORDER).permutation(len(objects_in(self.meshes)[2]))
+        return np.random.default_rng(_ORDER_SEED).permutation(len(objects_in(self.meshes)[2]))
 
     def scene(self, index: int) -> Scene:
         """An upright object. The task of the scene is its number in the bank."""
-        (bank, _, meshes), one = objects_in(self.meshes), int(self.order[index])
+        (bank, _, meshes), number = objects_in(self.meshes), int(self.order[index])
         angle = np.random.default_rng(1000 + index).uniform(0.0, 2.0 * np.pi)
-        turn = Rotation.from_rotvec([0.0, angle, 0.0]).as_matrix()
-        vertices = np.asarray(meshes[one].vertices) @ turn.T
-        mesh = TriangleMesh(vertices.astype(np.float32), np.asarray(meshes[one].faces, np.int32), Frame())
-        return Scene(index, bank.names[one], mesh, one)
+        rotation = Rotation.from_rotvec([0.0, angle, 0.0]).as_matrix()
+        vertices = np.asarray(meshes[number].vertices) @ rotation.T
+        mesh = TriangleMesh(vertices.astype(np.float32), np.asarray(meshes[number].faces, np.int32), Frame())
+        return Scene(index, bank.names[number], mesh, number)
 
     def sensor(self, scene: Scene) -> Sensor:
         noise = nbv.SensorNoise(0.006 * _SIDE, 0.1)
@@ -100,7 +100,7 @@ class ClassStudy(Study):
         return self.camera.resized(28, 28)
 
     def others(self, scene: Scene) -> list[int]:
-        return [one for one in range(len(objects_in(self.meshes)[0])) if one != scene.task]
+        return [index for index in range(len(objects_in(self.meshes)[0])) if index != scene.task]
 
     def sampler_of(self, scene: Scene) -> SurfaceSampler:
         return self.sampler.with_bank(objects_in(self.meshes)[0].select(self.others(scene)), Upright())
@@ -112,16 +112,18 @@ class ClassStudy(Study):
     def follow(self, scene: Scene, truth: Any, planner: Planner, episode: Iterator[Step]) -> Record:
         """Record after each view whether the class is right, by the hypotheses and by the network."""
         kinds = np.array(objects_in(self.meshes)[1])
-        own, others = kinds[scene.task], kinds[self.others(scene)]
+        true_class, others = kinds[scene.task], kinds[self.others(scene)]
         network = pretrained_classifier("household", _SIDE)
         measures: Mapping[str, list[float]] = {"right": [], "probability": [], "network": []}
         for step in episode:
             weights = np.asarray(step.observations.hypotheses.shape_weights, np.float64)
-            share = {kind: weights[others == kind].sum() / max(weights.sum(), 1e-30) for kind in set(others)}
-            measures["right"].append(float(max(share, key=lambda kind: share[kind]) == own))
-            measures["probability"].append(float(share[own]))
-            said = HOUSEHOLD[int(np.argmax(network(step.observations.cloud)))].replace(" ", "_")
-            measures["network"].append(float(said == own) if own.replace("_", " ") in HOUSEHOLD else np.nan)
+            weight_of_class = {kind: weights[others == kind].sum() / max(weights.sum(), 1e-30) for kind in set(others)}
+            measures["right"].append(float(max(weight_of_class, key=lambda kind: weight_of_class[kind]) == true_class))
+            measures["probability"].append(float(weight_of_class[true_class]))
+            prediction = HOUSEHOLD[int(np.argmax(network(step.observations.cloud)))].replace(" ", "_")
+            measures["network"].append(
+                float(prediction == true_class) if true_class.replace("_", " ") in HOUSEHOLD else np.nan
+            )
         return dict(measures)
 
 

@@ -18,7 +18,7 @@ import jaxnbv as nbv
 CANDIDATES = 800
 # Settings of the published code: neighbours of a point, the empty angle that makes it a boundary point, clusters of
 # boundary points, and the angles by which views turn about the boundary.
-NEIGHBOURS, GAP, VIEWS, TURNS = 30, np.radians(120.0), 20, np.radians([-45.0, 0.0, 45.0])
+NEIGHBOURS, GAP, VIEWS, ROTATION_ANGLES = 30, np.radians(120.0), 20, np.radians([-45.0, 0.0, 45.0])
 
 
 class Protocol(NamedTuple):
@@ -40,7 +40,7 @@ class Protocol(NamedTuple):
     points: int
     views: int
     repeats: int
-    reported: tuple[int, ...]
+    reported_views: tuple[int, ...]
 
 
 class Look(NamedTuple):
@@ -67,40 +67,43 @@ class Trial:
         self.half, self.poses = half, nbv.look_at(protocol.distance / self.unit * directions)
         points = self.mesh.sample_points(key, protocol.points)
         self.points = one_a_voxel(points, points, protocol.voxel / self.unit)[0] if protocol.voxel else points
-        self._known: dict[int, np.ndarray] = {}
+        self._covers: dict[int, np.ndarray] = {}
         directions = np.asarray(self.camera.pixel_directions(), np.float64)
         self._directions = directions.reshape(self.camera.height, self.camera.width, 3)
 
     def covers(self, candidates: Iterable[int]) -> Bool[np.ndarray, "candidates points"]:
         """Points of the surface that each of some candidates covers. Keeps the scans."""
         for index in candidates:
-            if index not in self._known:
-                self._known[index] = self.look(self.poses[index]).covers
-        return np.stack([self._known[index] for index in candidates])
+            if index not in self._covers:
+                self._covers[index] = self.look(self.poses[index]).covers
+        return np.stack([self._covers[index] for index in candidates])
 
     def look(self, pose: nbv.Pose) -> Look:
         """The scan from a pose, by the rays that can meet the object."""
         origin, rotation = np.asarray(pose.position, np.float64), np.asarray(pose.rotation, np.float64)
         local = (self.points - origin) @ rotation
         column, row = self.camera.to_pixels(local[:, :2] / local[:, 2:]).T
-        rows, columns = (slice(max(int(at.min()) - 1, 0), max(int(at.max()) + 2, 0)) for at in (row, column))
+        rows, columns = (
+            slice(max(int(coordinates.min()) - 1, 0), max(int(coordinates.max()) + 2, 0))
+            for coordinates in (row, column)
+        )
         local = self._directions[rows, columns].reshape(-1, 3)
         directions = local @ rotation.T
         length = np.linalg.norm(directions, axis=1, keepdims=True)
         hits = self.mesh.trace(np.broadcast_to(origin, directions.shape), directions / length)
-        hit = np.asarray(hits.mask)
-        cloud, normals = np.asarray(hits.points, np.float64)[hit], np.asarray(hits.normals, np.float64)[hit]
+        is_hit = np.asarray(hits.mask)
+        cloud, normals = np.asarray(hits.points, np.float64)[is_hit], np.asarray(hits.normals, np.float64)[is_hit]
         if len(cloud) == 0:
             return Look(np.zeros(len(self.points), bool), np.zeros_like(self.points), cloud)
         if step := self.protocol.step / self.unit:
             depth = (cloud - origin) @ rotation[:, 2:]
-            cloud = origin + directions[hit] * step * np.round(depth / step)
+            cloud = origin + directions[is_hit] * step * np.round(depth / step)
         if self.protocol.voxel:
             cloud, normals = one_a_voxel(cloud, normals, self.protocol.voxel / self.unit)
         reach = self.protocol.tolerance / self.unit
-        apart, nearest = cKDTree(cloud).query(self.points, distance_upper_bound=reach)
-        covers = np.isfinite(apart)
-        return Look(covers, np.where(covers[:, None], normals[np.where(covers, nearest, 0)], 0.0), cloud)
+        distances, nearest = cKDTree(cloud).query(self.points, distance_upper_bound=reach)
+        is_covered = np.isfinite(distances)
+        return Look(is_covered, np.where(is_covered[:, None], normals[np.where(is_covered, nearest, 0)], 0.0), cloud)
 
 
 def one_a_voxel(points, normals, size: float) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]]:
@@ -118,38 +121,40 @@ def boundary_views(
     """Boundary points to look at, one for each cluster, and unit directions to look from. Both are empty if there is no
     boundary."""
     tree = cKDTree(points)
-    apart, near = tree.query(points, k=min(NEIGHBOURS, len(points)))
-    (rows,) = np.nonzero(is_boundary(points, normals, apart[:, 1:], near[:, 1:]))
+    distances, neighbours = tree.query(points, k=min(NEIGHBOURS, len(points)))
+    (rows,) = np.nonzero(is_boundary(points, normals, distances[:, 1:], neighbours[:, 1:]))
     if len(rows) == 0:
         return np.zeros((0, 3)), np.zeros((0, 3))
     _, label = kmeans2(points[rows], min(VIEWS, len(rows)), minit="++", seed=seed)
-    chosen = []
+    indices = []
     for cluster in np.unique(label):
-        of = rows[label == cluster]
-        chosen.append(of[np.argmin(np.linalg.norm(points[of] - points[of].mean(axis=0), axis=1))])
-    targets, up = points[chosen], normals[chosen]
-    out = unit(targets - points[near[chosen, 1:]].mean(axis=1))
+        members = rows[label == cluster]
+        indices.append(members[np.argmin(np.linalg.norm(points[members] - points[members].mean(axis=0), axis=1))])
+    targets, up = points[indices], normals[indices]
+    out = unit(targets - points[neighbours[indices, 1:]].mean(axis=1))
     axes = np.cross(out, up)
-    turns = TURNS[np.arange(len(chosen)) % len(TURNS)][:, None] * np.linalg.norm(axes, axis=1, keepdims=True)
-    along = unit(axes)
+    angles = ROTATION_ANGLES[np.arange(len(indices)) % len(ROTATION_ANGLES)][:, None] * np.linalg.norm(
+        axes, axis=1, keepdims=True
+    )
+    directions = unit(axes)
     # The normals turned about the boundary.
-    return targets, unit(Rotation.from_rotvec(turns * along).apply(up))
+    return targets, unit(Rotation.from_rotvec(angles * directions).apply(up))
 
 
-def is_boundary(points, normals, apart, near) -> Bool[np.ndarray, " n"]:
+def is_boundary(points, normals, distances, neighbours) -> Bool[np.ndarray, " n"]:
     """Whether the directions to a point's neighbours, seen along its normal, leave a gap of more than `GAP`."""
     first = unit(np.cross(normals, np.eye(3)[np.argmin(np.abs(normals), axis=1)]))
     second = np.cross(normals, first)
-    away = points[near] - points[:, None]
-    angle = np.arctan2(np.einsum("nkd,nd->nk", away, second), np.einsum("nkd,nd->nk", away, first))
-    counts = apart < apart.mean()
-    angle = np.sort(np.where(counts, angle, np.inf), axis=1)
-    count = np.sum(counts, axis=1)
+    offsets = points[neighbours] - points[:, None]
+    angle = np.arctan2(np.einsum("nkd,nd->nk", offsets, second), np.einsum("nkd,nd->nk", offsets, first))
+    is_near = distances < distances.mean()
+    angle = np.sort(np.where(is_near, angle, np.inf), axis=1)
+    count = np.sum(is_near, axis=1)
     with np.errstate(invalid="ignore"):
         gaps = np.nan_to_num(np.diff(angle, axis=1), nan=0.0, posinf=0.0)
     last = angle[np.arange(len(points)), np.maximum(count - 1, 0)]
-    around = np.where(count > 0, 2.0 * np.pi - (last - angle[:, 0]), 2.0 * np.pi)
-    return np.maximum(gaps.max(axis=1, initial=0.0), around) > GAP
+    closing_gap = np.where(count > 0, 2.0 * np.pi - (last - angle[:, 0]), 2.0 * np.pi)
+    return np.maximum(gaps.max(axis=1, initial=0.0), closing_gap) > GAP
 
 
 def unit(rows: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

@@ -44,10 +44,16 @@ def cosines(planner: nbv.Planner, scene, seed: int, step: float) -> np.ndarray:
     observations = planner.init(first, nbv.scan(scene, planner.camera, first))
     inputs = planner.step_inputs(observations, jax.random.key(seed))
     starts = nbv.look_at(np.asarray(nbv.geometry.fibonacci_sphere(POSES, RADIUS)))
-    at = jnp.asarray(0.05 * np.random.default_rng(seed).normal(size=(POSES, SPACE.num_parameters)), jnp.float32)
-    of = functools.partial(values, planner, inputs, starts)
-    differences = np.stack([np.asarray(of(at + move) - of(at - move)) for move in step * jnp.eye(at.shape[1])], axis=1)
-    slopes = np.asarray(gradients(planner, inputs, starts, at))
+    parameters = jnp.asarray(0.05 * np.random.default_rng(seed).normal(size=(POSES, SPACE.num_parameters)), jnp.float32)
+    evaluate = functools.partial(values, planner, inputs, starts)
+    differences = np.stack(
+        [
+            np.asarray(evaluate(parameters + move) - evaluate(parameters - move))
+            for move in step * jnp.eye(parameters.shape[1])
+        ],
+        axis=1,
+    )
+    slopes = np.asarray(gradients(planner, inputs, starts, parameters))
     lengths = np.linalg.norm(slopes, axis=1) * np.linalg.norm(differences, axis=1)
     return np.sum(slopes * differences, axis=1) / np.maximum(lengths, 1e-12)
 
@@ -59,12 +65,12 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=2)
     options = parser.parse_args()
     scene = nbv.load_mesh(options.mesh) if options.mesh else demo_object()
-    for where, fov in FIELDS_OF_VIEW.items():
+    for framing, fov in FIELDS_OF_VIEW.items():
         for name, acquisition in ACQUISITIONS.items():
             sampler, camera = nbv.SurfaceSampler(num_samples=SAMPLES), nbv.Camera(fov, RAYS, RAYS)
             planner = nbv.Planner(acquisition, nbv.DiscreteSearch(), camera, sampler)
             values = np.concatenate([cosines(planner, scene, seed, options.step) for seed in range(options.seeds)])
-            print(f"{name:12} {where:9} median {np.median(values):5.2f}, least {values.min():5.2f}", flush=True)
+            print(f"{name:12} {framing:9} median {np.median(values):5.2f}, least {values.min():5.2f}", flush=True)
 
 
 if __name__ == "__main__":

@@ -117,8 +117,8 @@ def judge(
         f"has {shape}: make both with the planner's grid",
     )
     empty_nodes = jnp.asarray(empty_nodes)
-    judged = _judge(surfaces, observations.cloud, truth, empty_nodes, planner.camera, planner.acquisition)
-    crps_depth, in_empty, inside, expected, true_values = (np.asarray(leaf) for leaf in judged)
+    arrays = _judge(surfaces, observations.cloud, truth, empty_nodes, planner.camera, planner.acquisition)
+    crps_depth, in_empty, probabilities, expected, true_values = (np.asarray(leaf) for leaf in arrays)
     record = Judgement(
         crps=float(crps_depth),
         in_empty=None if np.isnan(in_empty) else float(in_empty),
@@ -127,15 +127,15 @@ def judge(
     )
     if not bool(truth.inside.any()):
         return record
-    unseen = np.asarray((_over_nodes(truth.volume, planner.sampler.grid) <= 0) & ~empty_nodes)
-    forecast, happened = inside[unseen], np.asarray(truth.inside)[unseen]
-    plain = brier(forecast, happened)
+    is_unseen = np.asarray((_over_nodes(truth.volume, planner.sampler.grid) <= 0) & ~empty_nodes)
+    forecast, outcomes = probabilities[is_unseen], np.asarray(truth.inside)[is_unseen]
+    plain_brier = brier(forecast, outcomes)
     return record._replace(
-        brier=plain,
-        fair_brier=plain - float(np.mean(forecast * (1.0 - forecast))) / (surfaces.values.shape[0] - 1),
+        brier=plain_brier,
+        fair_brier=plain_brier - float(np.mean(forecast * (1.0 - forecast))) / (surfaces.values.shape[0] - 1),
         mean_inside=float(forecast.mean()),
-        true_inside=float(happened.mean()),
-        reliability=reliability(forecast, happened),
+        true_inside=float(outcomes.mean()),
+        reliability=reliability(forecast, outcomes),
     )
 
 
@@ -163,13 +163,13 @@ def exit_depths(
 ) -> tuple[Float[Array, "*n"], Bool[Array, "*n"]]:
     """Distance at which rays leave a box, in direction lengths, and whether they meet it (Kay and Kajiya 1986)."""
     origins, directions = jnp.asarray(origins), jnp.asarray(directions)
-    start, along = (list(jnp.moveaxis(vectors, -1, 0)) for vectors in (origins, directions))
-    enters, leaves = ray_interval(start, along, volume.low, volume.high)
+    start, components = (list(jnp.moveaxis(vectors, -1, 0)) for vectors in (origins, directions))
+    enters, leaves = ray_interval(start, components, volume.low, volume.high)
     return leaves, leaves > jnp.maximum(enters, 0.0)
 
 
 def ray_depths(
-    seen: PointCloud, camera: Camera, poses: Pose, volume: Box
+    scans: PointCloud, camera: Camera, poses: Pose, volume: Box
 ) -> tuple[Float[Array, "*poses rays"], Bool[Array, "*poses rays"]]:
     """Depth along the rays of a scan, in scene units, and which rays meet the volume.
 
@@ -178,22 +178,22 @@ def ray_depths(
     """
     origins, directions = camera.rays(poses)
     leaves, meets = exit_depths(volume, origins, directions)
-    depth = jnp.sum((seen.points - origins) * directions, axis=-1)
-    return jnp.where(seen.mask, jnp.minimum(depth, leaves), leaves), meets
+    depth = jnp.sum((scans.points - origins) * directions, axis=-1)
+    return jnp.where(scans.mask, jnp.minimum(depth, leaves), leaves), meets
 
 
-def brier(forecast: Float[AnyArray, " n"], happened: Bool[AnyArray, " n"]) -> float:
+def brier(forecast: Float[AnyArray, " n"], outcomes: Bool[AnyArray, " n"]) -> float:
     """Mean squared difference between probabilities and outcomes (1 or 0).
 
     **Raises:** `ValueError` if there are none.
     """
     require(len(forecast) > 0, "no forecasts to judge: every node of the volume was seen to be empty, or it has none")
-    return float(np.mean((np.asarray(forecast) - np.asarray(happened)) ** 2))
+    return float(np.mean((np.asarray(forecast) - np.asarray(outcomes)) ** 2))
 
 
-def reliability(forecast: Float[AnyArray, " n"], happened: Bool[AnyArray, " n"], bins: int = BINS) -> Reliability:
+def reliability(forecast: Float[AnyArray, " n"], outcomes: Bool[AnyArray, " n"], bins: int = BINS) -> Reliability:
     """Mean forecast and observed frequency by bins of the forecast, [0, 1/bins), ..., [1 - 1/bins, 1]."""
-    forecast, happened = np.asarray(forecast, np.float64), np.asarray(happened)
+    forecast, outcomes = np.asarray(forecast, np.float64), np.asarray(outcomes)
     index = np.minimum((forecast * bins).astype(int), bins - 1)
     count = np.bincount(index, minlength=bins)
 
@@ -201,7 +201,7 @@ def reliability(forecast: Float[AnyArray, " n"], happened: Bool[AnyArray, " n"],
         sums = np.bincount(index, weights=values, minlength=bins)
         return [float(total / n) if n else None for total, n in zip(sums, count, strict=True)]
 
-    return Reliability(mean(forecast), mean(happened), count.tolist())
+    return Reliability(mean(forecast), mean(outcomes), count.tolist())
 
 
 def empty_share(

@@ -102,12 +102,12 @@ def show(rows: list[dict], names: list[str]) -> None:
     discrete, seconds = column("discrete", "value"), column("discrete", "seconds")
     print(f"{'of the discrete search':32s} {'value':>7s} {'least':>7s} {'reached':>8s} {'search':>7s} {'step':>7s}")
     for name in names:
-        ratio, took = column(name, "value") / discrete, column(name, "seconds")
+        ratio, search_seconds = column(name, "value") / discrete, column(name, "seconds")
         reached = f"{int((ratio >= 1.0).sum())}/{len(rows)}"
-        step = (samples + took) / (samples + seconds)
+        step = (samples + search_seconds) / (samples + seconds)
         print(
             f"{name:32s} {np.median(ratio):7.3f} {ratio.min():7.3f} {reached:>8s} "
-            f"{np.median(took / seconds):7.2f} {np.median(step):7.2f}"
+            f"{np.median(search_seconds / seconds):7.2f} {np.median(step):7.2f}"
         )
     cost = np.median([row["six gradients"] / row["six values"] for row in rows])
     print(f"the discrete search takes {np.median(seconds):.2f} s, the samples {np.median(samples):.2f} s")

@@ -22,8 +22,8 @@ def without_the_class(study: ClassificationStudy, scene: Scene) -> Planner:
     """A planner whose bank has the study's objects of all classes but the scene's."""
     sampler = study.sampler
     assert isinstance(sampler.model, KnownShapes), "run the study by --model known"
-    bank, own = sampler.model.bank, study.objects.classes[scene.task.label]
-    others = [row for row, name in enumerate(bank.names) if kind_of(name) != own]
+    bank, class_name = sampler.model.bank, study.objects.classes[scene.task.label]
+    others = [row for row, name in enumerate(bank.names) if kind_of(name) != class_name]
     return _planner(study, scene, sampler.without_bank.with_bank(bank.select(others), sampler.model.poses))
 
 

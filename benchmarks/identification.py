@@ -36,7 +36,7 @@ from jaxnbv.studies.scenes.placed_parts import Parts, parts_in, place_part
 from jaxnbv.surfaces.part_hypotheses import NONE
 
 # Longest sides of objects of --others in metres, error of normals in radians, axis of the mount's error.
-_SIDES, _NORMALS, _AXIS = (0.08, 0.25), 0.15, np.array([0.6, 0.64, 0.48])
+_SIDES, _NORMAL_NOISE, _MOUNT_AXIS = (0.08, 0.25), 0.15, np.array([0.6, 0.64, 0.48])
 _BINS = 10
 
 
@@ -44,37 +44,37 @@ def other_scene(study: IdentificationStudy, index: int, files: list[Path]) -> Sc
     """An object of another folder, placed like the parts."""
     random, parts = np.random.default_rng(500 + index), parts_in(study.meshes)
     file = files[int(random.integers(len(files)))]
-    read = trimesh.load(file, force="mesh")
-    vertices = np.asarray(read.vertices)
+    file_mesh = trimesh.load(file, force="mesh")
+    vertices = np.asarray(file_mesh.vertices)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     vertices = (vertices - 0.5 * (low + high)) / (high - low).max() * random.uniform(*_SIDES)
-    mesh = TriangleMesh(vertices.astype(np.float32), np.asarray(read.faces, np.int32), Frame())
+    mesh = TriangleMesh(vertices.astype(np.float32), np.asarray(file_mesh.faces, np.int32), Frame())
     # The resting pose of the object does not matter, since the hypotheses are the bank's parts.
-    placed = place_part(
+    placed_part = place_part(
         Parts(parts.bank, (*parts.meshes, mesh)), len(parts.bank), study.setup, study.key(index, "scene")
     )
-    return Scene(index, file.stem, placed.mesh, placed)
+    return Scene(index, file.stem, placed_part.mesh, placed_part)
 
 
 def image_of(
     study: IdentificationStudy, scene: Scene, pose: Pose, noise: float, mount: float, seed: int
 ) -> tuple[PointCloud, Pose]:
     """A noisy scan, and the pose that the robot reports for it."""
-    seen, random = scan(scene.surface, study.camera, pose), np.random.default_rng(seed)
-    mask, place = np.asarray(seen.mask)[:, None], np.asarray(pose.position)
-    rays = np.asarray(seen.points) - place
+    true_scan, random = scan(scene.surface, study.camera, pose), np.random.default_rng(seed)
+    mask, place = np.asarray(true_scan.mask)[:, None], np.asarray(pose.position)
+    rays = np.asarray(true_scan.points) - place
     rays = rays / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-9)
-    along = 1e-3 * noise * scene.task.scale * random.standard_normal((len(rays), 1))
-    normals = np.asarray(seen.normals) + _NORMALS * random.standard_normal(rays.shape)
+    range_noise = 1e-3 * noise * scene.task.scale * random.standard_normal((len(rays), 1))
+    normals = np.asarray(true_scan.normals) + _NORMAL_NOISE * random.standard_normal(rays.shape)
     rotation = np.asarray(pose.rotation)
-    said = rotation @ Rotation.from_rotvec(np.radians(mount) * _AXIS).as_matrix()
-    moved = said @ rotation.T
-    points = np.where(mask, (np.asarray(seen.points) + along * rays - place) @ moved.T + place, 0.0)
-    normals = normals @ moved.T / np.linalg.norm(normals, axis=1, keepdims=True)
-    sight = np.asarray(seen.sight) + along[:, 0]
+    reported_rotation = rotation @ Rotation.from_rotvec(np.radians(mount) * _MOUNT_AXIS).as_matrix()
+    error_rotation = reported_rotation @ rotation.T
+    points = np.where(mask, (np.asarray(true_scan.points) + range_noise * rays - place) @ error_rotation.T + place, 0.0)
+    normals = normals @ error_rotation.T / np.linalg.norm(normals, axis=1, keepdims=True)
+    sight = np.asarray(true_scan.sight) + range_noise[:, 0]
     noisy = {"points": points, "normals": np.where(mask, normals, 0.0), "sight": sight}
-    cloud = dataclasses.replace(seen, **{name: jnp.asarray(rows, jnp.float32) for name, rows in noisy.items()})
-    return cloud, Pose(jnp.asarray(said, jnp.float32), pose.position)
+    cloud = dataclasses.replace(true_scan, **{name: jnp.asarray(rows, jnp.float32) for name, rows in noisy.items()})
+    return cloud, Pose(jnp.asarray(reported_rotation, jnp.float32), pose.position)
 
 
 def beliefs(
@@ -86,20 +86,20 @@ def beliefs(
     others = random.choice(np.delete(np.arange(study.num_candidates), first), options.views - 1, replace=False)
     observations = None
     for number in [first, *others.tolist()]:
-        pose = jax.tree.map(lambda rows, at=number: rows[at], poses)
+        pose = jax.tree.map(lambda rows, index=number: rows[index], poses)
         seed = 1000 * scene.index + number
-        cloud, said = image_of(study, scene, pose, options.noise, options.mount, seed)
+        cloud, reported_pose = image_of(study, scene, pose, options.noise, options.mount, seed)
         if observations is None:
-            observations = planner.init(said, cloud, study.camera)
+            observations = planner.init(reported_pose, cloud, study.camera)
         else:
-            observations = planner.observe(observations, said, cloud, study.camera)
+            observations = planner.observe(observations, reported_pose, cloud, study.camera)
         yield observations.hypotheses.names()
 
 
 def calibration_error(rows: np.ndarray) -> float:
     """Expected calibration error of rows (probability, whether it was right), by the numbers of rows in the bins."""
     bins = np.minimum((_BINS * rows[:, 0]).astype(int), _BINS - 1)
-    return sum(abs(np.sum(rows[bins == one, 0] - rows[bins == one, 1])) for one in range(_BINS)) / len(rows)
+    return sum(abs(np.sum(rows[bins == index, 0] - rows[bins == index, 1])) for index in range(_BINS)) / len(rows)
 
 
 def main() -> None:
@@ -124,8 +124,8 @@ def main() -> None:
             bank = scene.task.bank.select([part for part in range(len(scene.task.bank)) if part != scene.task.part])
             planner = dataclasses.replace(planner, sampler=study.sampler.with_bank(bank, scene.task.poses))
         likeliest = [next(iter(belief.items())) for belief in beliefs(study, planner, scene, options)]
-        rows.append([(probability, float(said == name)) for said, probability in likeliest])
-        print(f"{scene.name:24}", *(f"{said} {probability:.2f}" for said, probability in likeliest), flush=True)
+        rows.append([(probability, float(answer == name)) for answer, probability in likeliest])
+        print(f"{scene.name:24}", *(f"{answer} {probability:.2f}" for answer, probability in likeliest), flush=True)
     table = np.array(rows)
     for title, column in {"right": 1, "probability": 0}.items():
         print(f"{title:24}", *(f"{100 * value:.0f}" for value in table[..., column].mean(axis=0)))

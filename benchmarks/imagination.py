@@ -45,7 +45,7 @@ from jaxnbv.studies.scenes import PART_CATEGORIES, Split, demo_object, part_scen
 GRID = nbv.Grid(64, 0.7 * 2.5)
 RAYS = nbv.Camera(height=32, width=32)
 VOLUME = nbv.Box()
-VIEWS, LEAST_HITS = 2, 100
+VIEWS, MIN_HITS = 2, 100
 
 Variant = Callable[[nbv.Grid], tuple[nbv.SurfaceModel, nbv.Carving | None]]
 TWO_SCALES = nbv.ScreenedSPSR().base
@@ -113,7 +113,7 @@ def random_views(scene: nbv.scanning.Surface, key: jax.Array) -> list[tuple[nbv.
         direction = jax.random.normal(direction_key, (3,))
         pose = nbv.look_at(2.5 * direction / jnp.linalg.norm(direction))
         cloud = observe_scene(scene, nbv.Camera(), pose, nbv.SensorNoise(), noise_key)
-        views += [(pose, cloud)] if int(cloud.count) >= LEAST_HITS else []
+        views += [(pose, cloud)] if int(cloud.count) >= MIN_HITS else []
         if len(views) == VIEWS:
             return views
     raise SystemExit(f"the object shows from fewer than {VIEWS} of 100 random directions: give a larger one")
@@ -170,7 +170,7 @@ def show(rows: dict[tuple[str, int, str], list[dict]], names: list[str]) -> None
                         ratio = values(model, views, what, name).mean() / base.mean()
                         change.setdefault(name.split("/")[0], []).append(100.0 * (ratio - 1.0))
                 if change:
-                    mean = np.mean([one for group in change.values() for one in group])
+                    mean = np.mean([change_of_object for group in change.values() for change_of_object in group])
                     text = "  ".join(f"{kind} {np.mean(c):+.0f} ({max(c):+.0f})" for kind, c in change.items())
                     print(f"{model:{wide}}{mean:+7.0f}   {text}")
 
@@ -203,13 +203,13 @@ def main() -> None:
     names = arguments.models or list(variants)
     if unknown := set(names) - set(variants):
         parser.error(f"there is no model {', '.join(sorted(unknown))}: choose from {', '.join(variants)}")
-    compared = names[0], arguments.better or names[-1]
-    if compared[1] not in names:
-        parser.error(f"--better {compared[1]} is none of the models that are compared: {', '.join(names)}")
+    pair = names[0], arguments.better or names[-1]
+    if pair[1] not in names:
+        parser.error(f"--better {pair[1]} is none of the models that are compared: {', '.join(names)}")
     planners = {name: planner_of(variants[name]) for name in names}
     candidates = sphere_candidates(arguments.candidates, 2.5)
     stored = json.loads(arguments.out.read_text()) if arguments.out.exists() else {}
-    rows, warm = {}, set[str]()
+    rows, compiled_models = {}, set[str]()
     objects = objects_of(arguments)
     with tqdm(total=len(objects) * len(arguments.seeds) * len(names), unit="run") as bar:
         for name, make in objects.items():
@@ -218,16 +218,16 @@ def main() -> None:
                 base, views = jax.random.fold_in(jax.random.key(seed), zlib.crc32(name.encode())), None
                 for model, plain in planners.items():
                     planner = with_bank(plain, bank, name) if bank is not None and model == "known" else plain
-                    settings = describe([scene, planner, arguments.candidates, RAYS, VOLUME, LEAST_HITS])
+                    settings = describe([scene, planner, arguments.candidates, RAYS, VOLUME, MIN_HITS])
                     label = f"{name}, seed {seed}, {model}"
                     bar.set_description(label)
-                    made_of = hashlib.sha256(json.dumps(settings).encode()).hexdigest()
-                    if stored.get(label, {}).get("made_of") != made_of:
+                    digest = hashlib.sha256(json.dumps(settings).encode()).hexdigest()
+                    if stored.get(label, {}).get("made_of") != digest:
                         truth = truth or Truth.of(scene, planner, candidates, VOLUME, RAYS)
                         views = views or random_views(scene, jax.random.fold_in(base, 0))
-                        records = run(planner, views, truth, jax.random.fold_in(base, 1), model in warm)
-                        warm.add(model)
-                        stored[label] = {"made_of": made_of, "versions": versions(), "records": records}
+                        records = run(planner, views, truth, jax.random.fold_in(base, 1), model in compiled_models)
+                        compiled_models.add(model)
+                        stored[label] = {"made_of": digest, "versions": versions(), "records": records}
                         arguments.out.parent.mkdir(parents=True, exist_ok=True)
                         write_whole(
                             arguments.out, lambda out: out.write((json.dumps(stored, indent=1) + "\n").encode())
@@ -236,11 +236,11 @@ def main() -> None:
                     bar.update()
     show(rows, names)
     if arguments.reliability:
-        draw_reliability(arguments.reliability, rows, compared)
+        draw_reliability(arguments.reliability, rows, pair)
     if arguments.figure:
         name, make = next(iter(objects.items()))
         base = jax.random.fold_in(jax.random.key(arguments.seeds[0]), zlib.crc32(name.encode()))
-        by_model = {model: planners[model] for model in compared}
+        by_model = {model: planners[model] for model in pair}
         scene = make()
         first = random_views(scene, jax.random.fold_in(base, 0))[0]
         draw_samples(arguments.figure, scene, first, by_model, jax.random.fold_in(base, 1))

@@ -18,16 +18,16 @@ from jaxnbv.viz.style import BEFORE, GREY, INK, LINE, NEW
 TINT = "#f0a45c"
 
 
-def picture(surface: nbv.scanning.Surface, eye: nbv.Pose, seen: nbv.PointCloud, pixels: int = 440) -> np.ndarray:
+def picture(surface: nbv.scanning.Surface, eye: nbv.Pose, cloud: nbv.PointCloud, pixels: int = 440) -> np.ndarray:
     """The surface lit from beside the eye, tinted near scanned points, as RGBA. Four rays a pixel."""
     camera = nbv.Camera(2.0 * math.atan(1.9 / 11.0), 2 * pixels, 2 * pixels)
     view = nbv.scan(surface, camera, eye)
     normals = np.asarray(view.normals)
-    near = np.asarray(nearest_squared_distance(view.points, seen)) < 0.05**2
+    is_near = np.asarray(nearest_squared_distance(view.points, cloud)) < 0.05**2
     right, down, forward = np.asarray(eye.rotation).T
     light = -forward - 0.6 * right - 0.8 * down
-    lit = 0.62 + 0.44 * np.clip(normals @ (light / np.linalg.norm(light)), -0.5, 1.0)
-    colours = np.where(near[:, None], mpl.colors.to_rgb(TINT), mpl.colors.to_rgb(LINE)) * lit[:, None]
+    brightness = 0.62 + 0.44 * np.clip(normals @ (light / np.linalg.norm(light)), -0.5, 1.0)
+    colours = np.where(is_near[:, None], mpl.colors.to_rgb(TINT), mpl.colors.to_rgb(LINE)) * brightness[:, None]
     colours[~np.asarray(view.mask)] = 1.0
     image = np.concatenate([np.clip(colours, 0.0, 1.0), np.asarray(view.mask, float)[:, None]], axis=1)
     return image.reshape(pixels, 2, pixels, 2, 4).mean(axis=(1, 3))
@@ -38,21 +38,21 @@ def crop(images: list[np.ndarray]) -> tuple[slice, slice]:
     opacity = np.mean([image[..., 3] for image in images], axis=0)
     spans = []
     for axis in (1, 0):
-        (used,) = np.nonzero(opacity.sum(axis=axis) > 0.5)
-        spans.append(slice(max(used[0] - 6, 0), used[-1] + 7))
+        (indices,) = np.nonzero(opacity.sum(axis=axis) > 0.5)
+        spans.append(slice(max(indices[0] - 6, 0), indices[-1] + 7))
     return spans[0], spans[1]
 
 
 def draw_samples(
-    path: Path, scene: nbv.scanning.Surface, view: tuple, named: dict[str, nbv.Planner], key: jax.Array
+    path: Path, scene: nbv.scanning.Surface, view: tuple, planners: dict[str, nbv.Planner], key: jax.Array
 ) -> None:
     """Draw the true surface and four samples of each of two models after one view, seen from the side of the view."""
     pose, scan = view
-    away, up = np.asarray(pose.position) / 2.5, np.array([0.0, 1.0, 0.0])
-    across = np.cross(up, away) / max(float(np.linalg.norm(np.cross(up, away))), 1e-6)
-    eye = nbv.look_at(11.0 * (math.cos(1.15) * away + math.sin(1.15) * across + 0.25 * up))
+    direction, up = np.asarray(pose.position) / 2.5, np.array([0.0, 1.0, 0.0])
+    across = np.cross(up, direction) / max(float(np.linalg.norm(np.cross(up, direction))), 1e-6)
+    eye = nbv.look_at(11.0 * (math.cos(1.15) * direction + math.sin(1.15) * across + 0.25 * up))
     images = [picture(scene, eye, scan)]
-    for planner in named.values():
+    for planner in planners.values():
         surfaces = planner.sampler.sample(planner.init(pose, scan), key)
         images += [picture(jax.tree.map(lambda leaf, i=i: leaf[i], surfaces), eye, scan) for i in range(4)]
     rows, columns = crop(images)
@@ -74,7 +74,7 @@ def draw_samples(
 
         place(images[0], 0.0, 0.0, large / tall)
         write(0.06, large + 0.06, "the object, and what one view saw of it")
-        for row, name in enumerate(named):
+        for row, name in enumerate(planners):
             left, bottom = large * wide / tall + 0.2, (1 - row) * (tall + head)
             write(left, bottom + tall + 0.06, f"imagined from this view: {name}")
             for column in range(4):
@@ -102,9 +102,9 @@ def draw_reliability(path: Path, rows: dict[tuple[str, int, str], list[dict]], n
             axes.plot([0, 1], [0, 1], color=GREY, linewidth=0.8, linestyle=":")
             for name, colour in zip(names, (BEFORE, NEW), strict=True):
                 runs = [run[index]["reliability"] for (_, _, model), run in rows.items() if model == name]
-                forecast, observed, share = pooled([run for run in runs if run is not None])
+                forecast, observed, fraction = pool_bins([run for run in runs if run is not None])
                 axes.plot(forecast, observed, color=colour, linewidth=1.2, label=name)
-                axes.scatter(forecast, observed, s=4.0 + 160.0 * share, color=colour)
+                axes.scatter(forecast, observed, s=4.0 + 160.0 * fraction, color=colour)
             axes.set(xlim=(-0.03, 1.03), ylim=(-0.03, 1.03), aspect="equal", xlabel="P(inside) imagined")
             axes.set_title(f"after {index + 1} view{'s' if index else ''}", fontsize=9)
         panels[0].set_ylabel("share truly inside")
@@ -113,13 +113,13 @@ def draw_reliability(path: Path, rows: dict[tuple[str, int, str], list[dict]], n
         figure.savefig(path, dpi=150, bbox_inches="tight")
 
 
-def pooled(runs: list[dict]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def pool_bins(runs: list[dict]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mean forecast, share inside and share of the nodes, for each bin of some runs that is not empty."""
     nodes = np.array([run["nodes"] for run in runs])
-    filled = nodes.sum(axis=0) > 0
+    is_filled = nodes.sum(axis=0) > 0
     forecast, observed = (
-        np.sum(nodes * np.array([[mean or 0.0 for mean in run[key]] for run in runs]), axis=0)[filled]
-        / nodes.sum(axis=0)[filled]
+        np.sum(nodes * np.array([[mean or 0.0 for mean in run[key]] for run in runs]), axis=0)[is_filled]
+        / nodes.sum(axis=0)[is_filled]
         for key in ("forecast", "observed")
     )
-    return forecast, observed, nodes.sum(axis=0)[filled] / nodes.sum()
+    return forecast, observed, nodes.sum(axis=0)[is_filled] / nodes.sum()

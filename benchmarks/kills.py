@@ -83,23 +83,23 @@ def content(path: Path) -> bytes:
     """The bytes of a file. In records of a study all times are set to zero."""
     if not path.name.startswith("scene_"):
         return path.read_bytes()
-    record = json.loads(path.read_text(), object_hook=lambda held: held | {"seconds": 0})["record"]
+    record = json.loads(path.read_text(), object_hook=lambda fields: fields | {"seconds": 0})["record"]
     return json.dumps(record).encode()
 
 
-def let_through(name: str, out: Path, inputs: Path) -> float:
+def run_to_end(name: str, out: Path, inputs: Path) -> float:
     """Run a command to its end. Returns its seconds."""
-    began = time.monotonic()
+    start_time = time.monotonic()
     process, *others = start(name, out, inputs)
     _, errors = process.communicate()
     for other in others:
         other.communicate()
     # The folder's lock may have refused this process while the other ran. Run it again, alone.
     if process.returncode and others:
-        return let_through(name, out, inputs)
+        return run_to_end(name, out, inputs)
     if process.returncode:
         raise SystemExit(f"{name} ended with {process.returncode}: {errors.decode()[-2000:]}")
-    return time.monotonic() - began
+    return time.monotonic() - start_time
 
 
 def main() -> None:
@@ -115,29 +115,31 @@ def main() -> None:
     (inputs := options.out / "inputs").mkdir(parents=True)
     trimesh.creation.box((1.0, 0.7, 0.5)).export(inputs / "box.ply")
     random, failures = np.random.default_rng(0), []
-    share = -(-options.kills // len(options.commands))
+    kills_per_command = -(-options.kills // len(options.commands))
     for name in options.commands:
         # The second run compiles nothing, like the runs that are killed.
-        let_through(name, options.out / name / "first", inputs)
-        seconds = let_through(name, options.out / name / "whole", inputs)
-        expected, killed = contents(options.out / name / "whole"), 0
-        with tqdm(total=share, desc=name, unit="kill") as bar:
-            while killed < share:
+        run_to_end(name, options.out / name / "first", inputs)
+        seconds = run_to_end(name, options.out / name / "whole", inputs)
+        expected, num_killed = contents(options.out / name / "whole"), 0
+        with tqdm(total=kills_per_command, desc=name, unit="kill") as bar:
+            while num_killed < kills_per_command:
                 shutil.rmtree(out := options.out / name / "killed", ignore_errors=True)
                 # Kill several times in the same folder, at one random moment of each stratum of the run's time.
-                for moment in random.permutation(min(STRATA, share - killed)):
+                for moment in random.permutation(min(STRATA, kills_per_command - num_killed)):
                     processes = start(name, out, inputs)
                     time.sleep(seconds * (moment + random.random()) / STRATA)
-                    killed += any(process.poll() is None for process in processes)
+                    num_killed += any(process.poll() is None for process in processes)
                     for process in processes:
                         process.kill()
                         process.communicate()
-                bar.update(killed - bar.n)
-                let_through(name, out, inputs)
+                bar.update(num_killed - bar.n)
+                run_to_end(name, out, inputs)
                 if contents(out) != expected:
-                    differ = [file for file, content_now in contents(out).items() if expected.get(file) != content_now]
-                    failures.append(f"{name} after {killed} kills: {differ or sorted(expected)}")
-        print(f"{name}: {killed} kills of {seconds:.0f} s")
+                    changed_files = [
+                        file for file, content_now in contents(out).items() if expected.get(file) != content_now
+                    ]
+                    failures.append(f"{name} after {num_killed} kills: {changed_files or sorted(expected)}")
+        print(f"{name}: {num_killed} kills of {seconds:.0f} s")
     print("\n".join(failures) or "every run ended with the files of one that was left alone")
     sys.exit(bool(failures))
 

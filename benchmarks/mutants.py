@@ -41,19 +41,23 @@ def places(path: Path) -> dict[tuple[int, int], list[tuple[str, int]]]:
         # An operator with arguments changes nothing without them.
         if (kind := get_operator(name)).arguments():
             continue
-        spots = [at for node in ast_nodes(parsed) for at, _ in kind().mutation_positions(node)]
-        for occurrence, at in enumerate(spots):
-            by_place.setdefault(at, []).append((name, occurrence))
-    typed = [note for node in ast.walk(ast.parse(code)) if (note := annotation(node)) is not None]
-    return {at: ways for at, ways in by_place.items() if not any(covers(note, at) for note in typed)}
+        positions = [position for node in ast_nodes(parsed) for position, _ in kind().mutation_positions(node)]
+        for occurrence, position in enumerate(positions):
+            by_place.setdefault(position, []).append((name, occurrence))
+    annotations = [note for node in ast.walk(ast.parse(code)) if (note := annotation(node)) is not None]
+    return {
+        position: mutations
+        for position, mutations in by_place.items()
+        if not any(covers(note, position) for note in annotations)
+    }
 
 
 def annotation(node: ast.AST) -> ast.AST | None:
     return getattr(node, "annotation", None) or getattr(node, "returns", None)
 
 
-def covers(node: ast.AST, at: tuple[int, int]) -> bool:
-    return (node.lineno, node.col_offset) <= at < (node.end_lineno, node.end_col_offset)
+def covers(node: ast.AST, position: tuple[int, int]) -> bool:
+    return (node.lineno, node.col_offset) <= position < (node.end_lineno, node.end_col_offset)
 
 
 def statement(code: str, line: int) -> range:
@@ -91,13 +95,13 @@ def outcome(path: Path, mutated: str, tests: list[str]) -> str:
     os.utime(path, (time.time() + 10, times.st_mtime + np.random.default_rng().integers(1, 1 << 20)))
     command = [sys.executable, "-m", "pytest", "-x", "-p", "no:cacheprovider", "-o", "addopts=", *tests]
     try:
-        ended = subprocess.run(command, capture_output=True, timeout=3.0 * SECONDS).returncode
+        return_code = subprocess.run(command, capture_output=True, timeout=3.0 * SECONDS).returncode
     except subprocess.TimeoutExpired:
         return "no end"
     finally:
         path.write_text(code)
         os.utime(path, (times.st_atime, times.st_mtime))
-    return "killed" if ended else "survived"
+    return "killed" if return_code else "survived"
 
 
 def main() -> None:
@@ -112,35 +116,37 @@ def main() -> None:
     from cosmic_ray.plugins import get_operator
     from coverage import CoverageData
 
-    measured = CoverageData(options.coverage)
-    measured.read()
+    coverage_data = CoverageData(options.coverage)
+    coverage_data.read()
     durations = re.findall(r"^([\d.]+)s \w+ +(tests\S.*)$", options.durations.read_text(), re.MULTILINE)
     seconds: dict[str, float] = {}
-    for took, name in durations:
-        seconds[name] = seconds.get(name, 0.0) + float(took)
+    for duration, name in durations:
+        seconds[name] = seconds.get(name, 0.0) + float(duration)
     files = [
         file for part in PARTS for file in sorted(Path("jaxnbv").glob(f"{part}/**/*.py" if "." not in part else part))
     ]
-    drawn = [(path, at, ways) for path in files for at, ways in places(path).items()]
+    all_places = [(path, position, mutations) for path in files for position, mutations in places(path).items()]
     random = np.random.default_rng(0)
     rows = json.loads(options.out.read_text()) if options.out.exists() else []
-    chosen = random.choice(len(drawn), options.mutants, replace=False)
-    for number, index in enumerate(tqdm(chosen, unit="mutant")):
-        path, at, ways = drawn[index]
-        name, occurrence = ways[random.integers(len(ways))]
+    indices = random.choice(len(all_places), options.mutants, replace=False)
+    for number, index in enumerate(tqdm(indices, unit="mutant")):
+        path, position, mutations = all_places[index]
+        name, occurrence = mutations[random.integers(len(mutations))]
         if number < len(rows):
             continue
         code = path.read_text()
         mutated = mutate_code(code, get_operator(name)(), occurrence)
-        tests = tests_of(path, code, at[0], measured.contexts_by_lineno(str(path.resolve())), seconds)
-        after = mutated.splitlines()[at[0] - 1].strip()
-        rows.append({"at": f"{path}:{at[0]}", "to": after, "by": name, "is": outcome(path, mutated, tests)})
+        tests = tests_of(path, code, position[0], coverage_data.contexts_by_lineno(str(path.resolve())), seconds)
+        after = mutated.splitlines()[position[0] - 1].strip()
+        rows.append({"at": f"{path}:{position[0]}", "to": after, "by": name, "is": outcome(path, mutated, tests)})
         options.out.parent.mkdir(parents=True, exist_ok=True)
         options.out.write_text(json.dumps(rows, indent=1))
     for row in rows:
         if row["is"] not in ("killed", "no end"):
             print(f"{row['is']}: {row['at']}  {row['to']}")
-    print(f"{sum(row['is'] in ('killed', 'no end') for row in rows)} of {len(rows)} killed, of {len(drawn)} places")
+    print(
+        f"{sum(row['is'] in ('killed', 'no end') for row in rows)} of {len(rows)} killed, of {len(all_places)} places"
+    )
 
 
 if __name__ == "__main__":

@@ -81,27 +81,27 @@ def timings(network: PointNet2Classifier, points: jax.Array, normals: jax.Array)
     first = network, points[0], normals[0]
 
     @eqx.filter_jit
-    def one(network, points, normals):
+    def classify_one(network, points, normals):
         return network(points, normals)
 
     @eqx.filter_jit
-    def in_turn(network, points, normals):
+    def classify_in_turn(network, points, normals):
         return jax.lax.map(lambda cloud: network(*cloud), (points, normals))
 
     @eqx.filter_jit
-    def together(network, points, normals):
+    def classify_batch(network, points, normals):
         return jax.vmap(network)(points, normals)
 
     @eqx.filter_jit
-    def gradient(network, points, normals):
+    def differentiate(network, points, normals):
         return jax.value_and_grad(lambda points: network(points, normals)[0])(points)
 
     grouping = eqx.filter_jit(groups)
     return {
-        "one cloud": least_time(lambda: one(*first)),
-        "each of a batch, lax.map": least_time(lambda: in_turn(network, points, normals)) / len(points),
-        "each of a batch, vmap": least_time(lambda: together(network, points, normals)) / len(points),
-        "one cloud and its gradient": least_time(lambda: gradient(*first)),
+        "one cloud": least_time(lambda: classify_one(*first)),
+        "each of a batch, lax.map": least_time(lambda: classify_in_turn(network, points, normals)) / len(points),
+        "each of a batch, vmap": least_time(lambda: classify_batch(network, points, normals)) / len(points),
+        "one cloud and its gradient": least_time(lambda: differentiate(*first)),
         "sampling and grouping of one": least_time(lambda: grouping(network, points[0])),
     }
 

@@ -35,7 +35,7 @@ from jaxnbv.geometry.farthest_points import farthest_point_indices
 from jaxnbv.storage.files import write_text
 from jaxnbv.studies.engine.results import interval
 
-LOOKED_AT = 200
+NUM_SCORED = 200
 CAPACITY, SAMPLES = 2048, 16
 
 _D435 = nbv.Camera.from_intrinsics([[696.0, 0, 640], [0, 696, 360], [0, 0, 1]], 720, 1280)
@@ -52,7 +52,7 @@ PROTOCOLS = {
         points=10_000,
         views=10,
         repeats=1,
-        reported=(3, 6, 10),
+        reported_views=(3, 6, 10),
     ),
     "benbv": Protocol(
         scale=lambda sides: 0.2 / float(np.linalg.norm(sides)),
@@ -65,7 +65,7 @@ PROTOCOLS = {
         points=60_000,
         views=15,
         repeats=10,
-        reported=(3, 6, 10, 15),
+        reported_views=(3, 6, 10, 15),
     ),
 }
 METHODS = {
@@ -77,13 +77,13 @@ METHODS = {
 }
 
 
-def planned(trial: Trial, search: nbv.search.Search, rays: int, first: int, seed: int) -> tuple[list[int], list[float]]:
+def plan(trial: Trial, search: nbv.search.Search, rays: int, first: int, seed: int) -> tuple[list[int], list[float]]:
     """The candidates that a planner chooses, and the seconds of each choice that does not compile."""
     distance = float(np.linalg.norm(trial.poses.position[0]))
-    needed = 2.0 * math.asin(min(1.05 * trial.mesh.bounding_radius / distance, 1.0))
+    fov = 2.0 * math.asin(min(1.05 * trial.mesh.bounding_radius / distance, 1.0))
     # Rounded up, so that objects of similar size share their programs.
-    needed = math.radians(5.0) * math.ceil(needed / math.radians(5.0))
-    camera = nbv.Camera(min(needed, trial.protocol.camera.fov), rays, rays)
+    fov = math.radians(5.0) * math.ceil(fov / math.radians(5.0))
+    camera = nbv.Camera(min(fov, trial.protocol.camera.fov), rays, rays)
     planner = nbv.Planner(
         nbv.NewSurface(),
         search,
@@ -92,26 +92,26 @@ def planned(trial: Trial, search: nbv.search.Search, rays: int, first: int, seed
         capacity=CAPACITY,
         max_views=trial.protocol.views,
     )
-    key, places = jax.random.key(seed), np.asarray(trial.poses.position, np.float64)
-    pose, chosen, seconds = trial.poses[first], [first], []
+    key, positions = jax.random.key(seed), np.asarray(trial.poses.position, np.float64)
+    pose, indices, seconds = trial.poses[first], [first], []
     observations = planner.init(pose, nbv.scan(trial.mesh, camera, pose))
-    while len(chosen) < trial.protocol.views:
+    while len(indices) < trial.protocol.views:
         start = time.perf_counter()
-        pose = jax.block_until_ready(planner.propose(observations, jax.random.fold_in(key, len(chosen)))).pose
+        pose = jax.block_until_ready(planner.propose(observations, jax.random.fold_in(key, len(indices)))).pose
         seconds.append(time.perf_counter() - start)
-        chosen.append(int(np.argmin(np.linalg.norm(places - np.asarray(pose.position), axis=1))))
+        indices.append(int(np.argmin(np.linalg.norm(positions - np.asarray(pose.position), axis=1))))
         observations = planner.observe(observations, pose, nbv.scan(trial.mesh, camera, pose))
-    return chosen, seconds[2:]
+    return indices, seconds[2:]
 
 
 def greedy(trial: Trial, first: int) -> list[int]:
     """The candidates that truly add most, among those that `new surface` scores."""
-    among = spread(trial.poses)
-    covers, chosen, covered = trial.covers(among.tolist()), [first], trial.covers([first])[0]
-    while len(chosen) < trial.protocol.views:
+    candidates = spread(trial.poses)
+    covers, indices, covered = trial.covers(candidates.tolist()), [first], trial.covers([first])[0]
+    while len(indices) < trial.protocol.views:
         best = int(np.argmax(np.sum(covers & ~covered, axis=1)))
-        covered, chosen = covered | covers[best], [*chosen, int(among[best])]
-    return chosen
+        covered, indices = covered | covers[best], [*indices, int(candidates[best])]
+    return indices
 
 
 def uniform(trial: Trial, first: int) -> list[int]:
@@ -143,29 +143,29 @@ def beyond_boundary(trial: Trial, first: int, seed: int, best: bool) -> list[Boo
         targets, directions = boundary_views(trial.points[covered], normals[covered], int(random.integers(2**31)))
         if len(targets) == 0:
             break
-        away = trial.protocol.distance / trial.unit * directions
-        poses = [nbv.look_at(target + way, target) for target, way in zip(targets, away, strict=True)]
+        offsets = trial.protocol.distance / trial.unit * directions
+        poses = [nbv.look_at(target + offset, target) for target, offset in zip(targets, offsets, strict=True)]
         looks = [trial.look(pose) for pose in (poses if best else [poses[int(random.integers(len(poses)))]])]
-        look = max(looks, key=lambda one: score(trial, one, covered))
+        look = max(looks, key=lambda candidate: score(trial, candidate, covered))
         covered, normals = covered | look.covers, np.where(covered[:, None], normals, look.normals)
         coverage.append(look.covers)
     return coverage
 
 
-def score(trial: Trial, look: Look, known: Bool[np.ndarray, " points"]) -> float:
-    """BENBV's score: w coverage + (1 - w) f(overlap), w = 1 / (1 + exp(-10 (known - 0.5)))."""
+def score(trial: Trial, look: Look, is_covered: Bool[np.ndarray, " points"]) -> float:
+    """BENBV's score: w coverage + (1 - w) f(overlap), w = 1 / (1 + exp(-10 (covered - 0.5)))."""
     if len(look.cloud) == 0:
         return 0.0
     reach = trial.protocol.tolerance / trial.unit
-    overlap = np.mean(np.isfinite(cKDTree(trial.points[known]).query(look.cloud, distance_upper_bound=reach)[0]))
+    overlap = np.mean(np.isfinite(cKDTree(trial.points[is_covered]).query(look.cloud, distance_upper_bound=reach)[0]))
     worth = 5 * overlap - 6.25 * overlap**2 if overlap < 0.4 else 1.0 if overlap < 0.5 else 4 * overlap * (1 - overlap)
-    weight = 1.0 / (1.0 + math.exp(-10.0 * (np.mean(known) - 0.5)))
-    return float(weight * np.mean(known | look.covers) + (1.0 - weight) * worth)
+    weight = 1.0 / (1.0 + math.exp(-10.0 * (np.mean(is_covered) - 0.5)))
+    return float(weight * np.mean(is_covered | look.covers) + (1.0 - weight) * worth)
 
 
 def spread(poses: nbv.Pose) -> Int[np.ndarray, " some"]:
-    """Indices of `LOOKED_AT` candidates, by farthest point sampling."""
-    return np.asarray(farthest_point_indices(poses.position, np.ones(CANDIDATES, bool), LOOKED_AT))
+    """Indices of `NUM_SCORED` candidates, by farthest point sampling."""
+    return np.asarray(farthest_point_indices(poses.position, np.ones(CANDIDATES, bool), NUM_SCORED))
 
 
 def run(trial: Trial, methods: tuple[str, ...], rays: int, seed: int) -> dict:
@@ -174,13 +174,15 @@ def run(trial: Trial, methods: tuple[str, ...], rays: int, seed: int) -> dict:
     above = np.asarray(trial.poses.position)[:, 1] >= 0
     first = 0 if protocol.repeats == 1 else int(random.choice(np.nonzero(above)[0]))
     lattice = np.radians([(polar, azimuth) for polar in range(30, 180, 30) for azimuth in range(0, 360, 45)])
-    more = protocol.views - 1
-    ways: dict[str, Callable] = {
-        "random": lambda: trial.covers([first, *random.choice(np.arange(1, CANDIDATES), more, replace=False).tolist()]),
+    num_more = protocol.views - 1
+    coverage_of_method: dict[str, Callable] = {
+        "random": lambda: trial.covers(
+            [first, *random.choice(np.arange(1, CANDIDATES), num_more, replace=False).tolist()]
+        ),
         "uniform": lambda: trial.covers(uniform(trial, first)),
         "oracle": lambda: trial.covers(greedy(trial, first)),
-        "random sphere": lambda: from_sphere(trial, first, random.uniform((0, 0), (np.pi, 2 * np.pi), (more, 2))),
-        "uniform sphere": lambda: from_sphere(trial, first, random.permutation(lattice)[:more]),
+        "random sphere": lambda: from_sphere(trial, first, random.uniform((0, 0), (np.pi, 2 * np.pi), (num_more, 2))),
+        "uniform sphere": lambda: from_sphere(trial, first, random.permutation(lattice)[:num_more]),
         "random boundary": lambda: beyond_boundary(trial, first, seed, best=False),
         "boundary oracle": lambda: beyond_boundary(trial, first, seed, best=True),
     }
@@ -191,10 +193,10 @@ def run(trial: Trial, methods: tuple[str, ...], rays: int, seed: int) -> dict:
     for method in methods:
         seconds: list[float] = []
         if method in searches:
-            chosen, seconds = planned(trial, searches[method], rays, first, seed)
-            coverage = trial.covers(chosen)
+            indices, seconds = plan(trial, searches[method], rays, first, seed)
+            coverage = trial.covers(indices)
         else:
-            coverage = np.stack(ways[method]())
+            coverage = np.stack(coverage_of_method[method]())
         covered = np.mean(np.logical_or.accumulate(coverage, axis=0), axis=1)
         covered = np.pad(covered, (0, protocol.views - len(covered)), mode="edge")
         results[method] = {"covered": covered.tolist(), "seconds": float(np.mean(seconds)) if seconds else None}
@@ -207,21 +209,21 @@ def table(records: dict, methods: tuple[str, ...], protocol: Protocol) -> str:
     by_object: dict[str, list[dict]] = {}
     for name, record in records.items():
         by_object.setdefault(name.rpartition(" ")[0], []).append(record)
-    runs = max(map(len, by_object.values()))
-    heads = [*(f"view {view}" for view in protocol.reported), "all views", f"{methods[0]} ahead"]
-    lines = [f"{len(by_object)} objects, {runs} runs each; percent covered, 90 % intervals over objects"]
+    num_runs = max(map(len, by_object.values()))
+    heads = [*(f"view {view}" for view in protocol.reported_views), "all views", f"{methods[0]} ahead"]
+    lines = [f"{len(by_object)} objects, {num_runs} runs each; percent covered, 90 % intervals over objects"]
     lines.append(f"{'':16}" + "".join(f"{head:>21}" for head in heads) + f"{'seconds a view':>16}")
     curves = {
-        method: np.array([np.mean([one[method]["covered"] for one in of], axis=0) for of in by_object.values()])
+        method: np.array([np.mean([run[method]["covered"] for run in runs], axis=0) for runs in by_object.values()])
         for method in methods
     }
     for method, curve in curves.items():
-        ahead = curves[methods[0]].mean(axis=1) - curve.mean(axis=1)
-        columns = np.column_stack([*(curve[:, view - 1] for view in protocol.reported), curve.mean(axis=1), ahead])
+        lead = curves[methods[0]].mean(axis=1) - curve.mean(axis=1)
+        columns = np.column_stack([*(curve[:, view - 1] for view in protocol.reported_views), curve.mean(axis=1), lead])
         low, high = interval(columns)
         cells = zip(100 * columns.mean(axis=0), 100 * low, 100 * high, strict=True)
-        took = [one[method]["seconds"] for of in by_object.values() for one in of]
-        second = f"{np.mean(took):16.2f}" if took[0] is not None else ""
+        seconds = [run[method]["seconds"] for runs in by_object.values() for run in runs]
+        second = f"{np.mean(seconds):16.2f}" if seconds[0] is not None else ""
         lines.append(f"{method:16}" + "".join(f"{a:7.1f} [{b:5.1f},{c:5.1f}]" for a, b, c in cells) + second)
     return "\n".join(lines)
 

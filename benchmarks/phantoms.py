@@ -43,7 +43,7 @@ from jaxnbv.tasks.coverage import Newness, seen_share
 
 KINDS = ("cut", "empty", "silent", "unseen")
 COLUMNS = ("rank", "chosen", "phantom", *KINDS, "covered", "promised", "found", "seen", "area")
-_ENOUGH = 0.9
+_STOP_FRACTION = 0.9
 
 
 class Case:
@@ -57,7 +57,7 @@ class Case:
         area = None if recorded.mesh is None else area_shown(recorded)
         # Leave out points that no frame shows.
         self.area = None if area is None else area[:, area.any(axis=0)]
-        self.shown = cKDTree(np.asarray(frame.to_scene(jnp.asarray(self.recording.voxels))))
+        self.shown_tree = cKDTree(np.asarray(frame.to_scene(jnp.asarray(self.recording.voxels))))
 
     def rows(self, start: int) -> Iterable[list[float]]:
         """The columns after each view of an episode by the study's own planner."""
@@ -88,38 +88,40 @@ class Case:
         expected = np.asarray(areas.sum(axis=-1).mean(axis=0))
         is_covered = recording.is_shown[visited].any(axis=0)
         gain = (recording.is_shown & ~is_covered).sum(axis=1)
-        left = ~np.isin(np.arange(len(gain)), visited)
-        varies = np.ptp(expected[left]) > 0 and np.ptp(gain[left]) > 0
-        rank = float(spearmanr(expected[left], gain[left])[0]) if varies else np.nan
-        chosen = gain[left][expected[left].argmax()] / max(1, gain[left].max())
-        weights, places = np.asarray(areas).reshape(-1), np.asarray(points).reshape(-1, 3)
-        weights, places = weights[weights > 0], places[weights > 0]
-        phantom = self.shown.query(places)[0] > 2.0 * self.voxel
-        kinds = self._kinds(places[phantom], visited)
-        share = weights[phantom].sum() / max(weights.sum(), 1e-9)
-        of_kind = [weights[phantom][kinds == kind].sum() / max(weights[phantom].sum(), 1e-9) for kind in range(4)]
+        is_unvisited = ~np.isin(np.arange(len(gain)), visited)
+        varies = np.ptp(expected[is_unvisited]) > 0 and np.ptp(gain[is_unvisited]) > 0
+        rank = float(spearmanr(expected[is_unvisited], gain[is_unvisited])[0]) if varies else np.nan
+        gain_ratio = gain[is_unvisited][expected[is_unvisited].argmax()] / max(1, gain[is_unvisited].max())
+        weights, positions = np.asarray(areas).reshape(-1), np.asarray(points).reshape(-1, 3)
+        weights, positions = weights[weights > 0], positions[weights > 0]
+        is_phantom = self.shown_tree.query(positions)[0] > 2.0 * self.voxel
+        kinds = self._kinds(positions[is_phantom], visited)
+        phantom_fraction = weights[is_phantom].sum() / max(weights.sum(), 1e-9)
+        of_kind = [weights[is_phantom][kinds == kind].sum() / max(weights[is_phantom].sum(), 1e-9) for kind in range(4)]
         covered = float(seen_share(newness, surfaces, camera, recording.poses, inputs.observations.poses))
-        return [rank, chosen, share, *of_kind, covered]
+        return [rank, gain_ratio, phantom_fraction, *of_kind, covered]
 
-    def _kinds(self, places: np.ndarray, visited: list[int]) -> np.ndarray:
+    def _kinds(self, positions: np.ndarray, visited: list[int]) -> np.ndarray:
         study, recording = self.study, self.recording
         volume = study.sampler.carving.volume
-        cut = np.asarray(volume(jnp.asarray(places))) > -self.voxel
-        empty, silent = np.zeros(len(places), bool), np.zeros(len(places), bool)
+        is_cut = np.asarray(volume(jnp.asarray(positions))) > -self.voxel
+        is_empty, is_silent = np.zeros(len(positions), bool), np.zeros(len(positions), bool)
         camera = study.camera
         for index in visited:
             pose, cloud = recording.poses[index], recording.scans[index]
-            local = (places - np.asarray(pose.position)) @ np.asarray(pose.rotation)
-            ahead = local[:, 2] > 0
-            pixel = np.asarray(camera.to_pixels(jnp.asarray(local[:, :2] / np.where(ahead, local[:, 2], 1.0)[:, None])))
+            local = (positions - np.asarray(pose.position)) @ np.asarray(pose.rotation)
+            is_ahead = local[:, 2] > 0
+            pixel = np.asarray(
+                camera.to_pixels(jnp.asarray(local[:, :2] / np.where(is_ahead, local[:, 2], 1.0)[:, None]))
+            )
             column, row = np.floor(pixel).astype(int).T
-            inside = ahead & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-            ray = np.where(inside, row * camera.width + column, 0)
+            is_inside = is_ahead & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+            ray = np.where(is_inside, row * camera.width + column, 0)
             sight = np.asarray(cloud.sight)[ray]
-            returned = np.isfinite(sight)
-            empty |= inside & returned & (sight > np.linalg.norm(local, axis=1) + self.voxel)
-            silent |= inside & ~returned
-        return np.select([cut, empty, silent], [0, 1, 2], 3)
+            has_return = np.isfinite(sight)
+            is_empty |= is_inside & has_return & (sight > np.linalg.norm(local, axis=1) + self.voxel)
+            is_silent |= is_inside & ~has_return
+        return np.select([is_cut, is_empty, is_silent], [0, 1, 2], 3)
 
 
 @jax.jit
@@ -138,16 +140,16 @@ def _new_area(cloud: PointCloud, pose: Pose, study: RecordedStudy, newness: Newn
     return jnp.sum(pixel_area(cloud, study.camera, pose, STEEP) * newness(cloud.points))
 
 
-def measured(case: Case, starts: int) -> np.ndarray:
+def measure_rows(case: Case, starts: int) -> np.ndarray:
     """The numbers of the table before the mean: (starts, views, columns)."""
     return np.array([list(case.rows(start)) for start in range(starts)])
 
 
-def at_the_end(rows: np.ndarray) -> np.ndarray:
+def shares_at_stop(rows: np.ndarray) -> np.ndarray:
     """Shares seen, by voxels and by area, when the expected share was first reached: (episodes that reached it, 2)."""
-    enough = rows[..., COLUMNS.index("covered")] >= _ENOUGH
-    ended = enough.any(axis=1)
-    return rows[ended, enough[ended].argmax(axis=1)][:, -2:]
+    is_enough = rows[..., COLUMNS.index("covered")] >= _STOP_FRACTION
+    has_ended = is_enough.any(axis=1)
+    return rows[has_ended, is_enough[has_ended].argmax(axis=1)][:, -2:]
 
 
 def main() -> None:
@@ -171,14 +173,14 @@ def main() -> None:
     for recorded in cases:
         # Each object has its own box, and so its own programs. Those of twenty exceed the limit of memory maps.
         jax.clear_caches()
-        tables.append(measured(Case(recorded, args.views), args.starts))
+        tables.append(measure_rows(Case(recorded, args.views), args.starts))
         _show(recorded.name, np.mean(tables[-1], axis=0))
     episodes = np.concatenate(tables)
     if len(tables) > 1:
         _show(f"mean of {len(tables)}", np.mean(episodes, axis=0))
-    ended = at_the_end(episodes)
-    print(f"\nCovered({_ENOUGH}) ends {len(ended)} of {len(episodes)} episodes; seen by then, in percent:")
-    for name, column in zip(COLUMNS[-2:], 100 * ended.T, strict=True):
+    shares = shares_at_stop(episodes)
+    print(f"\nCovered({_STOP_FRACTION}) ends {len(shares)} of {len(episodes)} episodes; seen by then, in percent:")
+    for name, column in zip(COLUMNS[-2:], 100 * shares.T, strict=True):
         # The area of a real recording is not known.
         if len(values := column[~np.isnan(column)]) == 0:
             continue

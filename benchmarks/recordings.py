@@ -35,10 +35,10 @@ _CAMERA = nbv.Camera(2.0 * math.atan(0.4), 480, 640, max_incidence=math.radians(
 # In metres: longest side of an object, noise at a distance of 1, unit of the images.
 _SIDE, _NOISE, _UNIT = 0.5, 1e-3, 1e-4
 # Numbers of poses on the whole sphere, and on its upper half.
-_AROUND, _ABOVE = 60, 40
+_NUM_AROUND, _NUM_ABOVE = 60, 40
 _HALF_TABLE = 20.0
 # Distance of the camera from the bunny in metres, and its focal length. The scanner's rays were nearly parallel.
-_FAR, _BUNNY_PIXELS = 1.0, 600.0
+_BUNNY_DISTANCE, _BUNNY_PIXELS = 1.0, 600.0
 
 
 class Recorded(NamedTuple):
@@ -62,8 +62,8 @@ def of_mesh(file: Path, folder: Path, above: bool) -> Recorded:
     corners = np.array([[-0.5 * size[0], -0.5 * size[1], 0.0], [0.5 * size[0], 0.5 * size[1], size[2]]])
     frame = nbv.Frame.fit(corners, up="z")
     # The table's noise stays below the box.
-    room = np.array([[-0.03, -0.03, 0.02 if above else -0.03], [0.03, 0.03, 0.03]])
-    box = tuple((corners + _SIDE * room).reshape(-1).tolist())
+    margin = np.array([[-0.03, -0.03, 0.02 if above else -0.03], [0.03, 0.03, 0.03]])
+    box = tuple((corners + _SIDE * margin).reshape(-1).tolist())
     world_mesh = TriangleMesh(np.asarray(frame.to_world(mesh.vertices), np.float64), mesh.faces, nbv.Frame())
     recorded = Recorded(f"{file.stem}, {'above' if above else 'around'}", folder, box, mesh=world_mesh)
     if (folder / "frames.json").exists():
@@ -71,15 +71,15 @@ def of_mesh(file: Path, folder: Path, above: bool) -> Recorded:
     if above:
         mesh = _on_table(mesh, -0.5 * extents[1])
     radius = fit_distance(Setting(_CAMERA, 1.0, 1), float(np.linalg.norm(extents)) / 2.0).radius
-    count, lowest = (_ABOVE, math.radians(10.0)) if above else (_AROUND, -math.pi / 2)
+    count, lowest = (_NUM_ABOVE, math.radians(10.0)) if above else (_NUM_AROUND, -math.pi / 2)
     poses = nbv.look_at(fibonacci_sphere(count, radius, lowest))
     noise = nbv.DepthNoise(_NOISE, scale=frame.scale)
     images = []
     for index, pose in enumerate(poses):
         cloud = nbv.scan(mesh, _CAMERA, pose)
         depth = np.where(cloud.mask, (cloud.points - pose.position) @ pose.forward, 0.0)
-        measured = noise.measured(depth, jax.random.key(index))
-        images.append(np.asarray(measured, np.float64).reshape(_CAMERA.height, _CAMERA.width) / frame.scale)
+        noisy_depth = noise.measured(depth, jax.random.key(index))
+        images.append(np.asarray(noisy_depth, np.float64).reshape(_CAMERA.height, _CAMERA.width) / frame.scale)
     matrices = np.asarray(frame.to_world(poses).to_matrix(), np.float64)
     _write(folder, images, matrices, _INTRINSICS)
     return recorded
@@ -94,17 +94,17 @@ def of_bunny(file: Path, folder: Path) -> Recorded:
     ends = np.cumsum(data["count"])
     images, matrices = [], []
     for points, rotation, shift in zip(np.split(data["points_10um"], ends[:-1]), data["R"], data["t"], strict=True):
-        own = points * 1e-5
-        middle = own.mean(axis=0)
+        scan_points = points * 1e-5
+        middle = scan_points.mean(axis=0)
         # The scanner looks along -z with y up, the camera along z with y down.
-        local = (own - middle) * (1.0, -1.0, -1.0) + np.array([0.0, 0.0, _FAR])
+        local = (scan_points - middle) * (1.0, -1.0, -1.0) + np.array([0.0, 0.0, _BUNNY_DISTANCE])
         column, row = np.round(_BUNNY_PIXELS * local[:, :2] / local[:, 2:] + 120.0).astype(int).T
         image = np.full((240, 240), np.inf)
         np.minimum.at(image, (row, column), local[:, 2])
         images.append(np.where(np.isfinite(image), image, 0.0))
         matrix = np.eye(4)
         matrix[:3, :3] = rotation @ np.diag([1.0, -1.0, -1.0])
-        matrix[:3, 3] = rotation @ (middle + np.array([0.0, 0.0, _FAR])) + shift
+        matrix[:3, 3] = rotation @ (middle + np.array([0.0, 0.0, _BUNNY_DISTANCE])) + shift
         matrices.append(matrix)
     _write(
         folder, images, np.stack(matrices), np.array([[_BUNNY_PIXELS, 0, 120.5], [0, _BUNNY_PIXELS, 120.5], [0, 0, 1]])
@@ -113,8 +113,8 @@ def of_bunny(file: Path, folder: Path) -> Recorded:
 
 
 def _on_table(mesh: TriangleMesh, height: float) -> TriangleMesh:
-    far = _HALF_TABLE
-    corners = [[-far, height, -far], [far, height, -far], [far, height, far], [-far, height, far]]
+    half = _HALF_TABLE
+    corners = [[-half, height, -half], [half, height, -half], [half, height, half], [-half, height, half]]
     vertices = np.concatenate([mesh.vertices, corners])
     faces = np.concatenate([mesh.faces, len(mesh.vertices) + np.array([[0, 2, 1], [0, 3, 2]])])
     return TriangleMesh(vertices, faces, mesh.frame)
@@ -128,8 +128,8 @@ def _write(folder: Path, images: list[np.ndarray], matrices: np.ndarray, intrins
         name = f"depth-{index:03}.png"
         Image.fromarray(np.clip(np.round(image / _UNIT), 0, 65534).astype(np.uint16)).save(folder / name)
         frames.append({"depth": name, "pose": matrix.tolist()})
-    said = {"intrinsics": intrinsics.tolist(), "depth_scale": _UNIT, "frames": frames}
-    (folder / "frames.json").write_text(json.dumps(said))
+    content = {"intrinsics": intrinsics.tolist(), "depth_scale": _UNIT, "frames": frames}
+    (folder / "frames.json").write_text(json.dumps(content))
 
 
 def area_shown(recorded: Recorded, count: int = 20_000) -> np.ndarray:
@@ -141,19 +141,21 @@ def area_shown(recorded: Recorded, count: int = 20_000) -> np.ndarray:
     assert recorded.box is not None
     mesh = trimesh.Trimesh(recorded.mesh.vertices, recorded.mesh.faces, process=False)
     points, faces = trimesh.sample.sample_surface(mesh, count, seed=0)
-    inside = np.all((points >= recorded.box[:3]) & (points <= recorded.box[3:]), axis=1)
-    points, normals = points[inside], mesh.face_normals[faces[inside]]
-    middle = np.array([320.0, 240.0])
+    is_inside = np.all((points >= recorded.box[:3]) & (points <= recorded.box[3:]), axis=1)
+    points, normals = points[is_inside], mesh.face_normals[faces[is_inside]]
+    image_centre = np.array([320.0, 240.0])
     masks = []
     for matrix in RecordedFrames(str(recorded.folder)).matrices:
         offset = points - matrix[:3, 3]
-        away = np.linalg.norm(offset, axis=1)
-        directions, local = offset / away[:, None], offset @ matrix[:3, :3]
-        within = np.all(np.abs(600.0 * local[:, :2]) <= middle * local[:, 2:], axis=1)
-        facing = -np.sum(directions * normals, axis=1) >= math.cos(_CAMERA.max_incidence)
+        distances = np.linalg.norm(offset, axis=1)
+        directions, local = offset / distances[:, None], offset @ matrix[:3, :3]
+        is_in_image = np.all(np.abs(600.0 * local[:, :2]) <= image_centre * local[:, 2:], axis=1)
+        is_facing = -np.sum(directions * normals, axis=1) >= math.cos(_CAMERA.max_incidence)
         hits = recorded.mesh.trace(np.broadcast_to(matrix[:3, 3], offset.shape), directions)
-        met = np.linalg.norm(np.asarray(hits.points) - matrix[:3, 3], axis=1)
-        masks.append(within & facing & np.asarray(hits.mask) & (np.abs(met - away) < 2e-3 * away))
+        hit_distances = np.linalg.norm(np.asarray(hits.points) - matrix[:3, 3], axis=1)
+        masks.append(
+            is_in_image & is_facing & np.asarray(hits.mask) & (np.abs(hit_distances - distances) < 2e-3 * distances)
+        )
     return np.array(masks)
 
 
@@ -162,7 +164,7 @@ def study_of(recorded: Recorded, views: int) -> RecordedStudy:
     return RecordedStudy.configured("screened", views, False, **options)[""]
 
 
-def covered(study: RecordedStudy, method: str, start: int) -> np.ndarray:
+def coverage_by_view(study: RecordedStudy, method: str, start: int) -> np.ndarray:
     """Share of the voxels seen after each view of a method."""
     scene = study.scene(start)
     first = study.recording.poses[study.first_view(scene)]
@@ -187,16 +189,17 @@ def main() -> None:
         folder = args.work / f"{file.stem}-{'above' if args.above else 'around'}"
         study = study_of(of_mesh(file, folder, args.above), args.views)
         for method, rows in curves.items():
-            rows.append(np.mean([covered(study, method, start) for start in range(args.starts)], axis=0)[1:])
+            rows.append(np.mean([coverage_by_view(study, method, start) for start in range(args.starts)], axis=0)[1:])
         print(file.stem, *(f"{method} {np.round(100 * rows[-1], 1)}" for method, rows in curves.items()), flush=True)
-    own = np.array(curves[NEW_AREA])
+    new_area = np.array(curves[NEW_AREA])
     for method, rows in curves.items():
         print(f"{method:12}", np.round(100 * np.mean(rows, axis=0), 1))
     for method in ("farthest", "random"):
-        less = 100 * (own - np.array(curves[method]))
-        less = np.concatenate([less, less.mean(axis=1, keepdims=True)], axis=1)
+        differences = 100 * (new_area - np.array(curves[method]))
+        differences = np.concatenate([differences, differences.mean(axis=1, keepdims=True)], axis=1)
         coverage = [
-            f"{mean:.1f} [{low:.1f}, {high:.1f}]" for mean, low, high in zip(less.mean(0), *interval(less), strict=True)
+            f"{mean:.1f} [{low:.1f}, {high:.1f}]"
+            for mean, low, high in zip(differences.mean(0), *interval(differences), strict=True)
         ]
         print(f"less {method:8}", "  ".join(coverage))
 

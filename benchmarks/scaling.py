@@ -23,8 +23,8 @@ from jaxnbv.planning.simulate import observe_scene
 from jaxnbv.storage.files import write_text
 from jaxnbv.studies.scenes import demo_object
 
-USUAL = {"points": 2000, "samples": 16, "candidates": 120, "rays": 50**2}
-ASKED = {
+DEFAULT_SIZES = {"points": 2000, "samples": 16, "candidates": 120, "rays": 50**2}
+SIZES = {
     "points": (500, 1000, 2000, 4000, 8000),
     "samples": (4, 8, 16, 32, 64),
     "candidates": (30, 60, 120, 240, 480),
@@ -34,7 +34,7 @@ STAGES = {"samples": "posterior and samples", "search": "search"}
 
 
 @functools.cache
-def measured(points: int, samples: int, candidates: int, rays: int) -> dict[str, float]:
+def measure(points: int, samples: int, candidates: int, rays: int) -> dict[str, float]:
     """Seconds of each stage at these sizes."""
     side, key = round(rays**0.5), jax.random.key(0)
     sampler = dataclasses.replace(nbv.SurfaceSampler(), num_samples=samples)
@@ -58,13 +58,13 @@ def measured(points: int, samples: int, candidates: int, rays: int) -> dict[str,
 
 def figure(times: dict[str, dict[str, dict[str, float]]], path: Path) -> None:
     """Draw a panel for each of the four, with logarithmic axes."""
-    chart, panels = plt.subplots(1, len(ASKED), figsize=(11, 2.7), sharey=True, layout="constrained")
-    for panel, (name, sizes) in zip(panels, ASKED.items(), strict=True):
+    chart, panels = plt.subplots(1, len(SIZES), figsize=(11, 2.7), sharey=True, layout="constrained")
+    for panel, (name, sizes) in zip(panels, SIZES.items(), strict=True):
         for stage, label in STAGES.items():
             panel.loglog(sizes, [times[name][str(size)][stage] for size in sizes], "o-", label=label)
         panel.set(xlabel=name, xticks=sizes, xticklabels=[f"{size:,}" for size in sizes])
         panel.minorticks_off()
-        panel.axvline(USUAL[name], color="0.8", zorder=0)
+        panel.axvline(DEFAULT_SIZES[name], color="0.8", zorder=0)
         panel.spines[["top", "right"]].set_visible(False)
     seconds = (0.02, 0.1, 0.5, 1, 2, 5, 10, 50)
     panels[0].set(ylabel="seconds", yticks=seconds, yticklabels=seconds, ylim=panels[0].get_ylim())
@@ -79,10 +79,10 @@ def main() -> None:
     out.parent.mkdir(parents=True, exist_ok=True)
     file = out.with_suffix(".json")
     times = json.loads(file.read_text()) if file.exists() else {}
-    for name, sizes in ASKED.items():
+    for name, sizes in SIZES.items():
         for size in sizes:
             if str(size) not in times.setdefault(name, {}):
-                times[name][str(size)] = measured(**USUAL | {name: size})
+                times[name][str(size)] = measure(**DEFAULT_SIZES | {name: size})
                 print(f"{size:,} {name}: {times[name][str(size)]}", flush=True)
                 write_text(file, json.dumps(times))
     figure(times, out.with_suffix(".png"))

@@ -35,8 +35,8 @@ KINDS: dict[str, type[ClassificationStudy]] = {
 
 def study_of(kind: str) -> ClassificationStudy:
     """The study of a kind on the validation split."""
-    found = KINDS[kind].configured(KNOWN, VIEWS, False, split=Split.VALIDATION, framing=Framing.CLOSE_UP)
-    (study,) = found.values()
+    studies = KINDS[kind].configured(KNOWN, VIEWS, False, split=Split.VALIDATION, framing=Framing.CLOSE_UP)
+    (study,) = studies.values()
     assert isinstance(study, ClassificationStudy)
     return study
 
@@ -48,7 +48,7 @@ def weights(study: ClassificationStudy, index: int) -> dict:
     first = study.first_view(scene)
     order = jax.random.permutation(study.key(index, "measure"), study.num_candidates).tolist()
     observations, rows = None, []
-    for view, candidate in enumerate([first, *(one for one in order if one != first)][:VIEWS]):
+    for view, candidate in enumerate([first, *(index for index in order if index != first)][:VIEWS]):
         pose = poses[candidate]
         scan = sensor(pose, view_keys(study.key(index, "episode"), view)[2])
         observations = planner.init(pose, scan) if observations is None else planner.observe(observations, pose, scan)
@@ -68,13 +68,13 @@ def show(kind: str, records: list[dict]) -> None:
     _line(f"{kind}, all", weight_rows.reshape(-1, weight_rows.shape[-1]), np.repeat(labels, VIEWS))
 
 
-def _line(name: str, held: np.ndarray, labels: np.ndarray) -> None:
-    right, true = held.argmax(axis=1) == labels, held[np.arange(len(held)), labels]
-    likeliest = held.max(axis=1)
+def _line(name: str, rows: np.ndarray, labels: np.ndarray) -> None:
+    right, true = rows.argmax(axis=1) == labels, rows[np.arange(len(rows)), labels]
+    likeliest = rows.max(axis=1)
     gaps = np.bincount(np.minimum(10 * likeliest, 9).astype(int), weights=likeliest - right)
-    error = np.abs(gaps).sum() / len(held)
-    cells = right.mean(), likeliest.mean(), true.mean(), held[:, -1].mean(), error
-    print(f"{name:22}{len(held):7}" + "".join(f"{cell:10.2f}" for cell in cells))
+    error = np.abs(gaps).sum() / len(rows)
+    cells = right.mean(), likeliest.mean(), true.mean(), rows[:, -1].mean(), error
+    print(f"{name:22}{len(rows):7}" + "".join(f"{cell:10.2f}" for cell in cells))
 
 
 def main() -> None:

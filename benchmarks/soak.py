@@ -61,25 +61,25 @@ def session(steps: int) -> Iterator[None]:
             yield
 
 
-def watched(going: Iterator[None], steps: int) -> pd.DataFrame:
+def measure_steps(iterator: Iterator[None], steps: int) -> pd.DataFrame:
     """Table of memory, time and compilations at ten moments."""
-    process, compiled, rows = psutil.Process(), [], []
+    process, compile_seconds, rows = psutil.Process(), [], []
 
     def listen(event: str, duration: float, **_: object) -> None:
         if event == "/jax/core/compile/backend_compile_duration":
-            compiled.append(duration)
+            compile_seconds.append(duration)
 
     jax.monitoring.register_event_duration_secs_listener(listen)
-    began, before, every = time.perf_counter(), 0, max(steps // 10, 1)
-    for step, _ in enumerate(going, start=1):
+    start, last_step, interval = time.perf_counter(), 0, max(steps // 10, 1)
+    for step, _ in enumerate(iterator, start=1):
         # Everything is compiled by now. The second proposal of the session comes at its eleventh image.
         if step == 2 * VIEWS:
-            compiled.clear()
-        if step % every == 0:
+            compile_seconds.clear()
+        if step % interval == 0:
             now = time.perf_counter()
-            milliseconds = 1000.0 * (now - began) / (step - before)
-            rows.append((step, process.memory_info().rss / 2**20, milliseconds, len(compiled)))
-            began, before = now, step
+            milliseconds = 1000.0 * (now - start) / (step - last_step)
+            rows.append((step, process.memory_info().rss / 2**20, milliseconds, len(compile_seconds)))
+            start, last_step = now, step
     jax.monitoring.unregister_event_duration_listener(listen)
     return pd.DataFrame(rows, columns=["steps", "MiB", "ms a step", "compiled"])
 
@@ -88,8 +88,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=2000)
     steps = parser.parse_args().steps
-    for name, going in {"planner": planning, "session": session}.items():
-        print(f"\n{name}\n{watched(going(steps), steps).to_string(index=False, float_format='%.0f')}", flush=True)
+    for name, function in {"planner": planning, "session": session}.items():
+        print(
+            f"\n{name}\n{measure_steps(function(steps), steps).to_string(index=False, float_format='%.0f')}", flush=True
+        )
 
 
 if __name__ == "__main__":

@@ -62,19 +62,19 @@ def planner_for(task: str, category: str) -> nbv.Planner:
     return planner_of(nbv.ExpectedUtilityImprovement(utility, num_points=1024), 2.0)
 
 
-def measured(task: str, index: int) -> dict:
+def measure(task: str, index: int) -> dict:
     """The view after which each rule stops, and the correctness after every view."""
     key = jax.random.fold_in(jax.random.key(15), index)
     if task == "class":
         pyramid = pyramid_scene(Split.TEST, index, Framing.WHOLE)
         surface, first, category = nbv.SDFSurface(pyramid), hidden_view(pyramid, key), ""
     else:
-        thing = part_scene(Split.TEST, index)
-        surface, first, category = nbv.SDFSurface(thing.solid), FIRST, CATEGORIES[int(thing.category)].name
+        part_object = part_scene(Split.TEST, index)
+        surface, first, category = nbv.SDFSurface(part_object.solid), FIRST, CATEGORIES[int(part_object.category)].name
     planner = planner_for(task, category)
     episode = nbv.simulate(planner, surface, first, VIEWS[task], key, progress=False)
     if task == "coverage":
-        is_shown, areas = truly_shown(thing.solid, planner, episode)
+        is_shown, areas = truly_shown(part_object.solid, planner, episode)
     right, ends = [], {name: VIEWS[task] for name in RULES[task]}
     for count, observations in enumerate(episode.observations(), start=1):
         if task == "class":
@@ -82,7 +82,7 @@ def measured(task: str, index: int) -> dict:
             right.append(float(int(np.argmax(values)) == int(pyramid.label)))
         elif task == "parts":
             counts = planner.acquisition.answer(observations.cloud).values
-            right.append(float((counts[np.asarray(thing.parts)] >= 60).all()))
+            right.append(float((counts[np.asarray(part_object.parts)] >= 60).all()))
         else:
             right.append(float(areas[is_shown[:count].any(axis=0)].sum() / areas.sum()))
         poses = tuple(view.pose for view in episode.views[:count])
@@ -107,28 +107,28 @@ def truly_shown(solid, planner: nbv.Planner, episode: Episode) -> tuple[np.ndarr
         np.asarray(is_visible(surface, planner.camera, view_poses, points, grid.spacing))
         for view_poses in (poses, planner.search.poses_around())
     )
-    any_shown = candidates.any(axis=0)
-    return views & any_shown, np.asarray(points.areas)[any_shown]
+    is_visible_from_any = candidates.any(axis=0)
+    return views & is_visible_from_any, np.asarray(points.areas)[is_visible_from_any]
 
 
 def table(task: str, records: list[dict]) -> str:
     views = VIEWS[task]
 
-    def shown(values) -> str:
+    def format_interval(values) -> str:
         (low,), (high,) = interval(np.asarray(values, float)[:, None])
         return f"{np.mean(values):5.2f} [{low:5.2f}, {high:5.2f}]"
 
-    last = [record["right"][-1] for record in records]
+    right_at_end = [record["right"][-1] for record in records]
     lines = [
         f"{task}: {len(records)} scenes, {views} views",
         f"{'rule':<14} views                 right then          right then less in the end",
     ]
-    lines.append(f"{'none':<14} {shown([views] * len(records))}  {shown(last)}")
+    lines.append(f"{'none':<14} {format_interval([views] * len(records))}  {format_interval(right_at_end)}")
     for name in RULES[task]:
         ends = [record["ends"][name] for record in records]
-        then = [record["right"][end - 1] for record, end in zip(records, ends, strict=True)]
-        lost = [a - b for a, b in zip(then, last, strict=True)]
-        lines.append(f"{name:<14} {shown(ends)}  {shown(then)}  {shown(lost)}")
+        right_at_stop = [record["right"][end - 1] for record, end in zip(records, ends, strict=True)]
+        differences = [a - b for a, b in zip(right_at_stop, right_at_end, strict=True)]
+        lines.append(f"{name:<14} {'  '.join(map(format_interval, (ends, right_at_stop, differences)))}")
     return "\n".join(lines)
 
 
@@ -143,7 +143,7 @@ def main() -> None:
     for task in options.task:
         records = results.setdefault(task, [])
         for index in tqdm(range(len(records), options.scenes), desc=task):
-            records.append(measured(task, index))
+            records.append(measure(task, index))
             write_text(options.out, json.dumps(results))
         print(table(task, records[: options.scenes]))
 

@@ -55,22 +55,26 @@ def episode(planner: nbv.Planner, mesh: nbv.TriangleMesh, truth: np.ndarray, vie
 def summary(records: dict, views: int) -> str:
     names = list(METHODS)
 
-    def shown(values) -> str:
+    def format_interval(values) -> str:
         (low,), (high,) = interval(np.asarray(values, float)[:, None])
         return f"{np.mean(values):6.3f} [{low:6.3f}, {high:6.3f}]"
 
     lines = [f"{len(records)} meshes, means and 90 % intervals over them"]
     for count in range(4, views + 1, 2):
         lines.append(f"after {count} views: coverage, way (scene units); coverage by the value's way; less the value's")
-        ways = {m: [r["value"]["way"][count - 1] for r in records.values()] for m in ["value"]}["value"]
+        path_lengths = {m: [r["value"]["way"][count - 1] for r in records.values()] for m in ["value"]}["value"]
         for name in names:
-            own = [record[name] for record in records.values()]
-            then = [one["coverage"][count - 1] for one in own]
-            by_way = [float(np.interp(way, one["way"], one["coverage"])) for way, one in zip(ways, own, strict=True)]
+            runs = [record[name] for record in records.values()]
+            coverages = [run["coverage"][count - 1] for run in runs]
+            coverages_at_length = [
+                float(np.interp(length, run["way"], run["coverage"]))
+                for length, run in zip(path_lengths, runs, strict=True)
+            ]
             base = [record["value"]["coverage"][count - 1] for record in records.values()]
-            less = [a - b for a, b in zip(then, base, strict=True)]
-            way = [one["way"][count - 1] for one in own]
-            lines.append(f"  {name:<26} {shown(then)}  {shown(way)}  {shown(by_way)}  {shown(less)}")
+            differences = [a - b for a, b in zip(coverages, base, strict=True)]
+            lengths = [run["way"][count - 1] for run in runs]
+            columns = coverages, lengths, coverages_at_length, differences
+            lines.append(f"  {name:<26} {'  '.join(map(format_interval, columns))}")
     return "\n".join(lines)
 
 
