@@ -28,27 +28,28 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 
 # Largest number of points of a view that are compared, and of other views with which a view is compared.
-_POINTS, _OTHERS = 800, 4
+_MAX_POINTS, _MAX_OTHER_VIEWS = 800, 4
 # Largest angle between the directions of two views that are compared, and fewest matched points that count as overlap.
-_WIDEST, _FEWEST = np.radians(70.0), 20
+_MAX_ANGLE, _MIN_MATCHES = np.radians(70.0), 20
 # Rounding error of points, as a fraction of the points' median distance from the cameras.
 _ROUNDING = 1e-6
 # Smallest cosine of the angle between the normals of two matched points.
-_ALIKE = 0.7
+_MIN_COSINE = 0.7
 # Largest distance between matched points in each round, as a fraction of the distance from the cameras.
-_REACHES = (0.08, 0.08, 0.08, 0.04, 0.04, 0.04, 0.02, 0.02, 0.01, 0.01)
+_MATCH_DISTANCES = (0.08, 0.08, 0.08, 0.04, 0.04, 0.04, 0.02, 0.02, 0.01, 0.01)
 # Ratio of the width c of rho to the median disagreement, and number of least-squares steps in a round.
-_SCALE, _STEPS = 2.0, 3
+_LOSS_WIDTH, _NUM_STEPS = 2.0, 3
 # Prior standard deviation of a pose error: in radians, and of its shift as a fraction of the distance from the cameras.
-# The errors of neighbouring points are correlated. Therefore _TOGETHER points count as one independent point.
-_ERROR, _TOGETHER = 0.03, 50
+# The errors of neighbouring points are correlated. Therefore _POINTS_PER_SAMPLE points count as one independent point.
+_PRIOR_DEVIATION, _POINTS_PER_SAMPLE = 0.03, 50
 # The views determine all of X if the smallest eigenvalue of J^T J exceeds this fraction of the largest. The ratio is
 # 4e-6 for three views of a shelf from one side, and 1e-3 or more for views that determine X.
-_TOLD = 3e-4
+_MIN_EIGENVALUE_RATIO = 3e-4
 # A correction is rejected if it moves points by more than this fraction of their distance from the cameras.
-_MOST = 0.15
-# Views that differ by more than _OFF times the noise disagree. A correction must divide their difference by _LESS.
-_OFF, _LESS = 3.0, 1.5
+_MAX_CORRECTION = 0.15
+# Views that differ by more than _DISAGREEMENT_RATIO times the noise disagree. A correction must divide their difference
+# by _MIN_IMPROVEMENT.
+_DISAGREEMENT_RATIO, _MIN_IMPROVEMENT = 3.0, 1.5
 _Corrections: TypeAlias = Float[np.ndarray, "views 4 4"]
 
 
@@ -93,8 +94,8 @@ class Alignment(eqx.Module):
         True if the disagreement of a view exceeds three times the noise, and either poses were corrected or the views
         do not determine all of the mount's error.
         """
-        is_off = bool(np.any(self.disagreement > _OFF * self.noise))
-        return is_off and (self.is_corrected or not self.is_determined)
+        exceeds_noise = bool(np.any(self.disagreement > _DISAGREEMENT_RATIO * self.noise))
+        return exceeds_noise and (self.is_corrected or not self.is_determined)
 
     @property
     def is_corrected(self) -> bool:
@@ -125,24 +126,24 @@ class _View(NamedTuple):
     normals: Float[np.ndarray, "n 3"]
     matrix: Float[np.ndarray, "4 4"]
 
-    def placed(self, correction: Float[np.ndarray, "4 4"]) -> tuple[np.ndarray, np.ndarray]:
-        true = self.matrix @ correction
-        return self.points @ true[:3, :3].T + true[:3, 3], self.normals @ true[:3, :3].T
+    def in_world(self, correction: Float[np.ndarray, "4 4"]) -> tuple[np.ndarray, np.ndarray]:
+        matrix = self.matrix @ correction
+        return self.points @ matrix[:3, :3].T + matrix[:3, 3], self.normals @ matrix[:3, :3].T
 
 
 class _Matches(NamedTuple):
     """Matched points of pairs of views, each in the coordinates of its own camera.
 
     - `views`: for each match, the indices of the two views.
-    - `first`, `own_normals`: point and normal in the first view.
-    - `second`, `normals`: point and normal in the second view.
+    - `first_points`, `first_normals`: point and normal in the first view.
+    - `second_points`, `second_normals`: point and normal in the second view.
     """
 
     views: Int[np.ndarray, "n 2"]
-    first: Float[np.ndarray, "n 3"]
-    second: Float[np.ndarray, "n 3"]
-    normals: Float[np.ndarray, "n 3"]
-    own_normals: Float[np.ndarray, "n 3"]
+    first_points: Float[np.ndarray, "n 3"]
+    second_points: Float[np.ndarray, "n 3"]
+    second_normals: Float[np.ndarray, "n 3"]
+    first_normals: Float[np.ndarray, "n 3"]
 
 
 @checked
@@ -160,93 +161,98 @@ def align_views(clouds: Sequence[PointCloud], poses: Sequence[Pose]) -> Alignmen
     require(len(clouds) == len(poses), f"there are {len(clouds)} clouds and {len(poses)} poses: give a pose for each")
     require(len(clouds) >= 2, f"there are {len(clouds)} views: only two or more can disagree")
     views = [_in_camera(cloud, pose) for cloud, pose in zip(clouds, poses, strict=True)]
-    pairs, away = _pairs(views), _median(np.concatenate([np.linalg.norm(view.points, axis=1) for view in views]))
-    require(away > 0, f"none of the {len(clouds)} clouds has a point: there is nothing to compare")
-    still = np.tile(np.eye(4), (len(views), 1, 1))
-    noise = max(_noise(views), _ROUNDING * away)
+    pairs = _pairs(views)
+    median_distance = _median(np.concatenate([np.linalg.norm(view.points, axis=1) for view in views]))
+    require(median_distance > 0, f"none of the {len(clouds)} clouds has a point: there is nothing to compare")
+    identities = np.tile(np.eye(4), (len(views), 1, 1))
+    noise = max(_noise(views), _ROUNDING * median_distance)
 
-    off, angle = _compared(views, pairs, still, away)
-    mount = _solved(views, pairs, still, away, is_mount=True)
+    disagreement, angle = _disagreement(views, pairs, identities, median_distance)
+    mount = _solve_corrections(views, pairs, identities, median_distance, is_mount=True)
     # Scale shifts by the distance, so that a rotation and a shift of the same size move points by the same length.
-    unit = np.repeat([1.0, away], 3)
-    matches = _matched(views, pairs, mount, _REACHES[-1] * away)
-    _, rows = _linearised(views, matches, mount, is_mount=True)
-    values, vectors = np.linalg.eigh((rows.T @ rows).toarray() * np.outer(unit, unit))
-    is_determined = bool(values[0] > _TOLD * values[-1])
-    corrections, is_mount, left = still, True, off
-    after, _ = _compared(views, pairs, mount, away)
-    is_off = bool(np.any(off > _OFF * noise))
-    if is_off and _is_plausible(mount, away) and _LESS * _median(after) < _median(off):
-        corrections, left = mount, after
-    if is_off and len(views) > 2 and np.any(left > _OFF * noise):
-        each = _solved(views, pairs, still, away, is_mount=False)
-        after, _ = _compared(views, pairs, each, away)
-        if _is_plausible(each, away) and _LESS * np.nanmax(after) < np.nanmax(left):
-            corrections, is_mount, left = each, False, after
+    unit = np.repeat([1.0, median_distance], 3)
+    matches = _match_points(views, pairs, mount, _MATCH_DISTANCES[-1] * median_distance)
+    _, jacobian = _linearise(views, matches, mount, is_mount=True)
+    values, vectors = np.linalg.eigh((jacobian.T @ jacobian).toarray() * np.outer(unit, unit))
+    is_determined = bool(values[0] > _MIN_EIGENVALUE_RATIO * values[-1])
+    corrections, is_mount, corrected = identities, True, disagreement
+    candidate, _ = _disagreement(views, pairs, mount, median_distance)
+    exceeds_noise = bool(np.any(disagreement > _DISAGREEMENT_RATIO * noise))
+    if (
+        exceeds_noise
+        and _is_plausible(mount, median_distance)
+        and _MIN_IMPROVEMENT * _median(candidate) < _median(disagreement)
+    ):
+        corrections, corrected = mount, candidate
+    if exceeds_noise and len(views) > 2 and np.any(corrected > _DISAGREEMENT_RATIO * noise):
+        separate = _solve_corrections(views, pairs, identities, median_distance, is_mount=False)
+        candidate, _ = _disagreement(views, pairs, separate, median_distance)
+        if _is_plausible(separate, median_distance) and _MIN_IMPROVEMENT * np.nanmax(candidate) < np.nanmax(corrected):
+            corrections, is_mount, corrected = separate, False, candidate
     # Undetermined components keep the prior variance.
-    error = _TOGETHER * (1.4826 * np.nan_to_num(_median(left))) ** 2
-    covariance = (vectors / (values / max(error, 1e-30) + _ERROR**-2)) @ vectors.T
+    variance = _POINTS_PER_SAMPLE * (1.4826 * np.nan_to_num(_median(corrected))) ** 2
+    covariance = (vectors / (values / max(variance, 1e-30) + _PRIOR_DEVIATION**-2)) @ vectors.T
     return Alignment(
-        off,
+        disagreement,
         angle,
         noise,
-        left,
+        corrected,
         corrections,
         is_mount,
         covariance * np.outer(unit, unit),
         is_determined,
         unit * vectors[:, 0],
         len(pairs),
-        away,
+        median_distance,
     )
 
 
 def _in_camera(cloud: PointCloud, pose: Pose) -> _View:
     """Return a view with a random subset of a cloud's points, in the coordinates of the camera."""
     points, normals = (rows.astype(np.float64) for rows in cloud.to_numpy())
-    rows = np.random.default_rng(0).permutation(len(points))[:_POINTS]
+    rows = np.random.default_rng(0).permutation(len(points))[:_MAX_POINTS]
     matrix = np.asarray(pose.to_matrix(), np.float64)
     return _View((points[rows] - matrix[:3, 3]) @ matrix[:3, :3], normals[rows] @ matrix[:3, :3], matrix)
 
 
 def _pairs(views: Sequence[_View]) -> list[tuple[int, int]]:
     """Return pairs of views that may show the same surface: each view with a few of similar direction."""
-    ahead = np.stack([view.matrix[:3, 2] for view in views])
-    angles = np.arccos(np.clip(ahead @ ahead.T, -1.0, 1.0))
+    forward = np.stack([view.matrix[:3, 2] for view in views])
+    angles = np.arccos(np.clip(forward @ forward.T, -1.0, 1.0))
     np.fill_diagonal(angles, np.inf)
-    nearest = np.argsort(angles, axis=1, kind="stable")[:, :_OTHERS]
-    return [(view, int(other)) for view, row in enumerate(nearest) for other in row if angles[view, other] < _WIDEST]
+    nearest = np.argsort(angles, axis=1, kind="stable")[:, :_MAX_OTHER_VIEWS]
+    return [(view, int(other)) for view, row in enumerate(nearest) for other in row if angles[view, other] < _MAX_ANGLE]
 
 
-def _matched(
-    views: Sequence[_View], pairs: Sequence[tuple[int, int]], corrections: _Corrections, reach: float
+def _match_points(
+    views: Sequence[_View], pairs: Sequence[tuple[int, int]], corrections: _Corrections, max_distance: float
 ) -> _Matches:
     """Match each point of a pair's first view with the nearest point of the second view.
 
-    Matches are at most `reach` apart and have similar normals. Pairs of views with few matches are left out.
+    Matches are at most `max_distance` apart and have similar normals. Pairs of views with few matches are left out.
     """
-    placed = [view.placed(correction) for view, correction in zip(views, corrections, strict=True)]
-    trees = [cKDTree(points) for points, _ in placed]
-    rows = [(np.zeros((0, 2), int), *[np.zeros((0, 3))] * 4)]
+    clouds = [view.in_world(correction) for view, correction in zip(views, corrections, strict=True)]
+    trees = [cKDTree(points) for points, _ in clouds]
+    parts = [(np.zeros((0, 2), int), *[np.zeros((0, 3))] * 4)]
     for i, j in pairs:
-        (points, normals), (_, others) = placed[i], placed[j]
-        distance, nearest = trees[j].query(points, distance_upper_bound=reach)
-        own = np.flatnonzero(np.isfinite(distance))
-        own = own[np.sum(normals[own] * others[nearest[own]], axis=1) > _ALIKE]
-        if len(own) >= _FEWEST:
-            other, one, two = nearest[own], views[i], views[j]
-            both = np.tile([i, j], (len(own), 1))
-            rows.append((both, one.points[own], two.points[other], two.normals[other], one.normals[own]))
-    return _Matches(*map(np.concatenate, zip(*rows, strict=True)))
+        (points, normals), (_, other_normals) = clouds[i], clouds[j]
+        distances, nearest = trees[j].query(points, distance_upper_bound=max_distance)
+        index = np.flatnonzero(np.isfinite(distances))
+        index = index[np.sum(normals[index] * other_normals[nearest[index]], axis=1) > _MIN_COSINE]
+        if len(index) >= _MIN_MATCHES:
+            other, first, second = nearest[index], views[i], views[j]
+            pair = np.tile([i, j], (len(index), 1))
+            parts.append((pair, first.points[index], second.points[other], second.normals[other], first.normals[index]))
+    return _Matches(*map(np.concatenate, zip(*parts, strict=True)))
 
 
-def _is_plausible(corrections: _Corrections, away: float) -> bool:
+def _is_plausible(corrections: _Corrections, median_distance: float) -> bool:
     """Return whether the corrections are small enough to be errors of poses.
 
-    They must move points by less than 15 % of `away`, the median distance of points from the cameras.
+    They must move points by less than 15 % of `median_distance`, the median distance of points from the cameras.
     """
-    turn, shift = errors_of(corrections)
-    return bool(np.max(away * turn + shift) < _MOST * away)
+    angles, shifts = errors_of(corrections)
+    return bool(np.max(median_distance * angles + shifts) < _MAX_CORRECTION * median_distance)
 
 
 def errors_of(corrections: _Corrections) -> tuple[Float[np.ndarray, " views"], Float[np.ndarray, " views"]]:
@@ -254,53 +260,60 @@ def errors_of(corrections: _Corrections) -> tuple[Float[np.ndarray, " views"], F
     return Rotation.from_matrix(corrections[:, :3, :3]).magnitude(), np.linalg.norm(corrections[:, :3, 3], axis=1)
 
 
-def _solved(
-    views: Sequence[_View], pairs: Sequence[tuple[int, int]], start: _Corrections, away: float, is_mount: bool
+def _solve_corrections(
+    views: Sequence[_View],
+    pairs: Sequence[tuple[int, int]],
+    start: _Corrections,
+    median_distance: float,
+    is_mount: bool,
 ) -> _Corrections:
     """Return the corrections that minimise the disagreement of the views, starting from `start`.
 
-    If `is_mount`, all views get the same correction. Otherwise each view but the first gets its own. `away` is the
-    median distance of points from the cameras.
+    If `is_mount`, all views get the same correction. Otherwise each view but the first gets its own. `median_distance`
+    is the median distance of points from the cameras.
     """
     corrections, num_steps = start, 1 if is_mount else len(views) - 1
-    for reach in _REACHES:
-        matches = _matched(views, pairs, corrections, reach * away)
+    for ratio in _MATCH_DISTANCES:
+        matches = _match_points(views, pairs, corrections, ratio * median_distance)
         if len(matches.views) == 0:
             break
-        off, rows = _linearised(views, matches, corrections, is_mount)
-        scale = max(_SCALE * float(np.median(np.abs(off))), _ROUNDING * away)
+        residuals, jacobian = _linearise(views, matches, corrections, is_mount)
+        scale = max(_LOSS_WIDTH * float(np.median(np.abs(residuals))), _ROUNDING * median_distance)
         errors = np.concatenate([_logarithm(matrix) for matrix in corrections[-num_steps:]])
-        prior = _TOGETHER * (scale / (_ERROR * np.tile(np.repeat([1.0, away], 3), num_steps))) ** 2
-        step = _robust(off, rows, scale, errors, prior)
+        prior = (
+            _POINTS_PER_SAMPLE
+            * (scale / (_PRIOR_DEVIATION * np.tile(np.repeat([1.0, median_distance], 3), num_steps))) ** 2
+        )
+        step = _robust_step(residuals, jacobian, scale, errors, prior)
         steps = np.tile(step, (len(views), 1)) if is_mount else np.concatenate([np.zeros(6), step]).reshape(-1, 6)
         corrections = corrections @ np.stack([_exponential(row) for row in steps])
     return corrections
 
 
-def _robust(
-    off: Float[np.ndarray, " n"],
-    rows: csr_array,
+def _robust_step(
+    residuals: Float[np.ndarray, " n"],
+    jacobian: csr_array,
     scale: float,
     errors: Float[np.ndarray, " steps"],
     prior: Float[np.ndarray, " steps"],
 ) -> Float[np.ndarray, " steps"]:
-    """Return the `step` that minimises sum rho(off + rows @ step) + sum prior (errors + step)^2.
+    """Return the `step` that minimises sum rho(residuals + jacobian @ step) + sum prior (errors + step)^2.
 
     The method is iteratively reweighted least squares. rho is the robust loss of the module's docstring.
 
-    - `off`, `rows`: point-to-plane distances and their derivative, from `_linearised`.
+    - `residuals`, `jacobian`: point-to-plane distances and their derivative, from `_linearise`.
     - `scale`: width c of rho.
     - `errors`, `prior`: the corrections so far, and the weights that pull them towards zero.
     """
-    step = np.zeros(rows.shape[1])
-    for _ in range(_STEPS):
-        weight = 1.0 / (1.0 + ((off + rows @ step) / scale) ** 2)
-        normal = (rows.T @ rows.multiply(weight[:, None])).toarray()
-        step = np.linalg.solve(normal + np.diag(prior), -(rows.T @ (weight * off)) - prior * errors)
+    step = np.zeros(jacobian.shape[1])
+    for _ in range(_NUM_STEPS):
+        weights = 1.0 / (1.0 + ((residuals + jacobian @ step) / scale) ** 2)
+        normal = (jacobian.T @ jacobian.multiply(weights[:, None])).toarray()
+        step = np.linalg.solve(normal + np.diag(prior), -(jacobian.T @ (weights * residuals)) - prior * errors)
     return step
 
 
-def _linearised(
+def _linearise(
     views: Sequence[_View], matches: _Matches, corrections: _Corrections, is_mount: bool
 ) -> tuple[Float[np.ndarray, " n"], csr_array]:
     """Return the signed point-to-plane distance of each match, and its derivative.
@@ -309,27 +322,29 @@ def _linearised(
     X <- X exp(step): one step for the mount, or one for each view but the first. Its six entries for a view are, up to
     sign, (p x m, m) with the point p and the normal m = n_q in the coordinates of this view's camera.
     """
-    true = np.stack([view.matrix for view in views]) @ corrections
+    poses = np.stack([view.matrix for view in views]) @ corrections
     (first, second), count = matches.views.T, len(matches.views)
-    normals = np.einsum("nij,nj->ni", true[second, :3, :3], matches.normals)
-    apart = _placed(true[first], matches.first) - _placed(true[second], matches.second)
+    normals = np.einsum("nij,nj->ni", poses[second, :3, :3], matches.second_normals)
+    differences = _transform(poses[first], matches.first_points) - _transform(poses[second], matches.second_points)
     # The plane rotates with the second view, so p for this view is the first point in the second camera's coordinates.
-    opposite = matches.second + np.einsum("nij,ni->nj", true[second, :3, :3], apart)
-    shares = [
-        (view, sign * np.concatenate([np.cross(points, turned), turned], axis=1))
-        for view, points, sign in ((first, matches.first, 1.0), (second, opposite, -1.0))
-        for turned in [np.einsum("nij,ni->nj", true[view, :3, :3], normals)]
+    opposite = matches.second_points + np.einsum("nij,ni->nj", poses[second, :3, :3], differences)
+    blocks = [
+        (view, sign * np.concatenate([np.cross(points, local_normals), local_normals], axis=1))
+        for view, points, sign in ((first, matches.first_points, 1.0), (second, opposite, -1.0))
+        for local_normals in [np.einsum("nij,ni->nj", poses[view, :3, :3], normals)]
     ]
     if is_mount:
-        return np.sum(normals * apart, axis=1), csr_array(shares[0][1] + shares[1][1])
+        return np.sum(normals * differences, axis=1), csr_array(blocks[0][1] + blocks[1][1])
     row = np.repeat(np.arange(count), 6)
-    entries = [(share.ravel(), row, (6 * (view[:, None] - 1) + np.arange(6)).ravel()) for view, share in shares]
+    entries = [(block.ravel(), row, (6 * (view[:, None] - 1) + np.arange(6)).ravel()) for view, block in blocks]
     value, row, column = map(np.concatenate, zip(*entries, strict=True))
-    own, size = column >= 0, (count, 6 * (len(views) - 1))
-    return np.sum(normals * apart, axis=1), csr_array(coo_array((value[own], (row[own], column[own])), shape=size))
+    is_free, size = column >= 0, (count, 6 * (len(views) - 1))
+    return np.sum(normals * differences, axis=1), csr_array(
+        coo_array((value[is_free], (row[is_free], column[is_free])), shape=size)
+    )
 
 
-def _placed(matrices: Float[np.ndarray, "n 4 4"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+def _transform(matrices: Float[np.ndarray, "n 4 4"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     return np.einsum("nij,nj->ni", matrices[:, :3, :3], points) + matrices[:, :3, 3]
 
 
@@ -344,28 +359,28 @@ def _logarithm(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6"]:
     return np.append(Rotation.from_matrix(matrix[:3, :3]).as_rotvec(), matrix[:3, 3])
 
 
-def _compared(
-    views: Sequence[_View], pairs: Sequence[tuple[int, int]], corrections: _Corrections, away: float
+def _disagreement(
+    views: Sequence[_View], pairs: Sequence[tuple[int, int]], corrections: _Corrections, median_distance: float
 ) -> tuple[Float[np.ndarray, " views"], Float[np.ndarray, " views"]]:
     """Return, for each view, how much it disagrees with the views that `pairs` compares it with.
 
     Points of two views are matched. The results are two medians over a view's matches: of the point-to-plane distance
-    between the two points, and of the angle between their normals (radians). NaN for a view without matches. `away` is
-    the median distance of points from the cameras.
+    between the two points, and of the angle between their normals (radians). NaN for a view without matches.
+    `median_distance` is the median distance of points from the cameras.
     """
-    matches = _matched(views, pairs, corrections, _REACHES[0] * away)
-    off, _ = _linearised(views, matches, corrections, is_mount=True)
-    turns = np.stack([view.matrix for view in views])[:, :3, :3] @ corrections[:, :3, :3]
-    first, second = (
-        np.einsum("nij,nj->ni", turns[view], normals)
-        for view, normals in zip(matches.views.T, (matches.own_normals, matches.normals), strict=True)
+    matches = _match_points(views, pairs, corrections, _MATCH_DISTANCES[0] * median_distance)
+    residuals, _ = _linearise(views, matches, corrections, is_mount=True)
+    rotations = np.stack([view.matrix for view in views])[:, :3, :3] @ corrections[:, :3, :3]
+    first_normals, second_normals = (
+        np.einsum("nij,nj->ni", rotations[view], normals)
+        for view, normals in zip(matches.views.T, (matches.first_normals, matches.second_normals), strict=True)
     )
-    angle = np.arccos(np.clip(np.sum(first * second, axis=1), -1.0, 1.0))
+    angle = np.arccos(np.clip(np.sum(first_normals * second_normals, axis=1), -1.0, 1.0))
     median = np.full((2, len(views)), np.nan)
-    for number in range(len(views)):
-        own = (matches.views == number).any(axis=1)
-        if own.any():
-            median[:, number] = np.median(np.abs(off[own])), np.median(angle[own])
+    for index in range(len(views)):
+        is_of_view = (matches.views == index).any(axis=1)
+        if is_of_view.any():
+            median[:, index] = np.median(np.abs(residuals[is_of_view])), np.median(angle[is_of_view])
     return median[0], median[1]
 
 
@@ -377,10 +392,10 @@ def _median(values: Float[np.ndarray, " n"]) -> float:
 
 def _noise(views: Sequence[_View]) -> float:
     """Return the median distance of points from the tangent plane at the nearest point of the same view."""
-    off = [np.zeros(0)]
+    distances = [np.zeros(0)]
     for points, normals, _ in views:
         if len(points) < 2:
             continue
         _, nearest = cKDTree(points).query(points, k=2)
-        off.append(np.sum(normals[nearest[:, 1]] * (points - points[nearest[:, 1]]), axis=1))
-    return float(np.nan_to_num(_median(np.abs(np.concatenate(off)))))
+        distances.append(np.sum(normals[nearest[:, 1]] * (points - points[nearest[:, 1]]), axis=1))
+    return float(np.nan_to_num(_median(np.abs(np.concatenate(distances)))))

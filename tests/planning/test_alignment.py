@@ -14,7 +14,7 @@ from small_session import around, session_of, shot
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose, look_at
-from jaxnbv.planning.alignment import _exponential, _in_camera, _linearised, _matched, align_views
+from jaxnbv.planning.alignment import _exponential, _in_camera, _linearise, _match_points, align_views
 
 SIDES = np.array([0.12, 0.2, 0.15])
 AXES = np.concatenate([np.eye(3), -np.eye(3)])
@@ -154,17 +154,17 @@ def test_its_derivatives_are_those_of_finite_differences(is_mount):
     views = [_in_camera(cloud, pose) for cloud, pose in zip(clouds, poses, strict=True)]
     pairs = [(i, j) for i in range(6) for j in range(6) if i != j]
     corrections = np.stack([random_motion(20 + n, 0.5, 0.005) for n in range(6)])
-    matches = _matched(views, pairs, corrections, 0.05)
-    off, rows = _linearised(views, matches, corrections, is_mount)
-    assert len(off) > 1000
-    step = 1e-6 * np.random.default_rng(0).normal(size=rows.shape[1])
+    matches = _match_points(views, pairs, corrections, 0.05)
+    residuals, jacobian = _linearise(views, matches, corrections, is_mount)
+    assert len(residuals) > 1000
+    step = 1e-6 * np.random.default_rng(0).normal(size=jacobian.shape[1])
 
     def moved(sign):
         steps = np.tile(step, (6, 1)) if is_mount else np.concatenate([np.zeros(6), step]).reshape(6, 6)
         there = corrections @ np.stack([_exponential(sign * one) for one in steps])
-        return _linearised(views, matches, there, is_mount)[0]
+        return _linearise(views, matches, there, is_mount)[0]
 
-    np.testing.assert_allclose(rows @ step, 0.5 * (moved(1.0) - moved(-1.0)), atol=1e-11)
+    np.testing.assert_allclose(jacobian @ step, 0.5 * (moved(1.0) - moved(-1.0)), atol=1e-11)
 
 
 def test_a_view_without_points_changes_nothing():
