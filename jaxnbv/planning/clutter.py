@@ -16,13 +16,13 @@ from jaxnbv.scanning import Obstacles
 from jaxnbv.scanning.sdf import Sampled
 
 # Number of cells along a side of the cube of cells. A cell is then about 1.5 cm wide for an object of 20 cm.
-_CELLS = 48
+_NUM_CELLS = 48
 # Smallest number of an image's points in an occupied cell. Fewer points may be flying pixels at a depth edge.
-_FEWEST = 5
+_MIN_POINTS = 5
 
 
 # Largest normalised image coordinate (x / z or y / z) for which the distortion formula is used.
-_WIDEST = 3.0
+_MAX_COORDINATE = 3.0
 
 
 class Clutter(NamedTuple):
@@ -40,7 +40,7 @@ class Clutter(NamedTuple):
     @classmethod
     def empty(cls, half_extent: float, box: Box) -> "Clutter":
         """Return clutter without votes."""
-        return cls(np.zeros((_CELLS,) * 3, np.int64), half_extent, box)
+        return cls(np.zeros((_NUM_CELLS,) * 3, np.int64), half_extent, box)
 
     def with_image(
         self,
@@ -61,9 +61,9 @@ class Clutter(NamedTuple):
             depth = np.where(image.robot, 0.0, depth)
         points = np.asarray(frame.to_scene(image.points(camera, pose)[depth > 0]), np.float64)
         cells = np.floor((points + self.half_extent) / self.spacing).astype(int)
-        cells = cells[((cells >= 0) & (cells < _CELLS)).all(axis=1)]
+        cells = cells[((cells >= 0) & (cells < _NUM_CELLS)).all(axis=1)]
         numbers = np.ravel_multi_index(tuple(cells.T), self.votes.shape)
-        is_occupied = np.bincount(numbers, minlength=self.votes.size).reshape(self.votes.shape) >= _FEWEST
+        is_occupied = np.bincount(numbers, minlength=self.votes.size).reshape(self.votes.shape) >= _MIN_POINTS
         centers = self._centers()
         is_near_box = np.asarray(self.box(centers)) < self.spacing
         is_of_obstacle = np.asarray(obstacles.distance(centers)) < obstacles.margin + self.spacing
@@ -84,10 +84,10 @@ class Clutter(NamedTuple):
     @property
     def spacing(self) -> float:
         """Side length of a cell, in scene units."""
-        return 2.0 * self.half_extent / _CELLS
+        return 2.0 * self.half_extent / _NUM_CELLS
 
     def _centers(self) -> Float[np.ndarray, "n n n 3"]:
-        axis = (np.arange(_CELLS) + 0.5) * self.spacing - self.half_extent
+        axis = (np.arange(_NUM_CELLS) + 0.5) * self.spacing - self.half_extent
         return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
 
     def _is_seen_through(
@@ -98,13 +98,15 @@ class Clutter(NamedTuple):
         centers = np.asarray(frame.to_world(self._centers().reshape(-1, 3)), np.float64)
         local = (centers - np.asarray(pose.position, np.float64)) @ np.asarray(pose.rotation, np.float64)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            place = local[:, :2] / local[:, 2:]
+            coordinates = local[:, :2] / local[:, 2:]
             # The distortion formula is not valid far outside the image.
-            place = np.where((np.abs(place) < _WIDEST).all(axis=1, keepdims=True), place, np.nan)
-            pixels = pixels_of(place, camera.intrinsics, camera.distortion)
+            coordinates = np.where(
+                (np.abs(coordinates) < _MAX_COORDINATE).all(axis=1, keepdims=True), coordinates, np.nan
+            )
+            pixels = pixels_of(coordinates, camera.intrinsics, camera.distortion)
         column, row = (np.nan_to_num(pixel, nan=-1.0) for pixel in pixels)
         column, row = np.round(column).astype(int), np.round(row).astype(int)
-        in_image = (local[:, 2] > 0) & (row >= 0) & (row < camera.height) & (column >= 0) & (column < camera.width)
-        measured = np.zeros(len(centers))
-        measured[in_image] = depth[row[in_image], column[in_image]]
-        return (measured > local[:, 2] + cell).reshape(self.votes.shape)
+        is_in_image = (local[:, 2] > 0) & (row >= 0) & (row < camera.height) & (column >= 0) & (column < camera.width)
+        measured_depths = np.zeros(len(centers))
+        measured_depths[is_in_image] = depth[row[is_in_image], column[is_in_image]]
+        return (measured_depths > local[:, 2] + cell).reshape(self.votes.shape)

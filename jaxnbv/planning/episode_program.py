@@ -57,18 +57,18 @@ def run(
     - `at_once`: number of episodes that a device computes together.
     """
 
-    def of_share(rows: Any, planner: Planner, views: Int[Array, ""]) -> Any:
+    def simulate_share(rows: Any, planner: Planner, views: Int[Array, ""]) -> Any:
         return batched_map(lambda row: _episode(planner, noise, views, *row), rows, at_once)
 
-    return shared(of_share, rows, planner, views)
+    return shared(simulate_share, rows, planner, views)
 
 
 def _episode(
     planner: Planner, noise: Noise, views: Int[Array, ""], scene: Surface, first: Pose, key: PRNGKeyArray
 ) -> tuple[ViewRecord, PointCloud, Bool[Array, ""]]:
-    room = planner.max_views
-    observations, record, sees = in_parts(_first_view, planner, noise, scene, first, key)
-    records = jax.tree.map(lambda leaf: jnp.zeros((room, *leaf.shape), leaf.dtype).at[0].set(leaf), record)
+    max_views = planner.max_views
+    observations, record, sees_object = in_parts(_first_view, planner, noise, scene, first, key)
+    records = jax.tree.map(lambda leaf: jnp.zeros((max_views, *leaf.shape), leaf.dtype).at[0].set(leaf), record)
     arrays, rest = eqx.partition(observations, eqx.is_array)
 
     # The number of iterations is traced, so the same program serves any number of views.
@@ -79,8 +79,8 @@ def _episode(
         records = jax.tree.map(lambda rows, row: rows.at[index].set(row), records, record)
         return eqx.filter(after, eqx.is_array), pending, records
 
-    arrays, _, records = jax.lax.fori_loop(1, views, add, (arrays, PoseList.empty(room), records))
-    return records, eqx.combine(arrays, rest).cloud, sees
+    arrays, _, records = jax.lax.fori_loop(1, views, add, (arrays, PoseList.empty(max_views), records))
+    return records, eqx.combine(arrays, rest).cloud, sees_object
 
 
 def _first_view(

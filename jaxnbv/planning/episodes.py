@@ -20,7 +20,7 @@ from jaxnbv.scanning import Noise, SensorNoise, Surface
 from jaxnbv.scanning.scanner import distance_problem
 from jaxnbv.scanning.scene_batch import scene_batch
 from jaxnbv.scanning.sdf import SignedDistance
-from jaxnbv.sharding import on_cpu, share_of
+from jaxnbv.sharding import on_cpu, rows_per_device
 from jaxnbv.surfaces import KnownShapes
 from jaxnbv.tasks.identification import weights_by_name
 
@@ -91,14 +91,14 @@ def episodes(
     rows = scene_batch(scenes, count), _batch_of_poses(first, count), keys
     # The value of the first view is NaN, so JAX must not check for NaN.
     with _devices(count), jax.debug_nans(False):
-        at_once = min(batch_size or (1 if on_cpu() else count), share_of(count))
+        at_once = min(batch_size or (1 if on_cpu() else count), rows_per_device(count))
         records, clouds, sees = run(planner, noise, jnp.asarray(views), rows, at_once)
         poses, values, answers = jax.tree.map(lambda leaf: leaf[:, :views], records)
     _check(planner, np.asarray(values), clouds, np.asarray(sees))
     if answers is not None and answers_by_parts(planner):
         assert isinstance(planner.sampler.model, KnownShapes)
-        _, by_name = weights_by_name(planner.sampler.model.bank, np.asarray(answers), planner.acquisition)
-        answers = jnp.asarray(by_name, answers.dtype)
+        _, weights = weights_by_name(planner.sampler.model.bank, np.asarray(answers), planner.acquisition)
+        answers = jnp.asarray(weights, answers.dtype)
     return Episodes(poses, values, clouds, answers)
 
 
@@ -119,9 +119,9 @@ def _batch_of_poses(first: Pose, count: int) -> Pose:
 
 def _devices(count: int) -> AbstractContextManager:
     """Return a context manager that lets JAX use up to `count` local devices, unless the user chose some."""
-    chosen = not get_abstract_mesh().empty or jax.config.jax_default_device is not None  # type: ignore[attr-defined]
+    is_chosen = not get_abstract_mesh().empty or jax.config.jax_default_device is not None  # type: ignore[attr-defined]
     devices = jax.local_devices()[:count]
-    return nullcontext() if chosen or len(devices) == 1 else jax.set_mesh(Mesh(np.array(devices), "devices"))
+    return nullcontext() if is_chosen or len(devices) == 1 else jax.set_mesh(Mesh(np.array(devices), "devices"))
 
 
 def _check(

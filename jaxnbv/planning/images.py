@@ -20,9 +20,9 @@ Ignore: TypeAlias = Callable[[Float[np.ndarray, "n 3"]], Any]
 """Function of world points (n, 3) that returns a bool for each point: True to ignore it, as a point of the robot."""
 
 # Largest number of rays of an image that are used. A cloud holds a few thousand points, so more rays only cost time.
-_MOST_RAYS = 20_000
+_MAX_RAYS = 20_000
 # Two pose matrices are equal if their entries differ by at most this. They may have been stored in 32 bits.
-_SAME_PLACE = 1e-5
+_MATRIX_TOLERANCE = 1e-5
 
 
 class Image(NamedTuple):
@@ -51,30 +51,28 @@ class Image(NamedTuple):
         pixels = as_numbers(depth, "the depth image", None)
         pixel_mask = None if mask is None else np.asarray(mask)
         if pixel_mask is not None:
-            proper = pixel_mask.dtype == bool and pixel_mask.shape == pixels.shape
+            is_valid = pixel_mask.dtype == bool and pixel_mask.shape == pixels.shape
             require(
-                proper, f"the mask is {short_text(mask)}: give a boolean array of the image's shape, {pixels.shape}"
+                is_valid, f"the mask is {short_text(mask)}: give a boolean array of the image's shape, {pixels.shape}"
             )
         # The pixels are copied, because a driver may write its next image into the same memory.
         return cls(pixels.copy(), as_numbers(matrix, "the matrix of a pose", np.float64), scale, pixel_mask)
 
-    def cleaned(self, camera: Camera, pose: Pose, box: Box) -> "Image":
+    def without_sentinels(self, camera: Camera, pose: Pose, box: Box) -> "Image":
         """Return a copy in which pixels whose value stands for "not measured" have depth zero.
 
         Such a value is the largest of an integer type, or it fills many pixels and is beyond the camera's range or well
-        beyond the box, see `without_sentinels`.
+        beyond the box, see `jaxnbv.geometry.depth_image`.
         """
         return self._replace(depth=without_sentinels(self.depth, camera, pose, self.scale, box))
 
     def points(self, camera: Camera, pose: Pose) -> Float[np.ndarray, "height width 3"]:
         """Return the world point of each pixel, or the camera's position for a pixel without a measurement."""
         depth = np.where(np.isfinite(self.depth), self.scale * np.asarray(self.depth, np.float64), 0.0)
-        ahead = np.asarray(camera.pixel_directions(), np.float64).reshape(*depth.shape, 3)
+        rays = np.asarray(camera.pixel_directions(), np.float64).reshape(*depth.shape, 3)
         if camera.distortion:
-            ahead = np.stack(
-                [*undistort_points(ahead[..., 0], ahead[..., 1], camera.distortion), ahead[..., 2]], axis=-1
-            )
-        local = depth[..., None] * ahead
+            rays = np.stack([*undistort_points(rays[..., 0], rays[..., 1], camera.distortion), rays[..., 2]], axis=-1)
+        local = depth[..., None] * rays
         return local @ np.asarray(pose.rotation, np.float64).T + np.asarray(pose.position, np.float64)
 
     def with_robot(self, ignore: Ignore, camera: Camera, pose: Pose) -> "Image":
@@ -84,14 +82,14 @@ class Image(NamedTuple):
 
         **Raises:** `ValueError` if `ignore` does not return a bool for each point.
         """
-        measured = np.isfinite(self.depth) & (self.depth > 0)
-        is_robot = np.asarray(ignore(self.points(camera, pose)[measured]))
+        is_measured = np.isfinite(self.depth) & (self.depth > 0)
+        is_robot = np.asarray(ignore(self.points(camera, pose)[is_measured]))
         require(
-            is_robot.shape == (int(measured.sum()),) and is_robot.dtype == bool,
-            f"ignore returned {short_text(is_robot)} for {int(measured.sum())} points: return a bool for each",
+            is_robot.shape == (int(is_measured.sum()),) and is_robot.dtype == bool,
+            f"ignore returned {short_text(is_robot)} for {int(is_measured.sum())} points: return a bool for each",
         )
         robot = np.zeros(self.depth.shape, bool)
-        robot[measured] = is_robot
+        robot[is_measured] = is_robot
         return self._replace(robot=robot)
 
     def cloud(self, camera: Camera, pose: Pose, stride: int, box: Box | None = None) -> PointCloud:
@@ -112,7 +110,7 @@ class Image(NamedTuple):
         values = np.unique(self.depth[self.depth > 0])
         return not bool(np.any(cloud.missed)) or (len(values) == 1 and bool(np.isfinite(values[0])))
 
-    def check_moved(self, earlier: "tuple[Image, ...]") -> None:
+    def check_not_stale(self, earlier: "tuple[Image, ...]") -> None:
         """Check that the image is not a stale frame, which the driver recorded before the camera moved.
 
         **Raises:** `ValueError` if one of the `earlier` images has the same depths but a different pose. An image
@@ -123,7 +121,7 @@ class Image(NamedTuple):
         for number, image in enumerate(earlier, start=1):
             is_same = np.array_equal(image.depth, self.depth, equal_nan=self.depth.dtype.kind == "f")
             require(
-                not is_same or bool(np.abs(image.matrix - self.matrix).max() <= _SAME_PLACE),
+                not is_same or bool(np.abs(image.matrix - self.matrix).max() <= _MATRIX_TOLERANCE),
                 f"the image is bit for bit equal to image {number}, which has a different pose, so the driver returned "
                 "an old frame. Discard the frames that the driver still holds after a move",
             )
@@ -137,14 +135,14 @@ def only_where(cloud: PointCloud, pixels: Bool[np.ndarray, "height width"], came
     """
     if camera.distortion:
         # The rays of a cloud belong to a camera without distortion, so the mask must be resampled.
-        place = np.asarray(camera.pixel_directions(), np.float64).reshape(*pixels.shape, 3)[..., :2]
-        column, row = pixels_of(place, camera.intrinsics, camera.distortion)
-        across = np.clip(np.round(column).astype(int), 0, camera.width - 1)
-        pixels = pixels[np.clip(np.round(row).astype(int), 0, camera.height - 1), across]
+        coordinates = np.asarray(camera.pixel_directions(), np.float64).reshape(*pixels.shape, 3)[..., :2]
+        column, row = pixels_of(coordinates, camera.intrinsics, camera.distortion)
+        columns = np.clip(np.round(column).astype(int), 0, camera.width - 1)
+        pixels = pixels[np.clip(np.round(row).astype(int), 0, camera.height - 1), columns]
     rows = slice(stride // 2, None, stride)
     return cloud.only(jnp.asarray(pixels[rows, rows].reshape(-1)))
 
 
 def stride_of(camera: Camera) -> int:
-    """Return the stride of rows and columns at which an image has at most about `_MOST_RAYS` rays."""
-    return math.ceil(math.sqrt(camera.num_rays / _MOST_RAYS))
+    """Return the stride of rows and columns at which an image has at most about `_MAX_RAYS` rays."""
+    return math.ceil(math.sqrt(camera.num_rays / _MAX_RAYS))

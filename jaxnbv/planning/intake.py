@@ -58,17 +58,17 @@ class Intake:
         **Raises:** `ValueError` as `Session.add` does. Nothing changes then.
         """
         index = len(self.images)
-        image.check_moved(self.images)
+        image.check_not_stale(self.images)
         pose = self.mount_error.pose(image, index)
-        clean = image.cleaned(self.camera, pose, self.box)
+        clean = image.without_sentinels(self.camera, pose, self.box)
         cloud = self._cloud(clean, pose, is_first=index == 0)
         if index > 0 and image.is_blank(cloud):
             return None
         table, ups = self.table, self.other_ups
         if index == 0 and self.planner.obstacles is None:
-            whole = clean.cloud(self.camera, pose, self.stride)
-            table = table_under(self.frame.to_scene(whole), self.frame.to_scene(self.box))
-            ups = other_ups(whole, self.box, self.frame.up) if table is None else ()
+            full_cloud = clean.cloud(self.camera, pose, self.stride)
+            table = table_under(self.frame.to_scene(full_cloud), self.frame.to_scene(self.box))
+            ups = other_ups(full_cloud, self.box, self.frame.up) if table is None else ()
             # Obstacles without a solid still keep cameras clear of the points of D.
             loop = loop.without_views(dataclasses.replace(self.planner, obstacles=table or Obstacles()))
         if image.mask is not None:
@@ -90,14 +90,14 @@ class Intake:
 
         **Raises:** `ValueError` if the first image shows nothing of the box.
         """
-        room, sampler = self.box, self.planner.sampler
+        region, sampler = self.box, self.planner.sampler
         if sampler.carving is not None:
-            room = sampler.carving.with_room(room, sampler.grid, self.frame)
+            region = sampler.carving.with_room(region, sampler.grid, self.frame)
         with warnings.catch_warnings():
             if is_first:
                 warnings.simplefilter("error", NothingInside)
             try:
-                return image.cloud(self.camera, pose, self.stride, room)
+                return image.cloud(self.camera, pose, self.stride, region)
             except NothingInside as problem:
                 raise InputError(f"the first image shows nothing of the box: {problem}") from problem
 

@@ -89,8 +89,8 @@ class _StepState:
     """Intermediate results for the next view.
 
     - `is_proposed`: whether a caller received the proposal. False if the proposal was computed for the stop rule only.
-    - `stop`: reason to stop, or None. Valid once `is_asked` is True.
-    - `is_asked`: whether the stop rule was evaluated.
+    - `stop`: reason to stop, or None. Valid once `is_evaluated` is True.
+    - `is_evaluated`: whether the stop rule was evaluated.
     """
 
     inputs: StepInputs | None = None
@@ -98,7 +98,7 @@ class _StepState:
     is_proposed: bool = False
     seconds: float = 0.0
     stop: str | None = None
-    is_asked: bool = False
+    is_evaluated: bool = False
 
 
 class Loop:
@@ -112,7 +112,7 @@ class Loop:
     - `until`: stop rule; None for no stop rule.
     - `frame`: frame of the user's world. The stop rule uses the units of this world.
     - `camera`: the sensor's camera in scene units, by default the planner's.
-    - `begin`: function that is called with a name from `STAGES` when this stage begins.
+    - `on_stage`: function that is called with a name from `STAGES` when this stage begins.
 
     **Raises:** `ValueError` if the rule does not apply to the planner's acquisition.
     """
@@ -125,16 +125,16 @@ class Loop:
         until: StopRule | None = None,
         frame: Frame = Frame(),  # noqa: B008
         camera: Camera | None = None,
-        begin: Callable[[str], None] = lambda stage: None,
+        on_stage: Callable[[str], None] = lambda stage: None,
     ):
         if until is not None:
             until.check(planner.acquisition)
         self.planner, self.key, self.until, self.frame = planner, key, until, frame
-        self.camera, self._begin = planner.camera if camera is None else camera, begin
+        self.camera, self._on_stage = planner.camera if camera is None else camera, on_stage
         self.views: tuple[View, ...] = ()
         self._observations: Observations | None = None
         self._pending = PoseList.empty(planner.max_views)
-        self._first_view_at: float | None = None
+        self._first_view_time: float | None = None
         self._next = _StepState()
 
     def without_views(self, planner: Planner) -> "Loop":
@@ -185,8 +185,8 @@ class Loop:
             observations = self.planner.observe(self._observations, pose, scan, self.camera)
         accepted()
         proposal = self._next.proposal if self._next.is_proposed else None
-        if self._first_view_at is None:
-            self._first_view_at = time.monotonic()
+        if self._first_view_time is None:
+            self._first_view_time = time.monotonic()
         if proposal is not None:
             self._pending = self._pending.append(proposal.pose)
         view = View(pose, scan, observations.cloud, proposal, self.camera, observations.hypotheses)
@@ -210,7 +210,7 @@ class Loop:
                 return None
             pose, seconds = self.propose().pose, self._next.seconds
             inputs = self._next.inputs if self.planner.search.uses_samples else None
-        self._begin(STAGES[2])
+        self._on_stage(STAGES[2])
         *_, noise_key = view_keys(self.key, len(self.views))
         view = self.add(pose, sensor(pose, noise_key))
         return Step(view, self.observations, inputs, seconds)
@@ -227,7 +227,7 @@ class Loop:
         """
         for pose, scan, proposal in stored:
             if proposal is not None:
-                self.resume(proposal)
+                self.set_stored_proposal(proposal)
             yield Step(self.add(pose, scan), self.observations, None, 0.0)
         while len(self.views) < self.planner.max_views and (step := self.take(sensor, first)) is not None:
             yield step
@@ -241,23 +241,23 @@ class Loop:
         **Raises:** `ValueError` before the first view, and as `Planner.propose` does.
         """
         self._next.is_proposed = True
-        return self._chosen()
+        return self._next_proposal()
 
-    def _chosen(self) -> Proposal:
+    def _next_proposal(self) -> Proposal:
         if self._next.proposal is None:
             inputs = self.inputs()
-            self._begin(STAGES[1])
+            self._on_stage(STAGES[1])
             start = time.perf_counter()
             _, search_key, _ = view_keys(self.key, len(self.views))
             proposal = self.planner.choose(inputs, search_key, self._pending)
             self._next.proposal, self._next.seconds = jax.block_until_ready(proposal), time.perf_counter() - start
         return self._next.proposal
 
-    def settle(self, proposal: Proposal) -> None:
+    def replace_proposal(self, proposal: Proposal) -> None:
         """Use this proposal for the next view instead of the search's, because an arm can reach it."""
         self._next.proposal = proposal
 
-    def resume(self, proposal: Proposal) -> None:
+    def set_stored_proposal(self, proposal: Proposal) -> None:
         """Use a stored proposal for the next view, without a new search."""
         self._next = _StepState(proposal=proposal, is_proposed=True)
 
@@ -265,7 +265,7 @@ class Loop:
         """Return the inputs of the search for the next view. They are computed once for each view."""
         if not self.planner.search.uses_samples:
             return StepInputs(self.observations)
-        return self._sampled()
+        return self._sample_inputs()
 
     @own_settings()
     def done(self) -> str | None:
@@ -275,19 +275,19 @@ class Loop:
 
         **Raises:** `ValueError` as `propose` does, if the rule needs the next proposal.
         """
-        if self.until is None or self._first_view_at is None or not self.views:
+        if self.until is None or self._first_view_time is None or not self.views:
             return None
-        if not self._next.is_asked:
+        if not self._next.is_evaluated:
             key, *_ = view_keys(self.key, len(self.views))
             poses = tuple(view.pose for view in self.views)
-            seconds = time.monotonic() - self._first_view_at
+            seconds = time.monotonic() - self._first_view_time
             context = StopContext(self.planner, self.observations, poses, seconds, key, self._surfaces, self.frame)
             self._next.stop = checked_reason(self.until, self.until.after(context))
             if self._next.stop is None and self.until.needs_proposal:
-                proposal = self._chosen()
+                proposal = self._next_proposal()
                 reason = self.until.before(context, proposal.pose, self.in_world(proposal.value))
                 self._next.stop = checked_reason(self.until, reason)
-            self._next.is_asked = True
+            self._next.is_evaluated = True
         return self._next.stop
 
     @property
@@ -300,15 +300,15 @@ class Loop:
         return float(self.frame.length_to_world(value, self.planner.quantity.length_power))
 
     def _surfaces(self) -> GridSurface:
-        surfaces = self._sampled().surfaces
+        surfaces = self._sample_inputs().surfaces
         assert surfaces is not None
         return surfaces
 
-    def _sampled(self) -> StepInputs:
+    def _sample_inputs(self) -> StepInputs:
         if self._next.inputs is None:
-            self._begin(STAGES[0])
+            self._on_stage(STAGES[0])
             sample_key, *_ = view_keys(self.key, len(self.views))
-            self._next.inputs = jax.block_until_ready(self.planner.sampled(self.observations, sample_key))
+            self._next.inputs = jax.block_until_ready(self.planner.sample_inputs(self.observations, sample_key))
         return self._next.inputs
 
 

@@ -12,11 +12,11 @@ from jaxnbv.planning.images import Image, stride_of
 from jaxnbv.planning.session_warnings import warn_of_mount
 
 # Images are compared at every third of the rows and columns that planning uses.
-_COARSER = 3
+_STRIDE = 3
 # Smallest number of views for a correction or warning. Two views may disagree by chance.
-_ENOUGH = 3
+_MIN_VIEWS = 3
 # New corrections are ignored if they move points by at most this fraction of the points' noise.
-_EQUAL = 0.5
+_MIN_CHANGE = 0.5
 
 
 class MountError:
@@ -38,7 +38,7 @@ class MountError:
     def add(self, image: Image, index: int) -> None:
         """Add the image with this index. An image that was added before is ignored.
 
-        - `image`: image in which pixels without a measurement have depth zero, see `Image.cleaned`.
+        - `image`: image in which pixels without a measurement have depth zero, see `Image.without_sentinels`.
         """
         if index == len(self._images):
             self._images.append(image)
@@ -53,15 +53,15 @@ class MountError:
             stride = stride_of(self.camera)
             strided = self.camera.strided(stride)
             coarse = np.zeros((strided.height, strided.width), bool)
-            coarse[_COARSER // 2 :: _COARSER, _COARSER // 2 :: _COARSER] = True
+            coarse[_STRIDE // 2 :: _STRIDE, _STRIDE // 2 :: _STRIDE] = True
             for image, pose in list(zip(self._images, poses, strict=True))[len(self._clouds) :]:
                 self._clouds.append(image.cloud(self.camera, pose, stride).only(jnp.asarray(coarse.reshape(-1))))
             self._alignment = align_views(self._clouds, poses)
         return self._alignment
 
-    def warn_if_off(self) -> bool:
+    def warn_if_misaligned(self) -> bool:
         """Warn if the images disagree, and return whether they do. Return False for fewer than three images."""
-        if len(self._images) < _ENOUGH or not (alignment := self.alignment()).disagrees:
+        if len(self._images) < _MIN_VIEWS or not (alignment := self.alignment()).disagrees:
             return False
         warn_of_mount(alignment)
         return True
@@ -88,12 +88,12 @@ class MountError:
 
     def update(self) -> bool:
         """Update the corrections from the images so far, and return whether they changed noticeably."""
-        if len(self._images) < _ENOUGH:
+        if len(self._images) < _MIN_VIEWS:
             return False
         alignment = self.alignment()
-        used = np.tile(self.mount, (len(self._images), 1, 1))
-        used[: len(self.corrections)] = self.corrections
-        turns, shifts = errors_of(np.linalg.inv(used) @ alignment.corrections)
-        moves = bool(np.max(alignment.distance * turns + shifts) > _EQUAL * alignment.noise)
-        self.corrections = alignment.corrections if moves else used
-        return moves
+        current = np.tile(self.mount, (len(self._images), 1, 1))
+        current[: len(self.corrections)] = self.corrections
+        angles, shifts = errors_of(np.linalg.inv(current) @ alignment.corrections)
+        is_changed = bool(np.max(alignment.distance * angles + shifts) > _MIN_CHANGE * alignment.noise)
+        self.corrections = alignment.corrections if is_changed else current
+        return is_changed

@@ -39,7 +39,7 @@ from jaxnbv.surfaces.part_hypotheses import hypotheses_of
 from jaxnbv.tasks import Identify
 from jaxnbv.utility import Quantity
 
-_PARTS_GRID = 64
+_PARTS_RESOLUTION = 64
 
 # The constructor converts a plain function to an acquisition, which mypy cannot see.
 if TYPE_CHECKING:
@@ -114,7 +114,7 @@ class Planner(eqx.Module):
 
         **Raises:** `ValueError` for a bank without parts, or not at true size.
         """
-        sampler = SurfaceSampler(grid=Grid(_PARTS_GRID), num_samples=8).with_bank(bank, poses)
+        sampler = SurfaceSampler(grid=Grid(_PARTS_RESOLUTION), num_samples=8).with_bank(bank, poses)
         return cls(acquisition, DiscreteSearch(), Camera(height=24, width=32), sampler, capacity=2000)
 
     @property
@@ -138,12 +138,12 @@ class Planner(eqx.Module):
         `check` raises.
         """
         camera = camera or self.camera
-        self._check(pose, scan, camera, first=True)
+        self._check(pose, scan, camera, is_first=True)
         grid = self.sampler.grid
         solid_nodes = None if self.obstacles is None else self.obstacles.within(grid)
-        used_grid = None if solid_nodes is None and self.sampler.carving is None else grid
+        observation_grid = None if solid_nodes is None and self.sampler.carving is None else grid
         observations = Observations.start(
-            limit_capacity(scan, self.capacity), self.max_views, used_grid, solid_nodes, camera
+            limit_capacity(scan, self.capacity), self.max_views, observation_grid, solid_nodes, camera
         )
         if self.search.uses_samples and not is_traced(observations):
             if not self.acquisition.cloud_only:
@@ -172,7 +172,7 @@ class Planner(eqx.Module):
         camera = camera or self.camera
         check_type(observations, Observations, "observations")
         check_type(pose, Pose, "the pose")
-        self._check(pose, scan, camera, first=False)
+        self._check(pose, scan, camera, is_first=False)
         if not is_traced(observations.num_views):
             views, capacity = int(observations.num_views), observations.poses.capacity
             require(
@@ -180,11 +180,11 @@ class Planner(eqx.Module):
                 f"the observations hold {views} views and have room for no more: make them with a planner of "
                 f"Planner(max_views=...) greater than {capacity}",
             )
-        after = self._with_view(self.sampler.adapt(observations), pose, scan, camera).add_points(scan)
+        new_observations = self._with_view(self.sampler.adapt(observations), pose, scan, camera).add_points(scan)
         # An acquisition about known parts uses no samples on the grid.
-        if self.search.uses_samples and not self.acquisition.needs_hypotheses and not is_traced(after):
-            self.sampler.grid.check(after.cloud)
-        return self.sampler.model.add_state(after)
+        if self.search.uses_samples and not self.acquisition.needs_hypotheses and not is_traced(new_observations):
+            self.sampler.grid.check(new_observations.cloud)
+        return self.sampler.model.add_state(new_observations)
 
     def replay(self, views: Iterable[tuple[Pose, PointCloud]], camera: Camera | None = None) -> Iterator[Observations]:
         """Yield the observations after each view, by `init` for the first view and `observe` for the others.
@@ -196,8 +196,8 @@ class Planner(eqx.Module):
         """
         observations = None
         for pose, scan in views:
-            after = (pose, scan, camera)
-            observations = self.init(*after) if observations is None else self.observe(observations, *after)
+            arguments = (pose, scan, camera)
+            observations = self.init(*arguments) if observations is None else self.observe(observations, *arguments)
             yield observations
 
     @own_settings()
@@ -217,13 +217,13 @@ class Planner(eqx.Module):
     def step_inputs(self, observations: Observations, key: PRNGKeyArray) -> StepInputs:
         """Return the inputs of the search, for `choose`. `propose` calls both.
 
-        The inputs are the result of `sampled`, or only the observations if the search uses no samples.
+        The inputs are the result of `sample_inputs`, or only the observations if the search uses no samples.
         """
         check_type(observations, Observations, "observations")
-        return self.sampled(observations, key) if self.search.uses_samples else StepInputs(observations)
+        return self.sample_inputs(observations, key) if self.search.uses_samples else StepInputs(observations)
 
     @own_settings()
-    def sampled(self, observations: Observations, key: PRNGKeyArray) -> StepInputs:
+    def sample_inputs(self, observations: Observations, key: PRNGKeyArray) -> StepInputs:
         """Return the observations, the model's posterior given them, and surfaces drawn from the posterior.
 
         For an acquisition with `measurable_only` (`NewSurface`), the surfaces omit what an earlier view should have
@@ -279,8 +279,8 @@ class Planner(eqx.Module):
         obstacles = None if self.obstacles is None else self.obstacles.with_clutter(None)
         return observations.add_view(pose, scan, camera, self.sampler.carving, obstacles)
 
-    def _check(self, pose: Pose | None, scan: PointCloud, camera: Camera, first: bool) -> None:
-        """Check the arguments of `init` (if `first`) or `observe`.
+    def _check(self, pose: Pose | None, scan: PointCloud, camera: Camera, is_first: bool) -> None:
+        """Check the arguments of `init` (if `is_first`) or `observe`.
 
         **Raises:** `ValueError` for invalid arguments.
         """
@@ -294,8 +294,8 @@ class Planner(eqx.Module):
         with jax.ensure_compile_time_eval():
             problem = None if pose is None else distance_problem(pose)
             require(problem is None, f"the pose is not of the scene: {problem}")
-            if first or bool(scan.mask.any()):
-                name = "the first scan" if first else "the scan"
+            if is_first or bool(scan.mask.any()):
+                name = "the first scan" if is_first else "the scan"
                 check_oriented(scan, name, min(self.sampler.grid.half_extent, HALF_WIDTH))
             require(
                 pose is None or scan.missed is None or scan.capacity == camera.num_rays,
@@ -341,8 +341,8 @@ def _check_parts(planner: Planner, problem: Problem, proposal: Proposal) -> None
     **Raises:** `ValueError` that names the cost or the component of the acquisition that is not finite.
     """
     values = proposal.values
-    wrong = jnp.isnan(values) | (values == jnp.inf)
-    pose = proposal.candidates[int(jnp.argmax(wrong))] if bool(wrong.any()) else proposal.pose
+    is_invalid = jnp.isnan(values) | (values == jnp.inf)
+    pose = proposal.candidates[int(jnp.argmax(is_invalid))] if bool(is_invalid.any()) else proposal.pose
     observations = problem.observations
     if planner.cost is not None and int(observations.num_views) > 0:
         total_cost((observations.poses.last, pose), planner.cost.of)

@@ -29,7 +29,7 @@ The function may return one of three kinds of answers:
 """
 
 # Number of poses in one call of the function.
-_BATCH = 8
+_BATCH_SIZE = 8
 # Rotations about the optical axis, in degrees, that are tried if the arm cannot reach the pose itself.
 _ROLLS = (45.0, -45.0, 90.0, -90.0, 135.0, -135.0, 180.0)
 _NO_REASON = "not reachable"
@@ -46,7 +46,7 @@ class Choice(NamedTuple):
     refusals: Mapping[str, int]
 
 
-class Refused(NamedTuple):
+class RefusedPose(NamedTuple):
     """A pose that the user refused, in scene coordinates, and the reason."""
 
     pose: Pose
@@ -75,7 +75,7 @@ class _Checks:
     poses: Pose
     values: Float[np.ndarray, " n"]
     answers: Callable[[Pose], list[float | str]]
-    refused: Sequence[Refused]
+    refused: Sequence[RefusedPose]
     values_at: Callable[[Pose], Float[Array, " n"]] | None
     refusals: Counter[str] = dataclasses.field(default_factory=Counter)
 
@@ -85,38 +85,38 @@ class _Checks:
         The only option is the pose itself if the arm can reach it. Otherwise the options are the rotations of the pose
         about the optical axis that the arm can reach.
         """
-        for start in range(0, len(self.values), _BATCH):
-            rows = range(start, min(start + _BATCH, len(self.values)))
+        for start in range(0, len(self.values), _BATCH_SIZE):
+            rows = range(start, min(start + _BATCH_SIZE, len(self.values)))
             for row, answer in zip(rows, self.answers(self.poses[jnp.asarray(rows)]), strict=True):
                 yield self._options(row, answer)
 
     def _options(self, row: int, answer: float | str) -> list[_Option]:
         pose, value = self.poses[row], float(self.values[row])
-        if (reason := _refusal(pose, self.refused)) is not None:
+        if (reason := _reason_if_refused(pose, self.refused)) is not None:
             self.refusals[reason] += 1
             return []
         if not isinstance(answer, str):
             return [self._option(pose, value, answer)]
-        turned = _rolled(pose)
-        scores = {index: score for index, score in enumerate(self.answers(turned)) if not isinstance(score, str)}
+        rolls = _rotations_about_axis(pose)
+        scores = {index: score for index, score in enumerate(self.answers(rolls)) if not isinstance(score, str)}
         if not scores:
             self.refusals[answer] += 1
             return []
-        values = np.full(len(_ROLLS), value) if self.values_at is None else np.asarray(self.values_at(turned), float)
-        return [self._option(turned[index], float(values[index]), score) for index, score in scores.items()]
+        values = np.full(len(_ROLLS), value) if self.values_at is None else np.asarray(self.values_at(rolls), float)
+        return [self._option(rolls[index], float(values[index]), score) for index, score in scores.items()]
 
     def _option(self, pose: Pose, value: float, score: float) -> _Option:
         # The search may have proposed a tied pose whose value is not the highest. Therefore values are capped at the
         # value of the proposed pose.
-        least = min(value, float(self.values[0]))
-        return _Option(pose, value, least * score if least > 0 else least)
+        max_value = min(value, float(self.values[0]))
+        return _Option(pose, value, max_value * score if max_value > 0 else max_value)
 
 
 def best_reachable(
     proposal: Proposal,
     reachable: Reachable | None,
     to_matrices: Callable[[Pose], Float[np.ndarray, "n 4 4"]],
-    refused: Sequence[Refused] = (),
+    refused: Sequence[RefusedPose] = (),
     values_at: Callable[[Pose], Float[Array, " n"]] | None = None,
     seconds: float = math.inf,
 ) -> Choice:
@@ -139,7 +139,7 @@ def best_reachable(
     def answers(batch: Pose) -> list[float | str]:
         return [1.0 for _ in batch.position] if reachable is None else _answers(reachable, to_matrices(batch))
 
-    poses, values = _looks(proposal)
+    poses, values = _evaluated_poses(proposal)
     checks, best, count, start = _Checks(poses, values, answers, refused, values_at), None, 0, time.monotonic()
     for count, options in enumerate(checks, start=1):
         for option in options:
@@ -150,14 +150,14 @@ def best_reachable(
     if best is not None:
         return Choice(_with_pose(proposal, best.pose, best.value), dict(checks.refusals))
     reasons = ", ".join(f"{number} {reason}" for reason, number in checks.refusals.most_common())
-    which = f"{count} of the {len(values)} poses" if count < len(values) else f"{count} poses"
+    subject = f"{count} of the {len(values)} poses" if count < len(values) else f"{count} poses"
     raise InputError(
-        f"none of the {which} that the search looked at can be reached ({reasons}): give other candidates, "
+        f"none of the {subject} that the search looked at can be reached ({reasons}): give other candidates, "
         f"Session(poses=...), or more{', or more seconds' if count < len(values) else ''}"
     )
 
 
-def _looks(proposal: Proposal) -> tuple[Pose, Float[np.ndarray, " looks"]]:
+def _evaluated_poses(proposal: Proposal) -> tuple[Pose, Float[np.ndarray, " poses"]]:
     """Return all poses that a search evaluated, and their values.
 
     The proposed pose comes first. The others follow in descending order of value.
@@ -178,24 +178,24 @@ def _with_pose(proposal: Proposal, pose: Pose, value: float) -> Proposal:
 
     The standard error is that of the candidate with this value, or None if there is no such candidate.
     """
-    error, errors, same = proposal.standard_error, proposal.standard_errors, proposal.values == value
+    error, errors, is_same = proposal.standard_error, proposal.standard_errors, proposal.values == value
     if value != float(proposal.value):
-        error = errors[jnp.argmax(same)] if errors is not None and bool(same.any()) else None
-    own = jnp.asarray(value, proposal.value.dtype)
-    return dataclasses.replace(proposal, pose=pose, value=own, standard_error=error)
+        error = errors[jnp.argmax(is_same)] if errors is not None and bool(is_same.any()) else None
+    array = jnp.asarray(value, proposal.value.dtype)
+    return dataclasses.replace(proposal, pose=pose, value=array, standard_error=error)
 
 
-def _rolled(pose: Pose) -> Pose:
+def _rotations_about_axis(pose: Pose) -> Pose:
     """Rotate a pose about its optical axis by each angle of `_ROLLS`, and return the poses as a batch."""
     axis = jnp.array([0.0, 0.0, 1.0], pose.rotation.dtype)
-    turns = jax.vmap(lambda angle: rotation_about(axis, angle))(jnp.radians(jnp.array(_ROLLS, axis.dtype)))
-    rotations = jnp.matmul(pose.rotation, turns, precision="highest")
+    matrices = jax.vmap(lambda angle: rotation_about(axis, angle))(jnp.radians(jnp.array(_ROLLS, axis.dtype)))
+    rotations = jnp.matmul(pose.rotation, matrices, precision="highest")
     return Pose(rotations, jnp.broadcast_to(pose.position, (len(_ROLLS), 3)))
 
 
-def _refusal(pose: Pose, refused: Sequence[Refused]) -> str | None:
+def _reason_if_refused(pose: Pose, refused: Sequence[RefusedPose]) -> str | None:
     """Return why the user refused a pose, or a rotation of it about the optical axis; None if not refused."""
-    return next((earlier.reason for earlier in refused if is_same_view(pose, earlier.pose)), None)
+    return next((refused_pose.reason for refused_pose in refused if is_same_view(pose, refused_pose.pose)), None)
 
 
 def _answers(reachable: Reachable, matrices: Float[np.ndarray, "n 4 4"]) -> list[float | str]:

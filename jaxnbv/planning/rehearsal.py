@@ -49,7 +49,7 @@ def rehearse(intake: Intake, loop: Loop) -> Rehearsal:
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:
         frame, planner = intake.frame, loop.planner
-        for pose in slanted(planner.search.poses_around(), 2):
+        for pose in slanted_poses(planner.search.poses_around(), 2):
             depth = ball_on_a_table(frame.to_scene(intake.camera), pose, frame.to_scene(intake.box)) / frame.scale
             matrix = frame.to_world(pose).to_matrix(intake.convention)
             loop = intake.add(loop, Image.of(depth, matrix, 1.0, None)) or loop
@@ -60,7 +60,7 @@ def rehearse(intake: Intake, loop: Loop) -> Rehearsal:
     return Rehearsal(programs, time.monotonic() - start)
 
 
-def slanted(poses: Pose, count: int) -> Pose:
+def slanted_poses(poses: Pose, count: int) -> Pose:
     """Return the `count` poses that look most nearly 30 degrees downward, since these show the table."""
     down = -np.asarray(poses.forward)[:, 1]
     return poses[jnp.asarray(np.argsort(np.abs(down - 0.5), kind="stable")[:count])]
@@ -73,15 +73,17 @@ def ball_on_a_table(camera: Camera, pose: Pose, box: Box) -> Float[np.ndarray, "
     outside the camera's range.
     """
     origin = np.asarray(pose.position, np.float64)
-    ahead = np.asarray(camera.pixel_directions(), np.float64)
-    rays = ahead @ np.asarray(pose.rotation, np.float64).T
+    directions = np.asarray(camera.pixel_directions(), np.float64)
+    rays = directions @ np.asarray(pose.rotation, np.float64).T
     middle, radius = 0.5 * (box.low + box.high), _RADIUS * float((box.high - box.low).min())
-    along, squared = rays @ (middle - origin), (rays**2).sum(axis=1)
-    root = along**2 - squared * (((middle - origin) ** 2).sum() - radius**2)
-    ball = np.where(root > 0, (along - np.sqrt(np.maximum(root, 0.0))) / squared, np.inf)
+    projections, squared_lengths = rays @ (middle - origin), (rays**2).sum(axis=1)
+    discriminants = projections**2 - squared_lengths * (((middle - origin) ** 2).sum() - radius**2)
+    ball_depth = np.where(
+        discriminants > 0, (projections - np.sqrt(np.maximum(discriminants, 0.0))) / squared_lengths, np.inf
+    )
     with np.errstate(divide="ignore"):
-        table = (box.low[1] - origin[1]) / rays[:, 1]
-    depth = np.minimum(np.where(ball > 0, ball, np.inf), np.where(table > 0, table, np.inf))
+        table_depth = (box.low[1] - origin[1]) / rays[:, 1]
+    depth = np.minimum(np.where(ball_depth > 0, ball_depth, np.inf), np.where(table_depth > 0, table_depth, np.inf))
     farthest = np.inf if camera.farthest is None else camera.farthest
-    measured = (depth >= camera.nearest) & (depth <= farthest) & np.isfinite(depth)
-    return np.where(measured, depth, 0.0).reshape(camera.height, camera.width)
+    is_measured = (depth >= camera.nearest) & (depth <= farthest) & np.isfinite(depth)
+    return np.where(is_measured, depth, 0.0).reshape(camera.height, camera.width)

@@ -27,7 +27,7 @@ from jaxnbv.planning.images import Ignore, Image
 from jaxnbv.planning.intake import Intake
 from jaxnbv.planning.loop import STAGES, Loop, View
 from jaxnbv.planning.planner import Planner
-from jaxnbv.planning.reachability import Reachable, Refused, best_reachable
+from jaxnbv.planning.reachability import Reachable, RefusedPose, best_reachable
 from jaxnbv.planning.rehearsal import Rehearsal, rehearse
 from jaxnbv.planning.session_folder import SessionFolder
 from jaxnbv.planning.session_scene import box_of, in_scene, usual_planner
@@ -140,17 +140,19 @@ class Session:
         planner = usual_planner() if planner is None else planner
         matrices = None if poses is None else as_numbers(poses, "the poses", np.float64)
         self._bar: tqdm[Any] | None = None
-        place = self.camera, self.box, self.frame, convention
-        self._given_planner = in_scene(planner, *place, matrices, obstacles)
-        self._intake = Intake(*place, self._given_planner)
-        rays = self.frame.to_scene(self.camera.strided(self._intake.stride))
-        self._loop = Loop(self._given_planner, self.key, self.until, self.frame, rays, begin=self._show)
-        self._cut: frozenset[str] = frozenset()
+        setup = self.camera, self.box, self.frame, convention
+        self._initial_planner = in_scene(planner, *setup, matrices, obstacles)
+        self._intake = Intake(*setup, self._initial_planner)
+        strided_camera = self.frame.to_scene(self.camera.strided(self._intake.stride))
+        self._loop = Loop(
+            self._initial_planner, self.key, self.until, self.frame, strided_camera, on_stage=self._show_stage
+        )
+        self._cut_faces: frozenset[str] = frozenset()
         self._next: NextView | None = None
         self.correct_mount, self._warned_of_mount = correct_mount, False
         self.reachable, self.ignore = reachable, ignore
-        self._refused: list[Refused] = []
-        self._rehearsing = threading.RLock()
+        self._refused_poses: list[RefusedPose] = []
+        self._rehearsal_lock = threading.RLock()
         self._folder: SessionFolder | None = None
         if folder is not None:
             # `load` passes these arguments to the new session.
@@ -194,9 +196,9 @@ class Session:
         `keep_compiled`). The session does not change. To rehearse while the camera moves to its first pose, call
         `threading.Thread(target=session.rehearse).start()`. `add` waits until the rehearsal has ended.
         """
-        with self._rehearsing:
-            intake = Intake(self.camera, self.box, self.frame, self.convention, self._given_planner)
-            loop = Loop(self._given_planner, self.key, self.until, self.frame, self._loop.camera)
+        with self._rehearsal_lock:
+            intake = Intake(self.camera, self.box, self.frame, self.convention, self._initial_planner)
+            loop = Loop(self._initial_planner, self.key, self.until, self.frame, self._loop.camera)
             return rehearse(intake, loop)
 
     @property
@@ -307,7 +309,7 @@ class Session:
         if self.ignore is not None:
             # `ignore` is called now, while the robot is still at this pose. The image stores the result.
             image = image.with_robot(self.ignore, self.camera, Pose.from_matrix(image.matrix, self.convention))
-        with self._rehearsing, self._alone() as folder:
+        with self._rehearsal_lock, self._lock_folder() as folder:
             looks_for_table = count == 0 and self.planner.obstacles is None
             self._add(image, lambda: None if folder is None else folder.store_image(count, image))
         if len(self.views) == count:
@@ -322,11 +324,11 @@ class Session:
         warn_of_inside(self.box, cameras, np.asarray(candidates))
         voxel = self.frame.length_to_world(self.planner.sampler.grid.spacing)
         points, _ = self.frame.to_world(self.observations.cloud).to_numpy()
-        self._cut = warn_of_cut(self.box, points, voxel, self._cut)
+        self._cut_faces = warn_of_cut(self.box, points, voxel, self._cut_faces)
         if self.correct_mount:
             self._correct()
         elif self.correct_mount is not None and not self._warned_of_mount:
-            self._warned_of_mount = self._intake.mount_error.warn_if_off()
+            self._warned_of_mount = self._intake.mount_error.warn_if_misaligned()
 
     @own_settings()
     def next(self, seconds: float = math.inf) -> NextView:
@@ -343,16 +345,16 @@ class Session:
         different process has added images to the folder.
         """
         if self._next is None:
-            with self._alone() as folder, self._planning():
+            with self._lock_folder() as folder, self._planning():
                 require(len(self.views) > 0, _NO_IMAGE)
                 proposal = self._loop.propose()
                 refusals: Mapping[str, int] = {}
-                if self.reachable is not None or self._refused:
-                    values_at = self._values_at if self._sees_more_turned else None
-                    arguments = self.reachable, self._matrices, self._refused, values_at, seconds
+                if self.reachable is not None or self._refused_poses:
+                    values_at = self._values_at if self._roll_changes_value else None
+                    arguments = self.reachable, self._matrices, self._refused_poses, values_at, seconds
                     proposal, refusals = best_reachable(proposal, *arguments)
-                    self._loop.settle(proposal)
-                next_view = self._next_of(proposal, refusals)
+                    self._loop.replace_proposal(proposal)
+                next_view = self._to_next_view(proposal, refusals)
                 warn_of_little(next_view.value, next_view.standard_error, self._value_at_visited(proposal))
                 if folder is not None:
                     folder.store_proposal(len(self.views), proposal)
@@ -385,11 +387,11 @@ class Session:
         """
         if self._next is None:
             raise InputError("there is no proposal to refuse: ask session.next() first")
-        refused = Refused(self._next.proposal.pose, reason)
-        with self._alone() as folder:
+        refused = RefusedPose(self._next.proposal.pose, reason)
+        with self._lock_folder() as folder:
             if folder is not None:
                 folder.store_refused(len(self.views), refused)
-            self._refused.append(refused)
+            self._refused_poses.append(refused)
             self._next = None
 
     @property
@@ -407,25 +409,25 @@ class Session:
         if not self._intake.mount_error.update():
             return
         images, views = self._intake.images, self.views
-        self._loop, self._intake = self._loop.without_views(self._given_planner), self._intake.without_images()
+        self._loop, self._intake = self._loop.without_views(self._initial_planner), self._intake.without_images()
         for image, view in zip(images, views, strict=True):
             if view.proposal is not None:
-                self._loop.resume(view.proposal)
+                self._loop.set_stored_proposal(view.proposal)
             self._add(image)
 
     def _read(self, folder: SessionFolder) -> None:
         """Add the images of the folder to the session, with their proposals and the latest proposal."""
-        self._refused, count = folder.refused(), folder.num_images
+        self._refused_poses, count = folder.refused(), folder.num_images
         for index in range(count + 1):
             if index and (proposal := folder.proposal(index)) is not None:
-                self._loop.resume(proposal)
-                self._next = self._next_of(proposal)
+                self._loop.set_stored_proposal(proposal)
+                self._next = self._to_next_view(proposal)
             if index < count:
                 self._add(folder.image(index))
                 if self.correct_mount:
                     self._correct()
 
-    def _next_of(self, proposal: Proposal, refusals: Mapping[str, int] = MappingProxyType({})) -> NextView:
+    def _to_next_view(self, proposal: Proposal, refusals: Mapping[str, int] = MappingProxyType({})) -> NextView:
         """Convert a proposal to the result of `next`, in world coordinates."""
         error = None if proposal.standard_error is None else self._loop.in_world(proposal.standard_error)
         error = error if error is not None and math.isfinite(error) else None
@@ -434,11 +436,11 @@ class Session:
 
     def _matrices(self, poses: Pose) -> Float[np.ndarray, "n 4 4"]:
         """Return the world matrices to command so that the camera arrives at scene poses (n,)."""
-        sent = self._intake.mount_error.command_poses(self.frame.to_world(poses))
-        return np.asarray(sent.to_matrix(self.convention), np.float64)
+        commanded_poses = self._intake.mount_error.command_poses(self.frame.to_world(poses))
+        return np.asarray(commanded_poses.to_matrix(self.convention), np.float64)
 
     @property
-    def _sees_more_turned(self) -> bool:
+    def _roll_changes_value(self) -> bool:
         """Whether a rotation of the camera about its optical axis changes the value of a pose."""
         camera = self.planner.camera
         return self.planner.search.uses_samples and camera.height != camera.width
@@ -449,7 +451,7 @@ class Session:
     def _value_at_visited(self, proposal: Proposal) -> float:
         return 0.0 if proposal.value_at_visited is None else self._loop.in_world(proposal.value_at_visited)
 
-    def _show(self, stage: str) -> None:
+    def _show_stage(self, stage: str) -> None:
         """Show a stage of planning on the progress bar. The first call creates the bar."""
         if self._bar is None:
             self._bar = progress_bar(total=2, wanted=self.progress)
@@ -467,7 +469,7 @@ class Session:
             self._bar = None
 
     @contextmanager
-    def _alone(self) -> Iterator[SessionFolder | None]:
+    def _lock_folder(self) -> Iterator[SessionFolder | None]:
         """Context manager: lock the folder for writing, and yield it; None if the session has no folder.
 
         **Raises:** `ValueError` if a different process writes to the folder or has added images.

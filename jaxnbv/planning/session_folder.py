@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxnbv.checks import require
 from jaxnbv.planning.images import Image
-from jaxnbv.planning.reachability import Refused
+from jaxnbv.planning.reachability import RefusedPose
 from jaxnbv.search import Proposal
 from jaxnbv.storage import RunFolder
 
@@ -86,12 +86,12 @@ class SessionFolder:
         """Store the proposal that was made after `num_images` images."""
         self._folder.write("proposal", num_images, proposal=proposal)
 
-    def refused(self) -> list[Refused]:
+    def refused(self) -> list[RefusedPose]:
         """Read all refused poses."""
         entries = [self._folder.read("refused", index) for index in range(self._folder.count("refused"))]
-        return [Refused(entry["pose"], str(entry["reason"])) for entry in entries]
+        return [RefusedPose(entry["pose"], str(entry["reason"])) for entry in entries]
 
-    def store_refused(self, num_images: int, refused: Refused) -> None:
+    def store_refused(self, num_images: int, refused: RefusedPose) -> None:
         """Store a refused pose, and remove the proposal that was made after `num_images` images."""
         index = self._folder.count("refused")
         self._folder.write("refused", index, pose=refused.pose, reason=np.asarray(refused.reason))

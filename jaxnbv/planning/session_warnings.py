@@ -13,7 +13,7 @@ from jaxnbv.planning.table import plane_of
 from jaxnbv.scanning import Obstacles
 
 # Smallest fraction of points beyond a face of the box that leads to a warning. Fewer points may be stray.
-_STRAY = 0.01
+_MIN_FRACTION = 0.01
 # `stacklevel` for the user's call of a session's method. For `add` it is one more, because a wrapper checks arguments.
 _CALLER, _CALLER_OF_ADD = 3, 4
 
@@ -25,14 +25,15 @@ def warn_of_cut(box: Box, points: Float[np.ndarray, "n 3"], voxel: float, faces:
     - `voxel`: side of a cell of the planner's grid, in world units.
     - `faces`: faces of earlier warnings, which are not repeated.
     """
-    shares = {face: share for face, share in box.shares_beyond(points, 0.5 * voxel).items() if share >= _STRAY}
-    for face in sorted(shares.keys() - faces):
+    fractions = box.shares_beyond(points, 0.5 * voxel)
+    fractions = {face: fraction for face, fraction in fractions.items() if fraction >= _MIN_FRACTION}
+    for face in sorted(fractions.keys() - faces):
         warnings.warn(
-            f"the object seems to go on beyond the box at {face}: {100 * shares[face]:.0f} % of the points lie within "
-            "a voxel beyond that face. Give a larger box, unless this one should cut the object",
+            f"the object seems to go on beyond the box at {face}: {100 * fractions[face]:.0f} % of the points lie "
+            "within a voxel beyond that face. Give a larger box, unless this one should cut the object",
             stacklevel=_CALLER_OF_ADD,
         )
-    return faces.union(shares)
+    return faces.union(fractions)
 
 
 def warn_of_table(table: Obstacles, frame: Frame) -> None:
@@ -74,17 +75,17 @@ def warn_of_no_table(up: str, others: tuple[str, ...]) -> None:
 
 def warn_of_mount(alignment: Alignment) -> None:
     """Warn that views disagree. The alignment is in world units."""
-    turns, shifts = alignment.errors
+    angles, shifts = alignment.errors
     worst = int(np.nanargmax(alignment.disagreement))
-    off = f"off by {shifts.max():.2g} and {np.degrees(turns.max()):.2g} degrees"
-    use = "Session(correct_mount=True) uses the correction"
+    error_text = f"off by {shifts.max():.2g} and {np.degrees(angles.max()):.2g} degrees"
+    hint = "Session(correct_mount=True) uses the correction"
     if not alignment.is_corrected:
         cause = f"these views do not determine the error of the camera's mount, but {alignment.motion} would"
     elif alignment.is_mount:
         more = "" if alignment.is_determined else f", and {alignment.motion} would determine the error better"
-        cause = f"the camera's mount seems {off}{more}; {use}"
+        cause = f"the camera's mount seems {error_text}{more}; {hint}"
     else:
-        cause = f"single poses seem {off} at most; {use}"
+        cause = f"single poses seem {error_text} at most; {hint}"
     warnings.warn(
         f"the views disagree by {alignment.disagreement[worst]:.2g}, where a single view's points scatter by "
         f"{alignment.noise:.2g}: {cause}",

@@ -32,7 +32,7 @@ from jaxnbv.surfaces.part_pose import distances_to
 # Default gap between objects, as a fraction of the longest side of the box.
 _GAP = 0.02
 # Smallest number of rays that show an object, and number of a cluster's points that are compared with known parts.
-_FEWEST, _COMPARED = 20, 256
+_MIN_RAYS, _NUM_COMPARED = 20, 256
 
 
 class Sessions:
@@ -65,19 +65,19 @@ class Sessions:
         progress: bool = True,
     ):
         # This session checks the arguments, and places the candidates around all objects.
-        whole = Session(camera, box, planner, up, key=key, until=until, obstacles=obstacles, progress=progress)
+        scene_session = Session(camera, box, planner, up, key=key, until=until, obstacles=obstacles, progress=progress)
         bank = getattr(planner.sampler.model, "bank", None)
         if bank is None or not planner.sampler.model.carries_hypotheses:
             raise InputError("the planner knows no parts: use Planner.for_parts(bank)")
         self.camera, self.box, self.until = camera, box_of(box), until
-        self._frame, self._planner, self._key = whole.frame, planner, whole.key
+        self._frame, self._planner, self._key = scene_session.frame, planner, scene_session.key
         self._obstacles, self._progress = obstacles, progress
         self._num_images = 0
-        self._mount_error, self._warned_of_mount = MountError(camera, whole.convention), False
+        self._mount_error, self._warned_of_mount = MountError(camera, scene_session.convention), False
         self._longest_part = 2.0 * float(jnp.max(jnp.linalg.norm(bank.shapes.extremes, axis=-1)))
         self._gap = _GAP * float(np.max(self.box.high - self.box.low)) if gap is None else gap
         require(self._gap > 0, f"the gap is {gap}; it must be positive")
-        candidates = self._frame.to_world(whole.planner.search.poses_around())
+        candidates = self._frame.to_world(scene_session.planner.search.poses_around())
         self._poses = np.asarray(candidates.to_matrix(), np.float64)
         self._folder = None if folder is None else Path(folder)
         # Index of the candidate that `next` proposed since the last image, and indices of all proposed candidates.
@@ -116,23 +116,23 @@ class Sessions:
         if self._obstacles is None:
             self._obstacles = self._table_of(cloud)
         image = Image.of(pixels, matrix, depth_scale, None)
-        points, inside = self._points(image, pose)
+        points, is_inside = self._points(image, pose)
         if labels is None:
             numbers = np.zeros(pixels.shape, int)
-            numbers[inside] = self._numbers(points[inside])
+            numbers[is_inside] = self._object_numbers(points[is_inside])
         else:
             numbers = as_numbers(labels, "the labels", None)
-            proper = numbers.shape == pixels.shape and np.issubdtype(numbers.dtype, np.integer)
+            is_valid = numbers.shape == pixels.shape and np.issubdtype(numbers.dtype, np.integer)
             require(
-                proper, f"the labels are {short_text(labels)}: give whole numbers, one for each of the image's pixels"
+                is_valid, f"the labels are {short_text(labels)}: give whole numbers, one for each of the image's pixels"
             )
-        numbers = np.where(inside, numbers, 0)
+        numbers = np.where(is_inside, numbers, 0)
         # Rows and columns that a session uses.
         rows = slice(stride // 2, None, stride)
         shown_numbers, counts = np.unique(numbers[rows, rows].reshape(-1)[np.asarray(cloud.mask)], return_counts=True)
-        for number in shown_numbers[counts >= _FEWEST].tolist():
+        for number in shown_numbers[counts >= _MIN_RAYS].tolist():
             if number > 0 and number not in self.objects:
-                self.objects[number] = self._session(number, self._box_about(points[numbers == number]))
+                self.objects[number] = self._session(number, self._box_around(points[numbers == number]))
         require(
             len(self.objects) > 0,
             f"the image shows no object in the box {self.box}: give a box that holds them, in the units of the poses",
@@ -145,7 +145,7 @@ class Sessions:
         self._next = None
         self._mount_error.add(image, self._num_images)
         self._num_images += 1
-        self._warned_of_mount = self._warned_of_mount or self._mount_error.warn_if_off()
+        self._warned_of_mount = self._warned_of_mount or self._mount_error.warn_if_misaligned()
 
     def next(self) -> Float[np.ndarray, "4 4"]:
         """Return the camera-to-world matrix of the pose for the next image.
@@ -158,8 +158,8 @@ class Sessions:
         """
         require(len(self.objects) > 0, "there is no image yet: add one first, sessions.add(depth, matrix)")
         if self._next is None:
-            open_ones = [session for session in self.objects.values() if session.done() is None]
-            total = np.sum([_values(session) for session in open_ones or self.objects.values()], axis=0)
+            open_sessions = [session for session in self.objects.values() if session.done() is None]
+            total = np.sum([_values(session) for session in open_sessions or self.objects.values()], axis=0)
             total[self._proposed] = -np.inf
             require(bool(np.isfinite(total).any()), f"all {len(total)} candidates have been proposed")
             self._next = int(np.argmax(total))
@@ -205,7 +205,7 @@ class Sessions:
                 stacklevel=4,
             )
             return Obstacles()
-        margin, clearance = (float(self._frame.length_to_world(one)) for one in (table.margin, table.clearance))
+        margin, clearance = (float(self._frame.length_to_world(length)) for length in (table.margin, table.clearance))
         return Obstacles((HalfSpace(*plane_of(table, self._frame)),), margin, clearance)
 
     def _points(self, image: Image, pose: Pose) -> tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
@@ -214,41 +214,41 @@ class Sessions:
         depth = (points - np.asarray(pose.position, np.float64)) @ np.asarray(pose.forward, np.float64)
         assert self._obstacles is not None
         is_free = np.asarray(self._obstacles.distance(points)) > self._obstacles.margin
-        inside = (depth > max(1e-9, self.camera.nearest)) & (np.asarray(self.box(points)) <= 0) & is_free
-        return points, inside
+        is_inside = (depth > max(1e-9, self.camera.nearest)) & (np.asarray(self.box(points)) <= 0) & is_free
+        return points, is_inside
 
-    def _numbers(self, points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
+    def _object_numbers(self, points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
         """Return the number of the earlier or new object that each point belongs to; zero for stray points."""
         owner = np.zeros(len(points), int)
         nearest = np.full(len(points), self._gap)
         for number, session in self.objects.items():
-            away, _ = cKDTree(session.cloud.to_numpy()[0]).query(points)
-            owner, nearest = np.where(away < nearest, number, owner), np.minimum(nearest, away)
-        cluster, last = clusters(points, self._gap), max(self.objects, default=0)
+            distances, _ = cKDTree(session.cloud.to_numpy()[0]).query(points)
+            owner, nearest = np.where(distances < nearest, number, owner), np.minimum(nearest, distances)
+        cluster, last_number = clusters(points, self._gap), max(self.objects, default=0)
         for index in range(cluster.max(initial=-1) + 1):
-            own = np.flatnonzero(cluster == index)
-            has_owner = owner[own] > 0
+            rows = np.flatnonzero(cluster == index)
+            has_owner = owner[rows] > 0
             if has_owner.any():
-                _, like = cKDTree(points[own[has_owner]]).query(points[own])
-                owner[own] = owner[own[has_owner]][like]
-            elif len(own) >= _FEWEST * stride_of(self.camera) ** 2:
-                part_owner = self._on_a_part(points[own])
-                last = last + 1 if part_owner is None else last
-                owner[own] = last if part_owner is None else part_owner
+                _, neighbour = cKDTree(points[rows[has_owner]]).query(points[rows])
+                owner[rows] = owner[rows[has_owner]][neighbour]
+            elif len(rows) >= _MIN_RAYS * stride_of(self.camera) ** 2:
+                part_owner = self._object_near(points[rows])
+                last_number = last_number + 1 if part_owner is None else last_number
+                owner[rows] = last_number if part_owner is None else part_owner
         return owner
 
-    def _on_a_part(self, points: Float[np.ndarray, "n 3"]) -> int | None:
+    def _object_near(self, points: Float[np.ndarray, "n 3"]) -> int | None:
         """Return the number of the earlier object to which a cluster belongs; None for a new object.
 
         The cluster belongs to the object whose surface is nearest to its points, if the distance is below the gap. The
         distance is the expected distance over the object's hypotheses.
         """
-        few = points[np.linspace(0, len(points) - 1, _COMPARED).astype(int)]
-        distances = {number: _expected_distance(session, few) for number, session in self.objects.items()}
+        subset = points[np.linspace(0, len(points) - 1, _NUM_COMPARED).astype(int)]
+        distances = {number: _expected_distance(session, subset) for number, session in self.objects.items()}
         best = min(distances, key=lambda number: distances[number], default=None)
         return best if best is not None and distances[best] < self._gap else None
 
-    def _box_about(self, points: Float[np.ndarray, "n 3"]) -> Box:
+    def _box_around(self, points: Float[np.ndarray, "n 3"]) -> Box:
         """Return a cube that contains an object, given some of the object's points.
 
         The cube extends beyond the points by their own extent, but at most to the length of the longest part. The sides
@@ -289,7 +289,7 @@ def _expected_distance(session: Session, points: Float[np.ndarray, "n 3"]) -> fl
     The distance is in world units. The expectation is over the object's hypotheses except "none of these".
     """
     hypotheses, frame = hypotheses_of(session.observations), session.frame
-    own = jnp.asarray(frame.to_scene(points), hypotheses.weights.dtype)
+    scene_points = jnp.asarray(frame.to_scene(points), hypotheses.weights.dtype)
     weights = np.asarray(hypotheses.weights, np.float64)[:-1]
-    off = np.abs(np.asarray(distances_to(hypotheses, own), np.float64))
-    return float(frame.length_to_world(np.median(weights @ off / max(weights.sum(), 1e-30))))
+    distances = np.abs(np.asarray(distances_to(hypotheses, scene_points), np.float64))
+    return float(frame.length_to_world(np.median(weights @ distances / max(weights.sum(), 1e-30))))

@@ -78,7 +78,7 @@ def simulate(
         )
         with progress_bar(total=views * len(STAGES), wanted=progress) as bar:
 
-            def begin(stage: str) -> None:
+            def on_stage(stage: str) -> None:
                 index = len(loop.views)
                 bar.set_description(f"view {index + 1}/{views}, {stage}")
                 bar.update(index * len(STAGES) + STAGES.index(stage) - bar.n)
@@ -86,7 +86,7 @@ def simulate(
             def sensor(pose: Pose, key: PRNGKeyArray) -> PointCloud:
                 return observe_scene(surface, planner.camera, pose, noise, key, planner.obstacles)
 
-            loop = Loop(planner, key, until, begin=begin)
+            loop = Loop(planner, key, until, on_stage=on_stage)
             for step in itertools.islice(loop.steps(sensor, first, stored), views):
                 index = len(loop.views) - 1
                 if store and index >= len(stored):

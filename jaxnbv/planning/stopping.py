@@ -119,10 +119,10 @@ def checked_reason(rule: StopRule, reason: str | None) -> str | None:
 
     **Raises:** `ValueError` unless the reason is a non-empty string or None.
     """
-    is_proper = reason is None or (isinstance(reason, str) and bool(reason))
+    is_valid = reason is None or (isinstance(reason, str) and bool(reason))
     name = type(rule).__name__
     require(
-        is_proper,
+        is_valid,
         f"the stop rule {name} returned {short_text(reason)}: it must return the reason in words, or None to go on",
     )
     return reason
@@ -151,29 +151,29 @@ class Sure(StopRule):
         )
 
     def check(self, acquisition: Acquisition) -> None:
-        _of_classes(acquisition)
+        _class_acquisition(acquisition)
 
     def after(self, context: StopContext) -> str | None:
         return self.reason(context.planner.acquisition, context.observations.cloud, context.key)
 
     def reason(self, acquisition: Acquisition, cloud: PointCloud, key: PRNGKeyArray) -> str | None:
         """Return the reason to stop given a cloud, as a text; None to continue. `key` draws the halves."""
-        acquisition = _of_classes(acquisition)
+        acquisition = _class_acquisition(acquisition)
         answer = acquisition.answer(cloud)
         best = int(np.argmax(answer.values))
-        least = float(answer.values[best])
+        lowest = float(answer.values[best])
         for index in range(self.num_resamplings):
-            if least < self.probability:
+            if lowest < self.probability:
                 return None
             half = acquisition.answer(half_of(cloud, jax.random.fold_in(key, index)))
-            least = min(least, float(half.values[best]))
-        if least < self.probability:
+            lowest = min(lowest, float(half.values[best]))
+        if lowest < self.probability:
             return None
-        halves = f", and at least {100 * least:.0f} % given half of the points" if self.num_resamplings else ""
+        halves = f", and at least {100 * lowest:.0f} % given half of the points" if self.num_resamplings else ""
         return f"sure of {answer.names[best]} ({100 * float(answer.values[best]):.0f} %{halves})"
 
 
-def _of_classes(acquisition: Acquisition) -> ClassAcquisition:
+def _class_acquisition(acquisition: Acquisition) -> ClassAcquisition:
     if not isinstance(acquisition, ClassAcquisition):
         raise InputError(
             f"Sure is about a class, but {type(acquisition).__name__} has no classifier: use CrossEntropy or "
@@ -205,8 +205,8 @@ class PartsFound(StopRule):
     def __check_init__(self):
         check_fields(self)
         require(self.points >= 1, f"a part is found by {self.points} points; give at least 1")
-        names = isinstance(self.parts, tuple) and all(isinstance(name, str) for name in self.parts)
-        require(self.parts is None or names, f"the parts are {short_text(self.parts)}; give a tuple of their names")
+        are_names = isinstance(self.parts, tuple) and all(isinstance(name, str) for name in self.parts)
+        require(self.parts is None or are_names, f"the parts are {short_text(self.parts)}; give a tuple of their names")
 
     def check(self, acquisition: Acquisition) -> None:
         utility = acquisition.utility if isinstance(acquisition, ExpectedUtilityImprovement) else None
@@ -220,8 +220,8 @@ class PartsFound(StopRule):
             bool(self.parts or names),
             "the segmenter has no names for its parts: give the parts to find as PartsFound(parts=('part 0', ...))",
         )
-        unknown = [name for name in self.parts or () if names and name not in names]
-        require(not unknown, f"the segmenter knows no part {unknown[:1]}: give some of {', '.join(names)}")
+        unknown_names = [name for name in self.parts or () if names and name not in names]
+        require(not unknown_names, f"the segmenter knows no part {unknown_names[:1]}: give some of {', '.join(names)}")
 
     def after(self, context: StopContext) -> str | None:
         answer = context.planner.acquisition.answer(context.observations.cloud)
@@ -254,10 +254,10 @@ class Covered(StopRule):
             NewSurface(self.size)
 
     def after(self, context: StopContext) -> str | None:
-        new = new_surface_of(context.planner.acquisition)
+        new_surface = new_surface_of(context.planner.acquisition)
         if self.size is not None:
-            new = NewSurface(self.size * context.frame.scale)
-        share = expected_coverage(context, new)
+            new_surface = NewSurface(self.size * context.frame.scale)
+        share = expected_coverage(context, new_surface)
         return f"{100 * share:.1f} % of what can be seen is expected to be covered" if share >= self.share else None
 
 
@@ -371,8 +371,8 @@ class Budget(StopRule):
     def before(self, context: StopContext, pose: Pose, value: float) -> str | None:
         if self.cost is None:
             return None
-        left = self.cost - context.cost(context.poses, self.of)
+        remainder = self.cost - context.cost(context.poses, self.of)
         next_cost = context.cost((context.poses[-1], pose), self.of)
-        if next_cost <= left:
+        if next_cost <= remainder:
             return None
-        return f"the next view would cost {next_cost:.3g}, but {left:.3g} of {self.cost:g} are left"
+        return f"the next view would cost {next_cost:.3g}, but {remainder:.3g} of {self.cost:g} are left"

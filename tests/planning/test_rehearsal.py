@@ -72,7 +72,7 @@ def test_an_image_waits_until_a_rehearsal_ends():
     session = session_of(poses=POSES, box=BOX)
     adding = threading.Thread(target=session.add, args=(shot(FIRST), FIRST, 1e-3))
     # Hold the lock of `rehearse`.
-    with session._rehearsing:
+    with session._rehearsal_lock:
         adding.start()
         adding.join(0.3)
         assert adding.is_alive()
