@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 from jaxnbv.errors import InputError
 
-_STANDARD = sysconfig.get_path("stdlib")
+_STDLIB = sysconfig.get_path("stdlib")
 # Methods that Python generates for dataclasses and named tuples.
 _GENERATED = {"__init__", "__repr__", "__eq__", "__lt__", "__le__", "__gt__", "__ge__", "__hash__", "__new__"} | {
     f"__{name}__" for name in ("setattr", "delattr", "replace")
@@ -35,17 +35,17 @@ def lookup(name: str) -> Any:
     return value
 
 
-def name_of(thing: Any) -> str:
+def name_of(obj: Any) -> str:
     """Return the module and qualified name of a class or function, for `lookup`; "" for other objects."""
-    own = getattr(thing, "__qualname__", None) or getattr(thing, "__name__", None)
-    module = getattr(thing, "__module__", None) or getattr(getattr(thing, "__objclass__", None), "__module__", None)
-    if not isinstance(own, str) or not isinstance(module, str):
+    qualified_name = getattr(obj, "__qualname__", None) or getattr(obj, "__name__", None)
+    module = getattr(obj, "__module__", None) or getattr(getattr(obj, "__objclass__", None), "__module__", None)
+    if not isinstance(qualified_name, str) or not isinstance(module, str):
         return ""
-    if lookup(f"{module}:{own}") is not thing:
+    if lookup(f"{module}:{qualified_name}") is not obj:
         # A lambda, or a function that was made inside a function, gets the name of a global variable that holds it.
         names = vars(sys.modules.get(module, object))
-        own = next((name for name in list(names) if names[name] is thing), own)
-    return f"{module}:{own}"
+        qualified_name = next((name for name in list(names) if names[name] is obj), qualified_name)
+    return f"{module}:{qualified_name}"
 
 
 def is_installed(module: str | None) -> bool:
@@ -61,13 +61,13 @@ def is_installed(module: str | None) -> bool:
     # Raised for modules without a file, such as __main__.
     except (ValueError, ImportError):
         return False
-    places = [] if spec is None else [spec.origin, *(spec.submodule_search_locations or ())]
+    locations = [] if spec is None else [spec.origin, *(spec.submodule_search_locations or ())]
     return any(
-        place in ("built-in", "frozen")
-        or {"site-packages", "dist-packages"} & {*Path(place).parts}
-        or Path(place).is_relative_to(_STANDARD)
-        for place in places
-        if place
+        location in ("built-in", "frozen")
+        or {"site-packages", "dist-packages"} & {*Path(location).parts}
+        or Path(location).is_relative_to(_STDLIB)
+        for location in locations
+        if location
     )
 
 
@@ -75,15 +75,15 @@ class _Plain:
     pass
 
 
-def is_plain(thing: Any) -> bool:
+def is_plain(obj: Any) -> bool:
     """Return whether the whole state of an object is in its `__dict__`.
 
     The state of other objects is also in slots or in memory of a C library.
     """
-    kind = type(thing)
-    slots = any(isinstance(member, MemberDescriptorType) for base in kind.__mro__ for member in vars(base).values())
-    made_by_python = bool(kind.__flags__ & _HEAP_TYPE) and kind.__basicsize__ == _Plain.__basicsize__
-    return kind is object or (made_by_python and not slots)
+    kind = type(obj)
+    has_slots = any(isinstance(member, MemberDescriptorType) for base in kind.__mro__ for member in vars(base).values())
+    is_python_class = bool(kind.__flags__ & _HEAP_TYPE) and kind.__basicsize__ == _Plain.__basicsize__
+    return kind is object or (is_python_class and not has_slots)
 
 
 def closure(function: FunctionType) -> dict[str, Any]:
@@ -95,13 +95,13 @@ def closure(function: FunctionType) -> dict[str, Any]:
     return values
 
 
-def reads_of(code: CodeType, names: dict[str, Any], way: str) -> Iterator[tuple[str, Any]]:
+def globals_read(code: CodeType, names: dict[str, Any], path: str) -> Iterator[tuple[str, Any]]:
     """Yield the names and values of the global variables that code reads.
 
     If the code reads an attribute of a user's module, yields this attribute instead of the module.
 
     - `names`: values of the global variables, keyed by name.
-    - `way`: path of the code in the configuration, such as "planner.search", for error messages.
+    - `path`: path of the code in the configuration, such as "planner.search", for error messages.
 
     **Raises:** `ValueError` if the code imports a user's module.
     """
@@ -109,37 +109,41 @@ def reads_of(code: CodeType, names: dict[str, Any], way: str) -> Iterator[tuple[
     for index, step in enumerate(steps):
         if step.opname == "IMPORT_NAME" and not is_installed(step.argval):
             raise InputError(
-                f"{way} imports {step.argval or 'a module'} while it runs: import it at the top of the file"
+                f"{path} imports {step.argval or 'a module'} while it runs: import it at the top of the file"
             )
         if step.opname in ("LOAD_GLOBAL", "LOAD_NAME") and step.argval in names:
             name, value = step.argval, names[step.argval]
-            for after in steps[index + 1 :]:
-                own = isinstance(value, ModuleType) and not is_installed(value.__name__)
-                if not own or after.opname not in ("LOAD_ATTR", "LOAD_METHOD") or not hasattr(value, after.argval):
+            for attribute in steps[index + 1 :]:
+                is_user_module = isinstance(value, ModuleType) and not is_installed(value.__name__)
+                if (
+                    not is_user_module
+                    or attribute.opname not in ("LOAD_ATTR", "LOAD_METHOD")
+                    or not hasattr(value, attribute.argval)
+                ):
                     break
-                name, value = f"{name}.{after.argval}", getattr(value, after.argval)
+                name, value = f"{name}.{attribute.argval}", getattr(value, attribute.argval)
             yield name, value
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
-            yield from reads_of(constant, names, way)
+            yield from globals_read(constant, names, path)
 
 
-def is_written(name: str, member: Any) -> bool:
+def is_user_defined(name: str, member: Any) -> bool:
     """Return whether a member of a class is written by its author and not generated by Python."""
     function = getattr(member, "__func__", member)
     if isinstance(function, FunctionType):
-        by_python = name in _GENERATED and function.__code__.co_filename == "<string>"
-        return not by_python and function.__globals__.get("__name__") != "collections"
+        is_generated = name in _GENERATED and function.__code__.co_filename == "<string>"
+        return not is_generated and function.__globals__.get("__name__") != "collections"
     return not (name.startswith("__") or name == "_abc_impl" or isinstance(member, _SLOTS))
 
 
-def source_of(function: FunctionType, way: str) -> str:
+def source_of(function: FunctionType, path: str) -> str:
     """Return the source of a function as text, for a lambda only its body.
 
     A line may have several lambdas. Therefore the body of a lambda is found by the lines and columns that Python stores
     for its instructions.
 
-    - `way`: path of the function in the configuration, such as "planner.search", for error messages.
+    - `path`: path of the function in the configuration, such as "planner.search", for error messages.
 
     **Raises:** `ValueError` if the source cannot be read.
     """
@@ -148,7 +152,7 @@ def source_of(function: FunctionType, way: str) -> str:
         text = textwrap.dedent(inspect.getsource(code))
     except (OSError, TypeError) as error:
         raise InputError(
-            f"{way or 'this'} is the function {function.__qualname__}, whose source cannot be read: define it in a "
+            f"{path or 'this'} is the function {function.__qualname__}, whose source cannot be read: define it in a "
             f'file, or give it a version that you change whenever it changes, {function.__name__}.version = "1"'
         ) from error
     if function.__name__ != "<lambda>":

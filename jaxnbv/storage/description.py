@@ -17,9 +17,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnbv.errors import InputError
-from jaxnbv.storage.code import closure, is_installed, is_plain, is_written, lookup, name_of, reads_of, source_of
+from jaxnbv.storage.code import (
+    closure,
+    globals_read,
+    is_installed,
+    is_plain,
+    is_user_defined,
+    lookup,
+    name_of,
+    source_of,
+)
 
-_LARGEST_LISTED = 16
+_MAX_LISTED = 16
 # Classes of objects that wrap functions, some with custom derivatives for JAX.
 _WRAPPERS = {"PjitFunction", "custom_jvp", "custom_vjp", "_JitWrapper", "BoundMethod", "_lru_cache_wrapper"} | {
     kind.__name__ for kind in (functools.cached_property, classmethod, property, staticmethod)
@@ -27,7 +36,7 @@ _WRAPPERS = {"PjitFunction", "custom_jvp", "custom_vjp", "_JitWrapper", "BoundMe
 _FUNCTIONS = ("__func__", "fget", "func", "fun", "jvp", "fwd", "bwd", "__wrapped__")
 
 
-def describe(thing: Any, arrays: dict[str, np.ndarray] | None = None, way: str = "") -> Any:
+def describe(obj: Any, arrays: dict[str, np.ndarray] | None = None, path: str = "") -> Any:
     """Describe a configuration as JSON. Different configurations have different descriptions.
 
     `rebuild` is the inverse. Equinox modules, dataclasses and named tuples are described by their classes and fields,
@@ -37,12 +46,12 @@ def describe(thing: Any, arrays: dict[str, np.ndarray] | None = None, way: str =
     and version.
 
     - `arrays`: a dictionary to fill with the contents of the large arrays, keyed by hash.
-    - `way`: path of `thing` in a larger configuration, such as "planner.search", for error messages.
+    - `path`: path of `obj` in a larger configuration, such as "planner.search", for error messages.
 
     **Raises:** `ValueError` if the state of an object cannot be described, or the source of a function cannot be read,
     and the object or function has no `version`. The error names its path.
     """
-    return _Describer({} if arrays is None else arrays).describe(thing, way)
+    return _Describer({} if arrays is None else arrays).describe(obj, path)
 
 
 def is_record(kind: type) -> bool:
@@ -63,118 +72,118 @@ class _Describer:
         self.visited: dict[int, tuple[int, Any]] = {}
         self.numbers = itertools.count()
 
-    def describe(self, thing: Any, way: str) -> Any:
-        kind = type(thing)
-        if thing is None or kind in (bool, int, str) or (kind is float and math.isfinite(thing)):
-            return thing
+    def describe(self, obj: Any, path: str) -> Any:
+        kind = type(obj)
+        if obj is None or kind in (bool, int, str) or (kind is float and math.isfinite(obj)):
+            return obj
         if kind in (float, complex):
-            return {"type": kind.__name__, "value": repr(thing)}
+            return {"type": kind.__name__, "value": repr(obj)}
         if kind is bytes:
-            return {"type": "bytes", "value": thing.hex()}
-        if isinstance(thing, enum.Enum):
-            return {"type": name_of(kind), "member": thing.name, "value": self.describe(thing.value, way)}
-        if isinstance(thing, PurePath):
-            return {"type": "path", "value": str(thing)}
-        if isinstance(thing, np.dtype):
-            return {"type": "dtype", "value": str(thing)}
-        if isinstance(thing, jax.Array | np.generic) or kind is np.ndarray:
-            return self._array(thing, way)
-        if id(thing) in self.visited:
-            return {"type": "again", "name": name_of(thing), "index": self.visited[id(thing)][0]}
-        self.visited[id(thing)] = next(self.numbers), thing
+            return {"type": "bytes", "value": obj.hex()}
+        if isinstance(obj, enum.Enum):
+            return {"type": name_of(kind), "member": obj.name, "value": self.describe(obj.value, path)}
+        if isinstance(obj, PurePath):
+            return {"type": "path", "value": str(obj)}
+        if isinstance(obj, np.dtype):
+            return {"type": "dtype", "value": str(obj)}
+        if isinstance(obj, jax.Array | np.generic) or kind is np.ndarray:
+            return self._describe_array(obj, path)
+        if id(obj) in self.visited:
+            return {"type": "again", "name": name_of(obj), "index": self.visited[id(obj)][0]}
+        self.visited[id(obj)] = next(self.numbers), obj
         try:
-            return self._object(thing, kind, way)
+            return self._describe_object(obj, kind, path)
         finally:
             # Only code is described once per call. Equal containers are described alike, whether or not they are the
             # same object.
-            if not isinstance(thing, FunctionType | type):
-                del self.visited[id(thing)]
+            if not isinstance(obj, FunctionType | type):
+                del self.visited[id(obj)]
 
-    def _object(self, thing: Any, kind: type, way: str) -> Any:
-        version = None if isinstance(thing, ModuleType) else getattr(thing, "version", None)
-        versioned = isinstance(version, str | int | float)
-        wraps = kind.__name__ in _WRAPPERS and is_installed(kind.__module__)
-        if is_record(kind) and not wraps:
-            code = {} if is_installed(kind.__module__) else {"class": self.describe(kind, f"{way}.class")}
-            values = {name: getattr(thing, name) for name in fields_of(kind)}
+    def _describe_object(self, obj: Any, kind: type, path: str) -> Any:
+        version = None if isinstance(obj, ModuleType) else getattr(obj, "version", None)
+        has_version = isinstance(version, str | int | float)
+        is_wrapper = kind.__name__ in _WRAPPERS and is_installed(kind.__module__)
+        if is_record(kind) and not is_wrapper:
+            code = {} if is_installed(kind.__module__) else {"class": self.describe(kind, f"{path}.class")}
+            values = {name: getattr(obj, name) for name in fields_of(kind)}
             # The version is described instead of fields that are functions.
-            state = {name: value for name, value in values.items() if not (versioned and callable(value))}
-            return {"type": name_of(kind), **code, **self._named(state, way)}
-        if versioned:
-            return {"type": "versioned", "name": name_of(thing) or name_of(kind), "version": version}
+            state = {name: value for name, value in values.items() if not (has_version and callable(value))}
+            return {"type": name_of(kind), **code, **self._describe_values(state, path)}
+        if has_version:
+            return {"type": "versioned", "name": name_of(obj) or name_of(kind), "version": version}
         if kind is dict:
-            if all(type(key) is str for key in thing) and "type" not in thing:
-                return self._named(thing, way)
-            return {"type": "dict", "items": self.describe(tuple(thing.items()), way)}
+            if all(type(key) is str for key in obj) and "type" not in obj:
+                return self._describe_values(obj, path)
+            return {"type": "dict", "items": self.describe(tuple(obj.items()), path)}
         if kind is tuple:
-            return [self.describe(value, f"{way}[{index}]") for index, value in enumerate(thing)]
+            return [self.describe(value, f"{path}[{index}]") for index, value in enumerate(obj)]
         if kind is list:
-            return {"type": "list", "items": self.describe(tuple(thing), way)}
+            return {"type": "list", "items": self.describe(tuple(obj), path)}
         if kind in (set, frozenset):
-            items = [self.describe(value, way) for value in thing]
+            items = [self.describe(value, path) for value in obj]
             return {"type": kind.__name__, "items": sorted(items, key=lambda item: json.dumps(item, sort_keys=True))}
-        if isinstance(thing, ModuleType):
-            own = {} if is_installed(thing.__name__) else {"version": getattr(thing, "__version__", None)}
-            return {"type": "module", "name": thing.__name__, **own}
-        name = name_of(thing)
-        if is_installed(name.partition(":")[0]) and lookup(name) is thing:
-            return {"type": "class" if isinstance(thing, type) else "function", "name": name}
-        if isinstance(thing, type):
-            parts = {"members": {key: value for key, value in vars(thing).items() if is_written(key, value)}}
-            return {"type": "class", "name": name, **self._beside({**parts, "bases": thing.__bases__}, way)}
-        if isinstance(thing, functools.partial):
-            return {"type": "partial", **self._named({"function": thing.func, "arguments": thing.args}, way)} | {
-                "keywords": self.describe(thing.keywords, way)
+        if isinstance(obj, ModuleType):
+            fields = {} if is_installed(obj.__name__) else {"version": getattr(obj, "__version__", None)}
+            return {"type": "module", "name": obj.__name__, **fields}
+        name = name_of(obj)
+        if is_installed(name.partition(":")[0]) and lookup(name) is obj:
+            return {"type": "class" if isinstance(obj, type) else "function", "name": name}
+        if isinstance(obj, type):
+            parts = {"members": {key: value for key, value in vars(obj).items() if is_user_defined(key, value)}}
+            return {"type": "class", "name": name, **self._without_arrays({**parts, "bases": obj.__bases__}, path)}
+        if isinstance(obj, functools.partial):
+            return {"type": "partial", **self._describe_values({"function": obj.func, "arguments": obj.args}, path)} | {
+                "keywords": self.describe(obj.keywords, path)
             }
-        bound = getattr(thing, "__self__", None)
-        if bound is not None and not isinstance(bound, ModuleType):
-            function = getattr(thing, "__func__", None) or getattr(type(bound), thing.__name__)
-            return {"type": "method", **self._named({"function": function, "self": bound}, way)}
-        if isinstance(thing, FunctionType):
-            return {"type": "function", "name": name, **self._function(thing, way)}
-        if wraps:
-            functions = {part: value for part in _FUNCTIONS if callable(value := getattr(thing, part, None))}
-            return {"type": "wrapped", "by": name_of(kind), "name": name, **self._named(functions, way)}
-        if is_installed(kind.__module__) and is_plain(thing):
-            return {"type": name_of(kind), **self._beside({"state": getattr(thing, "__dict__", {})}, way)}
+        instance = getattr(obj, "__self__", None)
+        if instance is not None and not isinstance(instance, ModuleType):
+            function = getattr(obj, "__func__", None) or getattr(type(instance), obj.__name__)
+            return {"type": "method", **self._describe_values({"function": function, "self": instance}, path)}
+        if isinstance(obj, FunctionType):
+            return {"type": "function", "name": name, **self._describe_function(obj, path)}
+        if is_wrapper:
+            functions = {part: value for part in _FUNCTIONS if callable(value := getattr(obj, part, None))}
+            return {"type": "wrapped", "by": name_of(kind), "name": name, **self._describe_values(functions, path)}
+        if is_installed(kind.__module__) and is_plain(obj):
+            return {"type": name_of(kind), **self._without_arrays({"state": getattr(obj, "__dict__", {})}, path)}
         raise InputError(
-            f"{way or 'this'} is a {kind.__name__}, which cannot be told apart from another {kind.__name__}: give it "
+            f"{path or 'this'} is a {kind.__name__}, which cannot be told apart from another {kind.__name__}: give it "
             "an attribute version, a text or a number that you change whenever it changes, or wrap a network from "
             'outside JAX as HostClassifier(..., version="2026-11")'
         )
 
-    def _array(self, thing: Any, way: str) -> Any:
-        if isinstance(thing, jax.Array) and jnp.issubdtype(thing.dtype, jax.dtypes.prng_key):
-            return {"type": f"key {jax.random.key_impl(thing)}", "data": jax.random.key_data(thing).tolist()}
-        origin = "jax" if isinstance(thing, jax.Array) else "numpy" if isinstance(thing, np.ndarray) else "scalar"
-        array = np.ascontiguousarray(thing).reshape(np.shape(thing))
+    def _describe_array(self, obj: Any, path: str) -> Any:
+        if isinstance(obj, jax.Array) and jnp.issubdtype(obj.dtype, jax.dtypes.prng_key):
+            return {"type": f"key {jax.random.key_impl(obj)}", "data": jax.random.key_data(obj).tolist()}
+        origin = "jax" if isinstance(obj, jax.Array) else "numpy" if isinstance(obj, np.ndarray) else "scalar"
+        array = np.ascontiguousarray(obj).reshape(np.shape(obj))
         if array.dtype.hasobject:
-            raise InputError(f"{way or 'this'} is an array of Python objects: give numbers")
+            raise InputError(f"{path or 'this'} is an array of Python objects: give numbers")
         # A "weak" JAX scalar was made from a Python number, and does not promote the types of other arrays.
-        kind = f"{'weak' if array.ndim == 0 and getattr(thing, 'weak_type', False) else origin} {array.dtype}"
-        if 0 < array.size <= _LARGEST_LISTED and array.dtype.kind in "biuf" and np.isfinite(array).all():
+        kind = f"{'weak' if array.ndim == 0 and getattr(obj, 'weak_type', False) else origin} {array.dtype}"
+        if 0 < array.size <= _MAX_LISTED and array.dtype.kind in "biuf" and np.isfinite(array).all():
             return {"type": kind, "values": array.tolist()}
         digest = hashlib.sha256(array.tobytes()).hexdigest()
         self.arrays[digest] = array
         return {"type": kind, "shape": list(array.shape), "sha256": digest}
 
-    def _named(self, values: dict[str, Any], way: str) -> dict[str, Any]:
-        return {name: self.describe(value, f"{way}.{name}".lstrip(".")) for name, value in values.items()}
+    def _describe_values(self, values: dict[str, Any], path: str) -> dict[str, Any]:
+        return {name: self.describe(value, f"{path}.{name}".lstrip(".")) for name, value in values.items()}
 
-    def _function(self, function: FunctionType, way: str) -> dict[str, Any]:
+    def _describe_function(self, function: FunctionType, path: str) -> dict[str, Any]:
         """Describe all that a function's result depends on, except definitions of installed packages."""
-        own = not is_installed(function.__globals__.get("__name__"))
+        is_user_code = not is_installed(function.__globals__.get("__name__"))
         parts = {"defaults": (function.__defaults__, function.__kwdefaults__), "closure": closure(function)}
-        if own:
-            reads = dict(reads_of(function.__code__, function.__globals__, way))
-            parts["globals"] = {name: reads[name] for name in sorted(reads)}
-        source = {"source": source_of(function, way)} if own or function.__name__ == "<lambda>" else {}
-        return source | self._beside(parts, way)
+        if is_user_code:
+            values = dict(globals_read(function.__code__, function.__globals__, path))
+            parts["globals"] = {name: values[name] for name in sorted(values)}
+        source = {"source": source_of(function, path)} if is_user_code or function.__name__ == "<lambda>" else {}
+        return source | self._without_arrays(parts, path)
 
-    def _beside(self, parts: dict[str, Any], way: str) -> dict[str, Any]:
+    def _without_arrays(self, parts: dict[str, Any], path: str) -> dict[str, Any]:
         """Describe parts of code without storing their arrays, since `rebuild` looks up code by name."""
         arrays, self.arrays = self.arrays, {}
         try:
-            return self._named(parts, way)
+            return self._describe_values(parts, path)
         finally:
             self.arrays = arrays

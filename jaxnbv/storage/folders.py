@@ -22,8 +22,8 @@ _LOCK = ".lock"
 # File of the large arrays of the configuration.
 ARRAYS = "arrays.npz"
 # Largest size of a file of arrays after unpacking, in bytes. Sixteen million rays fit, far more than a camera has.
-LARGEST = 2**29
-_LONGEST_SHOWN = 60
+MAX_ARRAY_BYTES = 2**29
+_MAX_TEXT_LENGTH = 60
 
 
 def software() -> dict[str, str]:
@@ -56,7 +56,7 @@ def differences(stored: Any, current: Any, name: str = "") -> list[str]:
 def _short(value: Any) -> str:
     """Return the beginning of the text of a value. The value may be the whole source of a function."""
     text = str(value)
-    return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}..."
+    return text if len(text) <= _MAX_TEXT_LENGTH else f"{text[:_MAX_TEXT_LENGTH]}..."
 
 
 def check_format(format: Any, supported: int, file: Path) -> None:
@@ -90,8 +90,8 @@ def write_arrays(file: Path, arrays: Mapping[str, np.ndarray]) -> None:
     **Raises:** `ValueError` if `write_whole` does, or if the arrays are larger than `read_arrays` accepts.
     """
     size = sum(array.nbytes for array in arrays.values())
-    require(size <= LARGEST, f"cannot write {file}: its arrays have {size} bytes, more than {LARGEST}")
-    write_whole(file, lambda opened: np.savez_compressed(opened, **arrays))  # type: ignore[arg-type]
+    require(size <= MAX_ARRAY_BYTES, f"cannot write {file}: its arrays have {size} bytes, more than {MAX_ARRAY_BYTES}")
+    write_whole(file, lambda stream: np.savez_compressed(stream, **arrays))  # type: ignore[arg-type]
 
 
 def read_arrays(file: Path, remedy: str, check: Callable[[dict[str, np.ndarray]], None]) -> dict[str, np.ndarray]:
@@ -104,12 +104,12 @@ def read_arrays(file: Path, remedy: str, check: Callable[[dict[str, np.ndarray]]
     try:
         if not file.is_file():
             raise ValueError("there is no file")
-        with np.load(file, allow_pickle=False) as saved:
-            size = sum(member.file_size for member in saved.zip.infolist())
+        with np.load(file, allow_pickle=False) as archive:
+            size = sum(member.file_size for member in archive.zip.infolist())
             # The headers of the file may take another 2^20 bytes.
-            if size > LARGEST + 2**20:
+            if size > MAX_ARRAY_BYTES + 2**20:
                 raise ValueError(f"it unpacks to {size} bytes")
-            arrays = {key: saved[key] for key in saved.files}
+            arrays = {key: archive[key] for key in archive.files}
         check(arrays)
         return arrays
     # If bits of the file are flipped, NumPy and zipfile raise some twenty kinds of errors.
@@ -175,7 +175,7 @@ class ResultFolder:
         self.path, self.config = make_folder(path), json.loads(json.dumps(config))
         self.arrays = dict(arrays)
         self.versions: dict[str, Any] = {}
-        self.bound = False
+        self.is_bound = False
         self._check()
 
     @contextmanager
@@ -189,48 +189,48 @@ class ResultFolder:
             self._check()
             yield
 
-    def set_versions(self, there: dict[str, Any]) -> None:
+    def set_versions(self, versions: dict[str, Any]) -> None:
         """Set the `versions` of the process that computes new results. Warns if the folder has different ones."""
-        self.versions = there
-        if not self.bound:
+        self.versions = versions
+        if not self.is_bound:
             return
-        written = read_record(self.path, self.kind, "choose another output folder")
-        if other := differences(written.get("versions"), there):
+        record = read_record(self.path, self.kind, "choose another output folder")
+        if changes := differences(record.get("versions"), versions):
             warnings.warn(
-                f"{self.path} was begun with other versions ({'; '.join(other)}): new results may differ in their last "
-                "bits from those of an uninterrupted run",
+                f"{self.path} was begun with other versions ({'; '.join(changes)}): new results may differ in their "
+                "last bits from those of an uninterrupted run",
                 stacklevel=3,
             )
 
     def bind(self) -> None:
         """Write the record and its arrays, if they are not there yet. Called before the first result."""
-        if not self.bound:
+        if not self.is_bound:
             record = {"format": self.format, "config": self.config, "versions": self.versions}
             # Write the record first, since arrays without a record would belong to no configuration.
             write_text(self.path / f"{self.kind}.json", json.dumps(record, indent=2))
             if self.arrays:
                 write_arrays(self.path / ARRAYS, self.arrays)
-            self.bound = True
+            self.is_bound = True
 
     def _check(self) -> None:
         file = self.path / f"{self.kind}.json"
         if not file.exists():
             names = sorted(entry.name for entry in self.path.iterdir())
-            foreign = [name for name in names if name != _LOCK and not name.endswith(".partial")]
+            others = [name for name in names if name != _LOCK and not name.endswith(".partial")]
             require(
-                not foreign or self.kind == "study",
-                f"the output folder {self.path} holds other files ({', '.join(foreign[:3])}): choose an empty folder",
+                not others or self.kind == "study",
+                f"the output folder {self.path} holds other files ({', '.join(others[:3])}): choose an empty folder",
             )
             return
-        written = read_record(self.path, self.kind, "choose another output folder")
-        check_format(written.get("format"), self.format, file)
+        record = read_record(self.path, self.kind, "choose another output folder")
+        check_format(record.get("format"), self.format, file)
         # If there is a record but no result, the run ended before its first result, and the record may be overwritten.
         if not any(self.path.glob(self.pattern)):
             return
-        changed = differences(written["config"], self.config)
+        changes = differences(record["config"], self.config)
         require(
-            not changed,
-            f"the output folder {self.path} belongs to another {self.kind}; it differs in {'; '.join(changed[:3])}. "
+            not changes,
+            f"the output folder {self.path} belongs to another {self.kind}; it differs in {'; '.join(changes[:3])}. "
             "Choose another folder, or remove this one",
         )
-        self.bound = True
+        self.is_bound = True

@@ -29,30 +29,30 @@ _TEXTS: dict[str, Callable[[Any], Any]] = {
 }
 
 
-def rebuild(description: Any, arrays: Mapping[str, np.ndarray], way: str) -> Any:
+def rebuild(description: Any, arrays: Mapping[str, np.ndarray], path: str) -> Any:
     """Rebuild a configuration from the description that `describe` returned.
 
     Classes and functions are looked up in jaxnbv and in modules that are already imported. No function and no
     constructor is called.
 
     - `arrays`: contents of the large arrays, keyed by hash, from `describe`.
-    - `way`: path of the configuration for error messages, such as "planner". The first name in this path is the
+    - `path`: path of the configuration for error messages, such as "planner". The first name in this path is the
       argument of `load` that can replace the configuration.
 
     **Raises:** `ValueError` if a part cannot be rebuilt, or has changed since it was described. The error names the
     part's path.
     """
-    remedy = f"import its module first, or give it again: load(..., {way.partition('.')[0] or 'planner'}=...)"
+    remedy = f"import its module first, or give it again: load(..., {path.partition('.')[0] or 'planner'}=...)"
     try:
-        thing = _Rebuilder(arrays, remedy).rebuild(description, way)
+        obj = _Rebuilder(arrays, remedy).rebuild(description, path)
     except InputError:
         raise
     # A description that was edited by hand may raise anything.
     except Exception as error:
-        raise InputError(f"{way} cannot be made again from its description ({error}): {remedy}") from error
-    changed = differences(description, describe(thing, way=way), way)
-    require(not changed, f"{'; '.join(changed[:3])}: the code or a value behind it has changed; {remedy}")
-    return thing
+        raise InputError(f"{path} cannot be made again from its description ({error}): {remedy}") from error
+    changes = differences(description, describe(obj, path=path), path)
+    require(not changes, f"{'; '.join(changes[:3])}: the code or a value behind it has changed; {remedy}")
+    return obj
 
 
 def read_config(path: str | Path, kind: str, format: int, replacements: Mapping[str, Any]) -> dict[str, Any]:
@@ -85,99 +85,106 @@ class _Rebuilder:
     def __init__(self, arrays: Mapping[str, np.ndarray], remedy: str):
         self.arrays, self.remedy = arrays, remedy
 
-    def rebuild(self, node: Any, way: str) -> Any:
+    def rebuild(self, node: Any, path: str) -> Any:
         if isinstance(node, list):
-            return tuple(self.rebuild(value, f"{way}[{index}]") for index, value in enumerate(node))
+            return tuple(self.rebuild(value, f"{path}[{index}]") for index, value in enumerate(node))
         if not isinstance(node, dict):
             return node
         if "type" not in node:
-            return {name: self.rebuild(value, f"{way}.{name}") for name, value in node.items()}
+            return {name: self.rebuild(value, f"{path}.{name}") for name, value in node.items()}
         kind = node["type"]
         if ":" in kind:
-            return self._record(kind, node, way)
+            return self._rebuild_record(kind, node, path)
         if kind in _TEXTS:
             return _TEXTS[kind](node["value"])
         if kind in ("list", "set", "frozenset", "dict"):
             return {"list": list, "set": set, "frozenset": frozenset, "dict": dict}[kind](
-                self.rebuild(node["items"], way)
+                self.rebuild(node["items"], path)
             )
         if kind in ("function", "class", "again", "wrapped"):
-            thing = self._code(node["name"], way)
-            alike = kind != "wrapped" or name_of(type(thing)) == node["by"]
-            require(alike, f"{way} is a {node.get('by')} of {node['name']} that has no name of its own: {self.remedy}")
-            return thing
+            obj = self._lookup_code(node["name"], path)
+            has_type = kind != "wrapped" or name_of(type(obj)) == node["by"]
+            require(
+                has_type, f"{path} is a {node.get('by')} of {node['name']} that has no name of its own: {self.remedy}"
+            )
+            return obj
         if kind == "partial":
             function, arguments, keywords = (
-                self.rebuild(node[part], way) for part in ("function", "arguments", "keywords")
+                self.rebuild(node[part], path) for part in ("function", "arguments", "keywords")
             )
             return functools.partial(function, *arguments, **keywords)
         if kind == "method":
-            function, bound = self.rebuild(node["function"], way), self.rebuild(node["self"], way)
-            own = any(member is function for base in type(bound).__mro__ for member in vars(base).values())
-            require(own, f"{way} is a method that {type(bound).__name__} does not have: {self.remedy}")
-            return getattr(bound, function.__name__)
+            function, instance = self.rebuild(node["function"], path), self.rebuild(node["self"], path)
+            has_method = any(member is function for base in type(instance).__mro__ for member in vars(base).values())
+            require(has_method, f"{path} is a method that {type(instance).__name__} does not have: {self.remedy}")
+            return getattr(instance, function.__name__)
         require(
-            " " in kind, f"{way} is a {node.get('name', kind)}, and the folder stores only its {kind}: {self.remedy}"
+            " " in kind, f"{path} is a {node.get('name', kind)}, and the folder stores only its {kind}: {self.remedy}"
         )
         origin, dtype = kind.split(" ")
         if origin == "key":
             return jax.random.wrap_key_data(jnp.array(node["data"], jnp.uint32), impl=dtype)
-        return self._array(origin, np.dtype(dtype), node, way)
+        return self._rebuild_array(origin, np.dtype(dtype), node, path)
 
-    def _array(self, origin: str, dtype: np.dtype, node: dict[str, Any], way: str) -> Any:
+    def _rebuild_array(self, origin: str, dtype: np.dtype, node: dict[str, Any], path: str) -> Any:
         if "values" in node:
             array = np.array(node["values"], dtype)
         else:
             digest = node["sha256"]
-            require(digest in self.arrays, f"{way} is an array that the folder does not hold: {self.remedy}")
+            require(digest in self.arrays, f"{path} is an array that the folder does not hold: {self.remedy}")
             array = np.frombuffer(self.arrays[digest].tobytes(), dtype).reshape(node["shape"]).copy()
         if origin == "weak":
             return jnp.asarray(array.item())
         return jnp.asarray(array) if origin == "jax" else array[()] if origin == "scalar" else array
 
-    def _record(self, name: str, node: dict[str, Any], way: str) -> Any:
-        kind = self._lookup(name, way)
+    def _rebuild_record(self, name: str, node: dict[str, Any], path: str) -> Any:
+        kind = self._lookup(name, path)
         if isinstance(kind, enum.EnumType):
             return kind[node["member"]]
-        require(isinstance(kind, type) and is_record(kind), f"{way} is a {name}, which is no dataclass: {self.remedy}")
-        absent = [field for field in fields_of(kind) if field not in node]
-        require(not absent, f"{way} is a {name} that was stored without its {', '.join(absent)}: {self.remedy}")
-        values = {field: self.rebuild(node[field], f"{way}.{field}") for field in fields_of(kind)}
+        require(isinstance(kind, type) and is_record(kind), f"{path} is a {name}, which is no dataclass: {self.remedy}")
+        absent_fields = [field for field in fields_of(kind) if field not in node]
+        require(
+            not absent_fields,
+            f"{path} is a {name} that was stored without its {', '.join(absent_fields)}: {self.remedy}",
+        )
+        values = {field: self.rebuild(node[field], f"{path}.{field}") for field in fields_of(kind)}
         if not dataclasses.is_dataclass(kind):
             return tuple.__new__(kind, values.values())
-        thing: Any = object.__new__(kind)  # type: ignore[arg-type]
+        obj: Any = object.__new__(kind)  # type: ignore[arg-type]
         for field, value in values.items():
-            object.__setattr__(thing, field, value)
+            object.__setattr__(obj, field, value)
         # Wrappers of Equinox have the name and docstring of the function that they wrap.
-        if is_installed(kind.__module__) and (wrapped := getattr(thing, "__wrapped__", None)) is not None:
+        if is_installed(kind.__module__) and (function := getattr(obj, "__wrapped__", None)) is not None:
             for attribute in functools.WRAPPER_ASSIGNMENTS:
-                object.__setattr__(thing, attribute, getattr(wrapped, attribute))
-        return thing
+                object.__setattr__(obj, attribute, getattr(function, attribute))
+        return obj
 
-    def _code(self, name: str, way: str) -> Any:
+    def _lookup_code(self, name: str, path: str) -> Any:
         """Look up a function, or the class of a record or of a NumPy scalar, by its name.
 
         **Raises:** `ValueError` for other classes, and for functions of packages that may have side effects.
         """
-        thing = self._lookup(name, way)
+        obj = self._lookup(name, path)
         module = name.partition(":")[0]
-        harmless = (
-            is_record(thing) or issubclass(thing, np.generic)
-            if isinstance(thing, type)
+        is_harmless = (
+            is_record(obj) or issubclass(obj, np.generic)
+            if isinstance(obj, type)
             else not is_installed(module)
-            or any(module == own or module.startswith(f"{own}.") for own in _HARMLESS)
+            or any(module == prefix or module.startswith(f"{prefix}.") for prefix in _HARMLESS)
             # These are the ufuncs of NumPy, and the functions of jax.numpy with the same names.
             or (module in ("numpy", "jax.numpy") and isinstance(getattr(np, name.partition(":")[2], None), np.ufunc))
         )
-        require(harmless, f"{way} is {name}, which no configuration that is read from a file may call: {self.remedy}")
-        return thing
+        require(
+            is_harmless, f"{path} is {name}, which no configuration that is read from a file may call: {self.remedy}"
+        )
+        return obj
 
-    def _lookup(self, name: str, way: str) -> Any:
+    def _lookup(self, name: str, path: str) -> Any:
         module = name.partition(":")[0]
         if module.startswith("jaxnbv.") and not module.endswith("__main__"):
             importlib.import_module(module)
-        thing = lookup(name)
-        if thing is None:
+        obj = lookup(name)
+        if obj is None:
             missing = "has nothing of that name" if module in sys.modules else "is not imported"
-            raise InputError(f"{way} is {name}, but {module} {missing}: {self.remedy}")
-        return thing
+            raise InputError(f"{path} is {name}, but {module} {missing}: {self.remedy}")
+        return obj

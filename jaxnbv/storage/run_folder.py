@@ -61,14 +61,14 @@ class RunFolder(ResultFolder):
     def __init__(self, path: str | Path, kind: str, config: dict[str, Any]):
         self.kind = kind
         arrays: dict[str, np.ndarray] = {}
-        described = {name: describe(part, arrays, name) for name, part in config.items()}
-        super().__init__(path, described, arrays)
+        descriptions = {name: describe(part, arrays, name) for name, part in config.items()}
+        super().__init__(path, descriptions, arrays)
         self.set_versions(versions())
 
     @classmethod
-    def config_of(cls, path: str | Path, kind: str, **given: Any) -> dict[str, Any]:
-        """Rebuild the configuration of an existing folder. `given` replaces parts of it, see `read_config`."""
-        return read_config(path, kind, cls.format, given)
+    def config_of(cls, path: str | Path, kind: str, **replacements: Any) -> dict[str, Any]:
+        """Rebuild the configuration of an existing folder, with `replacements` for some parts, see `read_config`."""
+        return read_config(path, kind, cls.format, replacements)
 
     def count(self, name: str) -> int:
         """Count the files with a name, such as "view" for view_00.npz, view_01.npz and so on.
@@ -100,10 +100,12 @@ class RunFolder(ResultFolder):
         """
         self.bind()
         leaves = jax.tree_util.tree_leaves_with_path(parts)
-        arrays = {jax.tree_util.keystr(way, simple=True, separator="."): np.asarray(leaf) for way, leaf in leaves}
+        arrays = {
+            jax.tree_util.keystr(key_path, simple=True, separator="."): np.asarray(leaf) for key_path, leaf in leaves
+        }
         arrays["index"] = np.asarray(index)
-        sealed: dict[str, Any] = arrays | {"sha256": np.asarray(_checksum(arrays))}
-        write_arrays(self.file(name, index), sealed)
+        contents: dict[str, Any] = arrays | {"sha256": np.asarray(_checksum(arrays))}
+        write_arrays(self.file(name, index), contents)
 
     def read(self, name: str, index: int) -> dict[str, Any]:
         """Read the parts in a file, keyed by name. Parts that were None are absent.
@@ -126,8 +128,8 @@ class RunFolder(ResultFolder):
         """Write points and normals to cloud.ply, a binary PLY file, in the coordinates of `cloud`."""
         points, normals = cloud.to_numpy()
         # Use a mesh without faces, since trimesh's point clouds have no normals.
-        bare = trimesh.Trimesh(points, vertex_normals=normals, process=False)
-        content = trimesh.exchange.ply.export_ply(bare, vertex_normal=True)
+        mesh = trimesh.Trimesh(points, vertex_normals=normals, process=False)
+        content = trimesh.exchange.ply.export_ply(mesh, vertex_normal=True)
         write_whole(self.path / "cloud.ply", lambda file: file.write(content))
 
 
