@@ -50,8 +50,8 @@ class MeshFile(NamedTuple):
 
 def interleave(groups: Iterable[Sequence[_T]]) -> list[_T]:
     """List the first item of each group, then the second item of each group, and so on."""
-    turns = itertools.chain.from_iterable(itertools.zip_longest(*groups))
-    return [item for item in turns if item is not None]
+    rounds = itertools.chain.from_iterable(itertools.zip_longest(*groups))
+    return [item for item in rounds if item is not None]
 
 
 @checked
@@ -67,13 +67,13 @@ def class_meshes(folder: str | Path, classes: Sequence[str]) -> tuple[MeshFile, 
     **Raises:** `ValueError` if there is no such folder, if no class has a folder, if the folder of a class has no mesh,
     or if `classes` is not a list of names.
     """
-    named = isinstance(classes, list | tuple) and all(isinstance(name, str) for name in classes)
-    require(named, f"the classes are {short_text(classes)}: give a list of names")
-    folder = _existing(folder)
+    are_names = isinstance(classes, list | tuple) and all(isinstance(name, str) for name in classes)
+    require(are_names, f"the classes are {short_text(classes)}: give a list of names")
+    folder = _check_folder(folder)
     folder = folder / "raw_scans" if (folder / "raw_scans").is_dir() else folder
     paths = {_plain(path.name): path for path in sorted(folder.iterdir()) if path.is_dir()}
     rows = [(label, paths.get(_plain(name), paths.get(_SYNSETS.get(name, "")))) for label, name in enumerate(classes)]
-    groups = [_of_class(path, label) for label, path in rows if path is not None]
+    groups = [_class_files(path, label) for label, path in rows if path is not None]
     require(len(groups) > 0, f"the folder {folder} has none of the folders {', '.join(classes)}: give one that has")
     return tuple(interleave(groups))
 
@@ -87,15 +87,15 @@ def mesh_files(folder: str | Path) -> tuple[MeshFile, ...]:
 
     **Raises:** `ValueError` if there is no such folder, or no mesh in it.
     """
-    return tuple(_of_class(_existing(folder), 0))
+    return tuple(_class_files(_check_folder(folder), 0))
 
 
-def _existing(folder: str | Path) -> Path:
+def _check_folder(folder: str | Path) -> Path:
     require(os.path.isdir(folder), f"there is no folder {folder}: give one that holds meshes")
     return Path(folder)
 
 
-def _of_class(folder: Path, label: int) -> list[MeshFile]:
+def _class_files(folder: Path, label: int) -> list[MeshFile]:
     formats = trimesh.available_formats()
     for pattern, up in _LAYOUTS.items():
         matches = sorted(folder.glob(pattern.format(name=folder.name)))

@@ -38,15 +38,15 @@ def stored_intrinsics(folder: Path) -> Float[np.ndarray, "3 3"] | None:
 
     **Raises:** `ValueError` if the file has none of these formats.
     """
-    for place in (folder, folder.resolve().parent):
+    for directory in (folder, folder.resolve().parent):
         for pattern in _FILES:
-            for file in sorted(place.glob(pattern)):
+            for file in sorted(directory.glob(pattern)):
                 if file.suffix.lower() in (".txt", ".json") and file.is_file():
-                    return _of_file(file)
+                    return _read_file(file)
     return None
 
 
-def _of_file(file: Path) -> Float[np.ndarray, "3 3"]:
+def _read_file(file: Path) -> Float[np.ndarray, "3 3"]:
     if file.name == "info.txt":
         fields = {row[0]: row[2:] for row in read_rows(file)}
         require(_BUNDLE_FUSION in fields, f"{file} names no {_BUNDLE_FUSION}: give intrinsics=(fx, fy, cx, cy)")

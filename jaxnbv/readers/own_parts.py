@@ -12,15 +12,15 @@ from jaxnbv.geometry.camera import Camera
 
 # Number of frames to compare, least number of frames that must show the mount, and number of blocks along the longer
 # side of an image.
-_FRAMES, _FEWEST, _BLOCKS = 16, 4, 80
+_NUM_FRAMES, _MIN_FRAMES, _NUM_BLOCKS = 16, 4, 80
 # Relative difference up to which depths count as equal: the depths of a block in different frames, and the depths of a
 # point in two frames.
-_EQUAL, _ALIKE = 0.02, 0.05
+_BLOCK_TOLERANCE, _POINT_TOLERANCE = 0.02, 0.05
 # Neighbouring blocks belong to the same component if their depths differ by at most this factor.
-_OF_PART = 1.1
+_MAX_DEPTH_RATIO = 1.1
 # A component belongs to the mount if other frames look through its position in the world more than this many times as
 # often as they see a surface there.
-_CLEAR = 4
+_MIN_DEEPER_RATIO = 4
 
 
 def own_parts(
@@ -40,21 +40,23 @@ def own_parts(
     - `matrices`: poses of the frames, camera to world, OpenCV's axes.
     - `scale`: length of a unit of the images in world units.
     """
-    indices = np.unique(np.linspace(0, len(matrices) - 1, _FRAMES).astype(int))
-    side = -(-max(camera.height, camera.width) // _BLOCKS)
+    indices = np.unique(np.linspace(0, len(matrices) - 1, _NUM_FRAMES).astype(int))
+    side = -(-max(camera.height, camera.width) // _NUM_BLOCKS)
     images = {int(frame): image(int(frame)) for frame in indices}
     frames = [frame for frame, depth in images.items() if depth.shape == (camera.height, camera.width)]
     depths = np.stack([_nearest_of_blocks(images[frame], side) for frame in frames])
-    measured = depths > 0
-    often = (2 * measured.sum(axis=0) >= len(frames)) & (measured.sum(axis=0) >= _FEWEST)
-    rows = np.where(measured & often, depths, np.nan)[:, often]
-    part = np.zeros(depths.shape[1:])
+    is_measured = depths > 0
+    is_frequent = (2 * is_measured.sum(axis=0) >= len(frames)) & (is_measured.sum(axis=0) >= _MIN_FRAMES)
+    rows = np.where(is_measured & is_frequent, depths, np.nan)[:, is_frequent]
+    candidate_depth = np.zeros(depths.shape[1:])
     if rows.size:
         low, middle, high = np.nanpercentile(rows, [10, 50, 90], axis=0)
-        part[often] = np.where(high - low < _EQUAL * middle, middle, 0.0)
-    if part.any():
-        part = np.where(_is_looked_through(scale * part, scale * depths, matrices[frames], camera, side), part, 0.0)
-    reach = _OF_PART * maximum_filter(part, 3)
+        candidate_depth[is_frequent] = np.where(high - low < _BLOCK_TOLERANCE * middle, middle, 0.0)
+    if candidate_depth.any():
+        candidate_depth = np.where(
+            _is_mount(scale * candidate_depth, scale * depths, matrices[frames], camera, side), candidate_depth, 0.0
+        )
+    reach = _MAX_DEPTH_RATIO * maximum_filter(candidate_depth, 3)
     return np.kron(reach, np.ones((side, side)))[: camera.height, : camera.width]
 
 
@@ -66,68 +68,72 @@ def _nearest_of_blocks(image: UInt16[np.ndarray, "h w"], side: int) -> Float[np.
     return np.where(np.isfinite(least), least, 0.0)
 
 
-def _is_looked_through(
-    part: Float[np.ndarray, "k l"],
+def _is_mount(
+    candidate_depth: Float[np.ndarray, "k l"],
     depths: Float[np.ndarray, "n k l"],
     matrices: Float[np.ndarray, "n 4 4"],
     camera: Camera,
     side: int,
 ) -> Bool[np.ndarray, "k l"]:
-    """Return a mask of the connected components of `part` that belong to the mount.
+    """Return a mask of the connected components of `candidate_depth` that belong to the mount.
 
     A component belongs to the mount if other frames see through the place in the world where it was during one frame.
 
-    - `part`: depths of the blocks with the same depth in most frames, in world units; zero in all other blocks.
+    - `candidate_depth`: depths of the blocks with the same depth in most frames, in world units; zero in all other
+      blocks.
     - `depths`: depths of the blocks in each frame, in world units.
     - `side`: length of a block's side in pixels.
     """
-    row, column = np.nonzero(part)
-    own, count = _pieces(part)
+    row, column = np.nonzero(candidate_depth)
+    component, count = _components(candidate_depth)
     (fx, skew, cx), (_, fy, cy), _ = np.asarray(camera.intrinsics, float)
     down = (side * (row + 0.5) - cy) / fy
     rays = np.stack([(side * (column + 0.5) - cx - skew * down) / fx, down, np.ones(len(row))], axis=-1)
-    points = part[row, column, None] * rays
-    deeper, alike = np.zeros(count), np.zeros(count)
+    points = candidate_depth[row, column, None] * rays
+    num_deeper, num_equal = np.zeros(count), np.zeros(count)
     # Use bounds of the depths around a block, since the surface may be slanted and the point may be anywhere in the
     # block.
     window = (1, 3, 3)
     least = minimum_filter(np.where(depths > 0, depths, np.inf), window)
-    most = maximum_filter(depths, window)
+    greatest = maximum_filter(depths, window)
     for first, matrix in enumerate(matrices):
-        is_shown = np.abs(depths[first, row, column] - part[row, column]) < _EQUAL * part[row, column]
+        is_shown = (
+            np.abs(depths[first, row, column] - candidate_depth[row, column])
+            < _BLOCK_TOLERANCE * candidate_depth[row, column]
+        )
         for second, other in enumerate(matrices):
-            move = np.linalg.inv(other) @ matrix
-            moved = points @ move[:3, :3].T + move[:3, 3]
-            is_valid = is_shown & (moved[:, 2] > 0) & (first != second)
-            across, along = (moved[:, :2] / np.where(is_valid, moved[:, 2], 1.0)[:, None]).T
-            at = np.floor(np.stack([fy * along + cy, fx * across + skew * along + cx]) / side)
-            is_valid &= np.all((at >= 0) & (at < np.array(part.shape)[:, None]), axis=0)
-            block = second, *np.where(is_valid, at, 0).astype(int)
+            motion = np.linalg.inv(other) @ matrix
+            second_points = points @ motion[:3, :3].T + motion[:3, 3]
+            is_valid = is_shown & (second_points[:, 2] > 0) & (first != second)
+            x, y = (second_points[:, :2] / np.where(is_valid, second_points[:, 2], 1.0)[:, None]).T
+            position = np.floor(np.stack([fy * y + cy, fx * x + skew * y + cx]) / side)
+            is_valid &= np.all((position >= 0) & (position < np.array(candidate_depth.shape)[:, None]), axis=0)
+            block = second, *np.where(is_valid, position, 0).astype(int)
             is_valid &= depths[block] > 0
-            is_deeper = least[block] > (1.0 + _ALIKE) * moved[:, 2]
-            is_before = most[block] < (1.0 - _ALIKE) * moved[:, 2]
-            np.add.at(deeper, own[is_valid & is_deeper], 1)
-            np.add.at(alike, own[is_valid & ~is_deeper & ~is_before], 1)
-    mask = np.zeros(part.shape, bool)
-    mask[row, column] = (deeper > _CLEAR * alike)[own]
+            is_deeper = least[block] > (1.0 + _POINT_TOLERANCE) * second_points[:, 2]
+            is_before = greatest[block] < (1.0 - _POINT_TOLERANCE) * second_points[:, 2]
+            np.add.at(num_deeper, component[is_valid & is_deeper], 1)
+            np.add.at(num_equal, component[is_valid & ~is_deeper & ~is_before], 1)
+    mask = np.zeros(candidate_depth.shape, bool)
+    mask[row, column] = (num_deeper > _MIN_DEEPER_RATIO * num_equal)[component]
     return mask
 
 
-def _pieces(part: Float[np.ndarray, "k l"]) -> tuple[Int[np.ndarray, " blocks"], int]:
+def _components(candidate_depth: Float[np.ndarray, "k l"]) -> tuple[Int[np.ndarray, " blocks"], int]:
     """Return the index of the connected component of each block with positive depth, and their number.
 
     Neighbouring blocks at about the same depth belong to the same component.
     """
-    padded = np.pad(part, 1)
+    padded = np.pad(candidate_depth, 1)
     number = np.zeros(padded.shape, int)
-    number[padded > 0] = np.arange(np.count_nonzero(part))
+    number[padded > 0] = np.arange(np.count_nonzero(candidate_depth))
     pairs = []
     for down, right in ((0, 1), (1, -1), (1, 0), (1, 1)):
         other = np.roll(padded, (-down, -right), axis=(0, 1))
         near, far = np.minimum(padded, other), np.maximum(padded, other)
-        joined = (near > 0) & (far <= _OF_PART * near)
-        pairs.append(np.stack([number[joined], np.roll(number, (-down, -right), axis=(0, 1))[joined]]))
+        is_joined = (near > 0) & (far <= _MAX_DEPTH_RATIO * near)
+        pairs.append(np.stack([number[is_joined], np.roll(number, (-down, -right), axis=(0, 1))[is_joined]]))
     first, second = np.concatenate(pairs, axis=1)
-    graph = coo_array((np.ones(len(first)), (first, second)), shape=(np.count_nonzero(part),) * 2)
-    count, own = connected_components(graph, directed=False)
-    return own, count
+    graph = coo_array((np.ones(len(first)), (first, second)), shape=(np.count_nonzero(candidate_depth),) * 2)
+    count, component = connected_components(graph, directed=False)
+    return component, count

@@ -23,9 +23,9 @@ from jaxnbv.readers.own_parts import own_parts
 from jaxnbv.readers.text_files import read_rows, read_table, read_text
 
 # Largest difference in seconds between the times of an image and of its pose in a TUM sequence.
-_APART = 0.02
+_MAX_TIME_DIFFERENCE = 0.02
 # 7-Scenes stores this number where nothing was measured.
-_NOT_MEASURED = np.iinfo(np.uint16).max
+_NO_MEASUREMENT = np.iinfo(np.uint16).max
 _ASK_INTRINSICS = (
     "give intrinsics=(fx, fy, cx, cy) in pixels (on the command line --intrinsics FX FY CX CY), or put a "
     "camera-intrinsics.txt into it. As published: 585, 585, 320, 240 for 7-Scenes; 517.3, 516.5, 318.6, 255.3 for "
@@ -38,7 +38,7 @@ _ASK_UNIT = (
 )
 
 
-class _Layout(NamedTuple):
+class _StoredRecording(NamedTuple):
     """Image files of a recording, camera-to-world matrices, and intrinsics and length unit if stored."""
 
     files: list[Path]
@@ -84,34 +84,34 @@ class RecordedFrames:
         intrinsics: Float[AnyArray, "..."] | list | tuple | None = None,
         depth_scale: float | None = None,
     ):
-        folder, turn = Path(folder), np.eye(4) if up is None else _upward(up)
+        folder, rotation = Path(folder), np.eye(4) if up is None else _rotation_to_z_up(up)
         require(os.path.isdir(folder), f"there is no folder {folder}: give the place of the unpacked data set")
-        read = next((reader for sign, reader in _READERS.items() if any(folder.glob(sign))), None)
-        if read is None:
+        reader = next((reader for pattern, reader in _READERS.items() if any(folder.glob(pattern))), None)
+        if reader is None:
             raise InputError(
                 f"{folder} holds no recorded sequence: give a folder of 7-Scenes (frame-*.depth.png and .pose.txt), of "
                 "TUM RGB-D (depth.txt and groundtruth.txt), or one with frames.json"
             )
         try:
-            layout = read(folder)
-            rigid, is_rigid = rigid_matrices(layout.matrices)
+            recording = reader(folder)
+            rigid, is_rigid = rigid_matrices(recording.matrices)
         except (OSError, ValueError, LookupError, TypeError) as error:
             problem = f"the recording in {folder} is not whole ({type(error).__name__}: {error})"
             raise InputError(f"{problem}: unpack the data set again") from error
-        files = _with_pose(layout.files, is_rigid, folder)
+        files = _with_pose(recording.files, is_rigid, folder)
         absent = [file for file in files if not os.path.isfile(file)]
         require(
             not absent,
             f"{len(absent)} of the {len(files)} files that {folder} names are not there, the first "
             f"{absent[:1]}: unpack the data set again",
         )
-        self.folder, self.files, self.matrices = folder, tuple(files), turn @ rigid[is_rigid]
-        matrix = layout.intrinsics if intrinsics is None else intrinsic_matrix(intrinsics, "the intrinsics")
+        self.folder, self.files, self.matrices = folder, tuple(files), rotation @ rigid[is_rigid]
+        matrix = recording.intrinsics if intrinsics is None else intrinsic_matrix(intrinsics, "the intrinsics")
         matrix = stored_intrinsics(folder) if matrix is None else matrix
         if matrix is None:
             raise InputError(f"nothing in {folder} says the intrinsics of its depth camera: {_ASK_INTRINSICS}")
         self.camera = Camera.from_intrinsics(matrix, *self._stored(0).shape)
-        scale = layout.depth_scale if depth_scale is None else depth_scale
+        scale = recording.depth_scale if depth_scale is None else depth_scale
         scale = depth_unit(self._stored, self.matrices, self.camera) if scale is None else scale
         if scale is None:
             raise InputError(f"the frames of {folder} do not determine the unit of their depths: {_ASK_UNIT}")
@@ -151,38 +151,42 @@ class RecordedFrames:
             pixels = np.asarray(optional("PIL.Image").open(file))
         except OSError as error:
             raise InputError(f"cannot read the depth image {file} ({error}): unpack the data set again") from error
-        whole = pixels.ndim == 2 and pixels.dtype.kind in "iu" and pixels.min() >= 0 and pixels.max() <= _NOT_MEASURED
-        require(whole, f"{file} is an image of {pixels.dtype}, {pixels.shape}: depth images have one channel of 16 bit")
-        return np.where(pixels == _NOT_MEASURED, 0, pixels).astype(np.uint16)
+        is_valid = (
+            pixels.ndim == 2 and pixels.dtype.kind in "iu" and pixels.min() >= 0 and pixels.max() <= _NO_MEASUREMENT
+        )
+        require(
+            is_valid, f"{file} is an image of {pixels.dtype}, {pixels.shape}: depth images have one channel of 16 bit"
+        )
+        return np.where(pixels == _NO_MEASUREMENT, 0, pixels).astype(np.uint16)
 
 
-def _seven_scenes(folder: Path) -> _Layout:
+def _seven_scenes(folder: Path) -> _StoredRecording:
     files = sorted(folder.glob("*.depth.png"))
     poses = [read_table(file.with_name(file.name.replace(".depth.png", ".pose.txt"))) for file in files]
-    return _Layout(files, np.stack(poses))
+    return _StoredRecording(files, np.stack(poses))
 
 
-def _tum(folder: Path) -> _Layout:
+def _tum(folder: Path) -> _StoredRecording:
     images = np.array([row[:2] for row in read_rows(folder / "depth.txt")])
     times, track = images[:, 0].astype(float), read_table(folder / "groundtruth.txt")
     nearest = np.abs(times[:, None] - track[None, :, 0]).argmin(axis=1)
-    rows = np.flatnonzero(np.abs(times - track[nearest, 0]) <= _APART)
-    require(len(rows) > 0, f"no image has a pose within {_APART} s")
+    rows = np.flatnonzero(np.abs(times - track[nearest, 0]) <= _MAX_TIME_DIFFERENCE)
+    require(len(rows) > 0, f"no image has a pose within {_MAX_TIME_DIFFERENCE} s")
     poses = track[nearest[rows], 1:8]
     length = np.linalg.norm(poses[:, 3:], axis=1)
     is_rotation = np.isfinite(length) & (length > 0)
     matrices = np.full((len(rows), 4, 4), np.nan)
     matrices[:, :3, 3], matrices[:, 3] = poses[:, :3], (0.0, 0.0, 0.0, 1.0)
     matrices[is_rotation, :3, :3] = Rotation.from_quat(poses[is_rotation, 3:]).as_matrix()
-    return _Layout([folder / images[index, 1] for index in rows], matrices)
+    return _StoredRecording([folder / images[index, 1] for index in rows], matrices)
 
 
-def _plain(folder: Path) -> _Layout:
+def _plain(folder: Path) -> _StoredRecording:
     content = json.loads(read_text(folder / "frames.json"))
     files = [folder / frame["depth"] for frame in content["frames"]]
     matrices = np.stack([np.array(frame["pose"], float) for frame in content["frames"]])
     intrinsics, scale = content.get("intrinsics"), content.get("depth_scale")
-    return _Layout(
+    return _StoredRecording(
         files,
         matrices,
         None if intrinsics is None else intrinsic_matrix(intrinsics, "intrinsics"),
@@ -191,7 +195,7 @@ def _plain(folder: Path) -> _Layout:
 
 
 # The reader of each format, keyed by a pattern of the format's files.
-_READERS: dict[str, Callable[[Path], _Layout]] = {
+_READERS: dict[str, Callable[[Path], _StoredRecording]] = {
     "frames.json": _plain,
     "groundtruth.txt": _tum,
     "*.depth.png": _seven_scenes,
@@ -203,25 +207,25 @@ def _with_pose(files: list[Path], has_pose: Bool[np.ndarray, " n"], folder: Path
 
     **Raises:** `ValueError` if most files have no valid pose.
     """
-    lost = [file.name for file, is_posed in zip(files, has_pose, strict=True) if not is_posed]
-    problem = f"{len(lost)} of the {len(files)} poses in {folder} are no rigid motion, the first that of {lost[:1]}"
+    names = [file.name for file, is_posed in zip(files, has_pose, strict=True) if not is_posed]
+    problem = f"{len(names)} of the {len(files)} poses in {folder} are no rigid motion, the first that of {names[:1]}"
     require(
-        2 * len(lost) <= len(files),
+        2 * len(names) <= len(files),
         f"{problem}: give 4 x 4 matrices from camera to world, [[R, t], [0, 1]] with R R^T = I",
     )
-    if lost:
+    if names:
         warnings.warn(f"{problem}: these frames are left out", stacklevel=3)
     return [file for file, is_posed in zip(files, has_pose, strict=True) if is_posed]
 
 
-def _upward(up: tuple[float, float, float]) -> Float[np.ndarray, "4 4"]:
+def _rotation_to_z_up(up: tuple[float, float, float]) -> Float[np.ndarray, "4 4"]:
     """Return the 4 x 4 matrix of the rotation that maps `up` to z and the x axis into the plane y = 0."""
     direction = as_numbers(up, "up", np.float64)
     length = float(np.linalg.norm(direction)) if direction.shape == (3,) else 0.0
     require(0 < length < math.inf, f"up is {short_text(up)}; give a direction, such as (0, -1, 0)")
     # If `up` is nearly parallel to x, map the y axis into this plane instead.
-    beside = np.eye(3)[int(abs(direction[0]) > 0.9 * length)]
-    rotation, _ = Rotation.align_vectors(np.eye(3)[[2, 0]], [direction / length, beside], weights=[np.inf, 1.0])
-    turn = np.eye(4)
-    turn[:3, :3] = rotation.as_matrix()
-    return turn
+    second_axis = np.eye(3)[int(abs(direction[0]) > 0.9 * length)]
+    rotation, _ = Rotation.align_vectors(np.eye(3)[[2, 0]], [direction / length, second_axis], weights=[np.inf, 1.0])
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation.as_matrix()
+    return matrix

@@ -9,7 +9,7 @@ from jaxnbv.checks import InputError, require
 from jaxnbv.errors import optional
 
 _ENDINGS = (".depth.png", ".png", ".tif", ".tiff", ".pgm")
-_BETWEEN = "._-"
+_SEPARATORS = "._-"
 
 
 class Segmentation:
@@ -31,7 +31,7 @@ class Segmentation:
         require(folder.is_dir(), f"there is no folder {folder}: give the one that holds the masks")
         stems = [_stem(frame) for frame in frames]
         files = {_stem(file): file for file in sorted(folder.iterdir()) if file.name != _stem(file)}
-        self._files = [_of_frame(stem, files) for stem in stems]
+        self._files = [_frame_files(stem, files) for stem in stems]
         objects = sorted({name for images in self._files for name in images if name})
         self._numbers = {name: number for number, name in enumerate(objects, start=1)}
         if not any(self._files):
@@ -59,8 +59,8 @@ class Segmentation:
             except OSError as error:
                 raise InputError(f"cannot read {file} ({error}): write it again") from error
             require(pixels.ndim == 2, f"{file} has the shape {pixels.shape}: give an image of one channel")
-            own = np.where(pixels > 0, self._numbers[name], 0) if name else pixels
-            labels = own if labels is None else np.where(labels > 0, labels, own)
+            object_labels = np.where(pixels > 0, self._numbers[name], 0) if name else pixels
+            labels = object_labels if labels is None else np.where(labels > 0, labels, object_labels)
         return labels
 
 
@@ -69,7 +69,7 @@ def _stem(file: Path) -> str:
     return file.name[: len(file.name) - len(ending)]
 
 
-def _of_frame(stem: str, files: dict[str, Path]) -> dict[str, Path]:
+def _frame_files(stem: str, files: dict[str, Path]) -> dict[str, Path]:
     """Return the masks of a frame keyed by object name, or its label image with the key "".
 
     - `stem`: name of the frame's file without its ending.
@@ -80,5 +80,5 @@ def _of_frame(stem: str, files: dict[str, Path]) -> dict[str, Path]:
     return {
         other[len(stem) + 1 :]: file
         for other, file in files.items()
-        if other.startswith(stem) and len(other) > len(stem) + 1 and other[len(stem)] in _BETWEEN
+        if other.startswith(stem) and len(other) > len(stem) + 1 and other[len(stem)] in _SEPARATORS
     }
