@@ -23,7 +23,7 @@ from jaxnbv.programs import program
 from jaxnbv.scanning.grid import Grid
 
 # Fraction of points that may lie more than two margins outside the volume. Noise moves fewer points than this so far.
-_STRAY = 0.01
+_MAX_STRAY_FRACTION = 0.01
 
 
 class Carving(eqx.Module):
@@ -76,12 +76,14 @@ class Carving(eqx.Module):
         if scan.missed is None:
             return jnp.zeros((grid.resolution,) * 3, bool)
         # `depth` is the depth along the camera's axis up to which each pixel's ray was empty.
-        along = jnp.matmul(scan.points - pose.position, pose.forward, precision="highest")
+        point_depth = jnp.matmul(scan.points - pose.position, pose.forward, precision="highest")
         limit = jnp.asarray(jnp.inf if camera.farthest is None else camera.farthest)
         if barrier is not None:
             limit = jnp.minimum(limit, barrier / jnp.linalg.norm(camera.pixel_directions(), axis=-1))
-        depth = jnp.where(scan.mask, along, jnp.where(scan.missed, limit, 0.0)).reshape(camera.height, camera.width)
-        return _crossed(grid, depth, camera, pose, self.margin_voxels * grid.spacing)
+        depth = jnp.where(scan.mask, point_depth, jnp.where(scan.missed, limit, 0.0)).reshape(
+            camera.height, camera.width
+        )
+        return _is_crossed(grid, depth, camera, pose, self.margin_voxels * grid.spacing)
 
     @program
     def outside(self, grid: Grid) -> Bool[Array, "g g g"]:
@@ -116,7 +118,7 @@ class Carving(eqx.Module):
         limit = self._beyond_volume(grid)
         outside, farthest = _beyond(self.volume, cloud, limit)
         require(
-            int(outside) <= _STRAY * int(cloud.count),
+            int(outside) <= _MAX_STRAY_FRACTION * int(cloud.count),
             f"{int(outside)} of {int(cloud.count)} scanned points lie up to {float(farthest):.4g} outside the volume "
             f"that is to hold the object ({self.volume}), more than {limit:.4g}: declare a larger one, "
             "Carving(Box(low, high)), drop points of other things, or bring the scan to scene coordinates with "
@@ -146,12 +148,14 @@ def carve(values: Float[Array, "*s g g g"], empty: Bool[Array, "g g g"]) -> Floa
 def _beyond(volume: Volume, cloud: PointCloud, limit: float) -> tuple[Int[Array, ""], Float[Array, ""]]:
     """Return the number of points more than `limit` outside the volume, and the largest signed distance."""
     # Evaluate all rows, so that clouds with different counts share a compilation.
-    distance = jnp.where(cloud.mask, volume(cloud.points), -jnp.inf)
+    distances = jnp.where(cloud.mask, volume(cloud.points), -jnp.inf)
     # The comparison is negated so that NaN counts as outside.
-    return jnp.sum(~(distance <= limit)), jnp.max(distance, initial=-jnp.inf)
+    return jnp.sum(~(distances <= limit)), jnp.max(distances, initial=-jnp.inf)
 
 
-def _crossed(grid: Grid, depth: Float[Array, "h w"], camera: Camera, pose: Pose, margin: float) -> Bool[Array, "g g g"]:
+def _is_crossed(
+    grid: Grid, depth: Float[Array, "h w"], camera: Camera, pose: Pose, margin: float
+) -> Bool[Array, "g g g"]:
     """Return, for each node, whether all rays near it stayed empty to at least `margin` beyond it.
 
     - `depth`: depth along the camera's axis up to which each pixel's ray was empty.
@@ -168,30 +172,30 @@ def _crossed(grid: Grid, depth: Float[Array, "h w"], camera: Camera, pose: Pose,
 
     def slab(x):
         nodes = jnp.stack([jnp.full_like(y, x), y, z], axis=-1)
-        right, down, ahead = jnp.matmul(nodes - pose.position, pose.rotation, precision="highest").T
-        in_front = ahead > 2.0 * margin
-        safe = jnp.where(in_front, ahead, 1.0)
-        a, b = right / safe, down / safe
-        place = camera.to_pixels(jnp.stack([a, b], axis=-1)).T
+        right, down, node_depth = jnp.matmul(nodes - pose.position, pose.rotation, precision="highest").T
+        is_in_front = node_depth > 2.0 * margin
+        safe_depth = jnp.where(is_in_front, node_depth, 1.0)
+        a, b = right / safe_depth, down / safe_depth
+        pixel = camera.to_pixels(jnp.stack([a, b], axis=-1)).T
         # The node must have rays on all sides.
-        inside = (place >= 0.5) & (place <= jnp.array([[camera.width - 0.5], [camera.height - 0.5]]))
-        column, row = jnp.floor(place).astype(jnp.int32)
+        is_inside = (pixel >= 0.5) & (pixel <= jnp.array([[camera.width - 0.5], [camera.height - 0.5]]))
+        column, row = jnp.floor(pixel).astype(jnp.int32)
         # The image of the ball of radius `margin` about the node lies within this radius, in pixels. The factor
         # 1 + a^2 + b^2 bounds its stretch off the axis. One pixel is added to include the rays on both sides.
-        radius = max(camera.focal_lengths) * margin / (safe - margin) * (1.0 + a**2 + b**2) + 1.0
+        radius = max(camera.focal_lengths) * margin / (safe_depth - margin) * (1.0 + a**2 + b**2) + 1.0
         radius = jnp.ceil(radius)
         level = jnp.floor(jnp.log2(radius)).astype(jnp.int32)
-        has_rays = in_front & inside.all(axis=0) & (level < len(nearest))
+        has_rays = is_in_front & is_inside.all(axis=0) & (level < len(nearest))
         level = jnp.where(has_rays, level, 0)
         # Four overlapping squares of half width 2^level <= radius cover the square of half width `radius`.
-        aside = jnp.where(has_rays, radius.astype(jnp.int32) - 2**level, 0)
+        shift = jnp.where(has_rays, radius.astype(jnp.int32) - 2**level, 0)
         corners = [
             pyramid[level, jnp.clip(row + down, 0, camera.height - 1), jnp.clip(column + across, 0, camera.width - 1)]
-            for down in (-aside, aside)
-            for across in (-aside, aside)
+            for down in (-shift, shift)
+            for across in (-shift, shift)
         ]
-        least = functools.reduce(jnp.minimum, corners)
-        return (has_rays & (least >= ahead + margin)).reshape(grid.resolution, -1)
+        least_depth = functools.reduce(jnp.minimum, corners)
+        return (has_rays & (least_depth >= node_depth + margin)).reshape(grid.resolution, -1)
 
     return jax.lax.map(slab, axis)
 

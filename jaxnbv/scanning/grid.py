@@ -20,9 +20,9 @@ from jaxnbv.scanning import tracing
 from jaxnbv.scanning.scanner import Hits, Surface, scan
 from jaxnbv.sharding import on_cpu, shared_map
 
-# Two normals count as opposite if the cosine between them is below `_OPPOSITE`. `Grid.check` warns if more than the
-# fraction `_THIN_SHARE` of the points lies on thin parts.
-_OPPOSITE, _THIN_SHARE = -0.8, 0.05
+# Two normals count as opposite if the cosine between them is below `_MAX_OPPOSITE_COSINE`. `Grid.check` warns if more
+# than the fraction `_MAX_THIN_FRACTION` of the points lies on thin parts.
+_MAX_OPPOSITE_COSINE, _MAX_THIN_FRACTION = -0.8, 0.05
 
 
 class Grid(eqx.Module):
@@ -61,11 +61,11 @@ class Grid(eqx.Module):
         """
         points, normals = cloud.to_numpy()
         pairs = cKDTree(points).query_pairs(self.spacing, output_type="ndarray")
-        opposite = np.sum(normals[pairs[:, 0]] * normals[pairs[:, 1]], axis=1) < _OPPOSITE
-        thin = len(np.unique(pairs[opposite]))
-        if thin > _THIN_SHARE * len(points):
+        is_opposite = np.sum(normals[pairs[:, 0]] * normals[pairs[:, 1]], axis=1) < _MAX_OPPOSITE_COSINE
+        num_thin = len(np.unique(pairs[is_opposite]))
+        if num_thin > _MAX_THIN_FRACTION * len(points):
             warnings.warn(
-                f"{thin} of {len(points)} points lie on parts thinner than a cell of the grid, {self.spacing:.3g} "
+                f"{num_thin} of {len(points)} points lie on parts thinner than a cell of the grid, {self.spacing:.3g} "
                 "scene units: some samples will miss these. Raise Grid(resolution=...)",
                 stacklevel=3,
             )
@@ -112,9 +112,9 @@ class GridSurface(Surface):
             values.shape[-3:] == (g, g, g),
             f"values of shape {values.shape} do not fit a grid of {g}^3 nodes: evaluate with x, y and z on grid.axis",
         )
-        relative, finite, distances = _prepared(values, level)
-        if not is_traced(finite):
-            require(bool(finite), "the values on the grid, or the level, are not finite")
+        relative, is_finite, distances = _prepare(values, level)
+        if not is_traced(is_finite):
+            require(bool(is_finite), "the values on the grid, or the level, are not finite")
         return cls(relative, distances, grid)
 
     def without_cells(self, cells: Bool[Array, "*s m m m"]) -> "GridSurface":
@@ -140,19 +140,21 @@ class GridSurface(Surface):
             f"rays are traced through one surface, not a batch of shape {self.values.shape[:-3]}: use scan_samples",
         )
         h, half = self.grid.spacing, self.grid.half_extent
-        field = tracing.Field(self.values.reshape(-1), self.distance.reshape(-1), self.grid.resolution)
+        field = tracing.GridField(self.values.reshape(-1), self.distance.reshape(-1), self.grid.resolution)
         o, d = list(jnp.asarray(origins).T), list(jnp.asarray(directions).T)
         t, mask = tracing.first_zero(field, [(x + half) / h for x in o], [x / h for x in d])
         if self.is_void is not None:
-            places = [jnp.floor((x + t * dx + half) / h).astype(jnp.int32) for x, dx in zip(o, d, strict=True)]
-            mask = mask & ~self.is_void[tuple(jnp.clip(cell, 0, self.grid.resolution - 2) for cell in places)]
+            cells = [jnp.floor((x + t * dx + half) / h).astype(jnp.int32) for x, dx in zip(o, d, strict=True)]
+            mask = mask & ~self.is_void[tuple(jnp.clip(cell, 0, self.grid.resolution - 2) for cell in cells)]
         hits = [jnp.where(mask, x + t * dx, 0.0) for x, dx in zip(o, d, strict=True)]
 
         normals = tracing.smooth_gradient(field, [(x + half) / h for x in hits])
         facing = -jnp.sign(sum(n * dx for n, dx in zip(normals, d, strict=True)))
         square = sum(n * n for n in normals)
-        valid = mask & (square > 0)
-        scale = jnp.where(valid, jnp.where(facing == 0, 1.0, facing) / jnp.sqrt(jnp.where(valid, square, 1.0)), 0.0)
+        is_valid = mask & (square > 0)
+        scale = jnp.where(
+            is_valid, jnp.where(facing == 0, 1.0, facing) / jnp.sqrt(jnp.where(is_valid, square, 1.0)), 0.0
+        )
         return Hits(jnp.stack(hits, axis=-1), jnp.stack([n * scale for n in normals], axis=-1), mask)
 
 
@@ -192,7 +194,7 @@ def mean_depth(scans: PointCloud, pose: Pose) -> Float[Array, " rays"]:
 
 
 @jax.jit
-def _prepared(
+def _prepare(
     values: Float[Array, "*s g g g"], level: Float[Array, ""]
 ) -> tuple[Float[Array, "*s g g g"], Bool[Array, ""], Int8[Array, "*s m m m"]]:
     """Return the values minus the level, whether all are finite, and each cell's `tracing.free_distance`."""

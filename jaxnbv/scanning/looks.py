@@ -26,13 +26,13 @@ from jaxnbv.scanning.scanner import Surface, pixel_area, scan
 from jaxnbv.sharding import shared_map
 
 # Largest stored distance to a hit, in spacings of the grid.
-_REACH = 3
+_MAX_DISTANCE = 3
 STEEP = 0.5
 """The cosine of incidence below which a surface counts as steep. Sensors measure little of a steep surface, so a
 missing hit on it proves nothing. The slopes of samples are also uncertain."""
 
 # Largest number of rays that is stored for a view. More rays would slow down the scans of sampled surfaces.
-_RAYS = 5_000
+_MAX_RAYS = 5_000
 
 
 class Looks(eqx.Module):
@@ -53,14 +53,14 @@ class Looks(eqx.Module):
     @classmethod
     def empty(cls, grid: Grid, camera: Camera, max_views: int) -> "Looks":
         """Return a `Looks` without views that has room for `max_views` views of the sensor's camera."""
-        camera = camera.strided(math.ceil(math.sqrt(camera.num_rays / _RAYS)))
-        far = jnp.full((grid.resolution,) * 3, _REACH * grid.spacing, jnp.result_type(float))
+        camera = camera.strided(math.ceil(math.sqrt(camera.num_rays / _MAX_RAYS)))
+        far = jnp.full((grid.resolution,) * 3, _MAX_DISTANCE * grid.spacing, jnp.result_type(float))
         return cls(far, jnp.zeros((max_views, camera.num_rays), far.dtype), camera, grid)
 
     @property
     def reach(self) -> float:
         """The largest value of `distance`, in scene units."""
-        return _REACH * self.grid.spacing
+        return _MAX_DISTANCE * self.grid.spacing
 
     @program
     def with_points(self, cloud: PointCloud, radii: Float[Array, " n"] | float = 0.0) -> "Looks":
@@ -70,19 +70,19 @@ class Looks(eqx.Module):
           the grid are reduced to it.
         """
         radii = jnp.minimum(radii, self.grid.spacing)
-        place = (cloud.points + self.grid.half_extent) / self.grid.spacing
-        low = jnp.floor(place).astype(jnp.int32)
+        position = (cloud.points + self.grid.half_extent) / self.grid.spacing
+        low = jnp.floor(position).astype(jnp.int32)
 
-        def near(distance, offset):
+        def add_offset(distance, offset):
             node = low + offset
-            to_point = jnp.maximum(self.grid.spacing * jnp.linalg.norm(node - place, axis=-1) - radii, 0.0)
+            to_point = jnp.maximum(self.grid.spacing * jnp.linalg.norm(node - position, axis=-1) - radii, 0.0)
             # JAX would count a negative index from the other end, so such rows get an index beyond the grid.
             is_node = cloud.mask & jnp.all(node >= 0, axis=-1)
             index = jnp.where(is_node[:, None], node, self.grid.resolution)
             return distance.at[tuple(index.T)].min(to_point, mode="drop"), None
 
-        offsets = np.array(list(itertools.product(range(1 - _REACH, _REACH + 1), repeat=3)))
-        return dataclasses.replace(self, distance=jax.lax.scan(near, self.distance, offsets)[0])
+        offsets = np.array(list(itertools.product(range(1 - _MAX_DISTANCE, _MAX_DISTANCE + 1), repeat=3)))
+        return dataclasses.replace(self, distance=jax.lax.scan(add_offset, self.distance, offsets)[0])
 
     def with_view(
         self,
@@ -106,8 +106,8 @@ class Looks(eqx.Module):
             return looks
         far = scan.sight if barrier is None else jnp.minimum(scan.sight, barrier)
         column, row = jnp.floor(camera.to_pixels(self.camera.pixel_directions()[:, :2])).astype(jnp.int32).T
-        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        sight = jnp.where(inside, far[jnp.where(inside, row * camera.width + column, 0)], 0.0)
+        is_inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        sight = jnp.where(is_inside, far[jnp.where(is_inside, row * camera.width + column, 0)], 0.0)
         return dataclasses.replace(looks, sight=looks.sight.at[index].set(sight.astype(looks.sight.dtype)))
 
     def __call__(self, x: Float[Array, "*n 3"]) -> Float[Array, "*n"]:
@@ -117,8 +117,8 @@ class Looks(eqx.Module):
         interpolated linearly, so on a measured surface the result is not zero, but up to half the spacing of the nodes.
         The result is differentiable in x (scene coordinates).
         """
-        places = list(jnp.moveaxis((x + self.grid.half_extent) / self.grid.spacing, -1, 0))
-        return jax.scipy.ndimage.map_coordinates(self.distance, places, order=1, mode="nearest")
+        positions = list(jnp.moveaxis((x + self.grid.half_extent) / self.grid.spacing, -1, 0))
+        return jax.scipy.ndimage.map_coordinates(self.distance, positions, order=1, mode="nearest")
 
     @program
     def without_unmeasured(self, surfaces: GridSurface, poses: PoseList) -> GridSurface:
@@ -149,20 +149,20 @@ class Looks(eqx.Module):
         distance = jnp.linalg.norm(offset, axis=-1)
         cosine, sight = -jnp.sum(offset * hits.normals, axis=-1) / distance, self.sight[index]
         # A steep surface may return no hit. But if the ray hit something deeper, the surface cannot be there.
-        passed = jnp.isfinite(sight) & ((sight - distance) * cosine > spacing)
-        is_unmeasured = hits.mask & (passed | (cosine >= STEEP) & (distance <= sight + spacing))
+        is_passed = jnp.isfinite(sight) & ((sight - distance) * cosine > spacing)
+        is_unmeasured = hits.mask & (is_passed | (cosine >= STEEP) & (distance <= sight + spacing))
         is_unmeasured &= self(hits.points) > spacing
         return jnp.where(is_unmeasured[:, None], self.grid.cell_of(hits.points), self.grid.resolution)
 
 
 def _unmeasured_by_any(surface: GridSurface, looks: Looks, poses: PoseList) -> Bool[Array, "m m m"]:
-    def look(index, is_unmeasured):
+    def mark(index, is_unmeasured):
         cells = looks.unmeasured_cells(surface, index, jax.tree.map(lambda rows: rows[index], poses.rows))
         return is_unmeasured.at[tuple(cells.T)].set(True, mode="drop")
 
-    is_unmeasured = jax.lax.fori_loop(0, poses.count, look, jnp.zeros(surface.distance.shape, bool))
+    is_unmeasured = jax.lax.fori_loop(0, poses.count, mark, jnp.zeros(surface.distance.shape, bool))
     # Include neighbouring cells, since the distance between rays can exceed the size of a cell.
     for axis in range(3):
-        window = tuple(3 if own == axis else 1 for own in range(3))
+        window = tuple(3 if other == axis else 1 for other in range(3))
         is_unmeasured = jax.lax.reduce_window(is_unmeasured, False, jax.lax.bitwise_or, window, (1, 1, 1), "SAME")
     return is_unmeasured

@@ -25,7 +25,7 @@ from jaxnbv.scanning.sdf.sampled import checked_triangles, winding_number
 from jaxnbv.scanning.triangle_rays import FirstFaces, first_faces
 
 # A connected component of a mesh that is supported by fewer points may come from stray points alone.
-_FEWEST_POINTS = 4
+_MIN_POINTS = 4
 
 
 @dataclasses.dataclass(unsafe_hash=True)
@@ -36,13 +36,13 @@ class _Tree:
     content follows from the triangles. So all instances are equal and have the same repr. A copy starts empty.
     """
 
-    _built = None
+    _cache = None
 
-    def of(self, vertices: np.ndarray, faces: np.ndarray) -> FirstFaces:
-        built = self._built
-        if built is None or built[0] is not vertices or built[1] is not faces:
-            built = self._built = vertices, faces, first_faces(vertices, faces)
-        return built[2]
+    def get(self, vertices: np.ndarray, faces: np.ndarray) -> FirstFaces:
+        cache = self._cache
+        if cache is None or cache[0] is not vertices or cache[1] is not faces:
+            cache = self._cache = vertices, faces, first_faces(vertices, faces)
+        return cache[2]
 
     def __reduce__(self) -> tuple[type["_Tree"], tuple[()]]:
         return _Tree, ()
@@ -93,13 +93,13 @@ class TriangleMesh(Surface):
         # Areas are compared with the squared size of the mesh, so that the unit of length does not matter.
         corners = vertices[faces]
         area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-        solid = area > 1e-14 * np.ptp(corners.reshape(-1, 3), axis=0).max() ** 2
-        require(bool(solid.any()), f"all {len(faces)} faces of the mesh have zero area: nothing can be scanned")
-        if not solid.all():
-            warnings.warn(f"dropped {(~solid).sum()} of {len(faces)} faces: they have zero area", stacklevel=2)
-        used, faces = np.unique(faces[solid], return_inverse=True)
-        frame = Frame.fit(np.asarray(vertices[used]), up=up)
-        return cls(frame.to_scene(vertices[used]), faces.reshape(-1, 3), frame)
+        has_area = area > 1e-14 * np.ptp(corners.reshape(-1, 3), axis=0).max() ** 2
+        require(bool(has_area.any()), f"all {len(faces)} faces of the mesh have zero area: nothing can be scanned")
+        if not has_area.all():
+            warnings.warn(f"dropped {(~has_area).sum()} of {len(faces)} faces: they have zero area", stacklevel=2)
+        rows, faces = np.unique(faces[has_area], return_inverse=True)
+        frame = Frame.fit(np.asarray(vertices[rows]), up=up)
+        return cls(frame.to_scene(vertices[rows]), faces.reshape(-1, 3), frame)
 
     def trace(self, origins: Float[AnyArray, "rays 3"], directions: Float[AnyArray, "rays 3"]) -> Hits:
         """Return the first hits of the rays (see `Surface.trace`), which lie exactly in the triangles' planes.
@@ -112,22 +112,22 @@ class TriangleMesh(Surface):
             "or trace SDFSurface(sdf.solid_of_mesh(mesh.vertices, mesh.faces)) instead, which runs inside",
         )
         origins, directions = (np.asarray(a, dtype=np.float64) for a in (origins, directions))
-        rows, distances = self._tree.of(self.vertices, self.faces)(origins, directions)
-        (hit,) = np.nonzero(rows >= 0)
-        origins, directions, near = origins[hit], directions[hit], distances[hit]
-        a, b, c = np.moveaxis(self.vertices[self.faces[rows[hit]]], 1, 0)
+        rows, distances = self._tree.get(self.vertices, self.faces)(origins, directions)
+        (hit_rays,) = np.nonzero(rows >= 0)
+        origins, directions, tracer_distances = origins[hit_rays], directions[hit_rays], distances[hit_rays]
+        a, b, c = np.moveaxis(self.vertices[self.faces[rows[hit_rays]]], 1, 0)
         normals = np.cross(b - a, c - a)
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         cosine = np.sum(normals * directions, axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = np.sum(normals * (a - origins), axis=1) / cosine
         # For a triangle seen edge-on, the intersection with its plane is ill-defined, so the tracer's distance is used.
-        depth = np.where(np.abs(depth - near) < 1e-3, depth, near)
+        depth = np.where(np.abs(depth - tracer_distances) < 1e-3, depth, tracer_distances)
         mask = np.zeros(len(rows), dtype=bool)
-        mask[hit] = True
+        mask[hit_rays] = True
         points, outward = np.zeros((2, len(mask), 3))
-        points[hit] = origins + depth[:, None] * directions
-        outward[hit] = normals * np.where(cosine > 0, -1.0, 1.0)[:, None]
+        points[hit_rays] = origins + depth[:, None] * directions
+        outward[hit_rays] = normals * np.where(cosine > 0, -1.0, 1.0)[:, None]
         dtype = jnp.result_type(float)
         return Hits(jnp.asarray(points, dtype), jnp.asarray(outward, dtype), jnp.asarray(mask))
 
@@ -139,8 +139,8 @@ class TriangleMesh(Surface):
         check_key(key)
         check_type(count, int, "the number of points")
         require(count >= 1, f"cannot sample {count} points; ask for at least one")
-        seed = np.random.default_rng(np.asarray(jax.random.key_data(key)))
-        points, _ = trimesh.sample.sample_surface(self.to_trimesh(), count, seed=seed)
+        rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+        points, _ = trimesh.sample.sample_surface(self.to_trimesh(), count, seed=rng)
         return np.asarray(points)
 
     @property
@@ -186,22 +186,25 @@ def level_triangles(
 
 
 def supported_pieces(
-    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], points: Float[np.ndarray, "n 3"], size: float
+    vertices: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    points: Float[np.ndarray, "n 3"],
+    max_distance: float,
 ) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "k 3"], int]:
     """Return the connected components of a mesh that have at least four points nearby.
 
-    A point belongs to the component of its nearest vertex, if that vertex is within `size` of the point. If no
+    A point belongs to the component of its nearest vertex, if that vertex is within `max_distance` of the point. If no
     component has four points, the components with the largest number of points are kept. Returns the vertices and faces
     of the kept components, and the number of dropped components.
     """
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
     graph = coo_array((np.ones(len(edges), bool), edges.T), (len(vertices), len(vertices)))
-    count, piece = connected_components(graph, directed=False)
+    count, component = connected_components(graph, directed=False)
     distance, nearest = cKDTree(vertices).query(points)
-    held = np.bincount(piece[nearest[distance <= size]], minlength=count)
-    kept = held >= min(_FEWEST_POINTS, held.max())
-    used, rows = np.unique(faces[kept[piece[faces[:, 0]]]], return_inverse=True)
-    return vertices[used], rows.reshape(-1, 3), int(np.sum(~kept))
+    num_points = np.bincount(component[nearest[distance <= max_distance]], minlength=count)
+    is_supported = num_points >= min(_MIN_POINTS, num_points.max())
+    vertex_rows, new_faces = np.unique(faces[is_supported[component[faces[:, 0]]]], return_inverse=True)
+    return vertices[vertex_rows], new_faces.reshape(-1, 3), int(np.sum(~is_supported))
 
 
 @checked

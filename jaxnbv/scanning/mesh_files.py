@@ -109,7 +109,7 @@ def read_nodes(path: str | Path | trimesh.Geometry) -> list[tuple[str, trimesh.T
     **Raises:** `ValueError` if the file is missing, cannot be read, has no faces, or has features that the reader would
     ignore.
     """
-    meshes = _read_file(Path(path)) if isinstance(path, str | Path) else _placed(path)
+    meshes = _read_file(Path(path)) if isinstance(path, str | Path) else _named_meshes(path)
     meshes = [(name, mesh) for name, mesh in meshes if len(mesh.faces)]
     require(len(meshes) > 0, f"{path} has no faces: it is a point cloud, empty, or an STL that was cut short")
     return meshes
@@ -136,11 +136,11 @@ def _read(path: Path) -> list[tuple[str, trimesh.Trimesh]]:
         return [(name, trimesh.Trimesh(vertices, faces, process=False)) for name, (vertices, faces) in rows.items()]
     resolver = trimesh.resolvers.FilePathResolver(str(path))
     if kind in ("glb", "gltf"):
-        return _placed(read_gltf(content, kind, resolver))
-    return _placed(trimesh.load_scene(BytesIO(content), kind, resolver, process=False))
+        return _named_meshes(read_gltf(content, kind, resolver))
+    return _named_meshes(trimesh.load_scene(BytesIO(content), kind, resolver, process=False))
 
 
-def _placed(geometry: trimesh.Geometry) -> list[tuple[str, trimesh.Trimesh]]:
+def _named_meshes(geometry: trimesh.Geometry) -> list[tuple[str, trimesh.Trimesh]]:
     """Return the node's name and the transformed mesh for each mesh of a scene, or for a single mesh.
 
     A mesh without a node is named by its index.

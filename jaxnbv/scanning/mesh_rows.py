@@ -55,11 +55,11 @@ def read_obj(content: bytes) -> dict[str, Triangles]:
             # later.
             rows = [corner - 1 if corner > 0 else len(vertices) + corner if corner else -1 for corner in corners]
             polygons.setdefault(material, []).append(rows)
-    places = as_array(vertices)
+    points = as_array(vertices)
     parts = {name: triangles_of(group) for name, group in polygons.items()}
     if len(parts) > 1:
-        return {name: _used(places, faces) for name, faces in parts.items()}
-    return {name: (places, faces) for name, faces in parts.items()}
+        return {name: _drop_unused(points, faces) for name, faces in parts.items()}
+    return {name: (points, faces) for name, faces in parts.items()}
 
 
 def read_off(content: bytes) -> Triangles:
@@ -83,8 +83,8 @@ def read_off(content: bytes) -> Triangles:
     corners = []
     for row in polygons:
         words = row[1 : int(row[0]) + 1] if row[0].isdigit() else []
-        proper = row[0] == str(len(words)) and all(word.isdigit() for word in words)
-        require(proper, f"has a face {' '.join(row)!r}, which is not a number of corners and their vertices")
+        is_valid = row[0] == str(len(words)) and all(word.isdigit() for word in words)
+        require(is_valid, f"has a face {' '.join(row)!r}, which is not a number of corners and their vertices")
         corners.append([int(word) for word in words])
     return as_array([row[:3] for row in points]), triangles_of(corners)
 
@@ -95,17 +95,17 @@ def triangles_of(polygons: Sequence[Sequence[int]] | Sequence[np.ndarray] | np.n
     A polygon with fewer than three corners gives no triangle.
     """
     if isinstance(polygons, np.ndarray):
-        alike = [polygons]
+        groups = [polygons]
     else:
         sizes = sorted({len(polygon) for polygon in polygons})
-        alike = [np.array([polygon for polygon in polygons if len(polygon) == size]) for size in sizes]
+        groups = [np.array([polygon for polygon in polygons if len(polygon) == size]) for size in sizes]
     fans = [np.zeros((0, 3), np.int64)]
-    for corners in alike:
+    for corners in groups:
         fans += [corners[:, [0, middle, middle + 1]].astype(np.int64) for middle in range(1, corners.shape[1] - 1)]
     return np.concatenate(fans)
 
 
-def _used(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Triangles:
+def _drop_unused(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Triangles:
     """Drop the vertices that no triangle uses. If an index is out of range, return all unchanged."""
     if not len(faces) or faces.min() < 0 or faces.max() >= len(vertices):
         return vertices, faces

@@ -66,17 +66,17 @@ def is_shown(
     )
     position, rotation = np.asarray(pose.position, np.float64), np.asarray(pose.rotation, np.float64)
     local = (truth - position) @ rotation
-    ahead = local[:, 2] > 0
-    column, row = np.floor(camera.to_pixels(local[:, :2] / np.where(ahead, local[:, 2], 1.0)[:, None])).T
-    inside = ahead & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    pixel = np.where(inside, row * camera.width + column, 0).astype(int)
+    is_ahead = local[:, 2] > 0
+    column, row = np.floor(camera.to_pixels(local[:, :2] / np.where(is_ahead, local[:, 2], 1.0)[:, None])).T
+    is_inside = is_ahead & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    pixel = np.where(is_inside, row * camera.width + column, 0).astype(int)
 
     ray = points - position
     distance = np.linalg.norm(ray, axis=1)
     cosine = np.maximum(np.abs(np.sum(ray * normals, axis=1)) / np.maximum(distance, 1e-12), GRAZING)
-    gain = 0.5 * math.hypot(*(1.0 / f for f in camera.focal_lengths)) * distance * np.sqrt(1.0 / cosine**2 - 1.0)
+    tolerance = 0.5 * math.hypot(*(1.0 / f for f in camera.focal_lengths)) * distance * np.sqrt(1.0 / cosine**2 - 1.0)
     farther = np.linalg.norm(local, axis=1) - distance[pixel]
-    return inside & mask[pixel] & (np.abs(farther) <= size + gain[pixel])
+    return is_inside & mask[pixel] & (np.abs(farther) <= size + tolerance[pixel])
 
 
 def truth_points(scene: Surface, key: PRNGKeyArray, count: int = SURFACE_POINTS) -> Float[np.ndarray, "count 3"] | None:

@@ -22,7 +22,7 @@ from jaxnbv.scanning.sdf import Rotated, SignedDistance
 from jaxnbv.scanning.sphere_tracing import SDFSurface
 
 # Obstacles farther than this from the scene's origin hide nothing.
-_FAR = 8.0
+_MAX_DISTANCE = 8.0
 
 
 class Obstacles(eqx.Module):
@@ -60,11 +60,11 @@ class Obstacles(eqx.Module):
     def in_scene(self, frame: Frame) -> "Obstacles":
         """Convert obstacles in world coordinates to scene coordinates."""
 
-        def moved(solid: SignedDistance) -> SignedDistance:
+        def to_scene(solid: SignedDistance) -> SignedDistance:
             return Rotated(solid.translate(-np.asarray(frame.center)), frame.rotation).scale(frame.scale)
 
-        clutter = None if self.clutter is None else moved(self.clutter)
-        solids = tuple(map(moved, self.solids))
+        clutter = None if self.clutter is None else to_scene(self.clutter)
+        solids = tuple(map(to_scene, self.solids))
         return Obstacles(solids, frame.scale * self.margin, frame.scale * self.clearance, clutter)
 
     def with_clutter(self, clutter: SignedDistance | None) -> "Obstacles":
@@ -84,7 +84,7 @@ class Obstacles(eqx.Module):
         if not self._all:
             return None
         origins, directions = camera.rays(poses)
-        surface = SDFSurface(functools.reduce(operator.or_, self._all), bounding_radius=_FAR)
+        surface = SDFSurface(functools.reduce(operator.or_, self._all), bounding_radius=_MAX_DISTANCE)
         hits = surface.trace(origins.reshape(-1, 3), directions.reshape(-1, 3))
         distance = jnp.linalg.norm(hits.points - origins.reshape(-1, 3), axis=-1)
         return jnp.where(hits.mask, distance, jnp.inf).reshape(origins.shape[:-1])
@@ -92,9 +92,9 @@ class Obstacles(eqx.Module):
     @program
     def remove_points(self, scan: PointCloud) -> PointCloud:
         """Remove the points of solids from a scan. In a sensor's image, their rays then count as missed."""
-        own = scan.mask & (self.distance(scan.points) < self.margin)
-        missed = None if scan.missed is None else scan.missed | own
-        return dataclasses.replace(scan.only(~own), missed=missed)
+        is_obstacle = scan.mask & (self.distance(scan.points) < self.margin)
+        missed = None if scan.missed is None else scan.missed | is_obstacle
+        return dataclasses.replace(scan.only(~is_obstacle), missed=missed)
 
     @program
     def within(self, grid: Grid) -> Bool[Array, "g g g"]:

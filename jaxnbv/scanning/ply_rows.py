@@ -36,7 +36,7 @@ def read_ply(content: bytes) -> Triangles:
     points, faces, strips = (columns.get(name, {}) for name in ("vertex", "face", "tristrips"))
     require({"x", "y", "z"} <= set(points), "has no vertices with x, y and z")
     corners = [rows for name, rows in faces.items() if name in ("vertex_indices", "vertex_index")]
-    pieces = [triangles_of(rows) for rows in corners] + [_of_strips(rows) for rows in strips.values()]
+    pieces = [triangles_of(rows) for rows in corners] + [_strip_triangles(rows) for rows in strips.values()]
     vertices = np.stack([np.asarray(points[axis], np.float64).ravel() for axis in "xyz"], axis=1)
     return vertices, np.concatenate([np.zeros((0, 3), np.int64), *pieces])
 
@@ -81,9 +81,9 @@ def _element(
     fields: list[Any] = []
     for (name, kind, length), values in zip(properties, first, strict=True):
         fields += [(name, kind)] if length is None else [(f"length of {name}", length), (name, kind, (len(values),))]
-    alike = np.dtype(fields)
-    if start + count * alike.itemsize <= len(body):
-        rows = np.frombuffer(body, alike, count, start)
+    row_type = np.dtype(fields)
+    if start + count * row_type.itemsize <= len(body):
+        rows = np.frombuffer(body, row_type, count, start)
         sizes = [(rows[f"length of {name}"], rows[name].shape[1]) for name, _, length in properties if length]
         if all((lengths == size).all() for lengths, size in sizes):
             return {name: rows[name] for name, *_ in properties}, start + rows.nbytes
@@ -112,7 +112,7 @@ def _row(body: bytes, start: int, properties: list[_Property], message: str) -> 
     return row, start
 
 
-def _of_strips(strips: Iterable[np.ndarray]) -> Int[np.ndarray, "f 3"]:
+def _strip_triangles(strips: Iterable[np.ndarray]) -> Int[np.ndarray, "f 3"]:
     """Convert triangle strips to triangles.
 
     An array of `strips` has the vertex indices of one strip, or of several strips separated by -1. Every second

@@ -24,7 +24,7 @@ from jaxnbv.programs import program
 
 # A camera farther than this from the scene's origin probably has its pose in other units. The limit, in scene units, is
 # forty times the longest side of an object.
-_FAR_OFF = 100.0
+_MAX_CAMERA_DISTANCE = 100.0
 
 
 class Hits(eqx.Module):
@@ -210,7 +210,7 @@ def distance_problem(pose: Pose) -> str | None:
     Accepts a pose or a batch of poses, but not under JAX transformations.
     """
     distance = float(np.linalg.norm(np.asarray(pose.position), axis=-1).max(initial=0.0))
-    if distance <= _FAR_OFF:
+    if distance <= _MAX_CAMERA_DISTANCE:
         return None
     return (
         f"a camera stands {distance:.4g} scene units from the middle of the scene, where an object's longest side is "
@@ -237,14 +237,14 @@ def scan(
     """
     origins, directions = camera.rays(pose)
     hits = surface.trace(origins.reshape(-1, 3), directions.reshape(-1, 3))
-    cloud = _returns(hits, origins, directions, camera, pose, barrier)
+    cloud = _measurable_hits(hits, origins, directions, camera, pose, barrier)
     if not is_traced(pose, cloud) and (problem := distance_problem(pose)) and not bool(cloud.mask.any()):
         warnings.warn(f"the scan sees nothing: {problem}", stacklevel=3)
     return cloud
 
 
 @program
-def _returns(
+def _measurable_hits(
     hits: Hits,
     origins: Float[Array, "*batch rays 3"],
     directions: Float[Array, "*batch rays 3"],
@@ -262,25 +262,27 @@ def _returns(
     if not camera.limited:
         return PointCloud(points, normals, mask, ~mask, _sight(points, origins, mask))
     depth = jnp.einsum("...rd,...d->...r", points - origins, pose.forward, precision="highest")
-    beyond = jnp.zeros_like(mask) if camera.farthest is None else depth > camera.farthest
+    is_beyond = jnp.zeros_like(mask) if camera.farthest is None else depth > camera.farthest
     cosine = -jnp.sum(normals * directions, axis=-1)
-    returns = mask & ~beyond & (depth >= camera.nearest) & (cosine >= math.cos(camera.max_incidence))
-    points, normals = (jnp.where(returns[..., None], rows, 0.0) for rows in (points, normals))
-    return PointCloud(points, normals, returns, ~mask | beyond, _sight(points, origins, returns))
+    is_measured = mask & ~is_beyond & (depth >= camera.nearest) & (cosine >= math.cos(camera.max_incidence))
+    points, normals = (jnp.where(is_measured[..., None], rows, 0.0) for rows in (points, normals))
+    return PointCloud(points, normals, is_measured, ~mask | is_beyond, _sight(points, origins, is_measured))
 
 
 def _sight(
-    points: Float[Array, "*batch rays 3"], origins: Float[Array, "*batch rays 3"], returns: Bool[Array, "*batch rays"]
+    points: Float[Array, "*batch rays 3"],
+    origins: Float[Array, "*batch rays 3"],
+    mask: Bool[Array, "*batch rays"],
 ) -> Float[Array, "*batch rays"]:
-    return jnp.where(returns, jnp.linalg.norm(points - origins, axis=-1), jnp.inf)
+    return jnp.where(mask, jnp.linalg.norm(points - origins, axis=-1), jnp.inf)
 
 
 @eqx.filter_custom_jvp
 def implicit_depth(
-    along: Callable[[Float[Array, " n"]], Float[Array, " n"]],
+    field_along_ray: Callable[[Float[Array, " n"]], Float[Array, " n"]],
     depth: Float[Array, " n"],
     mask: Bool[Array, " n"],
-    grazing: Float[Array, " n"],
+    least_slope: Float[Array, " n"],
 ) -> Float[Array, " n"]:
     """Return `depth` unchanged, but with derivatives from the implicit function theorem.
 
@@ -288,10 +290,11 @@ def implicit_depth(
     of the surface: f(theta, t(theta)) = 0. So dt = -(df/dtheta dtheta) / (df/dt). This rule can itself be
     differentiated, so derivatives of higher order are right too.
 
-    - `along`: a module that returns f at a given depth along each of n rays. Its arrays are the parameters theta.
+    - `field_along_ray`: a module that returns f at a given depth along each of n rays. Its arrays are the parameters
+      theta.
     - `depth`: depth t of a root of f on each ray, computed by any method.
     - `mask`: whether each ray hits the surface. The derivative is zero for rays that miss.
-    - `grazing`: least slope |df/dt| for each ray. A smaller slope is replaced by this value with the slope's sign,
+    - `least_slope`: least slope |df/dt| for each ray. A smaller slope is replaced by this value with the slope's sign,
       since the derivative is unbounded for a ray that runs along the surface.
     """
     return depth
@@ -299,27 +302,27 @@ def implicit_depth(
 
 @implicit_depth.def_jvp
 def _implicit_depth_jvp(primals, tangents):
-    along, depth, mask, grazing = primals
-    depth = implicit_depth(along, depth, mask, grazing)
-    _, slope = jax.jvp(along, (depth,), (jnp.ones_like(depth),))
-    slope = jnp.where(jnp.abs(slope) < grazing, jnp.where(slope < 0, -grazing, grazing), slope)
-    _, change = eqx.filter_jvp(lambda field: field(depth), (along,), (tangents[0],))
+    field_along_ray, depth, mask, least_slope = primals
+    depth = implicit_depth(field_along_ray, depth, mask, least_slope)
+    _, slope = jax.jvp(field_along_ray, (depth,), (jnp.ones_like(depth),))
+    slope = jnp.where(jnp.abs(slope) < least_slope, jnp.where(slope < 0, -least_slope, least_slope), slope)
+    _, change = eqx.filter_jvp(lambda field: field(depth), (field_along_ray,), (tangents[0],))
     return depth, jnp.where(mask, -change / jnp.where(slope == 0, 1.0, slope), 0.0)
 
 
-def pixel_area(scan: PointCloud, camera: Camera, pose: Pose, steepest: float) -> Float[Array, " rays"]:
+def pixel_area(scan: PointCloud, camera: Camera, pose: Pose, least_cosine: float) -> Float[Array, " rays"]:
     """Return the surface area that each pixel shows, in squared scene units.
 
     It is zero for pixels without a point. Otherwise the area is r^2 omega / cos = z^3 / (r fx fy cos), with focal
     lengths fx and fy, depth z, distance r, the pixel's solid angle omega and the cosine of incidence cos.
 
     - `scan`: the scan that this camera took from this pose.
-    - `steepest`: least cosine of incidence. A smaller cosine is replaced by this value.
+    - `least_cosine`: least cosine of incidence. A smaller cosine is replaced by this value.
     """
     offset = jnp.where(scan.mask[:, None], scan.points - pose.position, pose.forward)
     depth = jnp.matmul(offset, pose.forward, precision="highest")
     distance = jnp.linalg.norm(offset, axis=-1)
     cosine = jnp.abs(jnp.sum(offset * scan.normals, axis=-1)) / distance
     across, down = camera.focal_lengths
-    facing = depth**3 / (distance * across * down)
-    return jnp.where(scan.mask, facing / jnp.maximum(cosine, steepest), 0.0)
+    facing_area = depth**3 / (distance * across * down)
+    return jnp.where(scan.mask, facing_area / jnp.maximum(cosine, least_cosine), 0.0)

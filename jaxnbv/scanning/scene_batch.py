@@ -27,11 +27,11 @@ def scene_batch(scenes: Any, count: int) -> Surface:
     if not isinstance(scenes, Sequence):
         batch = _traceable(scenes, "the scene")
         shapes = [np.shape(leaf) for leaf in jax.tree.leaves(eqx.filter(batch, eqx.is_array))]
-        wrong = [shape for shape in shapes if shape[:1] != (count,)]
+        bad_shapes = [shape for shape in shapes if shape[:1] != (count,)]
         require(
-            not wrong,
-            f"there are {count} keys, but the scenes hold an array of shape {wrong[:1]}, which needs a leading axis of "
-            f"{count}: give a list with a scene for each key, [scene] * {count} to repeat one",
+            not bad_shapes,
+            f"there are {count} keys, but the scenes hold an array of shape {bad_shapes[:1]}, which needs a leading "
+            f"axis of {count}: give a list with a scene for each key, [scene] * {count} to repeat one",
         )
         return batch
     require(len(scenes) == count, f"there are {len(scenes)} scenes for {count} keys: give a scene for each key")

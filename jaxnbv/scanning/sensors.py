@@ -7,7 +7,7 @@ from jaxnbv.geometry.camera import Camera
 
 # Width of the image relative to the object. The object must not touch the border, because space near the border of an
 # image never counts as seen empty.
-_ROOM = 1.05
+_MARGIN_FACTOR = 1.05
 
 
 class Setting(NamedTuple):
@@ -32,4 +32,4 @@ def fit_distance(setting: Setting, bounding_radius: float) -> Setting:
 
     - `bounding_radius`: radius of a ball about the scene's origin that holds the object, in scene units.
     """
-    return setting._replace(radius=_ROOM * bounding_radius / math.sin(0.5 * setting.camera.fov))
+    return setting._replace(radius=_MARGIN_FACTOR * bounding_radius / math.sin(0.5 * setting.camera.fov))

@@ -18,13 +18,13 @@ from jaxnbv.scanning.sdf import SignedDistance
 _SHORTEST_STRIDE = 1e-3
 _MAX_STRIDES = 512
 # Once at most this fraction of the rays is unfinished, the unfinished rays continue in a smaller batch.
-_FEW = 1 / 8
-_CHORDS = 2
+_MAX_UNFINISHED = 1 / 8
+_NUM_CHORDS = 2
 # Slopes are evaluated this far before a hit along the ray, in units of the machine epsilon. The length is 1e-5 scene
 # units in float32, which is above the rounding of a hit and below the size of any detail.
-_FRONT = 84
+_FRONT_OFFSET = 84
 # Derivatives of hits are exact if the sine of the angle between the ray and the surface is at least this.
-_GRAZING = 0.05
+_MIN_SLOPE = 0.05
 
 
 class SDFSurface(Surface):
@@ -65,24 +65,25 @@ class SDFSurface(Surface):
     @program
     def trace(self, origins: Float[AnyArray, "rays 3"], directions: Float[AnyArray, "rays 3"]) -> Hits:
         origins, directions = jnp.asarray(origins), jnp.asarray(directions)
-        along = _Along(self.sdf, origins, directions)
-        fixed = jax.lax.stop_gradient(along)
-        depth, mask = _first_root(fixed.sdf, fixed.origins, fixed.directions, self.bounding_radius)
+        distance = _DistanceAlongRay(self.sdf, origins, directions)
+        constant = jax.lax.stop_gradient(distance)
+        depth, mask = _first_root(constant.sdf, constant.origins, constant.directions, self.bounding_radius)
         # Slopes are evaluated just in front of the surface. On the surface, a solid's formula may be at the border of
         # two cases, and rounding may give a slope that belongs to neither case.
-        before = _Along(self.sdf, origins - _FRONT * jnp.finfo(origins.dtype).eps * directions, directions)
-        depth = implicit_depth(before, fixed.newton(depth), mask, jnp.full_like(depth, _GRAZING))
-        points, front = along.points(depth), before.points(depth)
+        front_origins = origins - _FRONT_OFFSET * jnp.finfo(origins.dtype).eps * directions
+        front_distance = _DistanceAlongRay(self.sdf, front_origins, directions)
+        depth = implicit_depth(front_distance, constant.newton(depth), mask, jnp.full_like(depth, _MIN_SLOPE))
+        points, front_points = distance.points(depth), front_distance.points(depth)
         # Forward mode compiles to one pass over the points. Reverse mode would not, because of its scatter operations.
         axes = jnp.broadcast_to(jnp.eye(3, dtype=points.dtype)[:, None], (3, *points.shape))
-        gradient = jax.vmap(lambda axis: jax.jvp(self.sdf, (front,), (axis,))[1], out_axes=-1)(axes)
+        gradient = jax.vmap(lambda axis: jax.jvp(self.sdf, (front_points,), (axis,))[1], out_axes=-1)(axes)
         gradient = jnp.where(jnp.any(gradient != 0, axis=-1, keepdims=True), gradient, -directions)
         facing = -jnp.sign(jnp.sum(gradient * directions, axis=-1, keepdims=True))
         normals = jnp.where(facing == 0, 1.0, facing) * gradient / jnp.linalg.norm(gradient, axis=-1, keepdims=True)
         return Hits(jnp.where(mask[:, None], points, 0.0), jnp.where(mask[:, None], normals, 0.0), mask)
 
 
-class _Along(eqx.Module):
+class _DistanceAlongRay(eqx.Module):
     """The signed distance of a solid as a function of depth along rays."""
 
     sdf: SignedDistance
@@ -98,7 +99,7 @@ class _Along(eqx.Module):
     def newton(self, depth: Float[Array, " n"]) -> Float[Array, " n"]:
         """Return depths after one Newton step towards the root, exact to rounding except for grazing rays."""
         value, slope = jax.jvp(self, (depth,), (jnp.ones_like(depth),))
-        return depth - value / (jnp.where(slope < 0, -1.0, 1.0) * jnp.maximum(jnp.abs(slope), _GRAZING))
+        return depth - value / (jnp.where(slope < 0, -1.0, 1.0) * jnp.maximum(jnp.abs(slope), _MIN_SLOPE))
 
 
 def _first_root(
@@ -111,62 +112,66 @@ def _first_root(
     middle = -jnp.sum(origins * directions, axis=-1)
     squared = middle**2 - jnp.sum(origins**2, axis=-1) + radius**2
     half_chord = jnp.sqrt(jnp.maximum(squared, 0.0))
-    enter, leave = jnp.maximum(middle - half_chord, 0.0), middle + half_chord
+    min_depth, max_depth = jnp.maximum(middle - half_chord, 0.0), middle + half_chord
 
-    start = sdf(origins + enter[:, None] * directions)
-    alive = (squared > 0) & (leave > 0)
-    march = _March(origins, directions, jnp.where(start < 0, -1.0, 1.0), leave, enter, start, enter, start, alive)
+    value = sdf(origins + min_depth[:, None] * directions)
+    meets_ball = (squared > 0) & (max_depth > 0)
+    sign = jnp.where(value < 0, -1.0, 1.0)
+    march = _March(origins, directions, sign, max_depth, min_depth, value, min_depth, value, meets_ball)
 
     # Nearly all rays finish within a few strides. The unfinished rays continue in a smaller batch.
-    few = math.ceil(len(origins) * _FEW)
-    march, count = _advance(sdf, march, 0, few)
-    (rest,) = jnp.nonzero(march.alive, size=few, fill_value=len(origins))
-    stragglers = jax.tree.map(lambda leaf: leaf.at[rest].get(mode="fill", fill_value=0), march)
+    max_unfinished = math.ceil(len(origins) * _MAX_UNFINISHED)
+    march, count = _advance(sdf, march, 0, max_unfinished)
+    (rows,) = jnp.nonzero(march.is_unfinished, size=max_unfinished, fill_value=len(origins))
+    stragglers = jax.tree.map(lambda leaf: leaf.at[rows].get(mode="fill", fill_value=0), march)
     stragglers, _ = _advance(sdf, stragglers, count, 0)
-    march = jax.tree.map(lambda leaf, part: leaf.at[rest].set(part, mode="drop"), march, stragglers)
+    march = jax.tree.map(lambda leaf, part: leaf.at[rows].set(part, mode="drop"), march, stragglers)
 
-    mask = alive & ~march.alive & (march.side * march.f <= 0)
+    mask = meets_ball & ~march.is_unfinished & (march.start_sign * march.value <= 0)
     return jnp.where(mask, _refine(sdf, march), 0.0), mask
 
 
 class _March(eqx.Module):
     """State of the rays during sphere tracing.
 
-    - `side`: sign of the signed distance at the start of each ray.
-    - `leave`: depth at which the ray leaves the ball in which surfaces are searched.
-    - `depth`, `f`: current depth, and the signed distance at this depth.
-    - `before`, `f_before`: depth one stride earlier, and the signed distance at that depth.
-    - `alive`: whether the ray is unfinished.
+    - `start_sign`: sign of the signed distance at the start of each ray.
+    - `max_depth`: depth at which the ray leaves the ball in which surfaces are searched.
+    - `depth`, `value`: current depth, and the signed distance at this depth.
+    - `previous_depth`, `previous_value`: depth one stride earlier, and the signed distance at that depth.
+    - `is_unfinished`: whether the ray is unfinished.
     """
 
     origins: Float[Array, "n 3"]
     directions: Float[Array, "n 3"]
-    side: Float[Array, " n"]
-    leave: Float[Array, " n"]
-    before: Float[Array, " n"]
-    f_before: Float[Array, " n"]
+    start_sign: Float[Array, " n"]
+    max_depth: Float[Array, " n"]
+    previous_depth: Float[Array, " n"]
+    previous_value: Float[Array, " n"]
     depth: Float[Array, " n"]
-    f: Float[Array, " n"]
-    alive: Bool[Array, " n"]
+    value: Float[Array, " n"]
+    is_unfinished: Bool[Array, " n"]
 
 
-def _advance(sdf: SignedDistance, march: _March, count, enough: int):
-    """Advance the rays until at most `enough` are unfinished or `_MAX_STRIDES` strides are used up.
+def _advance(sdf: SignedDistance, march: _March, count, max_unfinished: int):
+    """Advance the rays until at most `max_unfinished` are unfinished or `_MAX_STRIDES` strides are used up.
 
     Returns the rays and the total number of strides, which starts at `count`.
     """
-    along = _Along(sdf, march.origins, march.directions)
+    distance = _DistanceAlongRay(sdf, march.origins, march.directions)
 
     def body(carry):
-        count, before, f_before, depth, f, alive = carry
-        further = depth + jnp.maximum(jnp.abs(f), _SHORTEST_STRIDE)
-        before, f_before = jnp.where(alive, depth, before), jnp.where(alive, f, f_before)
-        depth, f = jnp.where(alive, further, depth), jnp.where(alive, along(further), f)
-        return count + 1, before, f_before, depth, f, alive & (march.side * f > 0) & (depth < march.leave)
+        count, previous_depth, previous_value, depth, value, is_unfinished = carry
+        next_depth = depth + jnp.maximum(jnp.abs(value), _SHORTEST_STRIDE)
+        previous_depth = jnp.where(is_unfinished, depth, previous_depth)
+        previous_value = jnp.where(is_unfinished, value, previous_value)
+        depth = jnp.where(is_unfinished, next_depth, depth)
+        value = jnp.where(is_unfinished, distance(next_depth), value)
+        is_unfinished = is_unfinished & (march.start_sign * value > 0) & (depth < march.max_depth)
+        return count + 1, previous_depth, previous_value, depth, value, is_unfinished
 
-    carry = (count, march.before, march.f_before, march.depth, march.f, march.alive)
-    count, *rest = jax.lax.while_loop(lambda c: (c[0] < _MAX_STRIDES) & (jnp.sum(c[-1]) > enough), body, carry)
-    return _March(march.origins, march.directions, march.side, march.leave, *rest), count
+    carry = (count, march.previous_depth, march.previous_value, march.depth, march.value, march.is_unfinished)
+    count, *rest = jax.lax.while_loop(lambda c: (c[0] < _MAX_STRIDES) & (jnp.sum(c[-1]) > max_unfinished), body, carry)
+    return _March(march.origins, march.directions, march.start_sign, march.max_depth, *rest), count
 
 
 def _refine(sdf: SignedDistance, march: _March) -> Float[Array, " n"]:
@@ -174,18 +179,18 @@ def _refine(sdf: SignedDistance, march: _March) -> Float[Array, " n"]:
 
     The interval is short, so a few chords are enough to reach the rounding error.
     """
-    along = _Along(sdf, march.origins, march.directions)
+    distance = _DistanceAlongRay(sdf, march.origins, march.directions)
 
     def chord(_, bracket):
-        low, f_low, high, f_high = bracket
-        drop = f_low - f_high
-        root = low + (high - low) * f_low / jnp.where(drop == 0, 1.0, drop)
-        f = along(root)
-        ahead = march.side * f > 0
-        low, f_low = jnp.where(ahead, root, low), jnp.where(ahead, f, f_low)
-        high, f_high = jnp.where(ahead, high, root), jnp.where(ahead, f_high, f)
-        return low, f_low, high, f_high
+        low, low_value, high, high_value = bracket
+        drop = low_value - high_value
+        root = low + (high - low) * low_value / jnp.where(drop == 0, 1.0, drop)
+        value = distance(root)
+        is_before_root = march.start_sign * value > 0
+        low, low_value = jnp.where(is_before_root, root, low), jnp.where(is_before_root, value, low_value)
+        high, high_value = jnp.where(is_before_root, high, root), jnp.where(is_before_root, high_value, value)
+        return low, low_value, high, high_value
 
-    bracket = march.before, march.f_before, march.depth, march.f
-    low, f_low, high, f_high = jax.lax.fori_loop(0, _CHORDS, chord, bracket)
-    return jnp.where(jnp.abs(f_low) < jnp.abs(f_high), low, high)
+    bracket = march.previous_depth, march.previous_value, march.depth, march.value
+    low, low_value, high, high_value = jax.lax.fori_loop(0, _NUM_CHORDS, chord, bracket)
+    return jnp.where(jnp.abs(low_value) < jnp.abs(high_value), low, high)

@@ -21,56 +21,57 @@ from jaxnbv.scanning.scanner import implicit_depth
 # Once at most a fifth of the rays of a march is unfinished, the march continues with the unfinished rays only. Batches
 # smaller than an image are not reduced. Each batch size is compiled. If batches are reduced at a quarter instead of a
 # fifth, a march is as fast but takes a third longer to compile.
-_SHRINK = 5
-_SMALLEST = 2500
+_SHRINK_FACTOR = 5
+_MIN_BATCH = 2500
 
 # A ray grazes the surface if the slope of f along the ray, per cell, is below this fraction of the spread of f over the
 # cell's corners.
-_GRAZING = 0.03
+_MIN_SLOPE_RATIO = 0.03
 
 # The x, y and z components of n vectors as three arrays, which XLA fuses better than one.
 Triple = list[Float[Array, " n"]]
 
 
 class March(NamedTuple):
-    """State of a march along rays u + t du.
+    """State of a march along rays entry + t direction.
 
-    - `u`, `du`: point at which each ray enters the grid's box, and its direction.
+    - `entry`, `direction`: point at which each ray enters the grid's box, and its direction.
     - `t`: the ray's current position.
-    - `end`: t at which the ray leaves the box. Once the ray has reached a cell with a zero, `end` is the t at which it
-      leaves this cell. So if t < end after the march, there is a zero between t and end.
+    - `t_end`: t at which the ray leaves the box. Once the ray has reached a cell with a zero, `t_end` is the t at which
+      it leaves this cell. So if t < t_end after the march, there is a zero between t and t_end.
     - `sign`: sign of f at the start; zero until it has been computed.
-    - `alive`: whether the ray is unfinished.
+    - `is_unfinished`: whether the ray is unfinished.
     """
 
-    u: Triple
-    du: Triple
+    entry: Triple
+    direction: Triple
     t: Float[Array, " n"]
-    end: Float[Array, " n"]
+    t_end: Float[Array, " n"]
     sign: Int8[Array, " n"]
-    alive: Bool[Array, " n"]
+    is_unfinished: Bool[Array, " n"]
 
 
-class Field(eqx.Module):
+class GridField(eqx.Module):
     """A function f on a grid, and the distance from each cell of the grid to a change of sign of f.
 
     - `values`: f at the g^3 nodes, flattened in row-major order.
-    - `distance`: `free_distance` of the (g - 1)^3 cells, in cells, flattened in the same way.
+    - `cell_distance`: `free_distance` of the (g - 1)^3 cells, in cells, flattened in the same way.
+    - `resolution`: number of nodes along each axis, g.
     """
 
     values: Float[Array, " nodes"]
-    distance: Int8[Array, " cells"]
-    g: int = eqx.field(static=True)
+    cell_distance: Int8[Array, " cells"]
+    resolution: int = eqx.field(static=True)
 
     @property
-    def ahead(self) -> float:
+    def offset(self) -> float:
         """Distance, in cells along every axis, by which a position moves forward before its cell is computed.
 
         The offset exceeds the rounding of coordinates, so a ray on the border of two cells is always assigned to the
         cell that it enters, and the march cannot stall. A ray skips at most a sliver of this width. A zero in the
         sliver is still detected, because the sign in the next cell then differs from the sign at the start.
         """
-        return 16 * float(jnp.finfo(self.values.dtype).eps) * self.g
+        return 16 * float(jnp.finfo(self.values.dtype).eps) * self.resolution
 
 
 def free_distance(values: Float[Array, "g g g"]) -> Int8[Array, "m m m"]:
@@ -103,7 +104,7 @@ def free_distance(values: Float[Array, "g g g"]) -> Int8[Array, "m m m"]:
 class _InCell(eqx.Module):
     """The trilinear function of one fixed cell per ray, at positions t on the rays u + t du."""
 
-    field: Field
+    field: GridField
     u: Triple
     du: Triple
     cell: list[Int[Array, " n"]]
@@ -113,12 +114,12 @@ class _InCell(eqx.Module):
         return cubic(corner_values(self.cell, self.field), local, self.du)[0]
 
     @property
-    def grazing(self) -> Float[Array, " n"]:
+    def least_slope(self) -> Float[Array, " n"]:
         corners = corner_values(self.cell, self.field)
-        return _GRAZING * (_largest(corners) - _smallest(corners)) * jnp.sqrt(sum(d * d for d in self.du))
+        return _MIN_SLOPE_RATIO * (_largest(corners) - _smallest(corners)) * jnp.sqrt(sum(d * d for d in self.du))
 
 
-def first_zero(field: Field, u: Triple, du: Triple) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
+def first_zero(field: GridField, u: Triple, du: Triple) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
     """Return the position t of the first zero of f on each ray u + t du, and whether there is a zero.
 
     A ray starts at its origin u or, if u is outside the grid's box, where it enters the box. t is differentiable in the
@@ -128,19 +129,19 @@ def first_zero(field: Field, u: Triple, du: Triple) -> tuple[Float[Array, " n"],
     - `u`, `du`: origins and directions of the rays in grid coordinates.
     """
     t, mask, cell = _traced_zero(*jax.lax.stop_gradient((field, u, du)))
-    along = _InCell(field, u, du, cell)
-    return implicit_depth(along, t, mask, jax.lax.stop_gradient(along.grazing)), mask
+    field_along_ray = _InCell(field, u, du, cell)
+    return implicit_depth(field_along_ray, t, mask, jax.lax.stop_gradient(field_along_ray.least_slope)), mask
 
 
-def _first_zero(field: Field, u: Triple, du: Triple):
+def _first_zero(field: GridField, u: Triple, du: Triple):
     """Return the results of `first_zero`, without their derivatives, and the cell of each zero."""
     rays, start = enter(u, du, field)
     rays = march(rays, field)
-    mask = rays.t < rays.end
-    rays = rays._replace(t=jnp.where(mask, rays.t, 0.0), end=jnp.where(mask, rays.end, 0.0))
+    mask = rays.t < rays.t_end
+    rays = rays._replace(t=jnp.where(mask, rays.t, 0.0), t_end=jnp.where(mask, rays.t_end, 0.0))
     local, cell = cell_at(rays, field)
-    width = rays.end - rays.t
-    coefficients = cubic(corner_values(cell, field), local, [d * width for d in rays.du])
+    width = rays.t_end - rays.t
+    coefficients = cubic(corner_values(cell, field), local, [d * width for d in rays.direction])
     root = first_root([c * rays.sign for c in coefficients])
     return jnp.where(mask, start + rays.t + root * width, 0.0), mask, cell
 
@@ -149,13 +150,13 @@ _traced_zero = jax.custom_batching.custom_vmap(_first_zero)
 
 
 @_traced_zero.def_vmap
-def _traced_zero_batched(size: int, batched, field: Field, u: list[Array], du: list[Array]):
+def _traced_zero_batched(size: int, batched, field: GridField, u: list[Array], du: list[Array]):
     """Join a `vmap`'s batches of rays through one field into one batch, which takes less time."""
     u, du = jax.tree.map(
-        lambda x, has: x if has else jnp.broadcast_to(x, (size, *x.shape)), (u, du), tuple(batched[1:])
+        lambda x, is_batched: x if is_batched else jnp.broadcast_to(x, (size, *x.shape)), (u, du), tuple(batched[1:])
     )
     if any(jax.tree.leaves(batched[0])):
-        axes = jax.tree.map(lambda has: 0 if has else None, batched[0])
+        axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, batched[0])
         zeros = jax.vmap(_first_zero, in_axes=(axes, 0, 0))(field, u, du)
     else:
         flat = jax.tree.map(lambda x: x.reshape(-1), (u, du))
@@ -163,130 +164,137 @@ def _traced_zero_batched(size: int, batched, field: Field, u: list[Array], du: l
     return zeros, jax.tree.map(lambda _: True, zeros)
 
 
-def smooth_gradient(field: Field, x: Triple) -> Triple:
+def smooth_gradient(field: GridField, x: Triple) -> Triple:
     """Return a continuous gradient of f, in change per cell, at points x within the grid.
 
     The gradient is interpolated linearly from central differences at the nodes (one-sided on the border). The gradient
     of the trilinear interpolant itself would jump between cells.
     """
-    last = field.g - 1
+    last = field.resolution - 1
     cell = [jnp.clip(jnp.floor(jax.lax.stop_gradient(p)).astype(jnp.int32), 0, last - 1) for p in x]
     local = [p - c for p, c in zip(x, cell, strict=True)]
     index = [{offset: jnp.clip(c + offset, 0, last) for offset in (-1, 0, 1, 2)} for c in cell]
 
     @functools.cache
     def value(i, j, k):
-        return _take(field.values, _flat([index[0][i], index[1][j], index[2][k]], field.g))
+        return _take(field.values, _flat([index[0][i], index[1][j], index[2][k]], field.resolution))
 
     gradient = []
     for axis in range(3):
         total = jnp.zeros_like(x[axis])
         for node in CORNERS:
-            ahead, behind = ([n + step * (a == axis) for a, n in enumerate(node)] for step in (1, -1))
-            width = index[axis][ahead[axis]] - index[axis][behind[axis]]
+            next_node, previous_node = ([n + step * (a == axis) for a, n in enumerate(node)] for step in (1, -1))
+            width = index[axis][next_node[axis]] - index[axis][previous_node[axis]]
             weight = functools.reduce(jnp.multiply, [p if n else 1.0 - p for p, n in zip(local, node, strict=True)])
-            total += weight * (value(*ahead) - value(*behind)) / width
+            total += weight * (value(*next_node) - value(*previous_node)) / width
         gradient.append(total)
     return gradient
 
 
-def enter(u: Triple, du: Triple, field: Field) -> tuple[March, Float[Array, " n"]]:
+def enter(u: Triple, du: Triple, field: GridField) -> tuple[March, Float[Array, " n"]]:
     """Start a march where the rays u + t du enter the grid's box. Return it and the t of this point.
 
     The `t` of the march counts from this point.
     """
     # The box is smaller than the grid by a sliver, so that no position lies outside the grid after it is rounded and
     # moved forward.
-    low, high = 2 * field.ahead, field.g - 1 - 2 * field.ahead
+    low, high = 2 * field.offset, field.resolution - 1 - 2 * field.offset
     du = [jnp.where(jnp.abs(d) < 1e-9, 1e-9, d) for d in du]
     start, end = ray_interval(u, du, 3 * [low], 3 * [high])
     start = jnp.maximum(start, 0.0)
     u = [jnp.clip(x + start * d, low, high) for x, d in zip(u, du, strict=True)]
-    unknown = jnp.zeros(start.shape, jnp.int8)
-    return March(u, du, jnp.zeros_like(start), end - start, unknown, start < end), start
+    sign = jnp.zeros(start.shape, jnp.int8)
+    return March(u, du, jnp.zeros_like(start), end - start, sign, start < end), start
 
 
-def march(rays: March, field: Field) -> March:
-    """March all rays to the cell of their first zero, or out of the box (see `March.end`)."""
+def march(rays: March, field: GridField) -> March:
+    """March all rays to the cell of their first zero, or out of the box (see `March.t_end`)."""
     count = rays.t.size
-    remainder = count // _SHRINK if count > _SMALLEST else 0
+    remainder = count // _SHRINK_FACTOR if count > _MIN_BATCH else 0
     rays = jax.lax.while_loop(
-        lambda rays: jnp.sum(rays.alive) > remainder,
+        lambda rays: jnp.sum(rays.is_unfinished) > remainder,
         lambda rays: _search_cell(_stride(rays, field), field),
         rays,
     )
     if remainder == 0:
         return rays
-    index = jnp.nonzero(rays.alive, size=remainder, fill_value=count)[0]
+    index = jnp.nonzero(rays.is_unfinished, size=remainder, fill_value=count)[0]
     rest = jax.tree.map(lambda leaf: jnp.take(leaf, index, mode="clip"), rays)
-    rest = march(rest._replace(alive=index < count), field)
-    put = functools.partial(_put, index)
-    return rays._replace(t=put(rays.t, rest.t), end=put(rays.end, rest.end), sign=put(rays.sign, rest.sign))
+    rest = march(rest._replace(is_unfinished=index < count), field)
+    merge = functools.partial(_put, index)
+    return rays._replace(t=merge(rays.t, rest.t), t_end=merge(rays.t_end, rest.t_end), sign=merge(rays.sign, rest.sign))
 
 
-def _stride(rays: March, field: Field) -> March:
+def _stride(rays: March, field: GridField) -> March:
     """Move rays through cells without a change of sign until most reach one or leave the grid's box."""
 
     def step(state):
         rays, _ = state
         _, cell = cell_at(rays, field)
-        distance = _take(field.distance, _flat(cell, field.g - 1))
+        distance = _take(field.cell_distance, _flat(cell, field.resolution - 1))
         sign = jnp.where(rays.sign == 0, jnp.sign(distance), rays.sign)
-        free = rays.alive & (distance * sign > 0)
-        leave = _leave(rays, cell, jnp.abs(distance).astype(jnp.int32) - 1)
-        t = jnp.where(free, leave, rays.t)
-        alive = rays.alive & (t < rays.end)
-        return rays._replace(t=t, sign=sign, alive=alive), free & alive
+        is_free = rays.is_unfinished & (distance * sign > 0)
+        t_leave = _t_leave(rays, cell, jnp.abs(distance).astype(jnp.int32) - 1)
+        t = jnp.where(is_free, t_leave, rays.t)
+        is_unfinished = rays.is_unfinished & (t < rays.t_end)
+        return rays._replace(t=t, sign=sign, is_unfinished=is_unfinished), is_free & is_unfinished
 
-    few = rays.t.size // 8
-    return jax.lax.while_loop(lambda state: jnp.sum(state[1]) > few, step, (rays, jnp.ones_like(rays.alive)))[0]
+    max_moving = rays.t.size // 8
+    return jax.lax.while_loop(
+        lambda state: jnp.sum(state[1]) > max_moving, step, (rays, jnp.ones_like(rays.is_unfinished))
+    )[0]
 
 
-def _search_cell(rays: March, field: Field) -> March:
+def _search_cell(rays: March, field: GridField) -> March:
     """Search the current cell of each ray for a zero.
 
     A ray in a cell with a change of sign stops if the cell holds its first zero. Otherwise it leaves the cell.
     """
     local, cell = cell_at(rays, field)
-    distance = _take(field.distance, _flat(cell, field.g - 1))
-    here = rays.alive & (distance * rays.sign <= 0)
-    leave = jnp.minimum(_leave(rays, cell, 0), rays.end)
-    coefficients = cubic(corner_values(cell, field), local, [d * (leave - rays.t) for d in rays.du])
+    distance = _take(field.cell_distance, _flat(cell, field.resolution - 1))
+    has_sign_change = rays.is_unfinished & (distance * rays.sign <= 0)
+    t_leave = jnp.minimum(_t_leave(rays, cell, 0), rays.t_end)
+    coefficients = cubic(corner_values(cell, field), local, [d * (t_leave - rays.t) for d in rays.direction])
     sign = jnp.where(rays.sign == 0, jnp.where(coefficients[0] > 0, 1, -1).astype(jnp.int8), rays.sign)
     _, has_zero = first_bracket([c * sign for c in coefficients])
-    has_zero = has_zero & here
-    end = jnp.where(has_zero, leave, rays.end)
-    t = jnp.where(here & ~has_zero, leave, rays.t)
-    return rays._replace(t=t, end=end, sign=jnp.where(here, sign, rays.sign), alive=rays.alive & ~has_zero & (t < end))
+    has_zero = has_zero & has_sign_change
+    t_end = jnp.where(has_zero, t_leave, rays.t_end)
+    t = jnp.where(has_sign_change & ~has_zero, t_leave, rays.t)
+    return rays._replace(
+        t=t,
+        t_end=t_end,
+        sign=jnp.where(has_sign_change, sign, rays.sign),
+        is_unfinished=rays.is_unfinished & ~has_zero & (t < t_end),
+    )
 
 
-def cell_at(rays: March, field: Field) -> tuple[Triple, list[Int[Array, " n"]]]:
+def cell_at(rays: March, field: GridField) -> tuple[Triple, list[Int[Array, " n"]]]:
     """Return each ray's position within its cell, in [0, 1], and the index of this cell.
 
     A ray on the border of two cells is assigned to the cell that it is about to enter.
     """
-    position = [x + rays.t * d for x, d in zip(rays.u, rays.du, strict=True)]
+    position = [x + rays.t * d for x, d in zip(rays.entry, rays.direction, strict=True)]
     cell = [
-        jnp.floor(x + jnp.where(d > 0, field.ahead, -field.ahead)).astype(jnp.int32)
-        for x, d in zip(position, rays.du, strict=True)
+        jnp.floor(x + jnp.where(d > 0, field.offset, -field.offset)).astype(jnp.int32)
+        for x, d in zip(position, rays.direction, strict=True)
     ]
     return [x - c for x, c in zip(position, cell, strict=True)], cell
 
 
-def _leave(rays: March, cell: list[Int[Array, " n"]], cells) -> Float[Array, " n"]:
+def _t_leave(rays: March, cell: list[Int[Array, " n"]], cells) -> Float[Array, " n"]:
     """Return the t at which each ray leaves the cube of cells that are within `cells` cells of its own."""
-    sides = [c + jnp.where(d > 0, cells + 1, -cells) for c, d in zip(cell, rays.du, strict=True)]
-    return _smallest([(side - x) / d for side, x, d in zip(sides, rays.u, rays.du, strict=True)])
+    sides = [c + jnp.where(d > 0, cells + 1, -cells) for c, d in zip(cell, rays.direction, strict=True)]
+    return _smallest([(side - x) / d for side, x, d in zip(sides, rays.entry, rays.direction, strict=True)])
 
 
 def _flat(index: list[Int[Array, " n"]], side: int) -> Int[Array, " n"]:
     return (index[0] * side + index[1]) * side + index[2]
 
 
-def corner_values(cell: list[Int[Array, " n"]], field: Field) -> list[Float[Array, " n"]]:
+def corner_values(cell: list[Int[Array, " n"]], field: GridField) -> list[Float[Array, " n"]]:
     """Return the values at the corners of cells, in the order of `CORNERS`."""
-    base = _flat(cell, field.g)
-    return [_take(field.values, base + ((i * field.g + j) * field.g + k)) for i, j, k in CORNERS]
+    base = _flat(cell, field.resolution)
+    return [_take(field.values, base + ((i * field.resolution + j) * field.resolution + k)) for i, j, k in CORNERS]
 
 
 def _take(array: Array, index: Int[Array, " n"]) -> Array:

@@ -41,29 +41,31 @@ def spread_points(surface: GridSurface, count: int) -> SurfacePoints:
     - `count`: number of points. Points repeat if the surface crosses fewer edges.
     """
     values, grid = surface.values, surface.grid
-    inside = values <= 0
+    is_inside = values <= 0
     # The last node along an axis has no neighbour ahead.
-    crossed = [jnp.pad(jnp.diff(inside, axis=axis), [(0, int(own == axis)) for own in range(3)]) for axis in range(3)]
-    reached = jnp.cumsum(jnp.stack(crossed).reshape(-1))
+    is_crossed = [
+        jnp.pad(jnp.diff(is_inside, axis=axis), [(0, int(other == axis)) for other in range(3)]) for axis in range(3)
+    ]
+    num_crossed = jnp.cumsum(jnp.stack(is_crossed).reshape(-1))
     # Take one random edge in each of `count` equal intervals. With a fixed stride, the points could line up along the
     # grid's rows.
-    apart = jax.random.uniform(jax.random.key(0), (count,))
-    ranks = (jnp.arange(count) + apart) / count * reached[-1]
-    edge = jnp.searchsorted(reached, ranks, side="right").clip(0, reached.size - 1)
+    offsets = jax.random.uniform(jax.random.key(0), (count,))
+    ranks = (jnp.arange(count) + offsets) / count * num_crossed[-1]
+    edge = jnp.searchsorted(num_crossed, ranks, side="right").clip(0, num_crossed.size - 1)
     axis, *node = jnp.unravel_index(edge, (3, *values.shape))
-    ahead = jnp.eye(3, dtype=node[0].dtype)[axis]
-    at, beyond = jnp.stack(node, axis=-1), jnp.stack(node, axis=-1) + ahead
-    low, high = values[tuple(at.T)], values[tuple(beyond.T)]
-    way = jnp.where(low == high, 0.5, low / jnp.where(low == high, 1.0, low - high))
-    place = at + way[:, None] * ahead
-    field = tracing.Field(values.reshape(-1), surface.distance.reshape(-1), grid.resolution)
-    gradient = jnp.stack(tracing.smooth_gradient(field, list(place.T)), axis=-1)
+    step = jnp.eye(3, dtype=node[0].dtype)[axis]
+    first_node, second_node = jnp.stack(node, axis=-1), jnp.stack(node, axis=-1) + step
+    low, high = values[tuple(first_node.T)], values[tuple(second_node.T)]
+    fraction = jnp.where(low == high, 0.5, low / jnp.where(low == high, 1.0, low - high))
+    positions = first_node + fraction[:, None] * step
+    field = tracing.GridField(values.reshape(-1), surface.distance.reshape(-1), grid.resolution)
+    gradient = jnp.stack(tracing.smooth_gradient(field, list(positions.T)), axis=-1)
     length = jnp.linalg.norm(gradient, axis=-1, keepdims=True)
     normals = gradient / jnp.where(length > 0, length, 1.0)
     edges = jnp.sum(jnp.abs(normals), axis=-1)
-    each = grid.spacing**2 * reached[-1] / count
-    areas = jnp.where(edges > 0, each / jnp.where(edges > 0, edges, 1.0), 0.0)
-    return SurfacePoints(grid.spacing * place - grid.half_extent, normals, areas)
+    area_per_point = grid.spacing**2 * num_crossed[-1] / count
+    areas = jnp.where(edges > 0, area_per_point / jnp.where(edges > 0, edges, 1.0), 0.0)
+    return SurfacePoints(grid.spacing * positions - grid.half_extent, normals, areas)
 
 
 def is_visible(
@@ -90,19 +92,19 @@ def is_visible(
         directions = offset / jnp.where(distance > 0, distance, 1.0)[:, None]
         local = jnp.matmul(offset, pose.rotation, precision="highest")
         depth = local[:, 2]
-        inside = (depth > 0) & (depth >= camera.nearest)
+        is_seen = (depth > 0) & (depth >= camera.nearest)
         if camera.farthest is not None:
-            inside &= depth <= camera.farthest
-        column, row = jnp.floor(camera.to_pixels(local[:, :2] / jnp.where(inside, depth, 1.0)[:, None])).T
-        inside &= (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+            is_seen &= depth <= camera.farthest
+        column, row = jnp.floor(camera.to_pixels(local[:, :2] / jnp.where(is_seen, depth, 1.0)[:, None])).T
+        is_seen &= (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
         cosine = -jnp.sum(directions * points.normals, axis=-1)
-        inside &= cosine >= max(GRAZING, math.cos(camera.max_incidence))
+        is_seen &= cosine >= max(GRAZING, math.cos(camera.max_incidence))
         hits = surface.trace(jnp.broadcast_to(pose.position, offset.shape), directions)
-        inside &= hits.mask & (jnp.linalg.norm(hits.points - pose.position, axis=-1) >= distance - tolerance)
+        is_seen &= hits.mask & (jnp.linalg.norm(hits.points - pose.position, axis=-1) >= distance - tolerance)
         if barrier is None:
-            return inside
-        pixel = jnp.where(inside, row * camera.width + column, 0).astype(jnp.int32)
-        return inside & (distance < barrier[pixel])
+            return is_seen
+        pixel = jnp.where(is_seen, row * camera.width + column, 0).astype(jnp.int32)
+        return is_seen & (distance < barrier[pixel])
 
     # Poses are processed in batches of `_POSES`, so that the rays through one sample fit a CPU's cache.
     return jax.lax.map(from_pose, (poses, barrier), batch_size=_POSES)

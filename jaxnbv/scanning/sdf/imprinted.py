@@ -34,7 +34,7 @@ class ImprintedPyramid(SignedDistance):
     offset: Vector = parameter()
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
-        u, v, w = self._own(x)
+        u, v, w = self._local(x)
         slant = jnp.sqrt(1.0 + self.height**2)
         sides = ((jnp.maximum(jnp.abs(u), jnp.abs(v)) - 1.0) * self.height + w) / slant
         return self.scale * jnp.maximum(jnp.maximum(sides, -w), -self._imprint(u, v, w))
@@ -44,14 +44,14 @@ class ImprintedPyramid(SignedDistance):
 
         Both are given for each point x, in scene units.
         """
-        u, v, w = self._own(x)
+        u, v, w = self._local(x)
         return self.scale * self._imprint(u, v, w), self.scale * w
 
-    def _own(self, x):
+    def _local(self, x):
         a, b, c = (x[..., i, None] - self.offset[i] for i in range(3))
         rotation = self.rotation / self.scale
-        own = a * rotation[0] + b * rotation[1] + c * rotation[2]
-        return own[..., 0], own[..., 1], own[..., 2]
+        local = a * rotation[0] + b * rotation[1] + c * rotation[2]
+        return local[..., 0], local[..., 1], local[..., 2]
 
     def _imprint(self, u, v, w):
         """Return the signed distance to the prism that is pressed into the base, in the pyramid's frame.

@@ -57,8 +57,8 @@ class LabelledSolid(SignedDistance):
         distance = (
             corner_distance(jnp.abs(u) - half[:, 0], jnp.abs(v) - half[:, 1], jnp.abs(w) - half[:, 2]) - self.rounding
         )
-        steepest = 0.5 * (jnp.abs(self.slant) + jnp.sqrt(self.slant**2 + 4.0))
-        return jnp.where(self.labels > UNUSED, distance / steepest, jnp.inf)
+        stretch = 0.5 * (jnp.abs(self.slant) + jnp.sqrt(self.slant**2 + 4.0))
+        return jnp.where(self.labels > UNUSED, distance / stretch, jnp.inf)
 
     def part_labels(self, x: Float[AnyArray, "*n 3"]) -> Int[Array, "*n"]:
         """Return the label of the primitive whose surface is nearest to each point x.

@@ -34,8 +34,8 @@ class Sampled(SignedDistance):
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
         high = self.low + self.spacing * (jnp.array(self.values.shape) - 1)
         nearest = jnp.clip(x, self.low, high)
-        places = jnp.moveaxis((nearest - self.low) / self.spacing, -1, 0)
-        inside = jax.scipy.ndimage.map_coordinates(self.values, list(places), order=1, mode="nearest")
+        coordinates = jnp.moveaxis((nearest - self.low) / self.spacing, -1, 0)
+        inside = jax.scipy.ndimage.map_coordinates(self.values, list(coordinates), order=1, mode="nearest")
         beyond = safe_norm(*split(x - nearest))
         return jnp.where(beyond > 0, beyond + self.padding, inside)
 
@@ -88,11 +88,11 @@ def _signed_distance(
     middle, normal = corners.mean(axis=1), np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(float).tiny)
     step = 1e-4 * np.ptp(vertices, axis=0).max() * normal
-    thin = ~(_is_inside(middle + step, vertices, faces) | _is_inside(middle - step, vertices, faces))
-    if not thin.any():
+    is_thin = ~(_is_inside(middle + step, vertices, faces) | _is_inside(middle - step, vertices, faces))
+    if not is_thin.any():
         return signed
-    beside = distance_to_triangles(points, vertices, faces[thin])
-    return np.minimum(signed, beside - 0.5 * sheet)
+    sheet_distance = distance_to_triangles(points, vertices, faces[is_thin])
+    return np.minimum(signed, sheet_distance - 0.5 * sheet)
 
 
 def _is_inside(

@@ -82,11 +82,11 @@ class Cone(SignedDistance):
         slant = safe_norm(widening, rise)
         out, up = r - self.bottom_radius, y + self.half_height
         side = (rise * out - widening * up) / slant
-        along = (widening * out + rise * up) / slant
+        edge_position = (widening * out + rise * up) / slant
         cap = jnp.abs(y) - self.half_height
         inside = greatest(side, cap)
         bottom, top = safe_norm(out, up), safe_norm(r - self.top_radius, y - self.half_height)
-        outside = jnp.where(along < 0, bottom, jnp.where(along > slant, top, inside))
+        outside = jnp.where(edge_position < 0, bottom, jnp.where(edge_position > slant, top, inside))
         over_cap = (cap > 0) & (jnp.where(y > 0, r - self.top_radius, out) < 0)
         return jnp.where(over_cap, cap, jnp.where(inside > 0, outside, inside))
 
@@ -116,8 +116,8 @@ class Capsule(SignedDistance):
         segment = self.end - self.start
         squared = jnp.sum(segment**2)
         offset = split(x - self.start)
-        along = sum(c * d for c, d in zip(offset, segment, strict=True)) / jnp.where(squared > 0, squared, 1.0)
-        nearest = jnp.clip(along, 0.0, 1.0)
+        fraction = sum(c * d for c, d in zip(offset, segment, strict=True)) / jnp.where(squared > 0, squared, 1.0)
+        nearest = jnp.clip(fraction, 0.0, 1.0)
         return safe_norm(*(c - nearest * d for c, d in zip(offset, segment, strict=True))) - self.radius
 
 
