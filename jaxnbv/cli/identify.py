@@ -150,7 +150,7 @@ def _shows(frames: "RecordedFrames", index: int, corners: "np.ndarray") -> bool:
     from jaxnbv.geometry.pose import Pose
     from jaxnbv.planning.images import Image
 
-    image = Image.of(frames.depth(index), frames.matrices[index], frames.depth_scale, None)
+    image = Image.from_arrays(frames.depth(index), frames.matrices[index], frames.depth_scale, None)
     points = image.points(frames.camera, Pose.from_matrix(image.matrix))
     inside = (image.depth > 0) & np.all((points > corners[0]) & (points < corners[1]), axis=-1)
     return int(inside.sum()) >= _FEWEST

@@ -42,7 +42,7 @@ class Image(NamedTuple):
     robot: Bool[np.ndarray, "height width"] | None = None
 
     @classmethod
-    def of(cls, depth: AnyArray, matrix: AnyArray | list, scale: float, mask: AnyArray | None) -> "Image":
+    def from_arrays(cls, depth: AnyArray, matrix: AnyArray | list, scale: float, mask: AnyArray | None) -> "Image":
         """Check the user's arguments and convert them to an image.
 
         **Raises:** `ValueError` for a depth image or matrix that is not numeric, or a mask that is not a boolean array

@@ -105,5 +105,5 @@ class Intake:
         """Return clutter without votes; None if the user passed obstacles."""
         if self.planner.obstacles is not None:
             return None
-        reach = float(np.abs(np.asarray(self.planner.search.poses_around().position)).max())
-        return Clutter.empty(reach + float(Obstacles().clearance), self.frame.to_scene(self.box))
+        max_coordinate = float(np.abs(np.asarray(self.planner.search.poses_around().position)).max())
+        return Clutter.empty(max_coordinate + float(Obstacles().clearance), self.frame.to_scene(self.box))

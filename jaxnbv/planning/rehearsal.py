@@ -52,7 +52,7 @@ def rehearse(intake: Intake, loop: Loop) -> Rehearsal:
         for pose in slanted_poses(planner.search.poses_around(), 2):
             depth = ball_on_a_table(frame.to_scene(intake.camera), pose, frame.to_scene(intake.box)) / frame.scale
             matrix = frame.to_world(pose).to_matrix(intake.convention)
-            loop = intake.add(loop, Image.of(depth, matrix, 1.0, None)) or loop
+            loop = intake.add(loop, Image.from_arrays(depth, matrix, 1.0, None)) or loop
             loop.done()
             loop.propose()
     finally:

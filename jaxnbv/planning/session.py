@@ -305,7 +305,7 @@ class Session:
         - The image is identical to an earlier image that has a different pose.
         - A different process has added images to the folder.
         """
-        image, count = Image.of(depth, matrix, depth_scale, mask), len(self.views)
+        image, count = Image.from_arrays(depth, matrix, depth_scale, mask), len(self.views)
         if self.ignore is not None:
             # `ignore` is called now, while the robot is still at this pose. The image stores the result.
             image = image.with_robot(self.ignore, self.camera, Pose.from_matrix(image.matrix, self.convention))

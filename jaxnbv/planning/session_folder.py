@@ -62,7 +62,7 @@ class SessionFolder:
     def image(self, index: int) -> Image:
         """Read the image with this index, counted from 0."""
         entry = self._folder.read("image", index)
-        image = Image.of(entry["depth"], entry["matrix"], float(entry["depth_scale"]), entry.get("mask"))
+        image = Image.from_arrays(entry["depth"], entry["matrix"], float(entry["depth_scale"]), entry.get("mask"))
         return image._replace(robot=entry.get("robot"))
 
     def store_image(self, index: int, image: Image) -> None:

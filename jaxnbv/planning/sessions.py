@@ -115,7 +115,7 @@ class Sessions:
         cloud = PointCloud.from_depth(pixels, self.camera, pose, depth_scale, stride)
         if self._obstacles is None:
             self._obstacles = self._table_of(cloud)
-        image = Image.of(pixels, matrix, depth_scale, None)
+        image = Image.from_arrays(pixels, matrix, depth_scale, None)
         points, is_inside = self._points(image, pose)
         if labels is None:
             numbers = np.zeros(pixels.shape, int)
@@ -255,9 +255,9 @@ class Sessions:
         are equal because all objects can then share the same compiled programs.
         """
         low, high = points.min(axis=0), points.max(axis=0)
-        reach = float((high - low).max()) + self._gap
-        lowest = np.maximum(low - reach, high - self._longest_part)
-        highest = np.minimum(high + reach, low + self._longest_part)
+        padding = float((high - low).max()) + self._gap
+        lowest = np.maximum(low - padding, high - self._longest_part)
+        highest = np.minimum(high + padding, low + self._longest_part)
         middle, half = 0.5 * (lowest + highest), 0.5 * float((highest - lowest).max())
         return Box(middle - half, middle + half)
 
@@ -271,8 +271,8 @@ def clusters(points: Float[np.ndarray, "n 3"], gap: float) -> Int[np.ndarray, " 
     if len(points) == 0:
         return np.zeros(0, int)
     cells, cell = np.unique(np.floor(4.0 * points / gap).astype(np.int64), axis=0, return_inverse=True)
-    near = cKDTree(cells).query_pairs(4.0, output_type="ndarray")
-    graph = coo_array((np.ones(len(near), bool), (near[:, 0], near[:, 1])), shape=(len(cells), len(cells)))
+    pairs = cKDTree(cells).query_pairs(4.0, output_type="ndarray")
+    graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(cells), len(cells)))
     return connected_components(graph, directed=False)[1][cell.reshape(-1)]
 
 

@@ -44,7 +44,7 @@ def own_parts(
     side = -(-max(camera.height, camera.width) // _NUM_BLOCKS)
     images = {int(frame): image(int(frame)) for frame in indices}
     frames = [frame for frame, depth in images.items() if depth.shape == (camera.height, camera.width)]
-    depths = np.stack([_nearest_of_blocks(images[frame], side) for frame in frames])
+    depths = np.stack([_block_minima(images[frame], side) for frame in frames])
     is_measured = depths > 0
     is_frequent = (2 * is_measured.sum(axis=0) >= len(frames)) & (is_measured.sum(axis=0) >= _MIN_FRAMES)
     rows = np.where(is_measured & is_frequent, depths, np.nan)[:, is_frequent]
@@ -56,11 +56,11 @@ def own_parts(
         candidate_depth = np.where(
             _is_mount(scale * candidate_depth, scale * depths, matrices[frames], camera, side), candidate_depth, 0.0
         )
-    reach = _MAX_DEPTH_RATIO * maximum_filter(candidate_depth, 3)
-    return np.kron(reach, np.ones((side, side)))[: camera.height, : camera.width]
+    max_depths = _MAX_DEPTH_RATIO * maximum_filter(candidate_depth, 3)
+    return np.kron(max_depths, np.ones((side, side)))[: camera.height, : camera.width]
 
 
-def _nearest_of_blocks(image: UInt16[np.ndarray, "h w"], side: int) -> Float[np.ndarray, "k l"]:
+def _block_minima(image: UInt16[np.ndarray, "h w"], side: int) -> Float[np.ndarray, "k l"]:
     """Return the least depth in each block of `side` x `side` pixels; zero if nothing was measured in it."""
     image = np.pad(image, [(0, -size % side) for size in image.shape]).astype(float)
     blocks = np.where(image > 0, image, np.inf).reshape(image.shape[0] // side, side, image.shape[1] // side, side)

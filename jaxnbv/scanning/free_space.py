@@ -116,11 +116,11 @@ class Carving(eqx.Module):
         **Raises:** `ValueError` if more points lie outside.
         """
         limit = self._beyond_volume(grid)
-        outside, farthest = _beyond(self.volume, cloud, limit)
+        num_outside, farthest = _count_outside(self.volume, cloud, limit)
         require(
-            int(outside) <= _MAX_STRAY_FRACTION * int(cloud.count),
-            f"{int(outside)} of {int(cloud.count)} scanned points lie up to {float(farthest):.4g} outside the volume "
-            f"that is to hold the object ({self.volume}), more than {limit:.4g}: declare a larger one, "
+            int(num_outside) <= _MAX_STRAY_FRACTION * int(cloud.count),
+            f"{int(num_outside)} of {int(cloud.count)} scanned points lie up to {float(farthest):.4g} outside the "
+            f"volume that is to hold the object ({self.volume}), more than {limit:.4g}: declare a larger one, "
             "Carving(Box(low, high)), drop points of other things, or bring the scan to scene coordinates with "
             "Frame.to_scene",
         )
@@ -145,7 +145,7 @@ def carve(values: Float[Array, "*s g g g"], empty: Bool[Array, "g g g"]) -> Floa
 
 
 @program
-def _beyond(volume: Volume, cloud: PointCloud, limit: float) -> tuple[Int[Array, ""], Float[Array, ""]]:
+def _count_outside(volume: Volume, cloud: PointCloud, limit: float) -> tuple[Int[Array, ""], Float[Array, ""]]:
     """Return the number of points more than `limit` outside the volume, and the largest signed distance."""
     # Evaluate all rows, so that clouds with different counts share a compilation.
     distances = jnp.where(cloud.mask, volume(cloud.points), -jnp.inf)

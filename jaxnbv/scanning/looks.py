@@ -104,10 +104,10 @@ class Looks(eqx.Module):
         looks = self.with_points(scan, jnp.sqrt(jnp.maximum(0.5 * pixel_area(scan, camera, pose, STEEP), 0.0)))
         if scan.sight is None:
             return looks
-        far = scan.sight if barrier is None else jnp.minimum(scan.sight, barrier)
+        max_sight = scan.sight if barrier is None else jnp.minimum(scan.sight, barrier)
         column, row = jnp.floor(camera.to_pixels(self.camera.pixel_directions()[:, :2])).astype(jnp.int32).T
         is_inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        sight = jnp.where(is_inside, far[jnp.where(is_inside, row * camera.width + column, 0)], 0.0)
+        sight = jnp.where(is_inside, max_sight[jnp.where(is_inside, row * camera.width + column, 0)], 0.0)
         return dataclasses.replace(looks, sight=looks.sight.at[index].set(sight.astype(looks.sight.dtype)))
 
     def __call__(self, x: Float[Array, "*n 3"]) -> Float[Array, "*n"]:

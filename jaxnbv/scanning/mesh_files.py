@@ -80,11 +80,13 @@ def load_parts(path: str | Path | trimesh.Scene, up: str = "y") -> MeshParts:
     """
     nodes = read_nodes(path)
     mesh = joined_nodes(path, [node for _, node in nodes], up)
-    solid = [(name, node, node.faces[node.area_faces > 0]) for name, node in sorted(nodes, key=lambda node: node[0])]
-    whole = [(name, node, faces) for name, node, faces in solid if len(faces)]
-    require(len(whole) > 1, f"{path} has one node, and so no parts: save each part as a node of its own")
-    parts = tuple(TriangleMesh(mesh.frame.to_scene(node.vertices), faces, mesh.frame) for _, node, faces in whole)
-    return MeshParts(mesh, parts, tuple(name for name, *_ in whole))
+    candidates = [
+        (name, node, node.faces[node.area_faces > 0]) for name, node in sorted(nodes, key=lambda node: node[0])
+    ]
+    parts_faces = [(name, node, faces) for name, node, faces in candidates if len(faces)]
+    require(len(parts_faces) > 1, f"{path} has one node, and so no parts: save each part as a node of its own")
+    parts = tuple(TriangleMesh(mesh.frame.to_scene(node.vertices), faces, mesh.frame) for _, node, faces in parts_faces)
+    return MeshParts(mesh, parts, tuple(name for name, *_ in parts_faces))
 
 
 def joined_nodes(path: str | Path | trimesh.Geometry, meshes: list[trimesh.Trimesh], up: str) -> TriangleMesh:

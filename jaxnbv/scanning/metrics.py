@@ -41,11 +41,11 @@ def coverage(views: Iterable[Any], truth: Float[AnyArray, "n 3"], size: float = 
     truth = _points(truth, "true surface")
     require(size > 0, f"the size is {size}; it must be positive, in scene units")
     is_covered = np.zeros(len(truth), bool)
-    shares = []
+    fractions = []
     for view in views:
         is_covered |= is_shown(view.scan, view.camera, view.pose, truth, size)
-        shares.append(float(is_covered.mean()))
-    return shares
+        fractions.append(float(is_covered.mean()))
+    return fractions
 
 
 def is_shown(

@@ -120,8 +120,8 @@ def _strip_triangles(strips: Iterable[np.ndarray]) -> Int[np.ndarray, "f 3"]:
     """
     faces = [np.zeros((0, 3), np.int64)]
     for strip in strips:
-        whole = np.asarray(strip, np.int64)
-        for piece in np.split(whole, np.flatnonzero(whole < 0)):
+        indices = np.asarray(strip, np.int64)
+        for piece in np.split(indices, np.flatnonzero(indices < 0)):
             corners = piece[piece >= 0]
             rows = np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
             rows[1::2] = rows[1::2, ::-1]

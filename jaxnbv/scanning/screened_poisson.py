@@ -45,8 +45,8 @@ def screened_poisson(cloud: PointCloud, depth: int = 8) -> TriangleMesh:
         len(points) >= 4,
         f"the cloud has {len(points)} points, and a surface needs at least 4: scan more of the object",
     )
-    finite = bool(np.isfinite(points).all() and np.isfinite(normals).all())
-    require(finite, "the cloud has points or normals that are not finite: build it with PointCloud.from_arrays")
+    is_finite = bool(np.isfinite(points).all() and np.isfinite(normals).all())
+    require(is_finite, "the cloud has points or normals that are not finite: build it with PointCloud.from_arrays")
     meshes = pymeshlab.MeshSet(verbose=False)
     meshes.add_mesh(pymeshlab.Mesh(vertex_matrix=points, v_normals_matrix=normals))
     # Only one thread is used, since several threads would change the last bits from run to run.

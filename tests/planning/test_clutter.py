@@ -20,7 +20,7 @@ POST = Cuboid([0.03, 0.03, 0.3]).translate([0.3, -0.1, 0.15])
 
 
 def image_of(depth, pose):
-    return Image.of(depth, np.asarray(pose.matrix, np.float64), 1.0, None)
+    return Image.from_arrays(depth, np.asarray(pose.matrix, np.float64), 1.0, None)
 
 
 def voted(clutter, depth, pose, robot=None):

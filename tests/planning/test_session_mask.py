@@ -105,7 +105,7 @@ def test_masks_and_robots_are_seen_through_the_lens(k1):
     root = along**2 - squared * (center @ center - 0.3**2)
     on_ball = root > 0
     depth = np.where(on_ball, (along - np.sqrt(np.maximum(root, 0.0))) / squared, 2.0)
-    image, pose = Image.of(depth, np.eye(4), 1.0, None), nbv.Pose.from_matrix(np.eye(4))
+    image, pose = Image.from_arrays(depth, np.eye(4), 1.0, None), nbv.Pose.from_matrix(np.eye(4))
     np.testing.assert_allclose(image.points(camera, pose), depth[..., None] * rays, atol=1e-6)
 
     def away(cloud):
