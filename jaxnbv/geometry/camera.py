@@ -18,17 +18,17 @@ from jaxnbv.geometry.distortion import check_distortion
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.programs import program
 
-_Places = TypeVar("_Places", Float[Array, "*n 2"], Float[np.ndarray, "*n 2"])
+_Points = TypeVar("_Points", Float[Array, "*n 2"], Float[np.ndarray, "*n 2"])
 # Skew below this fraction of fx counts as zero.
-_SKEW = 1e-6
+_MAX_SKEW = 1e-6
 
 
-# Depth cameras have no rays more than 70 degrees off the axis (`_WIDEST` is the tangent). A principal point may be the
-# centre of an image if it is off by at most `_OFF_CENTER` times half the width and half the height.
-_WIDEST, _OFF_CENTER = math.tan(math.radians(70.0)), 0.2
+# Depth cameras have no rays more than 70 degrees off the axis (`_MAX_TANGENT` is the tangent). A principal point may be
+# the centre of an image if it is off by at most `_MAX_CENTER_OFFSET` times half the width and half the height.
+_MAX_TANGENT, _MAX_CENTER_OFFSET = math.tan(math.radians(70.0)), 0.2
 # If the principal point lies at this fraction or more of both the width and the height, the matrix is certainly for a
 # larger image.
-_SURELY = 0.96
+_MAX_CENTER_FRACTION = 0.96
 
 
 def _limit(depth: Any) -> Any:
@@ -128,7 +128,7 @@ class Camera(eqx.Module):
             f"the intrinsic matrix has a focal length of {fy:.4g} for {height} rows: give the matrix in pixels, not "
             "its inverse",
         )
-        require(abs(skew) <= _SKEW * fx, f"the intrinsic matrix has a skew of {skew}: undistort the image first")
+        require(abs(skew) <= _MAX_SKEW * fx, f"the intrinsic matrix has a skew of {skew}: undistort the image first")
         fov = 2.0 * math.atan(0.5 * height / fy)
         center = ((cx + 0.5) / width, (cy + 0.5) / height)
         _check_image_size(intrinsics, height, width, center)
@@ -154,15 +154,15 @@ class Camera(eqx.Module):
         **Raises:** `ValueError` for a stride below one, or one that leaves no pixel.
         """
         require(stride >= 1, f"the stride is {stride}; it must be at least 1")
-        first = stride // 2
-        height, width = (-(-(side - first) // stride) for side in (self.height, self.width))
+        start = stride // 2
+        height, width = (-(-(side - start) // stride) for side in (self.height, self.width))
         require(height >= 1 and width >= 1, f"a stride of {stride} leaves none of {self.height} x {self.width} pixels")
         matrix = self.intrinsics
         matrix[:2] /= stride
-        matrix[:2, 2] -= first / stride
+        matrix[:2, 2] -= start / stride
         fov, center = 2.0 * math.atan(0.5 * height / matrix[1, 1]), matrix[:2, 2] + 0.5
-        share = float(center[0] / width), float(center[1] / height)
-        return dataclasses.replace(self, fov=fov, height=height, width=width, center=share)
+        fractions = float(center[0] / width), float(center[1] / height)
+        return dataclasses.replace(self, fov=fov, height=height, width=width, center=fractions)
 
     @property
     def num_rays(self) -> int:
@@ -172,8 +172,8 @@ class Camera(eqx.Module):
     @property
     def focal_lengths(self) -> tuple[float, float]:
         """Horizontal and vertical focal length, in pixels."""
-        down = 0.5 * self.height / math.tan(0.5 * self.fov)
-        return self.aspect * down, down
+        vertical = 0.5 * self.height / math.tan(0.5 * self.fov)
+        return self.aspect * vertical, vertical
 
     @property
     def edges(self) -> tuple[float, float, float, float]:
@@ -196,13 +196,14 @@ class Camera(eqx.Module):
         directions = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
         return jnp.asarray(directions, dtype=jnp.result_type(float))
 
-    def to_pixels(self, image: _Places) -> _Places:
+    def to_pixels(self, plane_points: _Points) -> _Points:
         """Convert points (x, y) in the plane z = 1 of the camera's frame to (column, row) in pixels.
 
         The centre of the first pixel has column and row 0.5.
         """
         (fx, fy), (cx, cy) = self.focal_lengths, self.center
-        return image * np.array([fx, fy], image.dtype) + np.array([cx * self.width, cy * self.height], image.dtype)
+        scale, offset = np.array([[fx, fy], [cx * self.width, cy * self.height]], plane_points.dtype)
+        return plane_points * scale + offset
 
     @program
     def rays(self, pose: Pose) -> tuple[Float[Array, "*batch rays 3"], Float[Array, "*batch rays 3"]]:
@@ -222,21 +223,22 @@ def _check_image_size(matrix: np.ndarray, height: int, width: int, center: tuple
     outside this image and the image would extend more than 70 degrees off the axis.
     """
     (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
-    across, down = (
-        max(share, 1.0 - share) * side / f for share, side, f in zip(center, (width, height), (fx, fy), strict=True)
+    tangent_x, tangent_y = (
+        max(x, 1.0 - x) * side / f for x, side, f in zip(center, (width, height), (fx, fy), strict=True)
     )
     require(
-        all(0 <= share <= 1 for share in center) or max(across, down) < _WIDEST,
+        all(0 <= fraction <= 1 for fraction in center) or max(tangent_x, tangent_y) < _MAX_TANGENT,
         f"the principal point ({cx}, {cy}) lies outside the image of {width} x {height}, which would end "
-        f"{math.degrees(math.atan(max(across, down))):.0f} degrees off the axis: give the matrix for this image size",
+        f"{math.degrees(math.atan(max(tangent_x, tangent_y))):.0f} degrees off the axis: give the matrix for this "
+        "image size",
     )
     for ratio in (0.5, 2.0, 3.0, 4.0):
-        if not all(abs(2.0 * share / ratio - 1.0) <= _OFF_CENTER for share in center):
+        if not all(abs(2.0 * fraction / ratio - 1.0) <= _MAX_CENTER_OFFSET for fraction in center):
             continue
         problem = (
             f"the principal point ({cx:.5g}, {cy:.5g}) is the centre of an image of {2 * cx + 1:.0f} x "
             f"{2 * cy + 1:.0f}, but this one is {width} x {height}. If it was binned, decimated or resized, the matrix "
             f"is for the other size: divide its first two rows by {ratio:g}. If it is a window of a larger image"
         )
-        require(min(center) < _SURELY, f"{problem}, use Camera(fov, height, width, aspect, center)")
+        require(min(center) < _MAX_CENTER_FRACTION, f"{problem}, use Camera(fov, height, width, aspect, center)")
         warnings.warn(f"{problem}, ignore this warning", stacklevel=4)

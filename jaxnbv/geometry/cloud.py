@@ -29,8 +29,8 @@ from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
 
 # Largest number of rows that an index of 32 bits can count. A planner cannot hold nearly that many in memory.
-_MOST_ROWS = 2**31 - 1
-_LONGEST_NORMAL = 10.0
+_MAX_ROWS = 2**31 - 1
+_MAX_NORMAL_LENGTH = 10.0
 
 
 class PointCloud(eqx.Module):
@@ -92,7 +92,7 @@ class PointCloud(eqx.Module):
         check_type(capacity, int | None, "the capacity")
         capacity = count if capacity is None else capacity
         require(count > 0, "the cloud is empty: give at least one point and its normal")
-        require(capacity <= _MOST_ROWS, f"the capacity is {capacity}; give at most {_MOST_ROWS}")
+        require(capacity <= _MAX_ROWS, f"the capacity is {capacity}; give at most {_MAX_ROWS}")
         require(
             count <= capacity,
             f"{count} points do not fit a capacity of {capacity}: raise the capacity, or thin them first with "
@@ -247,17 +247,17 @@ def check_oriented(cloud: PointCloud, name: str, limit: float, unit: bool = True
     finite = bool(np.isfinite(points).all() and np.isfinite(normals).all())
     require(finite, f"{name} has points or normals that are not finite: drop or mask these rows")
     lengths = np.linalg.norm(normals, axis=1)
-    wrong = lengths[np.abs(lengths - 1.0) > 0.01] if unit else lengths[lengths > _LONGEST_NORMAL]
-    allowed = "not of unit length" if unit else f"longer than {_LONGEST_NORMAL:g}"
+    invalid_lengths = lengths[np.abs(lengths - 1.0) > 0.01] if unit else lengths[lengths > _MAX_NORMAL_LENGTH]
+    problem = "not of unit length" if unit else f"longer than {_MAX_NORMAL_LENGTH:g}"
     require(
-        wrong.size == 0,
-        f"{name} has {wrong.size} normals that are {allowed}, such as {wrong[:1]}: build it with "
+        invalid_lengths.size == 0,
+        f"{name} has {invalid_lengths.size} normals that are {problem}, such as {invalid_lengths[:1]}: build it with "
         "PointCloud.from_arrays, which normalises",
     )
-    furthest = float(np.abs(points).max())
+    largest = float(np.abs(points).max())
     require(
-        furthest <= float(points.dtype.type(limit)),
-        f"{name} has a point with a coordinate of {furthest:.4g}, outside the scene's cube of half side {limit:.4g}: "
+        largest <= float(points.dtype.type(limit)),
+        f"{name} has a point with a coordinate of {largest:.4g}, outside the scene's cube of half side {limit:.4g}: "
         "bring it to scene coordinates with Frame.to_scene (or simulate less noise)",
     )
 
@@ -291,10 +291,10 @@ def farthest_point_subsample(cloud: PointCloud, count: int) -> PointCloud:
     **Raises:** `ValueError` if `count` < 1.
     """
     check_single(cloud)
-    require(1 <= count <= _MOST_ROWS, f"asked for {count} points; ask for at least one and at most {_MOST_ROWS}")
-    chosen = farthest_point_indices(cloud.points, cloud.mask, count)
-    kept = jnp.arange(count) < cloud.count
-    return _take(cloud, chosen, kept)
+    require(1 <= count <= _MAX_ROWS, f"asked for {count} points; ask for at least one and at most {_MAX_ROWS}")
+    rows = farthest_point_indices(cloud.points, cloud.mask, count)
+    is_filled = jnp.arange(count) < cloud.count
+    return _take(cloud, rows, is_filled)
 
 
 @own_settings()
@@ -320,6 +320,6 @@ def limit_capacity(cloud: PointCloud, capacity: int) -> PointCloud:
     )
 
 
-def _take(cloud: PointCloud, index: Int[Array, " m"], kept: Bool[Array, " m"]) -> PointCloud:
-    points = jnp.where(kept[:, None], cloud.points[index], 0.0)
-    return PointCloud(points, jnp.where(kept[:, None], cloud.normals[index], 0.0), kept)
+def _take(cloud: PointCloud, rows: Int[Array, " m"], is_filled: Bool[Array, " m"]) -> PointCloud:
+    points = jnp.where(is_filled[:, None], cloud.points[rows], 0.0)
+    return PointCloud(points, jnp.where(is_filled[:, None], cloud.normals[rows], 0.0), is_filled)

@@ -11,8 +11,8 @@ from jaxtyping import Array, Bool, Float, Real
 from jaxnbv.checks import AnyArray, as_floats, as_numbers, is_traced, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.distortion import undistort_image
-from jaxnbv.geometry.gaps import block_samples, gap_of
-from jaxnbv.geometry.plane_fit import fitted_planes
+from jaxnbv.geometry.gaps import block_samples, find_block_side
+from jaxnbv.geometry.plane_fit import fit_planes
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.sentinels import sentinel_pixels
 from jaxnbv.geometry.volume import Box, ray_interval
@@ -20,12 +20,13 @@ from jaxnbv.programs import program
 
 Rows = tuple[Float[Array, "n 3"], Float[Array, "n 3"], Bool[Array, " n"], Bool[Array, " n"], Float[Array, " n"]]
 # Depths that differ from the depths of the box by more than this factor are probably in different units.
-_OTHER_UNITS = 20.0
+_MAX_DEPTH_RATIO = 20.0
 # A value beyond the box's greatest depth times this factor may be a sentinel ("not measured"). The surface that the
 # object stands on is nearer than that.
-_BEHIND = 1.1
-# If at least this fraction of the depths is within the factor `_OTHER_UNITS` of the box's depths, the units are right.
-_SOME = 1e-3
+_SENTINEL_DEPTH_RATIO = 1.1
+# If at least this fraction of the depths is within the factor `_MAX_DEPTH_RATIO` of the box's depths, the units are
+# right.
+_MIN_FRACTION = 1e-3
 
 
 class NothingInside(UserWarning):
@@ -58,18 +59,18 @@ def points_of_depth(
     # Reject an invalid stride before any other computation.
     camera.strided(stride)
     if not is_traced(depth, pose):
-        ahead = None if box is None else _depths_of(box, pose)
-        cleaned = np.where(_is_sentinel(np.asarray(numbers), camera, scale, ahead), 0.0, depth)
-        depth = jnp.asarray(cleaned)
-        _check_meaning(cleaned[np.isfinite(cleaned) & (cleaned > 0)], camera, ahead)
+        depth_range = None if box is None else _depth_range(box, pose)
+        values = np.where(_is_sentinel(np.asarray(numbers), camera, scale, depth_range), 0.0, depth)
+        depth = jnp.asarray(values)
+        _check_units(values[np.isfinite(values) & (values > 0)], camera, depth_range)
     if camera.distortion:
-        place = camera.pixel_directions().reshape(*shape, 3)[..., :2]
+        plane_points = camera.pixel_directions().reshape(*shape, 3)[..., :2]
         matrix = jnp.asarray(camera.intrinsics, depth.dtype)
-        depth, missed = undistort_image(depth, jnp.asarray(missed), place, matrix, camera.distortion)
-    gap = 1 if is_traced(depth) else gap_of(np.isfinite(depth) & (np.asarray(depth) > 0))
+        depth, missed = undistort_image(depth, jnp.asarray(missed), plane_points, matrix, camera.distortion)
+    block_side = 1 if is_traced(depth) else find_block_side(np.isfinite(depth) & (np.asarray(depth) > 0))
     # The rounding is an array, so that a program compiled for one unit of depth runs for any unit.
-    image = depth, jnp.asarray(missed), camera, pose, stride, jnp.asarray(rounding, depth.dtype), box, gap
-    points, normals, mask, missed, inside, sight = _oriented(*image)
+    image = depth, jnp.asarray(missed), camera, pose, stride, jnp.asarray(rounding, depth.dtype), box, block_side
+    points, normals, mask, missed, inside, sight = _points_and_normals(*image)
     if box is not None and not is_traced(points):
         _warn_of_nothing_inside(np.asarray(points)[np.asarray(mask)], np.asarray(inside)[np.asarray(mask)], box)
     mask = mask & inside
@@ -78,7 +79,7 @@ def points_of_depth(
 
 
 @program
-def _oriented(
+def _points_and_normals(
     depth: Float[Array, "h w"],
     missed: Bool[Array, "h w"],
     camera: Camera,
@@ -86,7 +87,7 @@ def _oriented(
     stride: int,
     rounding: Float[Array, ""],
     box: Box | None,
-    gap: int,
+    block_side: int,
 ) -> tuple[
     Float[Array, "n 3"],
     Float[Array, "n 3"],
@@ -101,46 +102,48 @@ def _oriented(
     whether the point lies in the box, and the distance from the camera to the hit (infinite without a hit).
 
     - `missed`: whether the ray of each pixel met nothing.
-    - `rounding`: standard deviation of the rounding of depths. `gap`: see `gap_of`.
+    - `rounding`: standard deviation of the rounding of depths. `block_side`: see `find_block_side`.
     """
-    rows, strided = slice(stride // 2, None, stride), camera.strided(stride)
-    samples = _rows_of(depth, jnp.isfinite(depth) & (depth > 0), stride, gap)[0]
-    sight = jnp.where(samples > 0, samples, jnp.inf).reshape(-1) * jnp.linalg.norm(strided.pixel_directions(), axis=-1)
+    rows, strided_camera = slice(stride // 2, None, stride), camera.strided(stride)
+    samples = _strided_samples(depth, jnp.isfinite(depth) & (depth > 0), stride, block_side)[0]
+    sight = jnp.where(samples > 0, samples, jnp.inf).reshape(-1)
+    sight = sight * jnp.linalg.norm(strided_camera.pixel_directions(), axis=-1)
     valid = jnp.isfinite(depth) & (depth > 0)
     if camera.farthest is not None:
         missed = missed | (valid & (depth > camera.farthest))
     valid = valid & ~missed & (depth >= camera.nearest)
-    smooth, normals, has_normal = fitted_planes(jnp.where(valid, depth, 0.0), valid, camera, stride, rounding, gap)
-    (depth, valid, nearest), camera = _rows_of(jnp.where(valid, depth, 0.0), valid, stride, gap), strided
+    smooth, normals, has_normal = fit_planes(jnp.where(valid, depth, 0.0), valid, camera, stride, rounding, block_side)
+    depth, valid, nearest = _strided_samples(jnp.where(valid, depth, 0.0), valid, stride, block_side)
     missed = missed[rows, rows]
     mask = (valid & has_normal).reshape(-1)
-    local = jnp.where(valid, jnp.where(has_normal, smooth, depth), 0.0).reshape(-1, 1) * camera.pixel_directions()
-    points = pose.to_scene(local)
+    local = jnp.where(valid, jnp.where(has_normal, smooth, depth), 0.0).reshape(-1, 1)
+    points = pose.to_scene(local * strided_camera.pixel_directions())
     normals = jnp.matmul(normals.reshape(-1, 3), pose.rotation.T, precision="highest")
 
     missed, inside = missed.reshape(-1), jnp.ones_like(mask)
     if box is not None:
-        crossed = valid.reshape(-1) & (nearest.reshape(-1) >= _depth_behind(box, camera, pose))
+        crosses_box = valid.reshape(-1) & (nearest.reshape(-1) >= _depth_behind(box, strided_camera, pose))
         inside = box(points) <= 0
-        missed = missed | (crossed & ~inside)
+        missed = missed | (crosses_box & ~inside)
     return points, normals, mask, missed, inside, sight
 
 
-def _rows_of(
-    depth: Float[Array, "h w"], valid: Bool[Array, "h w"], stride: int, gap: int
+def _strided_samples(
+    depth: Float[Array, "h w"], valid: Bool[Array, "h w"], stride: int, block_side: int
 ) -> tuple[Float[Array, "k l"], Bool[Array, "k l"], Float[Array, "k l"]]:
     """Return the depth, its validity and a lower bound on it at every `stride`-th row and column.
 
-    The image is divided into square blocks with side `gap`. The depth is that of the valid pixel nearest to the middle
-    of the pixel's own block. The bound is the least such depth of this block and, if `gap` > 1, of the eight around it.
+    The image is divided into square blocks with side `block_side`. The depth is that of the valid pixel nearest to the
+    middle of the pixel's own block. The bound is the least such depth of this block and, if `block_side` > 1, of the
+    eight around it.
     """
-    samples, is_sample, _ = block_samples(depth, valid, gap)
+    samples, is_sample, _ = block_samples(depth, valid, block_side)
     nearest = jnp.where(is_sample, samples, jnp.inf)
-    if gap > 1:
+    if block_side > 1:
         nearest = jax.lax.reduce_window(nearest, jnp.inf, jax.lax.min, (3, 3), (1, 1), "SAME")
-    rows, columns = (jnp.arange(stride // 2, size, stride) // gap for size in depth.shape)
-    at = rows[:, None], columns[None]
-    return samples[at], is_sample[at], nearest[at]
+    rows, columns = (jnp.arange(stride // 2, size, stride) // block_side for size in depth.shape)
+    index = rows[:, None], columns[None]
+    return samples[index], is_sample[index], nearest[index]
 
 
 def _depth_behind(box: Box, camera: Camera, pose: Pose) -> Float[Array, " n"]:
@@ -159,17 +162,18 @@ def without_sentinels(
 
     **Raises:** `ValueError` if the box lies behind the camera.
     """
-    return np.where(_is_sentinel(depth, camera, scale, _depths_of(box, pose)), 0, depth)
+    return np.where(_is_sentinel(depth, camera, scale, _depth_range(box, pose)), 0, depth)
 
 
 def _is_sentinel(
-    depth: Real[np.ndarray, "h w"], camera: Camera, scale: float, ahead: tuple[float, float] | None
+    depth: Real[np.ndarray, "h w"], camera: Camera, scale: float, depth_range: tuple[float, float] | None
 ) -> Bool[np.ndarray, "h w"]:
-    ends = np.inf if camera.farthest is None else camera.farthest, np.inf if ahead is None else _BEHIND * ahead[1]
-    return sentinel_pixels(depth, min(ends) / scale)
+    farthest = np.inf if camera.farthest is None else camera.farthest
+    background = np.inf if depth_range is None else _SENTINEL_DEPTH_RATIO * depth_range[1]
+    return sentinel_pixels(depth, min(farthest, background) / scale)
 
 
-def _depths_of(box: Box, pose: Pose) -> tuple[float, float]:
+def _depth_range(box: Box, pose: Pose) -> tuple[float, float]:
     """Return the least and greatest depth of a box's corners along the viewing direction of a pose.
 
     If the least depth is below a thousandth of the greatest depth, it is raised to this value.
@@ -177,23 +181,23 @@ def _depths_of(box: Box, pose: Pose) -> tuple[float, float]:
     **Raises:** `ValueError` if the box lies behind the camera.
     """
     corners = np.stack(np.meshgrid(*zip(box.low, box.high, strict=True)), axis=-1).reshape(-1, 3)
-    ahead = (corners - np.asarray(pose.position)) @ np.asarray(pose.forward)
-    farthest = float(ahead.max())
+    depths = (corners - np.asarray(pose.position)) @ np.asarray(pose.forward)
+    farthest = float(depths.max())
     require(
         farthest > 0,
         f"the box {box} lies behind the camera at {np.asarray(pose.position)}: give the pose "
         'from camera to world, not its inverse, and its convention, Pose.from_matrix(matrix, "opengl")',
     )
-    return max(float(ahead.min()), 1e-3 * farthest), farthest
+    return max(float(depths.min()), 1e-3 * farthest), farthest
 
 
-def _check_meaning(depth: Float[np.ndarray, " valid"], camera: Camera, ahead: tuple[float, float] | None) -> None:
+def _check_units(depth: Float[np.ndarray, " valid"], camera: Camera, depth_range: tuple[float, float] | None) -> None:
     """Check that the measured depths can be in the units of the camera's range and of the box.
 
     The depths must not all be nearer or all be farther than the camera's range. At least 0.1 % of the depths in the
     range must be within a factor of 20 of the box's depths. The other depths may come from a far background or glare.
 
-    - `ahead`: least and greatest depth of the box; None if there is no box.
+    - `depth_range`: least and greatest depth of the box; None if there is no box.
 
     **Raises:** `ValueError` if the units must be wrong.
     """
@@ -207,11 +211,11 @@ def _check_meaning(depth: Float[np.ndarray, " valid"], camera: Camera, ahead: tu
         "or another range",
     )
     depth = depth[(depth >= camera.nearest) & (depth <= farthest)]
-    if ahead is None or not len(depth):
+    if depth_range is None or not len(depth):
         return
-    near, far = ahead
+    near, far = depth_range
     require(
-        bool(((depth > near / _OTHER_UNITS) & (depth < _OTHER_UNITS * far)).mean() >= _SOME),
+        bool(((depth > near / _MAX_DEPTH_RATIO) & (depth < _MAX_DEPTH_RATIO * far)).mean() >= _MIN_FRACTION),
         f"the depths have a median of {np.median(depth):.4g}, but the box is {near:.4g} to {far:.4g} away: give the "
         "depth's scale, 0.001 for millimetres and a pose in metres",
     )

@@ -11,28 +11,28 @@ from jaxtyping import Array, Bool, Float, Shaped
 
 # The image is divided into at most 40 x 40 square tiles of at least 8 x 8 pixels, and depths into steps of 10 %. The
 # noise of a pixel is estimated from its tile and the eight around it, at its depth step and the two steps beside it.
-_TILES, _SMALLEST_TILE = 40, 8
+_MAX_TILES, _MIN_TILE_SIZE = 40, 8
 _DEPTH_STEP, _DEPTH_STEPS = math.log(1.1), 48
 # Third differences, divided by the depth, are counted in a histogram whose bins are powers of two from this value on.
 # The largest differences come from edges.
-_LEAST_DIFFERENCE, _LEVELS = 1e-5, 16
-_ENOUGH = 16
+_MIN_DIFFERENCE, _LEVELS = 1e-5, 16
+_MIN_COUNT = 16
 # Median magnitude of the third difference of independent normal errors, divided by the standard deviation of one error.
 _MEDIAN_SIZE = math.sqrt(20.0) * NormalDist().inv_cdf(0.75)
 
 
 def depth_noise(
-    depth: Float[Array, "h w"], valid: Bool[Array, "h w"], least: float | Float[Array, ""]
+    depth: Float[Array, "h w"], valid: Bool[Array, "h w"], min_noise: float | Float[Array, ""]
 ) -> Float[Array, "h w"]:
     """Return the standard deviation of each pixel's noise and rounding, in units of the depth.
 
-    The result is at least `least`. It is computed from the median magnitude of the third differences of depth along
+    The result is at least `min_noise`. It is computed from the median magnitude of the third differences of depth along
     rows and columns, which are mostly noise on a smooth surface. The median is over the differences near the pixel and
     at a similar depth. If these are fewer than 16, it is over the whole image at a similar depth, and if these are also
     fewer than 16, over all differences. If at least half but at most three quarters of the differences are zero, depths
     are rounded to steps, and the size of the steps is computed from the other differences.
     """
-    tile = max(-(-max(depth.shape) // _TILES), _SMALLEST_TILE)
+    tile = max(-(-max(depth.shape) // _MAX_TILES), _MIN_TILE_SIZE)
     tiles = tuple(-(-size // tile) for size in depth.shape)
     # Depth steps are relative to the nearest pixel, so that the unit of the depth does not matter.
     nearest = jnp.min(jnp.where(valid, depth, jnp.inf))
@@ -43,27 +43,27 @@ def depth_noise(
     for axis in (0, 1):
         # The differences use every second pixel. The errors of direct neighbours are correlated, since sensors smooth
         # their images.
-        a, b, c, d = (_every_second(depth, axis, index) for index in range(4))
-        is_smooth = functools.reduce(operator.and_, (_every_second(valid, axis, index) for index in range(4)))
+        a, b, c, d = (_group_member(depth, axis, index) for index in range(4))
+        is_smooth = functools.reduce(operator.and_, (_group_member(valid, axis, index) for index in range(4)))
         # Pixels beside an edge are left out, since they mix a near and a far surface.
         is_smooth &= functools.reduce(operator.and_, (jnp.abs(other - a) <= _DEPTH_STEP * a for other in (b, c, d)))
         size = jnp.abs(d - 3.0 * c + 3.0 * b - a) / jnp.where(is_smooth, a, 1.0)
-        level = 1 + jnp.floor(jnp.log2(jnp.maximum(size / _LEAST_DIFFERENCE, 0.5))).astype(jnp.int32)
-        place = (_every_second(index, axis, 0) for index in cell)
-        counts = counts.at[*place, jnp.where(is_smooth, level, _LEVELS)].add(1.0, mode="drop")
+        level = 1 + jnp.floor(jnp.log2(jnp.maximum(size / _MIN_DIFFERENCE, 0.5))).astype(jnp.int32)
+        group_cell = (_group_member(index, axis, 0) for index in cell)
+        counts = counts.at[*group_cell, jnp.where(is_smooth, level, _LEVELS)].add(1.0, mode="drop")
     counts = counts + jnp.roll(counts, 1, axis=2) + jnp.roll(counts, -1, axis=2)
-    near = jax.lax.reduce_window(counts, 0.0, jax.lax.add, (3, 3, 1, 1), (1, 1, 1, 1), "SAME")
+    window_counts = jax.lax.reduce_window(counts, 0.0, jax.lax.add, (3, 3, 1, 1), (1, 1, 1, 1), "SAME")
     for axes in ((0, 1), (0, 1, 2)):
-        few = jnp.sum(near, axis=-1, keepdims=True) < _ENOUGH
-        near = jnp.where(few, jnp.sum(counts, axis=axes, keepdims=True), near)
-    median = _median(near)
-    return jnp.maximum(depth * median[*cell] / _MEDIAN_SIZE, least)
+        is_few = jnp.sum(window_counts, axis=-1, keepdims=True) < _MIN_COUNT
+        window_counts = jnp.where(is_few, jnp.sum(counts, axis=axes, keepdims=True), window_counts)
+    median = _median(window_counts)
+    return jnp.maximum(depth * median[*cell] / _MEDIAN_SIZE, min_noise)
 
 
-def _every_second(image: Shaped[Array, "h w"], axis: int, index: int) -> Shaped[Array, "k l"]:
+def _group_member(image: Shaped[Array, "h w"], axis: int, index: int) -> Shaped[Array, "k l"]:
     """Return pixel `index` (0 to 3) of each group of four pixels that are two apart along an axis."""
-    kept = slice(2 * index, 2 * index + max(image.shape[axis] - 6, 0))
-    return image[kept] if axis == 0 else image[:, kept]
+    members = slice(2 * index, 2 * index + max(image.shape[axis] - 6, 0))
+    return image[members] if axis == 0 else image[:, members]
 
 
 def _median(counts: Float[Array, "*n levels"]) -> Float[Array, "*n"]:
@@ -74,9 +74,9 @@ def _median(counts: Float[Array, "*n levels"]) -> Float[Array, "*n"]:
     """
     zeros = counts[..., 0] / jnp.maximum(jnp.sum(counts, axis=-1), 1.0)
     counts = counts.at[..., 0].multiply((zeros < 0.5) | (zeros > 0.75))
-    below = jnp.cumsum(counts, axis=-1)
-    half = 0.5 * below[..., -1:]
-    level = jnp.argmax(below >= half, axis=-1, keepdims=True)
-    inside = jnp.take_along_axis(counts, level, axis=-1)
-    share = (half - (jnp.take_along_axis(below, level, axis=-1) - inside)) / jnp.maximum(inside, 1.0)
-    return jnp.where(half > 0, _LEAST_DIFFERENCE * 2.0 ** (level - 1.0) * (1.0 + share), 0.0)[..., 0]
+    cumulative = jnp.cumsum(counts, axis=-1)
+    half = 0.5 * cumulative[..., -1:]
+    level = jnp.argmax(cumulative >= half, axis=-1, keepdims=True)
+    count = jnp.take_along_axis(counts, level, axis=-1)
+    fraction = (half - (jnp.take_along_axis(cumulative, level, axis=-1) - count)) / jnp.maximum(count, 1.0)
+    return jnp.where(half > 0, _MIN_DIFFERENCE * 2.0 ** (level - 1.0) * (1.0 + fraction), 0.0)[..., 0]

@@ -15,9 +15,9 @@ from jaxnbv.checks import AnyArray, as_numbers, require
 from jaxnbv.programs import program
 
 _SHAPES = ((4,), (5,), (8,))
-# Neighbouring depths are not averaged if their relative difference exceeds both `_ALIKE` and `_STEEPEST` divided by the
-# focal length in pixels.
-_ALIKE, _STEEPEST = 0.01, 4.0
+# Neighbouring depths are not averaged if their relative difference exceeds both `_MAX_DIFFERENCE` and `_MAX_SLOPE`
+# divided by the focal length in pixels.
+_MAX_DIFFERENCE, _MAX_SLOPE = 0.01, 4.0
 # Lenses of depth cameras move a point by at most a third of its distance from the axis. So each iteration reduces the
 # error to about a third.
 _ITERATIONS = 25
@@ -30,9 +30,9 @@ def distort_points(
     k1, k2, p1, p2, k3, k4, k5, k6 = (*coefficients, *[0.0] * (8 - len(coefficients)))
     r2 = x**2 + y**2
     radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-    across = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)
-    down = y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
-    return across, down
+    x_distorted = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)
+    y_distorted = y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
+    return x_distorted, y_distorted
 
 
 def undistort_points(
@@ -42,19 +42,19 @@ def undistort_points(
 
     This inverts `distort_points` by fixed-point iteration, as in OpenCV.
     """
-    across, down = x, y
+    x_true, y_true = x, y
     for _ in range(_ITERATIONS):
-        moved = distort_points(across, down, coefficients)
-        across, down = across + x - np.asarray(moved[0]), down + y - np.asarray(moved[1])
-    return across, down
+        x_distorted, y_distorted = distort_points(x_true, y_true, coefficients)
+        x_true, y_true = x_true + x - np.asarray(x_distorted), y_true + y - np.asarray(y_distorted)
+    return x_true, y_true
 
 
 def pixels_of(
-    place: Float[AnyArray, "*n 2"], matrix: Float[AnyArray, "3 3"], coefficients: tuple[float, ...]
+    plane_points: Float[AnyArray, "*n 2"], matrix: Float[AnyArray, "3 3"], coefficients: tuple[float, ...]
 ) -> tuple[Float[AnyArray, "*n"], Float[AnyArray, "*n"]]:
-    """Return the column and row in pixels at which a lens shows each point `place` of the plane Z = 1."""
-    across, down = distort_points(place[..., 0], place[..., 1], coefficients)
-    return across * matrix[0, 0] + matrix[0, 2], down * matrix[1, 1] + matrix[1, 2]
+    """Return the column and row in pixels at which a lens shows each point of the plane Z = 1."""
+    x, y = distort_points(plane_points[..., 0], plane_points[..., 1], coefficients)
+    return x * matrix[0, 0] + matrix[0, 2], y * matrix[1, 1] + matrix[1, 2]
 
 
 def check_distortion(coefficients: tuple[float, ...], radius: float) -> None:
@@ -71,9 +71,9 @@ def check_distortion(coefficients: tuple[float, ...], radius: float) -> None:
         f"the distortion is {coefficients}: give OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]], or () for none",
     )
     radial = (*coefficients[:2], 0.0, 0.0, *coefficients[4:])
-    moved, _ = distort_points(np.linspace(0.0, radius, 100), np.zeros(100), radial)
+    distorted_radii, _ = distort_points(np.linspace(0.0, radius, 100), np.zeros(100), radial)
     require(
-        bool((np.diff(np.asarray(moved)) > 0).all()),
+        bool((np.diff(np.asarray(distorted_radii)) > 0).all()),
         f"the distortion {coefficients} folds the image: give OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]] in this "
         "order, of this camera",
     )
@@ -83,7 +83,7 @@ def check_distortion(coefficients: tuple[float, ...], radius: float) -> None:
 def undistort_image(
     depth: Float[Array, "h w"],
     missed: Bool[Array, "h w"],
-    place: Float[Array, "h w 2"],
+    plane_points: Float[Array, "h w 2"],
     matrix: Float[Array, "3 3"],
     coefficients: tuple[float, ...],
 ) -> tuple[Float[Array, "h w"], Bool[Array, "h w"]]:
@@ -95,21 +95,21 @@ def undistort_image(
 
     - `depth`: the distorted image, in which valid depths are positive and finite.
     - `missed`: whether each ray of the distorted image met nothing.
-    - `place`: positions of the new image's pixels in the plane Z = 1.
+    - `plane_points`: positions of the new image's pixels in the plane Z = 1.
     - `matrix`: intrinsic matrix of both images.
     """
     focal = jnp.diagonal(matrix)[:2]
-    column, row = (jnp.asarray(pixel) for pixel in pixels_of(place, matrix, coefficients))
+    column, row = (jnp.asarray(pixel) for pixel in pixels_of(plane_points, matrix, coefficients))
     height, width = depth.shape
-    within = (column > -0.5) & (column < width - 0.5) & (row > -0.5) & (row < height - 0.5)
+    is_inside = (column > -0.5) & (column < width - 0.5) & (row > -0.5) & (row < height - 0.5)
     nearest = jnp.round(row).astype(int).clip(0, height - 1), jnp.round(column).astype(int).clip(0, width - 1)
 
     top, left = jnp.floor(row).astype(int).clip(0, height - 2), jnp.floor(column).astype(int).clip(0, width - 2)
     valid = jnp.where(jnp.isfinite(depth) & (depth > 0), depth, 0.0)
-    four = jnp.stack([valid[top + i, left + j] for i in (0, 1) for j in (0, 1)])
-    low, high = jnp.min(four, axis=0), jnp.max(four, axis=0)
-    is_alike = (low > 0) & (high <= low * (1.0 + jnp.maximum(_ALIKE, _STEEPEST / jnp.min(focal))))
-    below, right = row - top, column - left
-    weights = jnp.stack([(1 - below) * (1 - right), (1 - below) * right, below * (1 - right), below * right])
-    smooth = 1.0 / jnp.sum(weights / jnp.where(is_alike, four, 1.0), axis=0)
-    return jnp.where(within, jnp.where(is_alike, smooth, depth[nearest]), 0.0), within & missed[nearest]
+    corners = jnp.stack([valid[top + i, left + j] for i in (0, 1) for j in (0, 1)])
+    low, high = jnp.min(corners, axis=0), jnp.max(corners, axis=0)
+    is_alike = (low > 0) & (high <= low * (1.0 + jnp.maximum(_MAX_DIFFERENCE, _MAX_SLOPE / jnp.min(focal))))
+    dy, dx = row - top, column - left
+    weights = jnp.stack([(1 - dy) * (1 - dx), (1 - dy) * dx, dy * (1 - dx), dy * dx])
+    smooth = 1.0 / jnp.sum(weights / jnp.where(is_alike, corners, 1.0), axis=0)
+    return jnp.where(is_inside, jnp.where(is_alike, smooth, depth[nearest]), 0.0), is_inside & missed[nearest]

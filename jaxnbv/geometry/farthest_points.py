@@ -21,7 +21,7 @@ def farthest_point_indices(points: Float[Array, "n d"], mask: Bool[Array, " n"],
     **Raises:** `ValueError` if `count` < 1.
     """
     require(count >= 1, f"cannot choose {count} points; ask for at least one")
-    padding = -len(points) % _FOLDS
+    padding = -len(points) % _NUM_PARTS
     columns = list(jnp.pad(jax.lax.stop_gradient(jnp.where(mask[:, None], points, 0.0)), ((0, padding), (0, 0))).T)
     filled = jnp.pad(mask, (0, padding))
     rows = jnp.arange(len(filled), dtype=jnp.int32)
@@ -29,20 +29,20 @@ def farthest_point_indices(points: Float[Array, "n d"], mask: Bool[Array, " n"],
     def choose(carry, _):
         distance, latest = carry
         squares = [(column - column[latest]) ** 2 for column in columns]
-        nearer = jnp.minimum(distance, functools.reduce(jnp.add, squares))
-        distance = jnp.where(rows == latest, _CHOSEN, nearer)
+        nearest = jnp.minimum(distance, functools.reduce(jnp.add, squares))
+        distance = jnp.where(rows == latest, _CHOSEN_DISTANCE, nearest)
         return (distance, _first_of_largest(distance, rows)), latest
 
-    start = jnp.where(filled, jnp.inf, jnp.full_like(columns[0], _EMPTY)), jnp.argmax(mask).astype(jnp.int32)
+    start = jnp.where(filled, jnp.inf, jnp.full_like(columns[0], _EMPTY_DISTANCE)), jnp.argmax(mask).astype(jnp.int32)
     return jax.lax.scan(choose, start, length=count)[1]
 
 
 # These values take the place of distances for chosen and for empty rows. If the bits of floats are read as integers,
 # -1.0 is smaller than -2.0, and both are smaller than any distance. So a chosen row comes before an empty row.
-_CHOSEN, _EMPTY = -2.0, -1.0
+_CHOSEN_DISTANCE, _EMPTY_DISTANCE = -2.0, -1.0
 # An array is first reduced elementwise across this many parts of it. On a CPU this is several times as fast as reducing
 # the whole array.
-_FOLDS = 8
+_NUM_PARTS = 8
 
 
 def _first_of_largest(distance: Float[Array, " n"], rows: Int[Array, " n"]) -> Int[Array, ""]:
@@ -54,9 +54,9 @@ def _first_of_largest(distance: Float[Array, " n"], rows: Int[Array, " n"]) -> I
     - `rows`: the indices 0, 1, 2, ... of the rows.
     """
     bits = jax.lax.bitcast_convert_type(distance, jnp.dtype(f"int{8 * distance.dtype.itemsize}"))
-    largest = jnp.max(_folded(jnp.maximum, bits))
-    return jnp.min(_folded(jnp.minimum, jnp.where(bits == largest, rows, len(rows))))
+    largest = jnp.max(_reduce_parts(jnp.maximum, bits))
+    return jnp.min(_reduce_parts(jnp.minimum, jnp.where(bits == largest, rows, len(rows))))
 
 
-def _folded(operation: Callable[[Array, Array], Array], values: Array) -> Array:
-    return functools.reduce(operation, jnp.split(values, _FOLDS))
+def _reduce_parts(operation: Callable[[Array, Array], Array], values: Array) -> Array:
+    return functools.reduce(operation, jnp.split(values, _NUM_PARTS))

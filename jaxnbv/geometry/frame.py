@@ -14,9 +14,9 @@ from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
 
 # Largest rounding of coordinates, in scene units: 1 % of the sensor noise.
-_ROUNDING = 1e-4
+_MAX_ROUNDING = 1e-4
 # Rotation from world to scene for each upward axis of the world. The second row, the scene's y axis, is this axis.
-_UP = {
+_UP_ROTATIONS = {
     "y": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
     "-y": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
     "z": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
@@ -24,7 +24,7 @@ _UP = {
     "x": ((0, -1, 0), (1, 0, 0), (0, 0, 1)),
     "-x": ((0, 1, 0), (-1, 0, 0), (0, 0, 1)),
 }
-AXES = tuple(_UP)
+AXES = tuple(_UP_ROTATIONS)
 
 
 class Frame(eqx.Module):
@@ -45,7 +45,7 @@ class Frame(eqx.Module):
     def __check_init__(self):
         check_fields(self)
         require(self.scale > 0, f"the frame's scale is {self.scale}; it must be positive")
-        require(self.up in _UP, f"up is {short_text(self.up)}; give one of {', '.join(_UP)}")
+        require(self.up in _UP_ROTATIONS, f"up is {short_text(self.up)}; give one of {', '.join(_UP_ROTATIONS)}")
 
     @classmethod
     @checked
@@ -81,7 +81,7 @@ class Frame(eqx.Module):
     @property
     def rotation(self) -> Float[np.ndarray, "3 3"]:
         """The rotation R, which maps directions from the world to the scene."""
-        return np.array(_UP[self.up], np.float64)
+        return np.array(_UP_ROTATIONS[self.up], np.float64)
 
     @own_settings()
     def to_scene(self, value):
@@ -96,52 +96,54 @@ class Frame(eqx.Module):
         if isinstance(value, PointCloud | Pose) and not is_traced(value):
             self._check_precision(value.points if isinstance(value, PointCloud) else value.position)
         center = np.asarray(self.center)
-        return _apply(value, lambda points: self._turned(points - center) * self.scale, self._turned, self.scale)
+        return _apply(value, lambda points: self._rotate(points - center) * self.scale, self._rotate, self.scale)
 
     @own_settings()
     def to_world(self, value):
         """Convert from scene to world: the inverse of `to_scene`, for the same types."""
         center = np.asarray(self.center)
-        return _apply(value, lambda points: self._back(points / self.scale) + center, self._back, 1.0 / self.scale)
+        return _apply(
+            value, lambda points: self._unrotate(points / self.scale) + center, self._unrotate, 1.0 / self.scale
+        )
 
-    def _turned(self, vectors):
+    def _rotate(self, vectors):
         return vectors if self.up == "y" else vectors @ self.rotation.T.astype(vectors.dtype)
 
-    def _back(self, vectors):
+    def _unrotate(self, vectors):
         return vectors if self.up == "y" else vectors @ self.rotation.astype(vectors.dtype)
 
     def _check_precision(self, coordinates: Array) -> None:
         largest = float(np.abs(np.asarray(coordinates)).max(initial=0.0))
         rounding = self.scale * largest * float(jnp.finfo(coordinates.dtype).eps)
         require(
-            rounding <= _ROUNDING,
+            rounding <= _MAX_ROUNDING,
             f"world coordinates of {largest:.4g} are rounded to {rounding:.2g} scene units as {coordinates.dtype}: "
             "bring the arrays to the scene first, PointCloud.from_arrays(frame.to_scene(points), normals), or enable "
             "jax_enable_x64",
         )
 
 
-def _apply(value, place, turn, scale: float):
+def _apply(value, map_points, map_directions, scale: float):
     """Convert a cloud, pose, box, camera or points by functions for points and for directions.
 
-    - `place`, `turn`: function that converts points, and function that converts directions.
+    - `map_points`, `map_directions`: function that converts points, and function that converts directions.
     - `scale`: factor for lengths.
     """
     if isinstance(value, PointCloud):
-        points = jnp.where(value.mask[..., None], place(value.points), 0.0).astype(value.points.dtype)
+        points = jnp.where(value.mask[..., None], map_points(value.points), 0.0).astype(value.points.dtype)
         sight = None if value.sight is None else scale * value.sight
-        return dataclasses.replace(value, points=points, normals=turn(value.normals), sight=sight)
+        return dataclasses.replace(value, points=points, normals=map_directions(value.normals), sight=sight)
     if isinstance(value, Pose):
-        rotation = jnp.swapaxes(turn(jnp.swapaxes(value.rotation, -1, -2)), -1, -2)
-        return Pose(rotation, place(value.position).astype(value.position.dtype))
+        rotation = jnp.swapaxes(map_directions(jnp.swapaxes(value.rotation, -1, -2)), -1, -2)
+        return Pose(rotation, map_points(value.position).astype(value.position.dtype))
     if isinstance(value, Box):
-        corners = place(np.array([value.low, value.high]))
+        corners = map_points(np.array([value.low, value.high]))
         return Box(corners.min(axis=0), corners.max(axis=0))
     if isinstance(value, Camera):
         farthest = None if value.farthest is None else scale * value.farthest
         return dataclasses.replace(value, nearest=scale * value.nearest, farthest=farthest)
     if isinstance(value, Array) and is_traced(value):
-        return place(value)
+        return map_points(value)
     array = as_numbers(value, "the points", None)
     require(array.shape[-1:] == (3,), f"the points are {short_text(value)}: give an array (..., 3), a cloud or a pose")
-    return place(array)
+    return map_points(array)

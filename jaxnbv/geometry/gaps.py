@@ -8,31 +8,33 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.ndimage import correlate
 
-# Sides of blocks that are tried. A side fits if the fraction of blocks with a valid pixel is at least `_FILLED` times
-# the fraction for blocks of four times the side.
-_SIDES, _FILLED = (2, 3, 4, 6, 8, 12, 16, 24), 0.7
-# In an image without gaps, at least the fraction `_WITH_PLANE` of the valid pixels has enough valid pixels in its 3 x 3
-# neighbourhood for a plane, that is, `_FEWEST` with the pixel itself.
-_WITH_PLANE, _FEWEST = 0.8, 4
+# Sides of blocks that are tried. A side fits if the fraction of blocks with a valid pixel is at least
+# `_MIN_FILLED_RATIO` times the fraction for blocks of four times the side.
+_SIDES, _MIN_FILLED_RATIO = (2, 3, 4, 6, 8, 12, 16, 24), 0.7
+# In an image without gaps, at least the fraction `_MIN_PLANE_FRACTION` of the valid pixels has enough valid pixels in
+# its 3 x 3 neighbourhood for a plane, that is, `_MIN_PLANE_PIXELS` with the pixel itself.
+_MIN_PLANE_FRACTION, _MIN_PLANE_PIXELS = 0.8, 4
 
 
-def gap_of(valid: Bool[np.ndarray, "h w"]) -> int:
-    """Return the gap of a depth image: the smallest side of square blocks that rarely lack a valid pixel.
+def find_block_side(valid: Bool[np.ndarray, "h w"]) -> int:
+    """Return the smallest side of square blocks of a depth image that rarely lack a valid pixel.
 
-    The gap is 1 if most valid pixels have enough neighbours for a plane, even if the image has holes. Otherwise it is
+    The side is 1 if most valid pixels have enough neighbours for a plane, even if the image has holes. Otherwise it is
     the smallest side for which the fraction of blocks with a valid pixel is about that of blocks of four times the
-    side. For example, the gap is 8 if every eighth row is valid.
+    side. For example, the side is 8 if every eighth row is valid.
     """
-    around = correlate(valid.astype(np.uint8), np.ones((3, 3), np.uint8), mode="constant")
-    if not valid.any() or np.mean(around[valid] >= _FEWEST) >= _WITH_PLANE:
+    num_valid = correlate(valid.astype(np.uint8), np.ones((3, 3), np.uint8), mode="constant")
+    if not valid.any() or np.mean(num_valid[valid] >= _MIN_PLANE_PIXELS) >= _MIN_PLANE_FRACTION:
         return 1
 
-    def filled(side: int) -> float:
+    def filled_fraction(side: int) -> float:
         height, width = (side * (size // side) for size in valid.shape)
         blocks = valid[:height, :width].reshape(height // side, side, width // side, side)
         return float(blocks.any(axis=(1, 3)).mean()) if blocks.size else 0.0
 
-    return next((side for side in _SIDES if filled(side) >= _FILLED * filled(4 * side)), _SIDES[-1])
+    return next(
+        (side for side in _SIDES if filled_fraction(side) >= _MIN_FILLED_RATIO * filled_fraction(4 * side)), _SIDES[-1]
+    )
 
 
 def block_samples(
@@ -54,8 +56,8 @@ def block_samples(
         return image.reshape(height, side, width, side).swapaxes(1, 2).reshape(height, width, side * side)
 
     row, column = np.divmod(np.arange(side * side), side)
-    off = (row - 0.5 * (side - 1)) ** 2 + (column - 0.5 * (side - 1)) ** 2
-    chosen = jnp.argmin(jnp.where(blocks(valid), off, jnp.inf), axis=-1)
-    place = jnp.stack([jnp.asarray(column)[chosen], jnp.asarray(row)[chosen]], axis=-1)
-    samples = jnp.take_along_axis(blocks(depth), chosen[..., None], axis=-1)[..., 0]
-    return samples, blocks(valid).any(axis=-1), place
+    squared_distances = (row - 0.5 * (side - 1)) ** 2 + (column - 0.5 * (side - 1)) ** 2
+    index = jnp.argmin(jnp.where(blocks(valid), squared_distances, jnp.inf), axis=-1)
+    offset = jnp.stack([jnp.asarray(column)[index], jnp.asarray(row)[index]], axis=-1)
+    samples = jnp.take_along_axis(blocks(depth), index[..., None], axis=-1)[..., 0]
+    return samples, blocks(valid).any(axis=-1), offset

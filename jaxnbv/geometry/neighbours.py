@@ -9,7 +9,7 @@ from jaxnbv.geometry.cloud import PointCloud, some_rows
 
 _UNROLL = 8
 # Number of points whose nearest neighbours `spacing` computes.
-_ASKED = 256
+_NUM_QUERIES = 256
 
 
 @jax.jit
@@ -27,7 +27,7 @@ def spacing(cloud: PointCloud) -> Float[Array, ""]:
 
     The median is over 256 evenly spaced filled rows. It is zero for a cloud with fewer than two points.
     """
-    nearest = distance_to_others(cloud, some_rows(cloud, _ASKED))
+    nearest = distance_to_others(cloud, some_rows(cloud, _NUM_QUERIES))
     return jnp.where(cloud.count > 1, jnp.median(nearest), 0.0)
 
 
@@ -39,8 +39,8 @@ def distance_to_others(cloud: PointCloud, rows: Int[Array, " r"]) -> Float[Array
     - `rows`: indices of rows of the cloud.
     """
     offsets = cloud.points[rows, None] - cloud.points
-    other = cloud.mask & (jnp.arange(cloud.capacity) != rows[:, None])
-    return jnp.sqrt(jnp.min(jnp.where(other, jnp.sum(offsets**2, axis=-1), jnp.inf), axis=1))
+    is_other = cloud.mask & (jnp.arange(cloud.capacity) != rows[:, None])
+    return jnp.sqrt(jnp.min(jnp.where(is_other, jnp.sum(offsets**2, axis=-1), jnp.inf), axis=1))
 
 
 class DistanceField(eqx.Module):
@@ -77,8 +77,8 @@ class DistanceField(eqx.Module):
 
         For a point outside the cube, return the distance from the nearest point of the cube.
         """
-        places = jnp.moveaxis((x - self.low) / self.spacing, -1, 0)
-        return jax.scipy.ndimage.map_coordinates(self.values, list(places), order=1, mode="nearest")
+        coordinates = jnp.moveaxis((x - self.low) / self.spacing, -1, 0)
+        return jax.scipy.ndimage.map_coordinates(self.values, list(coordinates), order=1, mode="nearest")
 
 
 @jax.custom_jvp
@@ -120,13 +120,13 @@ def _loop(x, points, mask, best, closer):
     planes = jnp.concatenate([jnp.where(mask[:, None], -2.0 * points, 0.0), squared[:, None]], axis=-1)
     planes = jnp.pad(planes, ((0, padding), (0, 0)), constant_values=jnp.inf).reshape(-1, _UNROLL, 4)
     planes = planes.at[..., :3].set(jnp.where(jnp.isinf(planes[..., 3:]), 0.0, planes[..., :3]))
-    filled = jnp.max(jnp.where(mask, jnp.arange(points.shape[0]) + 1, 0), initial=0)
+    num_rows = jnp.max(jnp.where(mask, jnp.arange(points.shape[0]) + 1, 0), initial=0)
 
-    def body(turn, best):
-        rows = planes[turn]
+    def body(block, best):
+        rows = planes[block]
         for step in range(_UNROLL):
             a, b, c, offset = rows[step]
-            best = closer(best, turn * _UNROLL + step, x[:, 0] * a + (x[:, 1] * b + (x[:, 2] * c + offset)))
+            best = closer(best, block * _UNROLL + step, x[:, 0] * a + (x[:, 1] * b + (x[:, 2] * c + offset)))
         return best
 
-    return jax.lax.fori_loop(0, -(-filled // _UNROLL), body, best)
+    return jax.lax.fori_loop(0, -(-num_rows // _UNROLL), body, best)

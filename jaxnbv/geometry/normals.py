@@ -26,20 +26,20 @@ def estimate_normals(
     **Raises:** `ValueError` for wrong shapes, fewer points than `neighbours`, fewer than three neighbours, a point or
     viewpoint that is not finite, or a point at the viewpoint.
     """
-    places = as_numbers(points, "the points", np.float64)
+    points = as_numbers(points, "the points", np.float64)
     sensor = as_numbers(viewpoint, "the viewpoint", np.float64)
-    require(places.ndim == 2 and places.shape[1] == 3, f"the points have shape {places.shape}: give (n, 3)")
-    require(sensor.shape in ((3,), places.shape), f"the viewpoint has shape {sensor.shape}: give (3,) or one per point")
+    require(points.ndim == 2 and points.shape[1] == 3, f"the points have shape {points.shape}: give (n, 3)")
+    require(sensor.shape in ((3,), points.shape), f"the viewpoint has shape {sensor.shape}: give (3,) or one per point")
     require(
-        3 <= neighbours <= len(places),
-        f"cannot fit planes to {neighbours} of {len(places)} points: take three at least, and no more than there are",
+        3 <= neighbours <= len(points),
+        f"cannot fit planes to {neighbours} of {len(points)} points: take three at least, and no more than there are",
     )
-    require(bool(np.isfinite(places).all() and np.isfinite(sensor).all()), "a point or the viewpoint is not finite")
-    toward = sensor - places
-    require(bool((np.linalg.norm(toward, axis=1) > 0).all()), "a point lies where the sensor stands: drop it")
-    _, index = cKDTree(places).query(places, neighbours)
-    around = places[index] - places[index].mean(axis=1, keepdims=True)
+    require(bool(np.isfinite(points).all() and np.isfinite(sensor).all()), "a point or the viewpoint is not finite")
+    to_sensor = sensor - points
+    require(bool((np.linalg.norm(to_sensor, axis=1) > 0).all()), "a point lies where the sensor stands: drop it")
+    _, index = cKDTree(points).query(points, neighbours)
+    offsets = points[index] - points[index].mean(axis=1, keepdims=True)
     # `eigh` returns eigenvalues in ascending order, so the points vary least in the first direction.
-    _, directions = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
+    _, directions = np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets))
     normals = directions[:, :, 0]
-    return np.where(np.sum(normals * toward, axis=1, keepdims=True) < 0, -normals, normals)
+    return np.where(np.sum(normals * to_sensor, axis=1, keepdims=True) < 0, -normals, normals)

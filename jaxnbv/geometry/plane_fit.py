@@ -24,24 +24,24 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.depth_noise import depth_noise
 from jaxnbv.geometry.gaps import block_samples
 
-_LARGEST_RADIUS = 10
-_SLOPE_ERROR = math.radians(2.5)
-# A neighbour can be on the same surface if its depth differs from the pixel's by at most `_STEEPEST` times their
-# distance across the image (a slope of 76 degrees), plus `_SPREAD` standard deviations of the noise.
-_STEEPEST, _SPREAD = 4.0, 6.0
-_FEWEST = 4
-# Noise makes two pixels of one surface differ by less than `_DIFFERENCE` standard deviations of a pixel's noise in most
-# cases. A pixel that differs by more from over five of its eight neighbours mixes a near and a far surface.
-_DIFFERENCE, _MOST_UNLIKE = 3.0 * math.sqrt(2.0), 5
+_MAX_RADIUS = 10
+_MAX_SLOPE_ERROR = math.radians(2.5)
+# A neighbour can be on the same surface if its depth differs from the pixel's by at most `_MAX_SLOPE` times their
+# distance across the image (a slope of 76 degrees), plus `_MAX_DEVIATIONS` standard deviations of the noise.
+_MAX_SLOPE, _MAX_DEVIATIONS = 4.0, 6.0
+_MIN_PIXELS = 4
+# Noise makes two pixels of one surface differ by less than `_MAX_DIFFERENCE` standard deviations of a pixel's noise in
+# most cases. A pixel that differs by more from over five of its eight neighbours mixes a near and a far surface.
+_MAX_DIFFERENCE, _MAX_UNLIKE = 3.0 * math.sqrt(2.0), 5
 
 
-def fitted_planes(
+def fit_planes(
     depth: Float[Array, "h w"],
     valid: Bool[Array, "h w"],
     camera: Camera,
     stride: int,
-    least_noise: float | Float[Array, ""],
-    gap: int = 1,
+    min_noise: float | Float[Array, ""],
+    block_side: int = 1,
 ) -> tuple[Float[Array, "k l"], Float[Array, "k l 3"], Bool[Array, "k l"]]:
     """Return a fitted plane's depth and normal at every `stride`-th row and column, and whether it exists.
 
@@ -50,27 +50,27 @@ def fitted_planes(
 
     - `depth`: depths, positive and finite where `valid`.
     - `camera`: the camera of the whole image.
-    - `least_noise`: lower bound on the standard deviation of the noise, such as that of rounding.
-    - `gap`: side of the blocks of pixels that give one sample each, see `gaps`. With gaps, the sizes of windows are
-      counted in blocks.
+    - `min_noise`: lower bound on the standard deviation of the noise, such as that of rounding.
+    - `block_side`: side of the blocks of pixels that give one sample each, see `gaps`. With gaps, the sizes of windows
+      are counted in blocks.
     """
     focal = jnp.asarray(camera.focal_lengths, depth.dtype)
     strided = slice(stride // 2, None, stride)
-    place = camera.pixel_directions().reshape(*depth.shape, 3)[strided, strided, :2].astype(depth.dtype)
+    plane_points = camera.pixel_directions().reshape(*depth.shape, 3)[strided, strided, :2].astype(depth.dtype)
     pixels = [jnp.arange(stride // 2, size, stride) for size in depth.shape]
-    rows, columns = (_LARGEST_RADIUS + pixel // gap for pixel in pixels)
-    samples, is_sample, offset = block_samples(depth, valid, gap)
-    sigma = depth_noise(samples, is_sample, least_noise)[(pixels[0] // gap)[:, None], pixels[1] // gap]
-    padded = jnp.pad(jnp.where(is_sample, samples, 0.0), _LARGEST_RADIUS)
-    offset = jnp.pad(offset, ((_LARGEST_RADIUS, _LARGEST_RADIUS), (_LARGEST_RADIUS, _LARGEST_RADIUS), (0, 0)))
-    inside = jnp.stack(jnp.meshgrid(pixels[1] % gap, pixels[0] % gap), axis=-1)
-    # `own` is the offset (column, row) in pixels from each pixel to the sample of its block.
-    own = offset[rows[:, None], columns[None]] - inside
+    rows, columns = (_MAX_RADIUS + pixel // block_side for pixel in pixels)
+    samples, is_sample, offset = block_samples(depth, valid, block_side)
+    sigma = depth_noise(samples, is_sample, min_noise)[(pixels[0] // block_side)[:, None], pixels[1] // block_side]
+    padded = jnp.pad(jnp.where(is_sample, samples, 0.0), _MAX_RADIUS)
+    offset = jnp.pad(offset, ((_MAX_RADIUS, _MAX_RADIUS), (_MAX_RADIUS, _MAX_RADIUS), (0, 0)))
+    block_offset = jnp.stack(jnp.meshgrid(pixels[1] % block_side, pixels[0] % block_side), axis=-1)
+    # `sample_offset` is the offset (column, row) in pixels from each pixel to the sample of its block.
+    sample_offset = offset[rows[:, None], columns[None]] - block_offset
     middle, has_middle = padded[rows[:, None], columns[None]], padded[rows[:, None], columns[None]] > 0
     middle = jnp.where(has_middle, middle, 1.0)
     spacing = middle[..., None] / focal
-    radius = _radius(gap * jnp.min(spacing, axis=-1), sigma)
-    window = (gap * radius)[..., None]
+    radius = _radius(block_side * jnp.min(spacing, axis=-1), sigma)
+    window = (block_side * radius)[..., None]
     width = 2 * jnp.max(jnp.where(has_middle, radius, 1)) + 1
 
     def add(index, sums):
@@ -78,45 +78,48 @@ def fitted_planes(
 
         `index` is the neighbour's index in the window. Positions are in units of the window's radius.
         """
-        down, right = index // width - width // 2, index % width - width // 2
-        near = padded[(rows + down)[:, None], (columns + right)[None]]
-        place = gap * jnp.stack([right, down]) - inside
-        place = place + offset[(rows + down)[:, None], (columns + right)[None]]
-        away = jnp.linalg.norm(spacing * (place - own), axis=-1)
-        beyond, distance = jnp.abs(near - middle) - _STEEPEST * away, jnp.maximum(jnp.abs(down), jnp.abs(right))
-        used = has_middle & (near > 0) & (beyond <= _SPREAD * sigma) & (distance <= radius)
-        unlike = (near > 0) & (beyond > _DIFFERENCE * sigma) & (distance == 1)
-        row = jnp.stack(jnp.broadcast_arrays(1.0, *jnp.moveaxis(place / window, -1, 0)), axis=-1)
-        row = jnp.where(used[..., None], row.astype(depth.dtype), 0.0)
-        ratio = middle / jnp.where(used, near, 1.0)
-        return sums[0] + row[..., :, None] * row[..., None, :], sums[1] + ratio[..., None] * row, sums[2] + unlike
+        row_step, column_step = index // width - width // 2, index % width - width // 2
+        neighbour = padded[(rows + row_step)[:, None], (columns + column_step)[None]]
+        position = block_side * jnp.stack([column_step, row_step]) - block_offset
+        position = position + offset[(rows + row_step)[:, None], (columns + column_step)[None]]
+        lateral = jnp.linalg.norm(spacing * (position - sample_offset), axis=-1)
+        excess = jnp.abs(neighbour - middle) - _MAX_SLOPE * lateral
+        distance = jnp.maximum(jnp.abs(row_step), jnp.abs(column_step))
+        is_included = has_middle & (neighbour > 0) & (excess <= _MAX_DEVIATIONS * sigma) & (distance <= radius)
+        is_unlike = (neighbour > 0) & (excess > _MAX_DIFFERENCE * sigma) & (distance == 1)
+        row = jnp.stack(jnp.broadcast_arrays(1.0, *jnp.moveaxis(position / window, -1, 0)), axis=-1)
+        row = jnp.where(is_included[..., None], row.astype(depth.dtype), 0.0)
+        ratio = middle / jnp.where(is_included, neighbour, 1.0)
+        return sums[0] + row[..., :, None] * row[..., None, :], sums[1] + ratio[..., None] * row, sums[2] + is_unlike
 
     zeros = *(jnp.zeros(middle.shape + shape, depth.dtype) for shape in ((3, 3), (3,))), jnp.zeros(middle.shape, int)
     normal, right_hand, num_unlike = jax.lax.fori_loop(0, width * width, add, zeros)
     # Pixels along a line do not define a plane.
-    has_plane = (normal[..., 0, 0] >= _FEWEST) & (_breadth(normal) > 1e-3) & (num_unlike <= _MOST_UNLIKE)
+    has_plane = (normal[..., 0, 0] >= _MIN_PIXELS) & (_breadth(normal) > 1e-3) & (num_unlike <= _MAX_UNLIKE)
     regular = jnp.where(has_plane[..., None, None], normal, jnp.eye(3, dtype=depth.dtype))
     plane = jnp.linalg.solve(regular, right_hand[..., None])[..., 0]
     has_plane = has_plane & (plane[..., 0] > 0)
     # Convert slopes per radius of the window to slopes per unit of (u, v).
     slope = plane[..., 1:] * focal / window
-    towards = jnp.concatenate([slope, plane[..., :1] - jnp.sum(slope * place, axis=-1, keepdims=True)], axis=-1)
-    length = jnp.linalg.norm(towards, axis=-1, keepdims=True)
-    reach = 3.0 * sigma + _STEEPEST * jnp.linalg.norm(spacing * own, axis=-1)
-    smooth = jnp.clip(middle / jnp.where(has_plane, plane[..., 0], 1.0), middle - reach, middle + reach)
-    return smooth, -towards / jnp.where(length > 0, length, 1.0), has_plane & (length[..., 0] > 0)
+    direction = jnp.concatenate(
+        [slope, plane[..., :1] - jnp.sum(slope * plane_points, axis=-1, keepdims=True)], axis=-1
+    )
+    length = jnp.linalg.norm(direction, axis=-1, keepdims=True)
+    max_shift = 3.0 * sigma + _MAX_SLOPE * jnp.linalg.norm(spacing * sample_offset, axis=-1)
+    smooth = jnp.clip(middle / jnp.where(has_plane, plane[..., 0], 1.0), middle - max_shift, middle + max_shift)
+    return smooth, -direction / jnp.where(length > 0, length, 1.0), has_plane & (length[..., 0] > 0)
 
 
 def _radius(spacing: Float[Array, "k l"], sigma: Float[Array, "k l"]) -> Int[Array, "k l"]:
-    """Return the radius in pixels of the smallest window whose slope has an error below `_SLOPE_ERROR`.
+    """Return the radius in pixels of the smallest window whose slope has an error below `_MAX_SLOPE_ERROR`.
 
-    The radius is at most `_LARGEST_RADIUS`.
+    The radius is at most `_MAX_RADIUS`.
 
     - `spacing`, `sigma`: distance between neighbouring pixels on the surface, and standard deviation of their depth.
     """
-    radii = jnp.arange(1, _LARGEST_RADIUS + 1)
+    radii = jnp.arange(1, _MAX_RADIUS + 1)
     error = math.sqrt(3.0) * sigma[..., None] / (spacing[..., None] * radii * (2 * radii + 1))
-    return jnp.minimum(1 + jnp.sum(error > _SLOPE_ERROR, axis=-1), _LARGEST_RADIUS)
+    return jnp.minimum(1 + jnp.sum(error > _MAX_SLOPE_ERROR, axis=-1), _MAX_RADIUS)
 
 
 def _breadth(normal: Float[Array, "k l 3 3"]) -> Float[Array, "k l"]:
@@ -126,6 +129,6 @@ def _breadth(normal: Float[Array, "k l 3 3"]) -> Float[Array, "k l"]:
     """
     total = jnp.maximum(normal[..., 0, 0], 1e-12)
     mean = normal[..., 0, 1:] / total[..., None]
-    spread = normal[..., 1:, 1:] / total[..., None, None] - mean[..., :, None] * mean[..., None, :]
-    trace, determinant = spread[..., 0, 0] + spread[..., 1, 1], jnp.linalg.det(spread)
+    covariance = normal[..., 1:, 1:] / total[..., None, None] - mean[..., :, None] * mean[..., None, :]
+    trace, determinant = covariance[..., 0, 0] + covariance[..., 1, 1], jnp.linalg.det(covariance)
     return 4.0 * determinant / jnp.maximum(trace**2, 1e-12)

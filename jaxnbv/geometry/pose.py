@@ -15,9 +15,9 @@ from jaxtyping import Array, Bool, Float
 
 from jaxnbv.checks import AnyArray, as_floats, check_batch, check_index, checked, is_traced, own_settings, require
 
-# A matrix counts as a rotation if no entry of |R R^T - I| exceeds `_ORTHONORMAL`. Up to `_ROUNDED`, it counts as a
+# A matrix counts as a rotation if no entry of |R R^T - I| exceeds `_MAX_ERROR`. Up to `_MAX_ROUNDING`, it counts as a
 # rotation that was written to three digits, and is corrected.
-_ORTHONORMAL, _ROUNDED = 1e-3, 5e-3
+_MAX_ERROR, _MAX_ROUNDING = 1e-3, 5e-3
 # Signs that convert the axes of each convention to OpenCV's right, down and forward axis.
 _CONVENTIONS = {"opencv": (1.0, 1.0, 1.0), "opengl": (1.0, -1.0, -1.0)}
 
@@ -73,7 +73,7 @@ class Pose(eqx.Module):
                 f"the last row of a pose's matrix is {last}, not (0, 0, 0, 1): give camera-to-world, not its transpose "
                 "or a projection",
             )
-            is_rounded = ((error := _off_rotation(rotation)) > _ORTHONORMAL) & (error <= _ROUNDED)
+            is_rounded = ((error := _rotation_error(rotation)) > _MAX_ERROR) & (error <= _MAX_ROUNDING)
             if is_rounded.any():
                 rotation = np.where(is_rounded[..., None, None], _nearest_rotation(rotation), rotation)
         return cls(jnp.asarray(rotation * axes.astype(matrices.dtype)), jnp.asarray(position))
@@ -132,14 +132,14 @@ def rigid_matrices(
     A matrix whose R is rounded to three digits still counts as a rigid motion. Matrices that are not rigid motions are
     returned unchanged.
     """
-    is_rigid = np.isfinite(matrices).all(axis=(1, 2)) & (_off_rotation(matrices[:, :3, :3]) <= _ROUNDED)
+    is_rigid = np.isfinite(matrices).all(axis=(1, 2)) & (_rotation_error(matrices[:, :3, :3]) <= _MAX_ROUNDING)
     is_rigid &= (np.abs(matrices[:, 3] - [0.0, 0.0, 0.0, 1.0]) < 1e-6).all(axis=1)
     rigid = np.array(matrices)
     rigid[is_rigid, :3, :3] = _nearest_rotation(matrices[is_rigid, :3, :3])
     return rigid, is_rigid
 
 
-def _off_rotation(rotation: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n"]:
+def _rotation_error(rotation: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n"]:
     """Return the largest entry of |R R^T - I| for each matrix R; infinite if R reflects or is not finite."""
     finite = np.where(np.isfinite(rotation).all(axis=(-1, -2), keepdims=True), rotation, 0.0)
     error = np.abs(finite @ np.swapaxes(finite, -1, -2) - np.eye(3)).max(axis=(-1, -2))
@@ -157,7 +157,7 @@ def _check_rigid(rotation: np.ndarray, position: np.ndarray) -> None:
     require(finite, f"the pose has entries that are not finite: rotation {rotation}, position {position}; give numbers")
     error = np.abs(rotation @ np.swapaxes(rotation, -1, -2) - np.eye(3)).max(initial=0.0)
     require(
-        bool((_off_rotation(rotation) < _ORTHONORMAL).all()),
+        bool((_rotation_error(rotation) < _MAX_ERROR).all()),
         f"the pose's 3 x 3 matrix is not a rotation: |R R^T - I| is {error:.3g} and det R is {np.linalg.det(rotation)}"
         "; build it with look_at, or orthonormalise it first",
     )
@@ -190,7 +190,7 @@ def look_at(
         f"look_at needs a position (..., 3), a target (3,) and an up (3,), got {position.shape}, {target.shape}, "
         f"{up.shape}",
     )
-    rotation, distance, length = _facing(position, target, up)
+    rotation, distance, length = _look_rotation(position, target, up)
     if not is_traced(position, target, up):
         for value, name in ((position, "position"), (target, "target"), (up, "up")):
             require(bool(np.isfinite(value).all()), f"look_at needs finite coordinates, got {name} {value}")
@@ -210,16 +210,16 @@ def look_at(
 
 
 @jax.jit
-def _facing(
+def _look_rotation(
     position: Float[Array, "*batch 3"], target: Float[Array, "3"], up: Float[Array, "3"]
 ) -> tuple[Float[Array, "*batch 3 3"], Float[Array, "*batch 1"], Float[Array, ""]]:
     """Return the rotation of `look_at`, the distance to the target, and the length of `up`."""
     offset, length = target - position, jnp.linalg.norm(up)
     distance = jnp.linalg.norm(offset, axis=-1, keepdims=True)
     forward = offset / distance
-    spare = jnp.eye(3, dtype=up.dtype)[jnp.argmin(jnp.abs(up))]
-    parallel = jnp.linalg.norm(jnp.cross(forward, up), axis=-1, keepdims=True) < 1e-4 * length
-    right = jnp.cross(forward, jnp.where(parallel, spare, up))
+    fallback = jnp.eye(3, dtype=up.dtype)[jnp.argmin(jnp.abs(up))]
+    is_parallel = jnp.linalg.norm(jnp.cross(forward, up), axis=-1, keepdims=True) < 1e-4 * length
+    right = jnp.cross(forward, jnp.where(is_parallel, fallback, up))
     right = right / jnp.linalg.norm(right, axis=-1, keepdims=True)
     return jnp.stack([right, jnp.cross(forward, right), forward], axis=-1), distance, length
 

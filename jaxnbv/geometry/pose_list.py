@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxnbv.geometry.pose import Pose
 
 # Two poses count as the same view if their positions (scene units) and their viewing directions differ by less.
-_SAME = 1e-3
+_MAX_DIFFERENCE = 1e-3
 
 
 class PoseList(eqx.Module):
@@ -69,5 +69,5 @@ def is_same_view(poses: Pose, others: Pose) -> Bool[Array, "*batch"]:
 
     A rotation about the viewing direction is ignored. Leading axes of the two arguments are broadcast.
     """
-    near = jnp.linalg.norm(poses.position - others.position, axis=-1) < _SAME
-    return near & (jnp.linalg.norm(poses.forward - others.forward, axis=-1) < _SAME)
+    is_near = jnp.linalg.norm(poses.position - others.position, axis=-1) < _MAX_DIFFERENCE
+    return is_near & (jnp.linalg.norm(poses.forward - others.forward, axis=-1) < _MAX_DIFFERENCE)

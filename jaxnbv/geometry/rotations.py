@@ -38,10 +38,10 @@ def rotation_from_vector(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
     zero, both fractions are replaced by their Taylor series, so the result is differentiable at w = 0 too.
     """
     square = jnp.sum(vector**2)
-    small = square < 1e-12
-    angle = jnp.sqrt(jnp.where(small, 1.0, square))
-    sine = jnp.where(small, 1.0 - square / 6.0, jnp.sin(angle) / angle)
-    versine = jnp.where(small, 0.5 - square / 24.0, (1.0 - jnp.cos(angle)) / angle**2)
+    is_small = square < 1e-12
+    angle = jnp.sqrt(jnp.where(is_small, 1.0, square))
+    sine = jnp.where(is_small, 1.0 - square / 6.0, jnp.sin(angle) / angle)
+    versine = jnp.where(is_small, 0.5 - square / 24.0, (1.0 - jnp.cos(angle)) / angle**2)
     cross = _cross(vector)
     return jnp.eye(3) + sine * cross + versine * jnp.matmul(cross, cross, precision="highest")
 
@@ -69,11 +69,11 @@ def rotation_from_6d(columns: Float[AnyArray, "*batch 6"]) -> Float[Array, "*bat
     """
     columns = jnp.asarray(columns, dtype=jnp.result_type(float))
     first = normalise(columns[..., :3], jnp.asarray([1.0, 0.0, 0.0], columns.dtype))
-    spare = _any_orthogonal(first)
-    second = normalise(_reject(normalise(columns[..., 3:], spare), first), spare, _rounding(columns))
+    fallback = _any_orthogonal(first)
+    second = normalise(_reject(normalise(columns[..., 3:], fallback), first), fallback, _rounding(columns))
     # For nearly parallel vectors, the difference has lost digits and is not orthogonal to `first`. A second projection
     # corrects this.
-    second = normalise(_reject(second, first), spare)
+    second = normalise(_reject(second, first), fallback)
     return jnp.stack([first, second, jnp.cross(first, second)], axis=-1)
 
 
@@ -89,9 +89,9 @@ def rotation_between(
     halfway = normalise(start + end, _any_orthogonal(start), _rounding(start))
     # The sum of nearly opposite vectors has lost digits, but their difference has not. The exact sum is orthogonal to
     # the difference, so the part of the sum along the difference is removed.
-    opposed = jnp.sum(start * end, axis=-1, keepdims=True) < 0
-    apart = normalise(jnp.where(opposed, start - end, 0.0), jnp.zeros_like(start))
-    halfway = normalise(_reject(halfway, apart), halfway)
+    is_opposed = jnp.sum(start * end, axis=-1, keepdims=True) < 0
+    difference = normalise(jnp.where(is_opposed, start - end, 0.0), jnp.zeros_like(start))
+    halfway = normalise(_reject(halfway, difference), halfway)
     return jnp.matmul(_reflection(halfway), _reflection(start), precision="highest")
 
 
@@ -101,18 +101,18 @@ def _reflection(unit: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
 
 
 def normalise(
-    vector: Float[Array, "*batch n"], spare: Float[Array, "*#batch n"], least: float = 0.0
+    vector: Float[Array, "*batch n"], fallback: Float[Array, "*#batch n"], min_length: float = 0.0
 ) -> Float[Array, "*batch n"]:
-    """Return the unit vector along a vector, or `spare` if the vector is too short.
+    """Return the unit vector along a vector, or `fallback` if the vector is too short.
 
-    A vector is long enough if the magnitude of its largest entry exceeds `least` and the smallest normal float.
+    A vector is long enough if the magnitude of its largest entry exceeds `min_length` and the smallest normal float.
     """
     # The vector is divided by its largest entry, so that no square overflows.
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(vector), axis=-1, keepdims=True))
-    usable = largest > max(least, float(jnp.finfo(vector.dtype).tiny))
-    vector = vector / jnp.where(usable, largest, 1.0)
-    square = jnp.where(usable, jnp.sum(vector**2, axis=-1, keepdims=True), 1.0)
-    return jnp.where(usable, vector / jnp.sqrt(square), spare)
+    is_usable = largest > max(min_length, float(jnp.finfo(vector.dtype).tiny))
+    vector = vector / jnp.where(is_usable, largest, 1.0)
+    square = jnp.where(is_usable, jnp.sum(vector**2, axis=-1, keepdims=True), 1.0)
+    return jnp.where(is_usable, vector / jnp.sqrt(square), fallback)
 
 
 def _rounding(unit: Float[Array, "*batch n"]) -> float:

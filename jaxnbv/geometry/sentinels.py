@@ -5,37 +5,38 @@ import warnings
 import numpy as np
 from jaxtyping import Bool, Real
 
-# A sentinel fills more pixels than `_ROWS` rows or columns. No value in a noise-free image of a floor does. A sentinel
-# also fills at least `_ABOVE` times as many pixels as any value that differs from it by at most the fraction `_NEAR`.
-_ROWS, _ABOVE, _NEAR = 2, 20, 0.05
+# A sentinel fills more pixels than `_MIN_ROWS` rows or columns. No value in a noise-free image of a floor does. A
+# sentinel also fills at least `_MIN_COUNT_RATIO` times as many pixels as any value that differs from it by at most the
+# fraction `_MAX_DIFFERENCE`.
+_MIN_ROWS, _MIN_COUNT_RATIO, _MAX_DIFFERENCE = 2, 20, 0.05
 # If the largest relevant depth is unknown, a sentinel must exceed any other value by at least this factor.
-_BEYOND = 2.0
+_MIN_VALUE_RATIO = 2.0
 
 
-def sentinel_pixels(image: Real[np.ndarray, "h w"], reach: float) -> Bool[np.ndarray, "h w"]:
+def sentinel_pixels(image: Real[np.ndarray, "h w"], max_depth: float) -> Bool[np.ndarray, "h w"]:
     """Return, for each pixel, whether it holds a sentinel: a value that means "not measured".
 
     Two kinds of values are sentinels. The first is the largest value of an integer type. The second is a value beyond
-    `reach` that fills far more pixels than any similar value. It gives a `UserWarning`. If all measured pixels hold
+    `max_depth` that fills far more pixels than any similar value. It gives a `UserWarning`. If all measured pixels hold
     the same value, this value is not a sentinel, since the image may show a wall.
 
     - `image`: depths in any units.
-    - `reach`: the largest relevant depth, in the image's units. If it is infinite (unknown), a sentinel of the second
-      kind must be more than twice any other value.
+    - `max_depth`: the largest relevant depth, in the image's units. If it is infinite (unknown), a sentinel of the
+      second kind must be more than twice any other value.
     """
     is_integer = np.issubdtype(image.dtype, np.integer)
-    largest = image == np.iinfo(image.dtype).max if is_integer else np.zeros(image.shape, bool)
-    measured = image[np.isfinite(image) & (image > 0) & ~largest]
+    is_largest = image == np.iinfo(image.dtype).max if is_integer else np.zeros(image.shape, bool)
+    measured = image[np.isfinite(image) & (image > 0) & ~is_largest]
     if not len(measured):
-        return largest
-    if np.isinf(reach):
+        return is_largest
+    if np.isinf(max_depth):
         others = measured[measured < measured.max()]
-        reach = _BEYOND * others.max(initial=0)
-    values, counts = np.unique(measured[measured > reach], return_counts=True)
+        max_depth = _MIN_VALUE_RATIO * others.max(initial=0)
+    values, counts = np.unique(measured[measured > max_depth], return_counts=True)
     sentinels = []
-    for index in np.flatnonzero((counts > _ROWS * max(image.shape)) & (counts < len(measured))):
-        low, high = np.searchsorted(values, values[index] * np.array([1.0 - _NEAR, 1.0 + _NEAR]))
-        if counts[index] < _ABOVE * np.delete(counts[low:high], index - low).max(initial=0):
+    for index in np.flatnonzero((counts > _MIN_ROWS * max(image.shape)) & (counts < len(measured))):
+        low, high = np.searchsorted(values, values[index] * np.array([1.0 - _MAX_DIFFERENCE, 1.0 + _MAX_DIFFERENCE]))
+        if counts[index] < _MIN_COUNT_RATIO * np.delete(counts[low:high], index - low).max(initial=0):
             continue
         sentinels.append(index)
         warnings.warn(
@@ -43,4 +44,4 @@ def sentinel_pixels(image: Real[np.ndarray, "h w"], reach: float) -> Bool[np.nda
             "these pixels count as not measured. Give infinity where a ray met nothing",
             stacklevel=5,
         )
-    return largest | np.isin(image, values[sentinels])
+    return is_largest | np.isin(image, values[sentinels])

@@ -16,12 +16,15 @@ from jaxnbv.geometry.pose import fibonacci_sphere
 from jaxnbv.programs import program
 
 Volume = Callable[[Float[Array, "n 3"]], Float[Array, " n"]]
-"""A function of points (scene coordinates) that is negative inside the volume and positive outside. Its magnitude is at
-most the distance to the boundary. `Box` and the solids of `jaxnbv.scanning.sdf` are volumes."""
+"""Signed distance of a volume, as a function of points in scene coordinates.
+
+It is negative inside the volume and positive outside, and its magnitude is at most the distance to the boundary. `Box`
+and the solids of `jaxnbv.scanning.sdf` are volumes.
+"""
 
 _BISECTIONS = 40
 # A radius that exceeds the distance from the origin to the corners of the cube that holds all scenes, in scene units.
-_FAR = 3.0
+_OUTER_RADIUS = 3.0
 
 
 def _corner(values) -> Float[np.ndarray, " 3"]:
@@ -44,9 +47,9 @@ class Box(eqx.Module):
     high: Any = eqx.field(converter=_corner, default=(1.25, 1.25, 1.25))
 
     def __check_init__(self):
-        proper = self.low.shape == self.high.shape == (3,)
+        is_valid = self.low.shape == self.high.shape == (3,)
         require(
-            proper and all(0 < side < math.inf for side in (self.high - self.low).tolist()),
+            is_valid and all(0 < side < math.inf for side in (self.high - self.low).tolist()),
             f"a box {self} has no inside: each of three sides must be positive and finite",
         )
 
@@ -57,23 +60,23 @@ class Box(eqx.Module):
         low, high = (tuple(np.asarray(corner).tolist()) for corner in (self.low, self.high))
         return f"from {low} to {high}"
 
-    def widened(self, by: float) -> "Box":
-        """Return the box with all faces but the lower one (y is up) moved outward by the length `by`.
+    def widened(self, margin: float) -> "Box":
+        """Return the box with all faces but the lower one (y is up) moved outward by the length `margin`.
 
         The lower face stays, since the surface that the object stands on is below it.
         """
-        return Box(self.low - np.array([by, 0.0, by]), self.high + by)
+        return Box(self.low - np.array([margin, 0.0, margin]), self.high + margin)
 
-    def shares_beyond(self, points: Float[np.ndarray, "n 3"], by: float) -> dict[str, float]:
-        """Return, for each face, the fraction of points that lie more than the length `by` beyond the face.
+    def shares_beyond(self, points: Float[np.ndarray, "n 3"], margin: float) -> dict[str, float]:
+        """Return, for each face, the fraction of points that lie more than the length `margin` beyond the face.
 
         The keys are the names of the faces, such as "+x". The dictionary is empty if there are no points.
         """
         if len(points) == 0:
             return {}
-        beyond = {"-": points < self.low - by, "+": points > self.high + by}
-        shares = {sign: rows.mean(axis=0) for sign, rows in beyond.items()}
-        return {f"{sign}{axis}": float(shares[sign][index]) for index, axis in enumerate("xyz") for sign in shares}
+        is_beyond = {"-": points < self.low - margin, "+": points > self.high + margin}
+        means = {sign: rows.mean(axis=0) for sign, rows in is_beyond.items()}
+        return {f"{sign}{axis}": float(means[sign][index]) for index, axis in enumerate("xyz") for sign in means}
 
     @classmethod
     def cube(cls, side: float) -> "Box":
@@ -87,9 +90,9 @@ class Box(eqx.Module):
         x = jnp.asarray(x)
         low, high = jnp.asarray(self.low, x.dtype), jnp.asarray(self.high, x.dtype)
         center, half = 0.5 * (low + high), 0.5 * (high - low)
-        beyond = jnp.abs(x - center) - half
-        outside = jnp.sqrt(jnp.sum(jnp.maximum(beyond, 0.0) ** 2, axis=-1))
-        return outside + jnp.minimum(jnp.max(beyond, axis=-1), 0.0)
+        excess = jnp.abs(x - center) - half
+        outside = jnp.sqrt(jnp.sum(jnp.maximum(excess, 0.0) ** 2, axis=-1))
+        return outside + jnp.minimum(jnp.max(excess, axis=-1), 0.0)
 
 
 def ray_interval(
@@ -113,13 +116,13 @@ def ray_interval(
 
 
 @program
-def boundary_points(volume: Volume, count: int, beyond: float = 0.0) -> Float[Array, "count 3"]:
+def boundary_points(volume: Volume, count: int, level: float = 0.0) -> Float[Array, "count 3"]:
     """Return points where `count` evenly spread rays from the origin cross the boundary of a volume.
 
     The points are found by bisection between the origin and a sphere beyond the scene. If the volume is not star-shaped
     about the origin, a ray may have several crossings, and any one of the crossings is returned.
 
-    - `beyond`: value of the volume's function at the returned points, in scene units. The default gives points on the
+    - `level`: value of the volume's function at the returned points, in scene units. The default gives points on the
       boundary. A positive value gives points outside the volume.
     """
     directions = fibonacci_sphere(count)
@@ -127,10 +130,10 @@ def boundary_points(volume: Volume, count: int, beyond: float = 0.0) -> Float[Ar
     def halve(_, interval):
         near, far = interval
         middle = 0.5 * (near + far)
-        inside = volume(middle[:, None] * directions) < beyond
-        return jnp.where(inside, middle, near), jnp.where(inside, far, middle)
+        is_inside = volume(middle[:, None] * directions) < level
+        return jnp.where(is_inside, middle, near), jnp.where(is_inside, far, middle)
 
-    ends = jnp.zeros(count, directions.dtype), jnp.full(count, _FAR, directions.dtype)
+    ends = jnp.zeros(count, directions.dtype), jnp.full(count, _OUTER_RADIUS, directions.dtype)
     near, far = jax.lax.fori_loop(0, _BISECTIONS, halve, ends)
     return 0.5 * (near + far)[:, None] * directions
 

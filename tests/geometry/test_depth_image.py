@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 import jaxnbv as nbv
-from jaxnbv.geometry.gaps import gap_of
+from jaxnbv.geometry.gaps import find_block_side
 from jaxnbv.scanning.sdf import Cuboid, Sphere
 
 # In metres, z up: a ball on a table, 0.8 m from the camera, and a pillar between them at the left.
@@ -197,9 +197,9 @@ def test_holes_are_no_gaps():
     have neighbours if as many pixels are random."""
     noise = gaussian_filter(np.random.default_rng(0).normal(size=(240, 320)), 1.5)
     clumps = noise > np.quantile(noise, 0.75)
-    assert gap_of(clumps) == 1
-    assert gap_of(np.random.default_rng(1).permutation(clumps.ravel()).reshape(clumps.shape)) > 1
-    assert gap_of(np.zeros((8, 8), bool)) == 1
+    assert find_block_side(clumps) == 1
+    assert find_block_side(np.random.default_rng(1).permutation(clumps.ravel()).reshape(clumps.shape)) > 1
+    assert find_block_side(np.zeros((8, 8), bool)) == 1
 
 
 def test_planes_are_seen_exactly_between_samples():

@@ -35,7 +35,7 @@ def test_the_image_is_of_a_ball_on_a_table():
 
 def sizes():
     """Number of compiled programs of each function that takes long to compile."""
-    functions = planner_module._propose, sampler_module._sample, depth_image._oriented
+    functions = planner_module._propose, sampler_module._sample, depth_image._points_and_normals
     return [function._jitted._cached._cache_size() for function in functions]
 
 
