@@ -31,10 +31,14 @@ import jax
 import numpy as np
 import psutil
 import pytest
+from hypothesis import settings
 from jaxtyping import install_import_hook
 
 gc.set_threshold(100_000, 20, 100)
 install_import_hook(["jaxnbv", "forecasts", "covering", "peers", "training", "training_clouds"], "beartype.beartype")
+# Every run draws the same examples, so that a failure can be repeated.
+settings.register_profile("repeatable", derandomize=True, deadline=None)
+settings.load_profile("repeatable")
 
 # Memory of a worker in bytes.
 MEMORY = 3 << 30
@@ -44,16 +48,18 @@ SHARED = Path(__file__).resolve().parents[2] / "shared"
 # A worker takes whole files, so that fixtures of a module run once. The longest files come first.
 LONGEST_FIRST = (
     "test_cli.py",
-    "test_notebooks.py",
+    "test_episodes.py",
+    "test_depth_image.py",
     "test_pages.py",
     "test_means.py",
     "test_known_shapes.py",
     "test_gradient.py",
-    "test_spsr.py",
+    "test_sessions.py",
+    "test_parts.py",
+    "test_hostile.py",
+    "test_sharding.py",
     "test_pose_gradients.py",
-    "test_trajectories.py",
-    "test_screened.py",
-    "test_processes.py",
+    "test_notebooks.py",
     "test_report.py",
 )
 

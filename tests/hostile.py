@@ -100,7 +100,7 @@ CALLS = {
     nbv.SurfaceSampler.preset: {"name": "paper", "longest_side": 2.5, "quick": True, "volume": None, "solid": False},
     nbv.tasks.MixedEntropy: {"classifier": number_of_points, "threshold": 0.5, "num_points": 16},
     nbv.surfaces.OnSurface: {"num_points": 10, "noise": 0.1},
-    nbv.surfaces.OutsideBoundary: {"volume": nbv.Box(), "num_points": 10, "value": 1.0, "noise": 0.5, "room": 0.1},
+    nbv.surfaces.OutsideBoundary: {"volume": nbv.Box(), "num_points": 10, "value": 1.0, "noise": 0.5, "margin": 0.1},
     nbv.Planner: {"acquisition": nbv.Coverage(), "search": nbv.DiscreteSearch(6), "camera": SMALL}
     | {"sampler": nbv.SurfaceSampler(MODEL, nbv.Grid(8), 2), "cost": None, "capacity": 32, "max_views": 3}
     | {"obstacles": None},

@@ -115,7 +115,7 @@ def marked_and_inside(centre, radius, half, axis, angle, start, end, direction, 
 
 
 @pytest.mark.slow
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=200)
 @given(st.integers(0, 2**31))
 def test_noise_on_any_solid_from_anywhere_carves_nothing_of_it(seed):
     """Nodes are 0.036 apart, so that the margin is 3.6 standard deviations."""

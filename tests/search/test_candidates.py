@@ -60,7 +60,7 @@ def elevations(poses, up):
     return np.arcsin(places @ np.array(up) / np.linalg.norm(places, axis=1))
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.floats(0.5, 2.0), st.floats(0.0, 2.0), st.floats(-1.5, 1.4), st.floats(0.05, 1.0))
 def test_an_arm_reaches_between_its_bounds(nearest, more, low, wider):
     high = min(low + wider, 0.5 * math.pi)

@@ -23,20 +23,20 @@ def angle(one, other):
     return np.degrees(np.arctan2(np.linalg.norm(np.cross(one, other)), one @ other))
 
 
-@settings(deadline=None, max_examples=50)
-@given(seed=st.integers(0, 1000), count=st.integers(1, 8), apart=st.floats(5.0, 120.0), excluded=st.integers(0, 39))
-def test_each_of_the_best_is_the_best_that_is_far_from_those_before_it(seed, count, apart, excluded):
+@settings(max_examples=50)
+@given(seed=st.integers(0, 1000), count=st.integers(1, 8), min_angle=st.floats(5.0, 120.0), excluded=st.integers(0, 39))
+def test_each_of_the_best_is_the_best_that_is_far_from_those_before_it(seed, count, min_angle, excluded):
     rng = np.random.default_rng(seed)
     values = rng.permutation(40).astype(np.float32)
     values[rng.permutation(40)[:excluded]] = -np.inf
-    positions, best = np.asarray(POSES.position, np.float64), proposal_of(values).best(count, apart)
+    positions, best = np.asarray(POSES.position, np.float64), proposal_of(values).best(count, min_angle)
     chosen = [int(np.linalg.norm(positions - place, axis=1).argmin()) for place in np.asarray(best.position)]
     for number in range(len(chosen) + 1):
         before = chosen[:number]
         free = [
             index
             for index in np.flatnonzero(values > -np.inf)
-            if all(angle(positions[index], positions[other]) >= apart for other in before)
+            if all(angle(positions[index], positions[other]) >= min_angle for other in before)
         ]
         if number < len(chosen):
             assert chosen[number] == max(free, key=lambda index: values[index])
@@ -46,6 +46,10 @@ def test_each_of_the_best_is_the_best_that_is_far_from_those_before_it(seed, cou
 
 def test_a_count_or_an_angle_that_cannot_be_is_refused():
     proposal = proposal_of(np.arange(40.0, dtype=np.float32))
-    for arguments, problem in (((0,), "the count is 0"), ((3, -1.0), "apart is -1.0"), ((3, 200.0), "apart is 200.0")):
+    for arguments, problem in (
+        ((0,), "the count is 0"),
+        ((3, -1.0), "min_angle is -1.0"),
+        ((3, 200.0), "min_angle is 200.0"),
+    ):
         with pytest.raises(InputError, match=problem):
             proposal.best(*arguments)

@@ -63,7 +63,7 @@ def assert_same(loaded, saved):
 
 
 @given(planner=PLANNERS, stop_reason=st.sampled_from([None, "enough"]), in_world=st.booleans())
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=6)
 def test_an_episode_is_loaded_as_it_was_saved(tmp_path_factory, planner, stop_reason, in_world):
     candidates = nbv.SphereCandidates(5).poses()
     poses, scans = [candidates[index] for index in range(3)], [scan_of(shift) for shift in (-0.5, 0.0, 0.5)]

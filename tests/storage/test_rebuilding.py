@@ -177,7 +177,7 @@ PLAIN = st.recursive(
 )
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(PLAIN)
 def test_any_plain_value_comes_back(value):
     arrays = {}

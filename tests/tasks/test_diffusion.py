@@ -164,7 +164,7 @@ def test_points_without_triangles_keep_what_they_get():
     assert cloud_temperature(np.zeros((0, 3)), heat).values.shape == (0,)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 45), st.integers(0, 40), st.sampled_from([1.0, 1e-3, 0.0]))
 def test_any_cloud_has_a_temperature(seed, count, copies, flatness):
     """Few points, flat clouds, lines and copies give temperatures within bounds, in any order, and equal for equal
