@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 else:
     AnyCandidates = Candidates
 
-Scores: TypeAlias = Float[Array, "asked samples candidates"]
-"""Scores for each acquisition of `CandidateSearch.acquisitions`, each posterior sample and each candidate."""
+Scores: TypeAlias = Float[Array, "acquisitions samples candidates"]
+"""Score of each candidate on each posterior sample, for each acquisition of `CandidateSearch.acquisitions`."""
 
 _TIE = 1e-5
 
@@ -176,9 +176,9 @@ def best_or_farthest(problem: Problem, candidates: Pose, scores: Float[Array, "s
     if not problem.acquisition.gains_once or problem.cost is not None:
         return proposal
     proposal = dataclasses.replace(proposal, value_at_visited=problem.value_at_visited())
-    visited = problem.observations.poses
+    visited_poses = problem.observations.poses
     # Without earlier cameras there is no distance, so the candidate of the highest value is preferred.
-    return preferred(proposal, jnp.where(visited.count > 0, visited.distance(candidates), proposal.values))
+    return preferred(proposal, jnp.where(visited_poses.count > 0, visited_poses.distance(candidates), proposal.values))
 
 
 def preferred(proposal: Proposal, preference: Float[Array, " candidates"]) -> Proposal:
@@ -186,10 +186,10 @@ def preferred(proposal: Proposal, preference: Float[Array, " candidates"]) -> Pr
 
     Ties are those of `Proposal.tied_with_best`. Excluded candidates (value -inf) are not considered.
     """
-    tied, errors = proposal.tied_with_best(), proposal.standard_errors
-    assert tied is not None
+    is_tied, errors = proposal.tied_with_best(), proposal.standard_errors
+    assert is_tied is not None
     assert errors is not None
-    preference = jnp.where(tied & (proposal.values > -jnp.inf), preference, -jnp.inf)
+    preference = jnp.where(is_tied & (proposal.values > -jnp.inf), preference, -jnp.inf)
     index = first_best(preference)
     # NaN in a preference or value propagates to the proposal, and the planner reports it.
     value = jnp.where(jnp.isnan(preference[index]), jnp.nan, proposal.values[index])
@@ -201,8 +201,8 @@ def first_best(values: Float[Array, " candidates"], tie: float = _TIE) -> Int[Ar
     """Return the first index whose value is within the relative difference `tie` of the highest value."""
     best = jnp.max(values)
     # No value ties with an infinite value. The planner reports NaN.
-    tied = values >= best - jnp.where(jnp.isfinite(best), tie * jnp.abs(best), 0.0)
-    return jnp.where(jnp.isfinite(best), jnp.argmax(tied), jnp.argmax(values))
+    is_tied = values >= best - jnp.where(jnp.isfinite(best), tie * jnp.abs(best), 0.0)
+    return jnp.where(jnp.isfinite(best), jnp.argmax(is_tied), jnp.argmax(values))
 
 
 def standard_error(scores: Float[Array, "samples *poses"]) -> Float[Array, "*poses"]:

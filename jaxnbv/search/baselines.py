@@ -68,8 +68,8 @@ def uncertain_length(problem: Problem, poses: Pose) -> Float[Array, " poses"]:
     grid = surfaces.grid
     step = 0.5 * grid.spacing
     # For a camera inside the grid, or outside and looking at the grid, these depths cross the whole grid.
-    away = jnp.linalg.norm(poses.position, axis=-1, keepdims=True) - 3**0.5 * grid.half_extent
-    depth = jnp.maximum(away, 0.0) + step * jnp.arange(int(2 * 3**0.5 * grid.half_extent / step) + 2)
+    entry_depth = jnp.linalg.norm(poses.position, axis=-1, keepdims=True) - 3**0.5 * grid.half_extent
+    depth = jnp.maximum(entry_depth, 0.0) + step * jnp.arange(int(2 * 3**0.5 * grid.half_extent / step) + 2)
     points = poses.position[:, None] + depth[..., None] * poses.forward[:, None]
     inside_grid = jnp.all(jnp.abs(points) <= grid.half_extent, axis=-1)
     coordinates = jnp.moveaxis((points + grid.half_extent) / grid.spacing, -1, 0)

@@ -48,9 +48,9 @@ class Candidates(eqx.Module):
         for answer in answers:
             is_bool = answer.shape == () and answer.dtype == bool
             require(is_bool, f"the predicate returned {short_text(answer)} for a pose; it must return True or False")
-        rows = np.array(answers)
-        require(rows.any(), f"none of {self.count} candidates is allowed: give more, or allow more")
-        return GivenPoses(poses[jnp.asarray(np.flatnonzero(rows))])
+        is_allowed = np.array(answers)
+        require(is_allowed.any(), f"none of {self.count} candidates is allowed: give more, or allow more")
+        return GivenPoses(poses[jnp.asarray(np.flatnonzero(is_allowed))])
 
 
 class SphereCandidates(Candidates):
@@ -73,7 +73,7 @@ class SphereCandidates(Candidates):
 
     def __check_init__(self):
         check_fields(self)
-        _check_places(self.count, self.radius, self.radius, self.up)
+        _check_positions(self.count, self.radius, self.radius, self.up)
         require(
             -0.5 * math.pi <= self.min_elevation < 0.5 * math.pi,
             f"the least elevation is {self.min_elevation} rad; it must lie within [-pi/2, pi/2)",
@@ -83,7 +83,7 @@ class SphereCandidates(Candidates):
         return dataclasses.replace(self, min_elevation=0.0) if self.min_elevation == -0.5 * math.pi else self
 
     def poses(self) -> Pose:
-        return _looking(fibonacci_sphere(self.count, self.radius, self.min_elevation), self.up)
+        return _look_at_origin(fibonacci_sphere(self.count, self.radius, self.min_elevation), self.up)
 
 
 class Reach(Candidates):
@@ -107,7 +107,7 @@ class Reach(Candidates):
 
     def __check_init__(self):
         check_fields(self)
-        _check_places(self.count, self.nearest, self.farthest, self.up)
+        _check_positions(self.count, self.nearest, self.farthest, self.up)
         require(
             -0.5 * math.pi <= self.min_elevation < self.max_elevation <= 0.5 * math.pi,
             f"the elevations are {self.min_elevation} and {self.max_elevation} rad; the second must be greater, and "
@@ -121,10 +121,10 @@ class Reach(Candidates):
         ring, angle = np.sqrt(1.0 - y**2), index * math.pi * (3.0 - math.sqrt(5.0))
         # Roberts' low-discrepancy sequence (2018) of the plastic number spreads directions and distances evenly
         # together.
-        share = (0.5 + index / _PLASTIC**2) % 1.0
-        distance = np.cbrt(self.nearest**3 + share * (self.farthest**3 - self.nearest**3))
-        places = distance[:, None] * np.stack([ring * np.cos(angle), y, ring * np.sin(angle)], axis=1)
-        return _looking(jnp.asarray(places, jnp.result_type(float)), self.up)
+        fraction = (0.5 + index / _PLASTIC**2) % 1.0
+        distance = np.cbrt(self.nearest**3 + fraction * (self.farthest**3 - self.nearest**3))
+        positions = distance[:, None] * np.stack([ring * np.cos(angle), y, ring * np.sin(angle)], axis=1)
+        return _look_at_origin(jnp.asarray(positions, jnp.result_type(float)), self.up)
 
 
 class GivenPoses(Candidates):
@@ -150,23 +150,23 @@ class GivenPoses(Candidates):
         return self.batch
 
 
-def _check_places(number: int, nearest: float, farthest: float, up: tuple[float, float, float]) -> None:
-    require(number >= 1, f"the search has {number} candidates; it needs at least one")
-    away = nearest if nearest == farthest else f"{nearest} to {farthest}"
+def _check_positions(count: int, nearest: float, farthest: float, up: tuple[float, float, float]) -> None:
+    require(count >= 1, f"the search has {count} candidates; it needs at least one")
+    distances = nearest if nearest == farthest else f"{nearest} to {farthest}"
     require(
         0 < nearest <= farthest < math.inf,
-        f"the candidates are {away} away from the origin; give positive scene units, the nearest first",
+        f"the candidates are {distances} away from the origin; give positive scene units, the nearest first",
     )
     require(0 < math.hypot(*up) < math.inf, f"up is {up}; it must be a direction, such as (0, 1, 0)")
 
 
-def _looking(places: Float[Array, "n 3"], up: tuple[float, float, float]) -> Pose:
-    """Rotate `places` as the y axis is rotated to `up`, and return poses there that look at the origin."""
-    axis = jnp.asarray(up, places.dtype)
+def _look_at_origin(positions: Float[Array, "n 3"], up: tuple[float, float, float]) -> Pose:
+    """Rotate `positions` as the y axis is rotated to `up`, and return poses there that look at the origin."""
+    axis = jnp.asarray(up, positions.dtype)
     if up[0] or up[2] or up[1] < 0:
-        turn = rotation_between(jnp.asarray([0.0, 1.0, 0.0], places.dtype), axis / jnp.linalg.norm(axis))
-        places = jnp.matmul(places, turn.T, precision="highest")
-    return look_at(places, up=axis)
+        rotation = rotation_between(jnp.asarray([0.0, 1.0, 0.0], positions.dtype), axis / jnp.linalg.norm(axis))
+        positions = jnp.matmul(positions, rotation.T, precision="highest")
+    return look_at(positions, up=axis)
 
 
 def as_candidates(value: object) -> Candidates:

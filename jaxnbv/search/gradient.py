@@ -128,10 +128,10 @@ class GradientSearch(Search):
         values = jnp.mean(scores, axis=0)
         order = jnp.argsort(jnp.where(problem.is_excluded(candidates), -jnp.inf, values), descending=True)
         # Solvers with a line search expect differences of order one.
-        scale = jnp.max(values) - jnp.min(values)
-        scale = jnp.where(scale > 0, scale, 1.0)
+        value_range = jnp.max(values) - jnp.min(values)
+        value_range = jnp.where(value_range > 0, value_range, 1.0)
         starts = candidates[order[: self.num_starts]]
-        trajectories, errors = jax.vmap(partial(self._walk, problem, scale))(starts)
+        trajectories, errors = jax.vmap(partial(self._walk, problem, value_range))(starts)
         best_candidate = best_unvisited(problem, candidates, values, tie=0.0, scores=scores)
         best_step = best_unvisited(problem, *trajectories.flat, tie=0.0)
         # A comparison with NaN is False, so `is_better` is True and NaN reaches the planner, which reports it.
@@ -147,13 +147,13 @@ class GradientSearch(Search):
         )
 
     def _walk(
-        self, problem: Problem, scale: Float[Array, ""], start: Pose
+        self, problem: Problem, value_range: Float[Array, ""], start: Pose
     ) -> tuple[Trajectories, Float[Array, " steps"]]:
         """Run the solver from a start, and return the trajectory and the standard errors of its values.
 
         The trajectory contains every evaluated pose. For a solver with a line search, it contains accepted poses only.
 
-        - `scale`: range of the candidates' values, by which the solver's objective is divided.
+        - `value_range`: range of the candidates' values, by which the solver's objective is divided.
         """
         solver = self.minimiser
 
@@ -164,20 +164,20 @@ class GradientSearch(Search):
             # If a gradient was NaN, the parameters are NaN, but the pose may still be finite.
             value = jnp.where(jnp.isfinite(parameters).all(), value, jnp.nan)
             # Poses that violate the clearance are never proposed. The penalty drives the solver away from such poses.
-            return _PENALTY * problem.violation(pose[None])[0] - value / scale, (pose, value, error)
+            return _PENALTY * problem.violation(pose[None])[0] - value / value_range, (pose, value, error)
 
         parameters = jnp.zeros(self.space.num_parameters, start.position.dtype)
         struct, aux_struct = jax.eval_shape(loss, parameters, None)
         state = solver.init(loss, parameters, None, {}, struct, aux_struct, frozenset())
-        state, rest = eqx.partition(state, eqx.is_array)
+        state, static = eqx.partition(state, eqx.is_array)
 
         def step(carry, _):
             parameters, state = carry
-            whole = eqx.combine(state, rest)
-            done, _ = solver.terminate(loss, parameters, None, {}, whole, frozenset())
-            moved, whole, output = solver.step(loss, parameters, None, {}, whole, frozenset())
-            after = moved, eqx.filter(whole, eqx.is_array)
-            return jax.tree.map(partial(jnp.where, done), carry, after), output
+            solver_state = eqx.combine(state, static)
+            is_done, _ = solver.terminate(loss, parameters, None, {}, solver_state, frozenset())
+            next_parameters, solver_state, output = solver.step(loss, parameters, None, {}, solver_state, frozenset())
+            next_carry = next_parameters, eqx.filter(solver_state, eqx.is_array)
+            return jax.tree.map(partial(jnp.where, is_done), carry, next_carry), output
 
         # The additional step evaluates the pose after the last iteration.
         _, (poses, values, errors) = jax.lax.scan(step, (parameters, state), length=self.iterations + 1)

@@ -16,8 +16,8 @@ from jaxnbv.search.problem import Problem
 from jaxnbv.search.proposal import Proposal
 
 # Smallest number of candidates that are scored together, and the rank that marks an unused entry of a `_Block`.
-_LEAST = 8
-_NOBODY = np.iinfo(np.int32).max
+_MIN_BLOCK_SIZE = 8
+_NO_RANK = np.iinfo(np.int32).max
 
 
 class HalvingSearch(CandidateSearch):
@@ -44,10 +44,10 @@ class HalvingSearch(CandidateSearch):
         """Propose as `pick` does, but score only the remaining candidates in each round."""
         candidates = self.candidates.poses()
 
-        def score(left: Int[Array, " left"], sample: Int[Array, ""]) -> Float[Array, " left"]:
-            return problem.scores(candidates[left], sample[None])[0]
+        def score(rows: Int[Array, " rows"], sample: Int[Array, ""]) -> Float[Array, " rows"]:
+            return problem.scores(candidates[rows], sample[None])[0]
 
-        return self._halved(problem, candidates, score)
+        return self._halve(problem, candidates, score)
 
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
         """Propose the best candidate of the last round.
@@ -55,41 +55,41 @@ class HalvingSearch(CandidateSearch):
         For a candidate that was dropped in an earlier round, the value and standard error come from the scores before
         that round.
         """
-        return self._halved(problem, candidates, lambda left, sample: scores[0, sample][left])
+        return self._halve(problem, candidates, lambda rows, sample: scores[0, sample][rows])
 
-    def _halved(self, problem: Problem, candidates: Pose, score: Callable) -> Proposal:
+    def _halve(self, problem: Problem, candidates: Pose, score: Callable) -> Proposal:
         count, is_excluded = self.candidates.count, problem.is_excluded(candidates)
         zeros = jnp.zeros(count, candidates.position.dtype)
 
-        def ranked(state, left):
+        def rank(state, num_left):
             """Return the indices of the candidates in a new order, and their mean scores so far.
 
-            The first `left` candidates of the current order stay first, and are sorted from the highest mean.
+            The first `num_left` candidates of the current order stay first, and are sorted from the highest mean.
             """
-            order, totals, scored = state
-            values = jnp.where(is_excluded, -jnp.inf, totals / jnp.maximum(scored, 1))
-            among = jnp.where(jnp.arange(count) < left, values[order], -jnp.inf)
-            return order[jnp.argsort(-among, stable=True)], values
+            order, totals, num_scored = state
+            values = jnp.where(is_excluded, -jnp.inf, totals / jnp.maximum(num_scored, 1))
+            ranked_values = jnp.where(jnp.arange(count) < num_left, values[order], -jnp.inf)
+            return order[jnp.argsort(-ranked_values, stable=True)], values
 
         def advance(carry, block):
             state, squares = carry
-            order, totals, scored = state
-            order = jax.lax.cond(block.sorts, lambda: ranked(state, block.left)[0], lambda: order)
+            order, totals, num_scored = state
+            order = jax.lax.cond(block.sorts, lambda: rank(state, block.num_left)[0], lambda: order)
             indices = order.at[block.ranks].get(mode="fill", fill_value=0)
             rows = jnp.where(block.ranks < count, indices, count)
-            scores, before = score(indices, block.sample), scored[indices]
+            scores, num_before = score(indices, block.sample), num_scored[indices]
             # Update the squared deviations from the mean by one sample (Welford 1962).
-            deviation = scores - totals[indices] / jnp.maximum(before, 1)
-            squares = squares.at[rows].add(deviation**2 * before / (before + 1), mode="drop")
+            deviation = scores - totals[indices] / jnp.maximum(num_before, 1)
+            squares = squares.at[rows].add(deviation**2 * num_before / (num_before + 1), mode="drop")
             totals = totals.at[rows].add(scores, mode="drop")
-            return ((order, totals, scored.at[rows].add(1, mode="drop")), squares), None
+            return ((order, totals, num_scored.at[rows].add(1, mode="drop")), squares), None
 
-        blocks, left = self._blocks(problem.num_samples)
+        blocks, num_left = self._blocks(problem.num_samples)
         start = (jnp.arange(count), zeros, zeros), zeros
         (state, squares), _ = jax.lax.scan(advance, start, blocks)
-        order, values = ranked(state, left)
-        scored, best = state[2], order[0]
-        errors = jnp.where(scored > 1, jnp.sqrt(squares / (jnp.maximum(scored - 1, 1) * scored)), jnp.nan)
+        order, values = rank(state, num_left)
+        num_scored, best = state[2], order[0]
+        errors = jnp.where(num_scored > 1, jnp.sqrt(squares / (jnp.maximum(num_scored - 1, 1) * num_scored)), jnp.nan)
         return Proposal(
             candidates[best], values[best], candidates, values, standard_error=errors[best], standard_errors=errors
         )
@@ -101,34 +101,34 @@ class HalvingSearch(CandidateSearch):
         size, so the program that scores a block is compiled once.
         """
         rounds: list[tuple[int, range]] = []
-        left, scored = self.candidates.count, 0
-        while scored < num_samples:
-            left = max(1, left // 2) if scored else left
-            upto = min(2 * scored if scored else self.num_first_samples, num_samples)
-            rounds.append((left, range(scored, upto)))
-            scored = upto
-        size = max(left, min(_LEAST, self.candidates.count))
-        before, blocks = self.candidates.count, []
-        for left, samples in rounds:
+        num_left, num_scored = self.candidates.count, 0
+        while num_scored < num_samples:
+            num_left = max(1, num_left // 2) if num_scored else num_left
+            end = min(2 * num_scored if num_scored else self.num_first_samples, num_samples)
+            rounds.append((num_left, range(num_scored, end)))
+            num_scored = end
+        size = max(num_left, min(_MIN_BLOCK_SIZE, self.candidates.count))
+        num_ranked, blocks = self.candidates.count, []
+        for num_left, samples in rounds:
             for sample in samples:
-                for start in range(0, left, size):
+                for start in range(0, num_left, size):
                     ranks = np.arange(start, start + size)
                     sorts = start == 0 and 0 < sample == samples[0]
-                    blocks.append((sorts, before, sample, np.where(ranks < left, ranks, _NOBODY)))
-            before = left
-        return _Block(*map(np.stack, zip(*blocks, strict=True))), left
+                    blocks.append((sorts, num_ranked, sample, np.where(ranks < num_left, ranks, _NO_RANK)))
+            num_ranked = num_left
+        return _Block(*map(np.stack, zip(*blocks, strict=True))), num_left
 
 
 class _Block(NamedTuple):
     """Candidates that are scored together on one posterior sample.
 
-    - `sorts`: whether to rank the first `left` candidates by their mean scores before this block is scored.
-    - `left`: number of remaining candidates before the ranking.
+    - `sorts`: whether to rank the first `num_left` candidates by their mean scores before this block is scored.
+    - `num_left`: number of remaining candidates before the ranking.
     - `sample`: index of the posterior sample.
-    - `ranks`: ranks of the candidates to score; `_NOBODY` for an unused entry.
+    - `ranks`: ranks of the candidates to score; `_NO_RANK` for an unused entry.
     """
 
     sorts: Bool[np.ndarray, "*blocks"]
-    left: Int[np.ndarray, "*blocks"]
+    num_left: Int[np.ndarray, "*blocks"]
     sample: Int[np.ndarray, "*blocks"]
     ranks: Int[np.ndarray, "*blocks size"]

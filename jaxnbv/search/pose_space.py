@@ -68,11 +68,12 @@ class SpherePoses(PoseSpace):
         require(0 < self.radius < math.inf, f"the sphere's radius is {self.radius}; it must be positive and finite")
 
     def candidates(self, count: int, key: PRNGKeyArray | None) -> Pose:
-        return _about_origin(count, self.radius, key)
+        return _sphere_poses(count, self.radius, key)
 
     def retract(self, start: Pose, parameters: Float[Array, " parameters"]) -> Pose:
-        _, after = _directions(start, parameters)
-        return Pose(_product(rotation_between(start.forward, -after), start.rotation), self.radius * after)
+        _, new_direction = _directions(start, parameters)
+        rotation = _product(rotation_between(start.forward, -new_direction), start.rotation)
+        return Pose(rotation, self.radius * new_direction)
 
 
 class FreePoses(PoseSpace):
@@ -94,7 +95,7 @@ class FreePoses(PoseSpace):
         require(0 < self.radius < math.inf, f"the radius is {self.radius}; it must be positive and finite")
 
     def candidates(self, count: int, key: PRNGKeyArray | None) -> Pose:
-        return _about_origin(count, self.radius, key)
+        return _sphere_poses(count, self.radius, key)
 
     def retract(self, start: Pose, parameters: Float[Array, " parameters"]) -> Pose:
         rotation = rotation_from_6d(rotation_to_6d(start.rotation) + parameters[:6])
@@ -143,26 +144,26 @@ class ConstrainedPoses(PoseSpace):
 
     def candidates(self, count: int, key: PRNGKeyArray | None) -> Pose:
         """Return poses on a sphere in the middle of the range of distances."""
-        return _about_origin(count, self._middle, key)
+        return _sphere_poses(count, self._middle, key)
 
     def retract(self, start: Pose, parameters: Float[Array, " parameters"]) -> Pose:
         direction, distance, gaze, roll = jnp.split(parameters, (3, 4, 6))
-        before, after = _directions(start, direction)
-        half = 0.5 * (self.farthest - self.nearest)
+        old_direction, new_direction = _directions(start, direction)
+        half_range = 0.5 * (self.farthest - self.nearest)
         offset = jnp.linalg.norm(start.position, keepdims=True) - self._middle
-        position = (self._middle + half * _move(offset / half, distance)) * after
+        position = (self._middle + half_range * _move(offset / half_range, distance)) * new_direction
 
         # Directions to the origin in the camera's frame, now and after the move.
-        x, y, z = to_origin = -jnp.matmul(start.rotation.T, before, precision="highest")
-        furthest = math.tan(self.off_axis)
-        image = furthest * _move(jnp.stack([x, y]) / (furthest * jnp.maximum(z, 1e-3)), gaze)
-        target = jnp.append(image, 1.0) / jnp.sqrt(1.0 + jnp.sum(image**2))
+        x, y, z = to_origin = -jnp.matmul(start.rotation.T, old_direction, precision="highest")
+        max_tangent = math.tan(self.off_axis)
+        plane_point = max_tangent * _move(jnp.stack([x, y]) / (max_tangent * jnp.maximum(z, 1e-3)), gaze)
+        target = jnp.append(plane_point, 1.0) / jnp.sqrt(1.0 + jnp.sum(plane_point**2))
         cosine, sine = normalise(roll + jnp.asarray([1.0, 0.0]), jnp.asarray([1.0, 0.0]))
         zero, one = jnp.zeros_like(sine), jnp.ones_like(sine)
-        about_axis = jnp.stack([cosine, -sine, zero, sine, cosine, zero, zero, zero, one]).reshape(3, 3)
+        roll_matrix = jnp.stack([cosine, -sine, zero, sine, cosine, zero, zero, zero, one]).reshape(3, 3)
 
-        turned = _product(rotation_between(before, after), start.rotation)
-        return Pose(_product(_product(turned, rotation_between(target, to_origin)), about_axis), position)
+        rotation = _product(rotation_between(old_direction, new_direction), start.rotation)
+        return Pose(_product(_product(rotation, rotation_between(target, to_origin)), roll_matrix), position)
 
     def check_camera(self, camera: Camera) -> None:
         """Raise `ValueError` if an edge of the image is less than `off_axis` from the optical axis.
@@ -178,31 +179,31 @@ class ConstrainedPoses(PoseSpace):
         )
 
 
-def _about_origin(count: int, radius: float, key: PRNGKeyArray | None) -> Pose:
+def _sphere_poses(count: int, radius: float, key: PRNGKeyArray | None) -> Pose:
     """Return a Fibonacci sphere of cameras that look at the origin. If `key` is not None, rotate it at random."""
-    places = fibonacci_sphere(count, radius)
+    positions = fibonacci_sphere(count, radius)
     if key is not None:
-        turn = rotation_from_6d(jax.random.normal(key, (6,)))
-        places = jnp.matmul(places, turn.T, precision="highest")
-    return look_at(places)
+        rotation = rotation_from_6d(jax.random.normal(key, (6,)))
+        positions = jnp.matmul(positions, rotation.T, precision="highest")
+    return look_at(positions)
 
 
 def _directions(start: Pose, parameters: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
     """Return the unit vectors from the origin to the camera, before and after the move by the parameters."""
-    before = normalise(start.position, jnp.asarray([0.0, 0.0, 1.0], start.position.dtype))
-    return before, normalise(before + parameters, before)
+    old_direction = normalise(start.position, jnp.asarray([0.0, 0.0, 1.0], start.position.dtype))
+    return old_direction, normalise(old_direction + parameters, old_direction)
 
 
 def _product(a: Float[Array, "3 3"], b: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
     return jnp.matmul(a, b, precision="highest")
 
 
-def _move(place: Float[Array, " n"], step: Float[Array, " n"]) -> Float[Array, " n"]:
+def _move(point: Float[Array, " n"], step: Float[Array, " n"]) -> Float[Array, " n"]:
     """Move a point of the open unit ball by a step. The result is also in the ball, for any step.
 
     The step is added in the coordinates p / sqrt(1 - |p|^2) of a point p, which map the ball to the whole space.
     """
-    length = jnp.linalg.norm(place)
-    place = place * jnp.where(length > 0.99, 0.99 / jnp.maximum(length, 0.99), 1.0)
-    far = place / jnp.sqrt(1.0 - jnp.sum(place**2)) + step
-    return far / jnp.sqrt(1.0 + jnp.sum(far**2))
+    length = jnp.linalg.norm(point)
+    point = point * jnp.where(length > 0.99, 0.99 / jnp.maximum(length, 0.99), 1.0)
+    coordinates = point / jnp.sqrt(1.0 - jnp.sum(point**2)) + step
+    return coordinates / jnp.sqrt(1.0 + jnp.sum(coordinates**2))

@@ -19,8 +19,10 @@ from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning import GridSurface, Obstacles, barrier_of
 
 ApplyCost: TypeAlias = Callable[[Float[Array, "*samples poses"], Observations, Pose], Float[Array, "*samples poses"]]
-"""Function of values, observations and poses (n,) that applies the cost of the moves to the values, and returns
-them."""
+"""Function that applies the cost of moving from the last view to the values of poses.
+
+It takes the values, the observations and the poses, a batch (n,), and returns the new values.
+"""
 
 
 class Problem(eqx.Module):
@@ -65,7 +67,7 @@ class Problem(eqx.Module):
         return jnp.mean(self.scores(poses), axis=0)
 
     def scores(
-        self, poses: Pose, samples: slice | Int[Array, " some"] = slice(None)
+        self, poses: Pose, samples: slice | Int[Array, " rows"] = slice(None)
     ) -> Float[Array, "*scores samples poses"]:
         """Return the acquisition's score for each sample and pose, after the cost of the move is applied.
 
@@ -89,15 +91,15 @@ class Problem(eqx.Module):
         other poses. Return zero for fewer than two views, because the value at a single visited pose is not an error:
         it counts surface that the view saw only at a steep angle.
         """
-        visited = self.observations.poses
-        uncosted = dataclasses.replace(self, cost=None)
+        visited_poses = self.observations.poses
+        without_cost = dataclasses.replace(self, cost=None)
 
         def add(index, total):
-            pose = jax.tree.map(lambda rows: rows[index][None], visited.rows)
-            return total + uncosted.values(pose)[0]
+            pose = jax.tree.map(lambda rows: rows[index][None], visited_poses.rows)
+            return total + without_cost.values(pose)[0]
 
-        total = jax.lax.fori_loop(0, visited.count, add, jnp.zeros((), visited.rows.position.dtype))
-        return jnp.where(visited.count > 1, total / jnp.maximum(visited.count, 1), 0.0)
+        total = jax.lax.fori_loop(0, visited_poses.count, add, jnp.zeros((), visited_poses.rows.position.dtype))
+        return jnp.where(visited_poses.count > 1, total / jnp.maximum(visited_poses.count, 1), 0.0)
 
     @property
     def num_samples(self) -> int:
@@ -116,10 +118,10 @@ class Problem(eqx.Module):
 
     def is_excluded(self, poses: Pose) -> Bool[Array, " poses"]:
         """Return whether each pose was visited or proposed before, or is too close to obstacles or the cloud."""
-        excluded = self.observations.poses.contains(poses)
+        is_excluded = self.observations.poses.contains(poses)
         if self.pending is not None:
-            excluded |= self.pending.contains(poses)
-        return excluded | (self.violation(poses) > 0)
+            is_excluded |= self.pending.contains(poses)
+        return is_excluded | (self.violation(poses) > 0)
 
     def violation(self, poses: Pose) -> Float[Array, " poses"]:
         """Return the length by which each pose is too close to an obstacle or to the cloud D.

@@ -21,7 +21,7 @@ class Trajectories(eqx.Module):
     values: Float[Array, "*starts steps"]
 
     @property
-    def flat(self) -> tuple[Pose, Float[Array, " looks"]]:
+    def flat(self) -> tuple[Pose, Float[Array, " poses"]]:
         """All poses and values along a single axis: first the starts, then their first steps, and so on."""
         poses, values = jax.tree.map(lambda rows: jnp.swapaxes(rows, 0, 1), (self.poses, self.values))
         return jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), (poses, values))
@@ -75,30 +75,32 @@ class Proposal(eqx.Module):
         best, bias = jnp.max(self.values), 0.0 if self.value_at_visited is None else self.value_at_visited
         return (self.values == best) | (best - self.values <= errors * self.difference_errors + bias)
 
-    def best(self, count: int, apart: float = 30.0) -> Pose:
+    def best(self, count: int, min_angle: float = 30.0) -> Pose:
         """Return a batch of the best candidates from different directions, best first.
 
-        Candidates are selected in descending order of value. A candidate is skipped if the angle at the origin between
-        it and a selected candidate is less than `apart` degrees. Excluded candidates are never selected. The batch is
+        Candidates are selected in descending order of value. Excluded candidates are never selected. The batch is
         shorter than `count` if there are not enough candidates.
+
+        - `min_angle`: least angle in degrees, at the origin, between two selected candidates. A candidate that is
+          closer to one of those selected before is skipped.
 
         **Raises:** `ValueError` for a count below 1, or an angle outside [0, 180].
         """
         require(count >= 1, f"the count is {count}: give the number of candidates, at least 1")
-        require(0.0 <= apart <= 180.0, f"apart is {apart}: give an angle in degrees, from 0 to 180")
+        require(0.0 <= min_angle <= 180.0, f"min_angle is {min_angle}: give an angle in degrees, from 0 to 180")
         values, positions = np.asarray(self.values), np.asarray(self.candidates.position, np.float64)
         directions = positions / np.maximum(np.linalg.norm(positions, axis=-1, keepdims=True), 1e-30)
-        least, chosen = np.cos(np.radians(apart)), list[int]()
+        max_cosine, rows = np.cos(np.radians(min_angle)), list[int]()
         for index in np.argsort(-values, stable=True).tolist():
-            near = directions[chosen] @ directions[index] > least
-            if values[index] > -np.inf and not near.any() and len(chosen) < count:
-                chosen.append(index)
-        return self.candidates[np.array(chosen, int)]
+            is_near = directions[rows] @ directions[index] > max_cosine
+            if values[index] > -np.inf and not is_near.any() and len(rows) < count:
+                rows.append(index)
+        return self.candidates[np.array(rows, int)]
 
     @property
     def num_tied(self) -> int | None:
         """Number of other candidates that are tied with the best; None if standard errors are unknown."""
-        tied = self.tied_with_best()
-        if tied is None or bool(jnp.isnan(jnp.asarray(self.difference_errors)).any()):
+        is_tied = self.tied_with_best()
+        if is_tied is None or bool(jnp.isnan(jnp.asarray(self.difference_errors)).any()):
             return None
-        return int(jnp.sum(tied)) - 1
+        return int(jnp.sum(is_tied)) - 1
