@@ -14,7 +14,7 @@ from jaxnbv.version import check_jax
 
 check_jax(importlib.metadata.version("jaxlib"))
 
-_named, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_load_name, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 
 def __getattr__(name: str) -> Any:
@@ -23,11 +23,11 @@ def __getattr__(name: str) -> Any:
         # Without an object, Python adds no second suggestion to the message.
         raise AttributeError(f"{problem}{suggestion(name, __all__)}", name=name, obj=None)
     with explained_imports():
-        return _named(name)
+        return _load_name(name)
 
 
 # Classes that notebooks show as a small picture with a line of facts.
-_SHOWN = {
+_NOTEBOOK_CLASSES = {
     "jaxnbv.geometry.cloud": "PointCloud",
     "jaxnbv.planning.episode": "Episode",
     "jaxnbv.planning.planner": "Planner",
@@ -45,11 +45,11 @@ def _html_of(value: Any) -> str:
 
 
 def _show_in_notebooks() -> None:
-    """Let IPython, if it runs, show the classes in `_SHOWN` as HTML. Their modules are imported at first display."""
+    """Let IPython, if it runs, show `_NOTEBOOK_CLASSES` as HTML. Their modules are imported at first display."""
     ipython = sys.modules.get("IPython")
     shell = None if ipython is None else ipython.get_ipython()
     if shell is not None:
-        for module, name in _SHOWN.items():
+        for module, name in _NOTEBOOK_CLASSES.items():
             shell.display_formatter.formatters["text/html"].for_type_by_name(module, name, _html_of)
 
 

@@ -34,7 +34,7 @@ from jaxnbv.programs import program
 from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning import GridSurface, Surface, scan
 from jaxnbv.scanning.grid import samples_at_once
-from jaxnbv.sharding import batched_map, share_of, shared, shared_map
+from jaxnbv.sharding import batched_map, rows_per_device, run_sharded, shared_map
 from jaxnbv.utility import Answer, AnyUtility, Quantity, Utility, as_utility, default_batch_size, plain_function
 
 
@@ -95,9 +95,11 @@ class Acquisition(eqx.Module):
 
         - `barrier`: distance along each ray to an obstacle, see `scan`.
         """
-        together = min(samples_at_once(camera, poses), share_of(surfaces.values.shape[0]))
+        samples_per_batch = min(samples_at_once(camera, poses), rows_per_device(surfaces.values.shape[0]))
         views = poses, barrier
-        return shared_map(_of_sample, surfaces, context, views, self, camera, together, at_once=together)
+        return shared_map(
+            _score_sample, surfaces, context, views, self, camera, samples_per_batch, at_once=samples_per_batch
+        )
 
     def inputs(self, step: StepInputs) -> StepInputs:
         """Return the inputs that `context` reads. Steps with inputs of equal shapes share one compilation."""
@@ -189,20 +191,20 @@ class ExpectedUtilityImprovement(Acquisition):
 
     def answer(self, cloud: PointCloud) -> Answer:
         """Return the utility's own answer, or the utility of the cloud if there is no such answer."""
-        own = self.utility.answer(cloud)
-        return Answer((self.utility.name,), np.array([float(context_of(self, cloud)[1])])) if own is None else own
+        answer = self.utility.answer(cloud)
+        return Answer((self.utility.name,), np.array([float(context_of(self, cloud)[1])])) if answer is None else answer
 
     def answer_values(self, cloud: PointCloud) -> Float[Array, " n"] | None:
         """Return the values of the utility's own answer, or the utility of the cloud, see `answer`."""
-        own = self.utility.answer_values(cloud)
-        if own is None and type(self.utility).answer is Utility.answer:
+        values = self.utility.answer_values(cloud)
+        if values is None and type(self.utility).answer is Utility.answer:
             return jnp.atleast_1d(context_of(self, cloud)[1])
-        return own
+        return values
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> Answer:
         """Return the utility's own true answer, or else the answer from points on the whole surface."""
-        own = self.utility.true_answer(scene, cloud)
-        return self.answer(cloud) if own is None else own
+        answer = self.utility.true_answer(scene, cloud)
+        return self.answer(cloud) if answer is None else answer
 
     def check(self, cloud: PointCloud) -> None:
         """Raise `ValueError` if the utility's own `check` does, or if the utility of the cloud is not finite."""
@@ -251,7 +253,8 @@ class AcquisitionList(Acquisition):
 
     def score(self, context: tuple[Any, ...], view: ImaginedView) -> Float[Array, " values"]:
         """Return the members' scores of one view, concatenated."""
-        values = [member.score(own, view) for member, own in zip(self.members, context, strict=True)]
+        pairs = zip(self.members, context, strict=True)
+        values = [member.score(member_context, view) for member, member_context in pairs]
         return jnp.concatenate([jnp.atleast_1d(value) for value in values])
 
     @property
@@ -373,18 +376,18 @@ def expected_value(
 
 
 def scores(
-    acquisition: Acquisition, context: Any, scans: PointCloud, camera: Camera, poses: Pose, samples: int = 1
+    acquisition: Acquisition, context: Any, scans: PointCloud, camera: Camera, poses: Pose, samples_per_batch: int = 1
 ) -> Float[Array, "poses *scores"]:
     """Return the scores of a batch of scans, one scan from each pose.
 
-    At a time, `acquisition.batch_size // samples` scans are scored.
+    At a time, `acquisition.batch_size // samples_per_batch` scans are scored.
 
-    - `samples`: number of posterior samples for which this function runs at the same time.
+    - `samples_per_batch`: number of posterior samples for which this function runs at the same time.
     """
     return batched_map(
         lambda rows: acquisition.score(context, ImaginedView(rows[0], camera, rows[1])),
         (scans, poses),
-        acquisition.batch_size // samples,
+        acquisition.batch_size // samples_per_batch,
     )
 
 
@@ -392,14 +395,14 @@ def scores(
 _Views: TypeAlias = tuple[Pose, Float[Array, "poses rays"] | None]
 
 
-def _of_sample(
-    surface: GridSurface, context: Any, views: _Views, acquisition: Acquisition, camera: Camera, together: int
+def _score_sample(
+    surface: GridSurface, context: Any, views: _Views, acquisition: Acquisition, camera: Camera, samples_per_batch: int
 ) -> Float[Array, "poses *scores"]:
-    return shared(_of_poses, views, surface, context, acquisition, camera, together)
+    return run_sharded(_score_poses, views, surface, context, acquisition, camera, samples_per_batch)
 
 
-def _of_poses(
-    views: _Views, surface: GridSurface, context: Any, acquisition: Acquisition, camera: Camera, together: int
+def _score_poses(
+    views: _Views, surface: GridSurface, context: Any, acquisition: Acquisition, camera: Camera, samples_per_batch: int
 ) -> Float[Array, "poses *scores"]:
     poses, barrier = views
-    return scores(acquisition, context, scan(surface, camera, poses, barrier), camera, poses, together)
+    return scores(acquisition, context, scan(surface, camera, poses, barrier), camera, poses, samples_per_batch)

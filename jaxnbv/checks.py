@@ -24,10 +24,10 @@ from jaxnbv.errors import install
 
 AnyArray = Array | np.ndarray
 _F = TypeVar("_F", bound=Callable[..., Any])
-_LONGEST_SHOWN = 60
+_MAX_TEXT_LENGTH = 60
 _hints_of = functools.cache(get_type_hints)
 # Folders of code that does not belong to the user.
-_OWN = tuple(
+_LIBRARY_FOLDERS = tuple(
     f"{Path(str(file)).parent}{os.sep}" for file in (jax.__file__, equinox.__file__, jaxtyping.__file__, __file__)
 )
 _NUMBERS = {tuple[float, float]: "two", tuple[float, float, float]: "three"}
@@ -49,7 +49,7 @@ _UNTRACEABLE: dict[type[Exception], tuple[str, str]] = {
     ),
 }
 # The largest 32-bit float. Larger numbers become infinite when they are converted.
-_LARGEST = float(np.finfo(np.float32).max)
+_MAX_FLOAT = float(np.finfo(np.float32).max)
 
 
 def check_device() -> None:
@@ -102,15 +102,15 @@ def checked(function: _F) -> _F:
     signature = inspect.signature(function)
 
     @functools.wraps(function)
-    def call(*arguments: Any, **named: Any) -> Any:
-        bound = signature.bind(*arguments, **named)
+    def call(*arguments: Any, **keywords: Any) -> Any:
+        bound = signature.bind(*arguments, **keywords)
         hints = _hints_of(function)
         for name, value in bound.arguments.items():
             if name in hints:
                 owner = type(arguments[0]).__name__ if function.__name__ == "__init__" else function.__name__
                 check_type(value, hints[name], f"{owner}'s {name}")
         with own_settings():
-            return function(*arguments, **named)
+            return function(*arguments, **keywords)
 
     return call  # type: ignore[return-value]
 
@@ -122,22 +122,22 @@ def check_type(value: Any, hint: Any, name: str) -> None:
     are ignored.
     """
     if hint is int:
-        whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
-        require(whole, f"{name} is {short_text(value)}; it must be a whole number")
+        is_whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
+        require(is_whole, f"{name} is {short_text(value)}; it must be a whole number")
     elif hint is float:
         require(_is_number(value), f"{name} is {short_text(value)}; it must be a finite number")
     elif hint is bool:
         require(isinstance(value, bool | np.bool_), f"{name} is {short_text(value)}; it must be True or False")
     elif hint in _NUMBERS:
         count = len(get_args(hint))
-        proper = isinstance(value, tuple | list) and len(value) == count and all(map(_is_number, value))
-        require(proper, f"{name} is {short_text(value)}; it must be {_NUMBERS[hint]} finite numbers")
+        is_valid = isinstance(value, tuple | list) and len(value) == count and all(map(_is_number, value))
+        require(is_valid, f"{name} is {short_text(value)}; it must be {_NUMBERS[hint]} finite numbers")
     elif isinstance(hint, types.UnionType) and type(None) in (kinds := get_args(hint)) and len(kinds) == 2:
         if value is not None:
             check_type(value, kinds[0] if kinds[1] is type(None) else kinds[1], name)
     elif (kinds := _classes(hint)) and not isinstance(value, kinds):
-        wanted = " or ".join("None" if kind is type(None) else kind.__name__ for kind in kinds)
-        raise InputError(f"{name} is {short_text(value)}; give {wanted}")
+        class_names = " or ".join("None" if kind is type(None) else kind.__name__ for kind in kinds)
+        raise InputError(f"{name} is {short_text(value)}; give {class_names}")
     elif get_origin(hint) is Callable and not callable(value):
         raise InputError(f"{name} is {short_text(value)}; give a function")
 
@@ -178,8 +178,8 @@ def takes_native(function: _F) -> _F:
     """Decorator: pass all arguments through `native`."""
 
     @functools.wraps(function)
-    def call(*arguments: Any, **named: Any) -> Any:
-        return function(*map(native, arguments), **{name: native(value) for name, value in named.items()})
+    def call(*arguments: Any, **keywords: Any) -> Any:
+        return function(*map(native, arguments), **{name: native(value) for name, value in keywords.items()})
 
     return call  # type: ignore[return-value]
 
@@ -205,14 +205,14 @@ def as_numbers(value: Any, name: str, dtype: Any = float) -> np.ndarray:
 
     **Raises:** `ValueError` if the value is not an array of real numbers, or is a masked array with masked entries.
     """
-    masked = isinstance(value, np.ma.MaskedArray) and bool(np.ma.getmaskarray(value).any())
-    require(not masked, f"{name} is a masked array: give what is valid in it as a plain array")
+    has_masked = isinstance(value, np.ma.MaskedArray) and bool(np.ma.getmaskarray(value).any())
+    require(not has_masked, f"{name} is a masked array: give what is valid in it as a plain array")
     try:
         array = native(np.asarray(value))
         # NumPy would convert text, dates, complex numbers and None to numbers.
-        real = array.dtype.kind in "biuf" or jnp.issubdtype(array.dtype, jnp.floating)
-        real = real or (array.dtype.kind == "O" and all(isinstance(item, numbers.Real) for item in array.flat))
-        require(real, f"{name} is {short_text(value)}; give real numbers")
+        is_real = array.dtype.kind in "biuf" or jnp.issubdtype(array.dtype, jnp.floating)
+        is_real = is_real or (array.dtype.kind == "O" and all(isinstance(item, numbers.Real) for item in array.flat))
+        require(is_real, f"{name} is {short_text(value)}; give real numbers")
         with np.errstate(over="ignore"):
             return array.astype(jnp.result_type(float) if dtype is float else dtype or array.dtype, copy=False)
     except InputError:
@@ -232,29 +232,31 @@ def functions_of_users() -> Iterator[None]:
         yield
     except tuple(_UNTRACEABLE) as error:
         user_frames = [
-            frame for frame in traceback.extract_tb(error.__traceback__) if not frame.filename.startswith(_OWN)
+            frame
+            for frame in traceback.extract_tb(error.__traceback__)
+            if not frame.filename.startswith(_LIBRARY_FOLDERS)
         ]
         if not user_frames:
             raise
-        at = f"{user_frames[-1].filename}:{user_frames[-1].lineno}"
+        location = f"{user_frames[-1].filename}:{user_frames[-1].lineno}"
         problem, remedy = next(words for kind, words in _UNTRACEABLE.items() if isinstance(error, kind))
         raise InputError(
-            f"{user_frames[-1].name} {problem} ({at}): {remedy}, or wrap a network from outside JAX in HostClassifier "
-            "or HostSegmenter"
+            f"{user_frames[-1].name} {problem} ({location}): {remedy}, or wrap a network from outside JAX in "
+            "HostClassifier or HostSegmenter"
         ) from error
 
 
-def checked_result(value: Any, name: str, axes: int, wanted: str) -> Any:
+def checked_result(value: Any, name: str, axes: int, requirement: str) -> Any:
     """Check a value that a user's function returned, and return it unchanged.
 
     - `axes`: the required number of axes. If it is 0, a plain number is valid too.
-    - `name`, `wanted`: the name of the value, and a description of valid values, for the error message.
+    - `name`, `requirement`: the name of the value, and a description of valid values, for the error message.
 
     **Raises:** `ValueError` unless the value is an array of real numbers with this number of axes.
     """
     dtype = getattr(value, "dtype", None)
-    real = isinstance(value, numbers.Real) if dtype is None else any(jnp.issubdtype(dtype, kind) for kind in _REAL)
-    require(real and np.ndim(value) == axes, f"{name} is {short_text(value)}: {wanted}")
+    is_real = isinstance(value, numbers.Real) if dtype is None else any(jnp.issubdtype(dtype, kind) for kind in _REAL)
+    require(is_real and np.ndim(value) == axes, f"{name} is {short_text(value)}: {requirement}")
     return value
 
 
@@ -267,7 +269,7 @@ def short_text(value: Any) -> str:
             text = repr(value)
         except RecursionError:
             return f"a {type(value).__name__} that is nested too deep"
-        return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}..."
+        return text if len(text) <= _MAX_TEXT_LENGTH else f"{text[:_MAX_TEXT_LENGTH]}..."
     return f"a {type(value).__name__}" if not isinstance(value, type) else f"the class {value.__name__}"
 
 
@@ -276,13 +278,13 @@ def _is_number(value: Any) -> bool:
         return np.ndim(value) == 0
     if isinstance(value, AnyArray) and value.ndim == 0 and getattr(value.dtype, "kind", "") in ("i", "u", "f"):
         value = float(value)
-    real = isinstance(value, numbers.Real) and not isinstance(value, bool)
-    return real and bool(abs(value) <= _LARGEST)
+    is_real = isinstance(value, numbers.Real) and not isinstance(value, bool)
+    return is_real and bool(abs(value) <= _MAX_FLOAT)
 
 
 def _classes(hint: Any) -> tuple[type, ...]:
     """Return the classes in a type hint, or an empty tuple if the hint contains anything but classes."""
     kinds = get_args(hint) if isinstance(hint, types.UnionType) or get_origin(hint) is Union else (hint,)
     # A jaxtyping annotation is a class too, but does not count here, because shapes are checked elsewhere.
-    plain = all(isinstance(kind, type) and not hasattr(kind, "dim_str") and kind is not object for kind in kinds)
-    return kinds if plain else ()
+    is_plain = all(isinstance(kind, type) and not hasattr(kind, "dim_str") and kind is not object for kind in kinds)
+    return kinds if is_plain else ()

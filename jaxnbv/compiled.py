@@ -12,7 +12,7 @@ from jaxnbv.errors import InputError
 
 # Name of the environment variable that contains the folder of the package's own programs.
 PROGRAMS = "JAXNBV_PROGRAMS"
-_FOLDER = "jax_compilation_cache_dir"
+_FOLDER_OPTION = "jax_compilation_cache_dir"
 # By default JAX does not store programs that compile within a second. Most programs of a step compile that fast.
 _THRESHOLDS = {"jax_persistent_cache_min_compile_time_secs": 0.0, "jax_persistent_cache_min_entry_size_bytes": 0}
 
@@ -31,8 +31,8 @@ def keep_compiled(folder: str | Path | None = None) -> str:
     """
     # If JAX is not imported yet, it will read the environment variables.
     jax = sys.modules.get("jax")
-    configured = getattr(jax.config, _FOLDER) if jax else os.environ.get(_FOLDER.upper())
-    path = str(folder or configured or platformdirs.user_cache_path("jaxnbv") / "xla")
+    jax_folder = getattr(jax.config, _FOLDER_OPTION) if jax else os.environ.get(_FOLDER_OPTION.upper())
+    path = str(folder or jax_folder or platformdirs.user_cache_path("jaxnbv") / "xla")
     # A path with :// is a bucket in the cloud, which JAX itself checks.
     if "://" not in path:
         _check_writable(Path(path))
@@ -41,13 +41,13 @@ def keep_compiled(folder: str | Path | None = None) -> str:
         # On many CPUs, this version logs two long lines for each program that it loads. The program runs correctly all
         # the same (jax issue 38445).
         os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-    os.environ[_FOLDER.upper()] = path
+    os.environ[_FOLDER_OPTION.upper()] = path
     for name, value in _THRESHOLDS.items():
         os.environ.setdefault(name.upper(), str(value))
     if jax:
         from jax.experimental.compilation_cache import compilation_cache
 
-        jax.config.update(_FOLDER, path)
+        jax.config.update(_FOLDER_OPTION, path)
         for name, value in _THRESHOLDS.items():
             jax.config.update(name, type(value)(os.environ[name.upper()]))
         # Reset the cache, because its folder is fixed once JAX has compiled something.

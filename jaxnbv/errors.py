@@ -34,9 +34,9 @@ class InputError(ValueError):
 
 def suggestion(name: str, names: Iterable[str]) -> str:
     """Return " Did you mean ...?" with the most similar name, or an empty string if no name is similar."""
-    by_lower = {one.lower(): one for one in names}
-    near = difflib.get_close_matches(name.lower(), by_lower, n=1)
-    return f" Did you mean {by_lower[near[0]]!r}?" if near else ""
+    by_lower = {candidate.lower(): candidate for candidate in names}
+    matches = difflib.get_close_matches(name.lower(), by_lower, n=1)
+    return f" Did you mean {by_lower[matches[0]]!r}?" if matches else ""
 
 
 @contextmanager

@@ -18,10 +18,10 @@ from jaxnbv.programs import program
 from jaxnbv.scanning import Carving, Grid, Looks, Obstacles, barrier_of
 
 # A model uses 100 to 200 empty points. The time to choose them grows with the number of points to choose from.
-_POINTS_ALONG_AXIS = 20
+_MAX_POINTS_PER_AXIS = 20
 # Largest number of points that are checked after each scan for being stray. The time is proportional to this number
 # times the capacity. Further points are checked after the next scan.
-_MOST_STRAY = 512
+_MAX_STRAY_CHECKS = 512
 
 
 class EmptyPoints(NamedTuple):
@@ -82,7 +82,7 @@ class Observations(eqx.Module):
         """Nodes of a coarser grid (at most 20 per axis), and which of them were seen to be empty, for models."""
         if self.empty_nodes is None or self.grid is None:
             return EmptyPoints(jnp.zeros((1, 3), self.cloud.points.dtype), jnp.zeros(1, bool))
-        stride = -(-self.grid.resolution // _POINTS_ALONG_AXIS)
+        stride = -(-self.grid.resolution // _MAX_POINTS_PER_AXIS)
         axis = jnp.asarray(self.grid.axis, jnp.result_type(float))[::stride]
         nodes = jnp.stack(jnp.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
         return EmptyPoints(nodes, self.empty_nodes[::stride, ::stride, ::stride].reshape(-1))
@@ -93,7 +93,7 @@ class Observations(eqx.Module):
         The cloud is thinned to its capacity by farthest point sampling. Then stray points are removed: isolated points
         in space that a view saw to be empty.
         """
-        return dataclasses.replace(self, cloud=_joined(self.cloud, scan, self.empty_nodes, self.grid))
+        return dataclasses.replace(self, cloud=_join(self.cloud, scan, self.empty_nodes, self.grid))
 
     def add_view(
         self, pose: Pose, scan: PointCloud, camera: Camera, carving: Carving | None, obstacles: Obstacles | None
@@ -122,9 +122,9 @@ def as_observations(value: Observations | PointCloud) -> Observations:
 
 
 @program
-def _joined(cloud: PointCloud, scan: PointCloud, empty: Bool[Array, "g g g"] | None, grid: Grid | None) -> PointCloud:
-    joined = limit_capacity(concatenate(cloud, scan), cloud.capacity)
-    return joined if empty is None or grid is None else joined.only(~_is_stray(joined, empty, grid))
+def _join(cloud: PointCloud, scan: PointCloud, empty: Bool[Array, "g g g"] | None, grid: Grid | None) -> PointCloud:
+    union = limit_capacity(concatenate(cloud, scan), cloud.capacity)
+    return union if empty is None or grid is None else union.only(~_is_stray(union, empty, grid))
 
 
 def _is_stray(cloud: PointCloud, empty: Bool[Array, "g g g"], grid: Grid) -> Bool[Array, " n"]:
@@ -136,10 +136,10 @@ def _is_stray(cloud: PointCloud, empty: Bool[Array, "g g g"], grid: Grid) -> Boo
 
     - `empty`: mask of the nodes that were seen to be empty.
     """
-    crossed = jax.lax.reduce_window(empty, True, jax.lax.bitwise_and, (2, 2, 2), (1, 1, 1), "VALID")
+    is_empty_cell = jax.lax.reduce_window(empty, True, jax.lax.bitwise_and, (2, 2, 2), (1, 1, 1), "VALID")
     cell = tuple(grid.cell_of(cloud.points).T)
-    inside = cloud.mask & crossed.at[cell].get(mode="fill", fill_value=False)
-    (rows,) = jnp.nonzero(inside, size=min(_MOST_STRAY, cloud.capacity), fill_value=cloud.capacity)
+    is_in_empty_cell = cloud.mask & is_empty_cell.at[cell].get(mode="fill", fill_value=False)
+    (rows,) = jnp.nonzero(is_in_empty_cell, size=min(_MAX_STRAY_CHECKS, cloud.capacity), fill_value=cloud.capacity)
     is_alone = distance_to_others(cloud, rows) > 2.0 * spacing(cloud)
     return jnp.zeros(cloud.capacity, bool).at[rows].set(is_alone, mode="drop")
 

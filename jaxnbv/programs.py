@@ -38,11 +38,11 @@ _LIBRARIES = ("jax", "jaxlib", "numpy", "equinox", "optimistix", "lineax", "opta
 _STANDARD = ("builtins", "collections", "copyreg", "functools", "math", "operator", "pathlib")
 # Name of the event that is reported to `jax.monitoring` after a program was loaded.
 LOADED = "/jaxnbv/program_load_duration"
-_compiling = threading.Lock()
+_compile_lock = threading.Lock()
 
 
 @dataclasses.dataclass(frozen=True)
-class _Slot:
+class _ArrayPlaceholder:
     """Placeholder for an array in the result of a program: its index in the list of output arrays."""
 
     index: int
@@ -52,7 +52,7 @@ class _Executable(NamedTuple):
     """A program that is compiled for arguments with certain shapes, types and static values.
 
     - `call`: the compiled function from the arguments' arrays to the output arrays.
-    - `result`: the result with a `_Slot` in place of each array.
+    - `result`: the result with an `_ArrayPlaceholder` in place of each array.
     """
 
     call: Callable[[list], list]
@@ -81,14 +81,14 @@ class _Program:
         values, structure = jax.tree.flatten(static)
         key = (folder, _settings(), kinds, tree, structure, tuple((type(value), value) for value in values))
         if key not in self._executables:
-            self._executables[key] = self._executable(Path(folder), static, tree, leaves, kinds)
+            self._executables[key] = self._load_or_compile(Path(folder), static, tree, leaves, kinds)
         executable = self._executables[key]
         if executable is None:
             return self._jitted(*args, **kwargs)
         outputs = executable.call(leaves)
-        return jax.tree.map(lambda x: outputs[x.index] if isinstance(x, _Slot) else x, executable.result)
+        return jax.tree.map(lambda x: outputs[x.index] if isinstance(x, _ArrayPlaceholder) else x, executable.result)
 
-    def _executable(self, folder: Path, static: Any, tree: Any, leaves: list, kinds: tuple) -> _Executable | None:
+    def _load_or_compile(self, folder: Path, static: Any, tree: Any, leaves: list, kinds: tuple) -> _Executable | None:
         """Load or compile the program for these arguments.
 
         Returns None if the arguments contain code of a module that is not permitted.
@@ -98,40 +98,40 @@ class _Program:
         """
         function = self._function.__module__, self._function.__qualname__
         try:
-            description = _pickled(
+            description = _pickle(
                 (function, static, tree, [str(kind) for kind in kinds], _settings(), _machine(), _source())
             )
         except _ForeignCodeError:
             return None
         entry = folder / hashlib.sha256(description).hexdigest()
-        kept = _read(entry)
-        if kept is not None:
-            name, result, num_outputs = pickle.loads(kept)
+        entry_data = _read(entry)
+        if entry_data is not None:
+            name, result, num_outputs = pickle.loads(entry_data)
             if (payload := _read(folder / name)) is not None:
-                return _Executable(_loaded(payload, leaves, num_outputs), result)
-        return self._compiled(entry, static, tree, leaves)
+                return _Executable(_load(payload, leaves, num_outputs), result)
+        return self._compile(entry, static, tree, leaves)
 
-    def _compiled(self, entry: Path, static: Any, tree: Any, leaves: list) -> _Executable:
+    def _compile(self, entry: Path, static: Any, tree: Any, leaves: list) -> _Executable:
         """Trace the function for these arguments, and return the program.
 
         If the same lowered code is already stored, for a different entry, the program is loaded. Otherwise it is
         compiled and stored.
 
-        - `entry`: file for these arguments, which names the file of their program. See also `_executable`.
+        - `entry`: file for these arguments, which names the file of their program. See also `_load_or_compile`.
         """
         result = None
 
-        def of_arrays(leaves: list) -> list:
+        def array_function(leaves: list) -> list:
             nonlocal result
             args, kwargs = eqx.combine(jax.tree.unflatten(tree, leaves), static)
             arrays, rest = eqx.partition(self._function(*args, **kwargs), eqx.is_array)
             outputs, structure = jax.tree.flatten(arrays)
-            result = eqx.combine(jax.tree.unflatten(structure, map(_Slot, range(len(outputs)))), rest)
+            result = eqx.combine(jax.tree.unflatten(structure, map(_ArrayPlaceholder, range(len(outputs)))), rest)
             return outputs
 
-        of_arrays.__name__ = of_arrays.__qualname__ = self._function.__name__
+        array_function.__name__ = array_function.__qualname__ = self._function.__name__
         # Unused arguments stay in the code. Without them, programs of different arguments could have the same code.
-        lowered = jax.jit(of_arrays, keep_unused=True).lower(leaves)
+        lowered = jax.jit(array_function, keep_unused=True).lower(leaves)
         code = lowered.as_text()
         # A program with a callback to Python cannot be stored, because it contains an address of this process.
         if "callback" in code:
@@ -143,9 +143,9 @@ class _Program:
         payload = _read(entry.parent / name)
         call: Callable[[list], list]
         if payload is not None:
-            call = _loaded(payload, leaves, num_outputs)
+            call = _load(payload, leaves, num_outputs)
         else:
-            call = compiled = _without_cache(lowered)
+            call = compiled = _compile_uncached(lowered)
             try:
                 payload, _, _ = serialize_executable.serialize(compiled)
             except (ValueError, NotImplementedError):
@@ -224,7 +224,7 @@ class _Pickler(pickle.Pickler):
         return NotImplemented
 
 
-def _pickled(x: Any) -> bytes:
+def _pickle(x: Any) -> bytes:
     """Pickle an object so that equal objects give equal bytes.
 
     **Raises:** `_ForeignCodeError` for code of a module that is not permitted, or for an object that pickle refuses.
@@ -253,20 +253,20 @@ def _without_names(code: str) -> str:
     return re.sub(r"(custom_call )?@(\w+)", number, code)
 
 
-def _without_cache(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
+def _compile_uncached(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
     """Compile without JAX's cache, as programs from this cache cannot be serialized completely on a CPU."""
-    with _compiling:
-        before = jax.config.values["jax_enable_compilation_cache"]
+    with _compile_lock:
+        was_enabled = jax.config.values["jax_enable_compilation_cache"]
         jax.config.update("jax_enable_compilation_cache", False)
         compilation_cache.reset_cache()
         try:
             return lowered.compile()
         finally:
-            jax.config.update("jax_enable_compilation_cache", before)
+            jax.config.update("jax_enable_compilation_cache", was_enabled)
             compilation_cache.reset_cache()
 
 
-def _loaded(payload: bytes, leaves: list, num_outputs: int) -> Callable[[list], list]:
+def _load(payload: bytes, leaves: list, num_outputs: int) -> Callable[[list], list]:
     start = time.monotonic()
     _initialise_lapack()
     inputs, outputs = jax.tree.structure(((leaves,), {})), jax.tree.structure([0] * num_outputs)

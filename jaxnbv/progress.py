@@ -7,14 +7,14 @@ from tqdm import tqdm
 
 
 def progress_bar(
-    items: Iterable[Any] | None = None, wanted: bool = True, leave: bool = False, **settings: Any
+    items: Iterable[Any] | None = None, enabled: bool = True, leave: bool = False, **settings: Any
 ) -> "tqdm[Any]":
     """Return a progress bar over `items`, or up to the `total` in the settings. Shown on terminals only.
 
-    - `wanted`: False hides the bar.
+    - `enabled`: False hides the bar.
     - `leave`: whether the bar stays on the screen once it is full.
     - `settings`: further arguments of tqdm, such as `desc`.
     """
     # The bar shows no remaining time. The first step compiles, so the estimate would be poor.
-    form = "{desc}: {n_fmt} of {total_fmt} |{bar:20}| {elapsed}"
-    return tqdm(items, leave=leave, disable=None if wanted else True, bar_format=form, **settings)
+    bar_format = "{desc}: {n_fmt} of {total_fmt} |{bar:20}| {elapsed}"
+    return tqdm(items, leave=leave, disable=None if enabled else True, bar_format=bar_format, **settings)

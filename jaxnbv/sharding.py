@@ -18,19 +18,19 @@ import jax.numpy as jnp
 from jax.sharding import AxisType, PartitionSpec, get_abstract_mesh
 
 
-def shared_map(function: Callable[..., Any], rows: Any, *common: Any, at_once: int = 1) -> Any:
+def shared_map(function: Callable[..., Any], rows: Any, *shared_args: Any, at_once: int = 1) -> Any:
     """Map `function(row, *common)` over the rows of a tree, with the rows divided among devices.
 
     Each device maps its rows by `jax.lax.map`.
 
-    - `rows`: arrays with a leading axis of rows. `common`: further arguments, the same for all rows.
+    - `rows`: arrays with a leading axis of rows. `shared_args`: further arguments, the same for all rows.
     - `at_once`: number of rows that a device computes together.
     """
 
-    def each(share: Any, *common: Any) -> Any:
-        return batched_map(lambda row: function(row, *common), share, at_once)
+    def map_part(part: Any, *shared_args: Any) -> Any:
+        return batched_map(lambda row: function(row, *shared_args), part, at_once)
 
-    return shared(each, rows, *common)
+    return run_sharded(map_part, rows, *shared_args)
 
 
 def batched_map(function: Callable[..., Any], rows: Any, at_once: int) -> Any:
@@ -41,7 +41,7 @@ def batched_map(function: Callable[..., Any], rows: Any, at_once: int) -> Any:
     return jax.lax.map(function, rows, batch_size=at_once if at_once > 1 else None)
 
 
-def shared(function: Callable[..., Any], rows: Any, *common: Any) -> Any:
+def run_sharded(function: Callable[..., Any], rows: Any, *shared_args: Any) -> Any:
     """Return `function(rows, *common)`, with the rows along the leading axis divided among devices.
 
     All devices get the whole result. The function must treat the rows independently. If there are more devices than
@@ -51,21 +51,21 @@ def shared(function: Callable[..., Any], rows: Any, *common: Any) -> Any:
     axes, devices = _axes()
     count = len(jax.tree.leaves(rows)[0])
     if devices == 1 or count < devices:
-        return function(rows, *common)
+        return function(rows, *shared_args)
     # If the rows do not divide evenly, the last devices compute some of the first rows again.
     rows = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf[: -count % devices]]), rows)
-    arrays, rest = eqx.partition((rows, common), eqx.is_array)
+    arrays, static = eqx.partition((rows, shared_args), eqx.is_array)
 
-    def on_each(share: Any, common: Any) -> Any:
-        share, common = eqx.combine((share, common), rest)
-        return jax.tree.map(lambda leaf: jax.lax.all_gather(leaf, axes, tiled=True), function(share, *common))
+    def run_part(part: Any, shared_args: Any) -> Any:
+        part, shared_args = eqx.combine((part, shared_args), static)
+        return jax.tree.map(lambda leaf: jax.lax.all_gather(leaf, axes, tiled=True), function(part, *shared_args))
 
-    specs, whole = (PartitionSpec(axes), PartitionSpec()), PartitionSpec()
-    everywhere = jax.shard_map(on_each, in_specs=specs, out_specs=whole, axis_names=set(axes), check_vma=False)
-    return jax.tree.map(lambda leaf: leaf[:count], everywhere(*arrays))
+    specs, replicated = (PartitionSpec(axes), PartitionSpec()), PartitionSpec()
+    sharded = jax.shard_map(run_part, in_specs=specs, out_specs=replicated, axis_names=set(axes), check_vma=False)
+    return jax.tree.map(lambda leaf: leaf[:count], sharded(*arrays))
 
 
-def share_of(count: int) -> int:
+def rows_per_device(count: int) -> int:
     """Return how many of `count` rows each device computes."""
     _, devices = _axes()
     return count if count < devices else -(-count // devices)

@@ -135,8 +135,8 @@ def plain_function(value: Any, name: str, example: str = "") -> Callable[..., An
 
     **Raises:** `ValueError` for anything else, including a class.
     """
-    proper = callable(value) and not isinstance(value, type)
-    require(proper, f"{name} is {short_text(value)}: give one{example}, or a function of a cloud")
+    is_function = callable(value) and not isinstance(value, type)
+    require(is_function, f"{name} is {short_text(value)}: give one{example}, or a function of a cloud")
     return value
 
 

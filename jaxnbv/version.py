@@ -7,7 +7,7 @@ from packaging.requirements import Requirement
 __version__ = importlib.metadata.version("jaxnbv")
 
 
-def check_jax(installed: str) -> None:
+def check_jax(jaxlib_version: str) -> None:
     """Refuse a version of jaxlib that the package's requirements exclude.
 
     Such versions compute wrong values on CPUs. `pip` does not install such versions with jaxnbv, but may do so
@@ -15,10 +15,10 @@ def check_jax(installed: str) -> None:
 
     **Raises:** `ImportError` with the accepted versions.
     """
-    needed = map(Requirement, importlib.metadata.requires("jaxnbv") or ())
-    accepted = next(need.specifier for need in needed if need.name == "jax")
-    if not accepted.contains(installed, prereleases=True):
+    requirements = map(Requirement, importlib.metadata.requires("jaxnbv") or ())
+    specifier = next(requirement.specifier for requirement in requirements if requirement.name == "jax")
+    if not specifier.contains(jaxlib_version, prereleases=True):
         raise ImportError(
-            f"jaxlib {installed} is installed, which is too old, computes wrong values on CPUs or crashes there "
-            f"(jax issues 39103 and 39257): pip install -U 'jax{accepted}'"
+            f"jaxlib {jaxlib_version} is installed, which is too old, computes wrong values on CPUs or crashes there "
+            f"(jax issues 39103 and 39257): pip install -U 'jax{specifier}'"
         )

@@ -184,7 +184,7 @@ def test_a_program_that_cannot_be_written_works(folder, monkeypatch):
 def test_after_an_edit_the_same_code_is_not_compiled_again(folder, monkeypatch):
     counted(lambda x: x + 1)[0](jnp.ones(2))
     monkeypatch.setattr(programs, "_source", lambda: "edited")
-    monkeypatch.setattr(programs, "_without_cache", lambda lowered: pytest.fail("compiled"))
+    monkeypatch.setattr(programs, "_compile_uncached", lambda lowered: pytest.fail("compiled"))
     stored, calls = counted(lambda x: x + 1)
     np.testing.assert_array_equal(stored(jnp.ones(2)), [2.0, 2.0])
     assert len(calls) == 1

@@ -17,7 +17,7 @@ PROGRAM = """
     from jax.sharding import AxisType, Mesh
 
     import jaxnbv as nbv
-    from jaxnbv.sharding import shared, shared_map
+    from jaxnbv.sharding import run_sharded, shared_map
 
 
     def on(devices, kind=AxisType.Auto):
@@ -29,12 +29,12 @@ PROGRAM = """
     seen = []
     with on(8):
         for count in (20, 8, 3):
-            jax.eval_shape(lambda rows: shared(lambda own: seen.append(len(own)) or own, rows), jnp.zeros((count, 2)))
+            jax.eval_shape(lambda x: run_sharded(lambda own: seen.append(len(own)) or own, x), jnp.zeros((count, 2)))
         x, y = jnp.linspace(0.0, 1.0, 20), jnp.array([2.0, 3.0])
         loss = lambda x, y: jnp.sum(shared_map(lambda a, b: jnp.sin(a * b).sum(), x, y) ** 2)
         slopes = jax.jit(jax.grad(loss, (0, 1)))(x, y)
     with on(8, AxisType.Explicit):
-        jax.eval_shape(lambda rows: shared(lambda own: seen.append(len(own)) or own, rows), jnp.zeros((20, 2)))
+        jax.eval_shape(lambda x: run_sharded(lambda own: seen.append(len(own)) or own, x), jnp.zeros((20, 2)))
     assert seen == [3, 1, 3, 20], seen
     total = jnp.sin(x[:, None] * y)
     inner = 2 * total.sum(1, keepdims=True) * jnp.cos(x[:, None] * y)

@@ -18,7 +18,7 @@ from jaxnbv.planning.program_parts import in_parts
 from jaxnbv.planning.simulate import observe_scene
 from jaxnbv.programs import program
 from jaxnbv.scanning import Noise, Surface
-from jaxnbv.sharding import batched_map, shared
+from jaxnbv.sharding import batched_map, run_sharded
 from jaxnbv.surfaces.part_hypotheses import hypotheses_of
 
 
@@ -60,7 +60,7 @@ def run(
     def simulate_share(rows: Any, planner: Planner, views: Int[Array, ""]) -> Any:
         return batched_map(lambda row: _episode(planner, noise, views, *row), rows, at_once)
 
-    return shared(simulate_share, rows, planner, views)
+    return run_sharded(simulate_share, rows, planner, views)
 
 
 def _episode(

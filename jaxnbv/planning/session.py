@@ -454,7 +454,7 @@ class Session:
     def _show_stage(self, stage: str) -> None:
         """Show a stage of planning on the progress bar. The first call creates the bar."""
         if self._bar is None:
-            self._bar = progress_bar(total=2, wanted=self.progress)
+            self._bar = progress_bar(total=2, enabled=self.progress)
         self._bar.set_description(f"view {len(self.views) + 1}, {stage}")
         self._bar.update(STAGES.index(stage) - self._bar.n)
 

@@ -76,7 +76,7 @@ def simulate(
             len(stored) <= views,
             f"asked for {views} views but {folder} already holds {len(stored)}: ask for more, or choose another folder",
         )
-        with progress_bar(total=views * len(STAGES), wanted=progress) as bar:
+        with progress_bar(total=views * len(STAGES), enabled=progress) as bar:
 
             def on_stage(stage: str) -> None:
                 index = len(loop.views)
