@@ -26,7 +26,7 @@ def simulated_sensor(surface: Surface, camera: Camera) -> Sensor:
 def random_first_view(
     is_enough: Callable[[PointCloud], bool], poses: Pose, sensor: Sensor, key: PRNGKeyArray, episode_key: PRNGKeyArray
 ) -> int | None:
-    """Return the index of a random pose whose scan satisfies `is_enough`, or None if there is no such pose.
+    """Return the index of a random pose whose scan satisfies `is_enough`, or None if there is none.
 
     - `poses`: the candidates, with one leading axis.
     - `key`: random key for the order in which the poses are tried.
