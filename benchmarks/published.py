@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxnbv import Coverage, DiscreteSearch, Planner, PointCloud
+from jaxnbv.acquisition import ImaginedView
 from jaxnbv.studies.engine.study import Scene
 from jaxnbv.studies.reconstruction import ReconstructionStudy
 
@@ -16,9 +17,9 @@ from jaxnbv.studies.reconstruction import ReconstructionStudy
 class MeanCoverage(Coverage):
     """Squared distances to the cloud, averaged over the points of a scan. The paper sums them."""
 
-    def __call__(self, context: PointCloud, scan: PointCloud) -> Float[Array, ""]:
-        """The mean squared distance. Zero for an empty scan."""
-        return super().__call__(context, scan) / jnp.maximum(scan.count, 1)
+    def score(self, context: PointCloud, view: ImaginedView) -> Float[Array, ""]:
+        """Return the mean squared distance from the scan to D, which is zero for an empty scan."""
+        return super().score(context, view) / jnp.maximum(view.scan.count, 1)
 
 
 def mean_coverage(study: ReconstructionStudy, scene: Scene) -> Planner:
