@@ -147,7 +147,9 @@ def _upright(axis):
 def assemble(primitives: list[Primitive], rotation_angle: float = 0.0, longest_side: float = 2.5) -> LabelledSolid:
     """Return the union of primitives, rotated about the y axis, then moved and scaled.
 
-    `rotation_angle` is the angle in radians. The bounding box of the result is centred in the scene, and its longest side is `longest_side`.
+    The bounding box of the result is centred in the scene, and its longest side is `longest_side`.
+
+    - `rotation_angle`: angle of the rotation, in radians.
     """
     rotation = rotation_about((0.0, 1.0, 0.0), rotation_angle)
     return union(fit([move(p, rotation=rotation) for p in primitives], longest_side))
