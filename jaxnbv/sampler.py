@@ -44,7 +44,7 @@ from jaxnbv.surfaces import (
 from jaxnbv.surfaces.known_shapes import short_ranged
 
 # How far the object may continue beyond a box that cuts it, in scene units: 8 % of the longest side.
-_ROOM = 0.2
+_MARGIN = 0.2
 
 MODELS = ("screened", "paper")
 """The names that `SurfaceSampler.preset` accepts."""
@@ -120,14 +120,14 @@ class SurfaceSampler(eqx.Module):
         require(name in MODELS, f"there is no model {name!r}: choose from {', '.join(MODELS)}")
         if name == "paper":
             return cls(GeometricSPSR(0.015, truncation=20) if quick else GeometricSPSR(), carving=None)
-        scale, usual = longest_side / 2.5, ScreenedSPSR()
-        room, volume = (0.0, Box.cube(longest_side)) if volume is None else (scale * _ROOM, volume)
-        lengthscales = scale * (usual.base.lengthscale + (jnp.array([0.005, 0.0]) if quick else 0.0))
+        scale, default = longest_side / 2.5, ScreenedSPSR()
+        margin, volume = (0.0, Box.cube(longest_side)) if volume is None else (scale * _MARGIN, volume)
+        lengthscales = scale * (default.base.lengthscale + (jnp.array([0.005, 0.0]) if quick else 0.0))
         # Shorter lengthscales need more frequencies, but time and memory grow with the cube of the truncation.
-        truncation = min(round((20 if quick else usual.base.truncation) / scale), 30 if quick else 48)
-        base = GeometricSPSR(lengthscales, usual.base.variance, truncation)
-        values = (OutsideBoundary(volume, room=room), OnSurface(), *(() if solid else (EmptySpace(),)))
-        return cls(ScreenedSPSR(base, values, offset=scale * usual.offset), carving=Carving(volume))
+        truncation = min(round((20 if quick else default.base.truncation) / scale), 30 if quick else 48)
+        base = GeometricSPSR(lengthscales, default.base.variance, truncation)
+        values = (OutsideBoundary(volume, margin=margin), OnSurface(), *(() if solid else (EmptySpace(),)))
+        return cls(ScreenedSPSR(base, values, offset=scale * default.offset), carving=Carving(volume))
 
     @own_settings()
     def with_bank(self, bank: ShapeBank, poses: ShapePoses) -> "SurfaceSampler":
@@ -139,9 +139,9 @@ class SurfaceSampler(eqx.Module):
         """
         box = Box() if self.carving is None else bounding_box(self.carving.volume)
         longest_side = float(np.max(box.high - box.low))
-        own = (self.model.base.truncation,) if isinstance(self.model, ScreenedSPSR) else ()
+        truncations = (self.model.base.truncation,) if isinstance(self.model, ScreenedSPSR) else ()
         return dataclasses.replace(
-            self, model=KnownShapes(bank, short_ranged(longest_side, *own), poses, box, self.model)
+            self, model=KnownShapes(bank, short_ranged(longest_side, *truncations), poses, box, self.model)
         )
 
     @property
@@ -157,7 +157,9 @@ class SurfaceSampler(eqx.Module):
 
         def replace(leaf):
             if isinstance(leaf, OutsideBoundary):
-                return dataclasses.replace(leaf, volume=volume, room=_ROOM) if replace(leaf.volume) is volume else leaf
+                return (
+                    dataclasses.replace(leaf, volume=volume, margin=_MARGIN) if replace(leaf.volume) is volume else leaf
+                )
             return volume if isinstance(leaf, Box) and leaf == Box() else leaf
 
         return jax.tree.map(replace, self, is_leaf=lambda leaf: isinstance(leaf, Box | OutsideBoundary))
@@ -172,8 +174,8 @@ class SurfaceSampler(eqx.Module):
         observations = self.adapt(observations)
         if self.carving is None or observations.empty_nodes is None:
             return self.model.condition(observations)
-        inside = observations.empty_nodes & self.carving.inside(self.grid)
-        return self.model.condition(dataclasses.replace(observations, empty_nodes=inside))
+        empty_nodes = observations.empty_nodes & self.carving.inside(self.grid)
+        return self.model.condition(dataclasses.replace(observations, empty_nodes=empty_nodes))
 
     @own_settings()
     def sample(
@@ -224,11 +226,11 @@ class SurfaceSampler(eqx.Module):
         """
         observations, nodes = self.adapt(observations), (self.grid.resolution,) * 3
         require(jnp.shape(values)[-3:] == nodes, f"the values are {short_text(values)}, but the grid has {nodes} nodes")
-        excluded = observations.obstacle_nodes
+        is_excluded = observations.obstacle_nodes
         if self.carving is not None and observations.empty_nodes is not None:
-            elsewhere = observations.empty_nodes | self.carving.outside(self.grid)
-            excluded = elsewhere if excluded is None else elsewhere | excluded
-        return values if excluded is None else carve(values, excluded)
+            is_outside = observations.empty_nodes | self.carving.outside(self.grid)
+            is_excluded = is_outside if is_excluded is None else is_outside | is_excluded
+        return values if is_excluded is None else carve(values, is_excluded)
 
     @own_settings()
     def mean(
@@ -274,10 +276,10 @@ class SurfaceSampler(eqx.Module):
                 "cloud"
             )
         points, _ = self.adapt(observations).cloud.to_numpy()
-        vertices, faces, dropped = supported_pieces(*triangles[:2], points, self.grid.spacing)
-        if dropped:
+        vertices, faces, count = supported_pieces(*triangles[:2], points, self.grid.spacing)
+        if count:
             warnings.warn(
-                f"left out {dropped} piece{'s' * (dropped > 1)} of the mesh with hardly any points of the cloud",
+                f"left out {count} piece{'s' * (count > 1)} of the mesh with hardly any points of the cloud",
                 stacklevel=2,
             )
         return TriangleMesh(vertices, faces, Frame())

@@ -154,14 +154,14 @@ def test_a_cut_by_the_volume_is_no_surface():
     assert int(small[0]) == int(small[1]) > 0
 
 
-@pytest.mark.parametrize("room", [0.0, 0.2])
-def test_a_users_box_does_not_close_the_object_at_its_faces(room):
+@pytest.mark.parametrize("margin", [0.0, 0.2])
+def test_a_users_box_does_not_close_the_object_at_its_faces(margin):
     box = nbv.Box((-1.0, -0.5, -0.8), (1.0, 0.9, 0.7))
-    rows = nbv.surfaces.OutsideBoundary(box, 200, room=room).rows(nbv.Observations.start(SCANS[0]))
-    np.testing.assert_allclose(box(rows.points), room, atol=1e-4)
+    rows = nbv.surfaces.OutsideBoundary(box, 200, margin=margin).rows(nbv.Observations.start(SCANS[0]))
+    np.testing.assert_allclose(box(rows.points), margin, atol=1e-4)
     pair = preset(volume=box).model.values[0], nbv.SurfaceSampler().within(box).model.values[0]
-    assert all(one.room == 0.2 and one.volume == box for one in pair)
-    assert preset().model.values[0].room == 0.0
+    assert all(one.margin == 0.2 and one.volume == box for one in pair)
+    assert preset().model.values[0].margin == 0.0
 
 
 def test_a_given_posterior_is_not_computed_again():
@@ -199,9 +199,9 @@ def test_another_box_takes_the_place_of_the_default_one_alone():
     after = before.within(box)
     assert [source.volume for source in after.model.values] == [box, own, box]
     assert after.carving == nbv.Carving(box, 1.5)
-    assert [source.room for source in after.model.values] == [0.2, 0.0, 0.2]
+    assert [source.margin for source in after.model.values] == [0.2, 0.0, 0.2]
     # Everything else is unchanged.
-    default = {"volume": nbv.Box(), "room": 0.0}
+    default = {"volume": nbv.Box(), "margin": 0.0}
     back = [dataclasses.replace(one, **default) for one in (after.model.values[0], after.model.values[2])]
     values = (back[0], after.model.values[1], back[1])
     model = dataclasses.replace(after.model, values=values)

@@ -62,10 +62,10 @@ class ValueRows(eqx.Module):
         require(
             bool((noise >= 0).all()), f"a value has a noise of {noise.min(initial=0.0):.4g}; it must not be negative"
         )
-        furthest = float(np.abs(points).max(initial=0.0))
+        largest = float(np.abs(points).max(initial=0.0))
         require(
-            furthest <= float(points.dtype.type(HALF_WIDTH)),
-            f"a value is given at a point with a coordinate of {furthest:.4g}, outside the scene, [-pi/2, pi/2]^3: "
+            largest <= float(points.dtype.type(HALF_WIDTH)),
+            f"a value is given at a point with a coordinate of {largest:.4g}, outside the scene, [-pi/2, pi/2]^3: "
             "mask the row, or bring the point there with Frame.to_scene",
         )
 
@@ -91,46 +91,46 @@ class OutsideBoundary(ValueSource):
     - `volume`: see `jaxnbv.geometry.volume`; by default the box to which scenes are scaled.
     - `num_points`: number of points, spread evenly as seen from the origin.
     - `value`, `noise`: observed value and its standard deviation, in units of h, half the rise of f across the surface.
-    - `room`: distance by which the points lie outside the boundary, in scene units. Points are clipped to the scene.
+    - `margin`: distance by which the points lie outside the boundary, in scene units. Points are clipped to the scene.
       If the volume cuts the object, give a positive distance. Otherwise sampled objects would close at the cut.
 
-    **Raises:** `ValueError` for a count below one, noise that is not positive, negative room, or a boundary that leaves
-    the scene, [-pi/2, pi/2]^3, or does not enclose the origin.
+    **Raises:** `ValueError` for a count below one, noise that is not positive, a negative margin, or a boundary that
+    leaves the scene, [-pi/2, pi/2]^3, or does not enclose the origin.
     """
 
     volume: Volume = Box()
     num_points: int = eqx.field(static=True, default=150)
     value: float = eqx.field(static=True, default=1.0)
     noise: float = eqx.field(static=True, default=0.5)
-    room: float = eqx.field(static=True, default=0.0)
+    margin: float = eqx.field(static=True, default=0.0)
 
     @own_settings()
     def __check_init__(self):
         check_fields(self)
-        require(0 <= self.room < math.inf, f"the room is {self.room}; it must be finite and not negative")
+        require(0 <= self.margin < math.inf, f"the margin is {self.margin}; it must be finite and not negative")
         _check(self.num_points, self.noise)
         if is_traced(self.volume):
             return
         with jax.ensure_compile_time_eval():
             try:
-                about = bounding_box(self.volume)
-                farthest = float(np.abs([about.low, about.high]).max())
-                middle = float(self.volume(jnp.zeros((1, 3)))[0])
+                bounds = bounding_box(self.volume)
+                largest = float(np.abs([bounds.low, bounds.high]).max())
+                distance = float(self.volume(jnp.zeros((1, 3)))[0])
             except Exception as error:
                 raise InputError(
                     f"the volume {short_text(self.volume)} gives no signed distances of points (n, 3) ({error}): "
                     "give a Box or a solid of jaxnbv.sdf"
                 ) from error
-        require(middle < 0, f"the volume {self.volume} must enclose the origin, whose distance is {middle:.4g}")
+        require(distance < 0, f"the volume {self.volume} must enclose the origin, whose distance is {distance:.4g}")
         require(
-            farthest <= HALF_WIDTH,
-            f"the boundary of {self.volume} has a coordinate of {farthest:.4g}: it must lie within the scene, "
+            largest <= HALF_WIDTH,
+            f"the boundary of {self.volume} has a coordinate of {largest:.4g}: it must lie within the scene, "
             "[-pi/2, pi/2]^3",
         )
 
     def rows(self, observations: Observations) -> ValueRows:
-        points = boundary_points(self.volume, self.num_points, self.room).astype(observations.cloud.points.dtype)
-        # Clip to the border of the scene, because the points may lie beyond it by `room` or by rounding in this dtype.
+        points = boundary_points(self.volume, self.num_points, self.margin).astype(observations.cloud.points.dtype)
+        # Clip to the border of the scene, because points may lie beyond it by `margin` or by rounding in this dtype.
         points = jnp.clip(points, -HALF_WIDTH, HALF_WIDTH)
         return _rows(points, self.value, self.noise, jnp.ones(self.num_points, bool))
 
@@ -152,8 +152,8 @@ class OnSurface(ValueSource):
         _check(self.num_points, self.noise)
 
     def rows(self, observations: Observations) -> ValueRows:
-        chosen = farthest_point_subsample(observations.cloud, self.num_points)
-        return _rows(chosen.points, 0.0, self.noise, chosen.mask)
+        cloud = farthest_point_subsample(observations.cloud, self.num_points)
+        return _rows(cloud.points, 0.0, self.noise, cloud.mask)
 
 
 class EmptySpace(ValueSource):
@@ -201,8 +201,8 @@ def concatenate_rows(sources: tuple[ValueSource, ...], observations: Observation
 
 
 def _rows(points, value: float, noise: float, mask) -> ValueRows:
-    one = jnp.ones(len(points), points.dtype)
-    return ValueRows(points, value * one, noise * one, mask)
+    ones = jnp.ones(len(points), points.dtype)
+    return ValueRows(points, value * ones, noise * ones, mask)
 
 
 def _check(num_points: int, noise: float) -> None:
