@@ -25,23 +25,23 @@ from jaxnbv.surfaces.placement import FreeRotation
 
 # Number of initial rotations, of initial shifts per rotation, and of points sampled on the mesh, which replace the mesh
 # in the first two stages.
-_ROTATIONS, _PLACES, _SAMPLES = 400, 3, 4000
+_NUM_ROTATIONS, _NUM_SHIFTS, _NUM_SAMPLES = 400, 3, 4000
 # Number of scan points in each stage; scales s of the steps in the first three stages; number of motions kept after the
 # first and the second stage, and number of steps in the last stage.
 _FIRST, _SECOND, _THIRD, _LAST = 64, 400, 1000, 20_000
 _SCALES = np.geomspace(0.1, 0.03, 8), np.geomspace(0.05, 0.01, 12), np.geomspace(0.02, 0.003, 12)
-_KEPT_FIRST, _KEPT_SECOND, _ROUNDS = 40, 6, 12
+_BEST_FIRST, _BEST_SECOND, _NUM_LAST_STEPS = 40, 6, 12
 # Default scale s as a multiple of the median distance, smallest scale, damping relative to the trace of the normal
 # equations, and largest step.
-_MEDIANS, _LEAST, _DAMPING, _LARGEST_STEP = 2.0, 1e-9, 1e-5, 0.5
+_SCALE_PER_MEDIAN, _MIN_SCALE, _DAMPING, _MAX_STEP = 2.0, 1e-9, 1e-5, 0.5
 # Motions that differ by less than this angle (stored as its cosine) and this shift count as equal.
-_SAME_TURN, _SAME_SHIFT = np.cos(np.radians(10.0)), 0.05
+_MIN_COSINE, _MAX_SHIFT = np.cos(np.radians(10.0)), 0.05
 # Number of rotations tried about the axis that the scan constrains least. An almost round part has many local optima
 # there.
-_TURNS = 72
+_SWEEP = 72
 # A motion is a rival of the best motion if its fit is at least this fraction of the best fit, and if the two motions
 # place the mesh at least this mean distance apart.
-_RIVAL, _ELSEWHERE = 0.97, 0.01
+_MIN_FIT_RATIO, _MIN_AMBIGUITY = 0.97, 0.01
 
 Nearest = Callable[[Float[np.ndarray, "n 3"]], tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]]
 """A function that maps points to the nearest points on a mesh, and to the normals of the mesh there."""
@@ -51,22 +51,22 @@ class Registration(NamedTuple):
     """Result of `register_scan`. Lengths are in the unit of the mesh.
 
     - `matrix`: the motion from the scan to the mesh.
-    - `median`: median distance of the scan's points from the mesh, after this motion.
-    - `rival`: distance between the mesh placed by `matrix` and the mesh placed by a motion that fits nearly as well:
-      a mean over the mesh, the largest over such motions. It is 0 if none of them is clearly different.
+    - `median_distance`: median distance of the scan's points from the mesh, after this motion.
+    - `ambiguity`: distance between the mesh placed by `matrix` and the mesh placed by a motion that fits nearly as
+      well: a mean over the mesh, the largest over such motions. It is 0 if none of them is clearly different.
     """
 
     matrix: Float[np.ndarray, "4 4"]
-    median: float
-    rival: float
+    median_distance: float
+    ambiguity: float
 
 
 class _Motions(NamedTuple):
-    turns: Float[np.ndarray, "s 3 3"]
+    rotations: Float[np.ndarray, "s 3 3"]
     shifts: Float[np.ndarray, "s 3"]
 
-    def at(self, rows: Sequence[int]) -> "_Motions":
-        return _Motions(self.turns[rows], self.shifts[rows])
+    def take(self, rows: Sequence[int]) -> "_Motions":
+        return _Motions(self.rotations[rows], self.shifts[rows])
 
 
 class _Equations(NamedTuple):
@@ -99,50 +99,50 @@ class _Stage(NamedTuple):
         - `scale`: distance from the surface at which a point's weight halves. The default, for each motion, is twice
           the median distance of the moved points from the surface.
         """
-        arms = np.einsum("nj,sij->sni", self.points, motions.turns)
-        places = arms + motions.shifts[:, None]
-        feet, outer = (rows.reshape(places.shape) for rows in self.nearest(places.reshape(-1, 3)))
-        agreement = np.sum(np.einsum("nj,sij->sni", self.normals, motions.turns) * outer, axis=-1)
+        arms = np.einsum("nj,sij->sni", self.points, motions.rotations)
+        positions = arms + motions.shifts[:, None]
+        feet, normals = (rows.reshape(positions.shape) for rows in self.nearest(positions.reshape(-1, 3)))
+        agreement = np.sum(np.einsum("nj,sij->sni", self.normals, motions.rotations) * normals, axis=-1)
         agreement = np.clip(agreement if self.is_solid else np.abs(agreement), 0.0, 1.0)
-        gaps = np.linalg.norm(places - feet, axis=-1)
-        scales = np.median(gaps, axis=1, keepdims=True) * _MEDIANS if scale is None else np.asarray(scale)
-        weight = agreement / (1.0 + (gaps / np.maximum(scales, _LEAST)) ** 2)
-        rows = np.concatenate([np.cross(arms, outer), outer], axis=-1)
+        gaps = np.linalg.norm(positions - feet, axis=-1)
+        scales = np.median(gaps, axis=1, keepdims=True) * _SCALE_PER_MEDIAN if scale is None else np.asarray(scale)
+        weight = agreement / (1.0 + (gaps / np.maximum(scales, _MIN_SCALE)) ** 2)
+        rows = np.concatenate([np.cross(arms, normals), normals], axis=-1)
         matrix = np.einsum("sni,snj->sij", weight[..., None] * rows, rows, optimize=True)
-        vector = np.einsum("sn,sni->si", weight * np.sum((places - feet) * outer, axis=-1), rows)
+        vector = np.einsum("sn,sni->si", weight * np.sum((positions - feet) * normals, axis=-1), rows)
         return _Equations(matrix, vector, gaps, agreement)
 
-    def aligned(self, motions: _Motions, scales: Sequence[float | None] | np.ndarray) -> _Motions:
+    def align(self, motions: _Motions, scales: Sequence[float | None] | np.ndarray) -> _Motions:
         """Return the motions after damped Gauss-Newton steps, one for each entry of `scales`."""
         for scale in scales:
             matrix, vector, *_ = self.equations(motions, scale)
             damping = _DAMPING * np.trace(matrix, axis1=1, axis2=2) + 1e-12
             step = -np.linalg.solve(matrix + damping[:, None, None] * np.eye(6), vector[..., None])[..., 0]
-            step *= np.minimum(1.0, _LARGEST_STEP / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-9))
-            turns = Rotation.from_rotvec(step[:, :3]).as_matrix() @ motions.turns
-            motions = _Motions(turns, motions.shifts + step[:, 3:])
+            step *= np.minimum(1.0, _MAX_STEP / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-9))
+            rotations = Rotation.from_rotvec(step[:, :3]).as_matrix() @ motions.rotations
+            motions = _Motions(rotations, motions.shifts + step[:, 3:])
         return motions
 
     def best(self, motions: _Motions, scale: float, count: int) -> _Motions:
         """Return the `count` motions with the best fits, without motions that nearly equal a better motion."""
         rows: list[int] = []
         for row in np.argsort(-self.equations(motions, scale).fit(scale), kind="stable").tolist():
-            cosine = 0.5 * (np.einsum("kij,ij->k", motions.turns[rows], motions.turns[row]) - 1.0)
+            cosine = 0.5 * (np.einsum("kij,ij->k", motions.rotations[rows], motions.rotations[row]) - 1.0)
             shift = np.linalg.norm(motions.shifts[rows] - motions.shifts[row], axis=1)
-            if not np.any((cosine > _SAME_TURN) & (shift < _SAME_SHIFT)):
+            if not np.any((cosine > _MIN_COSINE) & (shift < _MAX_SHIFT)):
                 rows.append(row)
             if len(rows) == count:
                 break
-        return motions.at(rows)
+        return motions.take(rows)
 
-    def swept(self, motion: _Motions) -> _Motions:
+    def rotate_about_weakest_axis(self, motion: _Motions) -> _Motions:
         """Return copies of a motion, each followed by a turn about the screw axis the scan constrains least."""
         weakest = np.linalg.eigh(self.equations(motion).matrix[0])[1][:, 0]
         twist = np.zeros((4, 4))
         twist[:3, :3], twist[:3, 3] = np.cross(np.eye(3), weakest[:3]), weakest[3:]
-        angles = np.linspace(0.0, 2.0 * np.pi, _TURNS, endpoint=False) / max(float(np.linalg.norm(weakest[:3])), 1e-3)
+        angles = np.linspace(0.0, 2.0 * np.pi, _SWEEP, endpoint=False) / max(float(np.linalg.norm(weakest[:3])), 1e-3)
         screws = scipy.linalg.expm(angles[:, None, None] * twist)
-        return _Motions(screws[:, :3, :3] @ motion.turns, screws[:, :3, 3] + motion.shifts)
+        return _Motions(screws[:, :3, :3] @ motion.rotations, screws[:, :3, 3] + motion.shifts)
 
 
 def orient_outward(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, bool]:
@@ -157,14 +157,14 @@ def orient_outward(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, bool]:
     mesh.remove_unreferenced_vertices()
     if not mesh.is_winding_consistent:
         mesh.faces = optional("igl").bfs_orient(np.ascontiguousarray(mesh.faces, np.int64))[0]
-    points, rows = trimesh.sample.sample_surface(mesh, _SAMPLES, seed=0)
+    points, rows = trimesh.sample.sample_surface(mesh, _NUM_SAMPLES, seed=0)
     step = 1e-4 * mesh.scale * mesh.face_normals[rows]
-    inner, outer = (np.abs(winding_number(at, mesh.vertices, mesh.faces)) for at in (points - step, points + step))
-    inside = float(np.mean(inner - outer))
-    if inside < -0.5:
+    inner, outer = (np.abs(winding_number(x, mesh.vertices, mesh.faces)) for x in (points - step, points + step))
+    difference = float(np.mean(inner - outer))
+    if difference < -0.5:
         # `Trimesh.invert` does not update the normals.
         mesh = trimesh.Trimesh(mesh.vertices, mesh.faces[:, ::-1], process=False)
-    return mesh, abs(inside) > 0.5
+    return mesh, abs(difference) > 0.5
 
 
 def register_scan(
@@ -182,7 +182,7 @@ def register_scan(
     unit, center, middle = mesh.scale, points.mean(axis=0), mesh.bounds.mean(axis=0)
     order = np.random.default_rng(0).permutation(len(points))[:_LAST]
     scan, directions = (points[order] - center) / unit, normals[order]
-    samples, rows = trimesh.sample.sample_surface(mesh, _SAMPLES, seed=0)
+    samples, rows = trimesh.sample.sample_surface(mesh, _NUM_SAMPLES, seed=0)
     samples = (samples - middle) / unit
     by_samples = _nearest_sample(samples, mesh.face_normals[rows])
     by_faces = _nearest_point((mesh.vertices - middle) / unit, mesh)
@@ -192,33 +192,33 @@ def register_scan(
     )
     coarse, middling, fine = _SCALES
     if start is None:
-        motions = first.best(first.aligned(_starts(scan, directions, samples), coarse), coarse[-1], _KEPT_FIRST)
-        motions = second.best(second.aligned(motions, middling), middling[-1], _KEPT_SECOND)
-        motions = third.aligned(motions, fine)
-        around = sweep.aligned(sweep.swept(third.best(motions, fine[-1], 1)), 4 * [fine[-1]])
-        both = zip(motions, sweep.best(around, fine[-1], _KEPT_SECOND), strict=True)
-        motions = third.aligned(_Motions(*map(np.concatenate, both)), 4 * [None])
+        motions = first.best(first.align(_initial_motions(scan, directions, samples), coarse), coarse[-1], _BEST_FIRST)
+        motions = second.best(second.align(motions, middling), middling[-1], _BEST_SECOND)
+        motions = third.align(motions, fine)
+        rotated = sweep.align(sweep.rotate_about_weakest_axis(third.best(motions, fine[-1], 1)), 4 * [fine[-1]])
+        pairs = zip(motions, sweep.best(rotated, fine[-1], _BEST_SECOND), strict=True)
+        motions = third.align(_Motions(*map(np.concatenate, pairs)), 4 * [None])
     else:
         motions = _Motions(start[None, :3, :3], (start[None, :3, :3] @ center + start[None, :3, 3] - middle) / unit)
-        motions = third.aligned(second.aligned(motions, middling), fine)
+        motions = third.align(second.align(motions, middling), fine)
     equations = third.equations(motions)
-    fit = equations.fit(max(_MEDIANS * float(np.median(equations.gaps, axis=1).min()), _LEAST))
+    fit = equations.fit(max(_SCALE_PER_MEDIAN * float(np.median(equations.gaps, axis=1).min()), _MIN_SCALE))
     winner, *others = np.argsort(-fit, kind="stable").tolist()
-    rivals = [motions.at([row]) for row in others if fit[row] > _RIVAL * fit[winner]]
-    rival = max((_apart(motions.at([winner]), other, samples, by_faces) for other in rivals), default=0.0)
-    motions = last.aligned(motions.at([winner]), _ROUNDS * [None])
+    rivals = [motions.take([row]) for row in others if fit[row] > _MIN_FIT_RATIO * fit[winner]]
+    ambiguity = max((_mesh_distance(motions.take([winner]), other, samples, by_faces) for other in rivals), default=0.0)
+    motions = last.align(motions.take([winner]), _NUM_LAST_STEPS * [None])
     matrix = np.eye(4)
-    matrix[:3, :3] = motions.turns[0]
-    matrix[:3, 3] = unit * motions.shifts[0] + middle - motions.turns[0] @ center
-    median = unit * float(np.median(last.equations(motions).gaps))
-    return Registration(matrix, median, unit * rival if rival > _ELSEWHERE else 0.0)
+    matrix[:3, :3] = motions.rotations[0]
+    matrix[:3, 3] = unit * motions.shifts[0] + middle - motions.rotations[0] @ center
+    median_distance = unit * float(np.median(last.equations(motions).gaps))
+    return Registration(matrix, median_distance, unit * ambiguity if ambiguity > _MIN_AMBIGUITY else 0.0)
 
 
 def _nearest_sample(points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]) -> Nearest:
     tree = cKDTree(points)
 
-    def nearest(places):
-        _, rows = tree.query(places)
+    def nearest(positions):
+        _, rows = tree.query(positions)
         return points[rows], normals[rows]
 
     return nearest
@@ -229,14 +229,14 @@ def _nearest_point(vertices: Float[np.ndarray, "v 3"], mesh: trimesh.Trimesh) ->
     tree = optional("igl").AABB()
     tree.init(vertices, faces)
 
-    def nearest(places):
-        _, rows, feet = tree.squared_distance(vertices, faces, np.ascontiguousarray(places))
+    def nearest(positions):
+        _, rows, feet = tree.squared_distance(vertices, faces, np.ascontiguousarray(positions))
         return feet, mesh.face_normals[rows]
 
     return nearest
 
 
-def _starts(
+def _initial_motions(
     points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], samples: Float[np.ndarray, "m 3"]
 ) -> _Motions:
     """Return the initial motions: rotations, each with a few shifts that put the scan in the mesh's box.
@@ -244,22 +244,25 @@ def _starts(
     The first shift centres the scan, and moves it along its mean normal to the front of the mesh. The other shifts are
     random.
     """
-    turns = FreeRotation().rotations(_ROTATIONS)
-    views = np.einsum("nj,sij->sni", points[:_THIRD], turns)
-    low, high = views.min(axis=1), views.max(axis=1)
-    least, most = samples.min(axis=0) - low, samples.max(axis=0) - high
-    ahead = turns @ trimesh.unitize(normals.mean(axis=0) + 1e-12)
-    front = (samples @ ahead.T).max(axis=0) - np.einsum("sni,si->sn", views, ahead).max(axis=1)
-    central = 0.5 * (least + most)
-    first = central + ahead * (front - np.sum(central * ahead, axis=1))[:, None]
-    shares = np.random.default_rng(0).random((_PLACES - 1, _ROTATIONS, 3))
-    return _Motions(np.tile(turns, (_PLACES, 1, 1)), np.concatenate([first, *(least + shares * (most - least))]))
+    rotations = FreeRotation().rotations(_NUM_ROTATIONS)
+    rotated = np.einsum("nj,sij->sni", points[:_THIRD], rotations)
+    low, high = rotated.min(axis=1), rotated.max(axis=1)
+    shift_low, shift_high = samples.min(axis=0) - low, samples.max(axis=0) - high
+    mean_normals = rotations @ trimesh.unitize(normals.mean(axis=0) + 1e-12)
+    front = (samples @ mean_normals.T).max(axis=0) - np.einsum("sni,si->sn", rotated, mean_normals).max(axis=1)
+    central = 0.5 * (shift_low + shift_high)
+    first = central + mean_normals * (front - np.sum(central * mean_normals, axis=1))[:, None]
+    fractions = np.random.default_rng(0).random((_NUM_SHIFTS - 1, _NUM_ROTATIONS, 3))
+    return _Motions(
+        np.tile(rotations, (_NUM_SHIFTS, 1, 1)),
+        np.concatenate([first, *(shift_low + fractions * (shift_high - shift_low))]),
+    )
 
 
-def _apart(first: _Motions, second: _Motions, samples: Float[np.ndarray, "m 3"], nearest: Nearest) -> float:
+def _mesh_distance(first: _Motions, second: _Motions, samples: Float[np.ndarray, "m 3"], nearest: Nearest) -> float:
     """Return the mean distance of the mesh placed by `second` from the mesh placed by `first`.
 
     Motions map the scan to the mesh, so their inverses place the mesh at the scan. `samples` are points on the mesh.
     """
-    moved = (samples - second.shifts[0]) @ second.turns[0] @ first.turns[0].T + first.shifts[0]
+    moved = (samples - second.shifts[0]) @ second.rotations[0] @ first.rotations[0].T + first.shifts[0]
     return float(np.mean(np.linalg.norm(moved - nearest(moved)[0], axis=1)))

@@ -62,8 +62,8 @@ def test_a_partial_noisy_scan_is_laid_on_its_part_from_anywhere(ahead):
     points, normals = moved(truth, *scanned(mesh, ahead, RNG, noise=0.1))
     result = register_scan(points, normals, mesh, is_solid)
     np.testing.assert_allclose(result.matrix @ truth, np.eye(4), atol=0.1)
-    assert result.median < 0.1
-    assert result.rival == 0
+    assert result.median_distance < 0.1
+    assert result.ambiguity == 0
 
 
 def test_a_start_is_refined_and_its_neighbourhood_kept():
@@ -81,7 +81,7 @@ def test_a_symmetric_part_has_no_rival():
     truth = motion(RNG)
     result = register_scan(*moved(truth, *scanned(mesh, (1, 2, 3), RNG, noise=0.05)), mesh, is_solid)
     assert off(mesh, result.matrix @ truth) < 0.05
-    assert result.rival == 0
+    assert result.ambiguity == 0
 
 
 def test_the_flat_of_a_shaft_determines_its_rotation():
@@ -96,7 +96,7 @@ def test_a_face_that_can_slide_has_a_rival():
     mesh, is_solid = orient_outward(bracket())
     points, normals = scanned(mesh, (0, 0, -1), RNG)
     patch = (points[:, 0] > 15) & (points[:, 0] < 40)
-    assert register_scan(points[patch], normals[patch], mesh, is_solid).rival > 1.0
+    assert register_scan(points[patch], normals[patch], mesh, is_solid).ambiguity > 1.0
 
 
 def test_faces_are_wound_outward_however_they_were_wound():
