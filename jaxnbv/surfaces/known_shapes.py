@@ -3,7 +3,7 @@
     prior      f = m_k(T^-1 x) + g,   k ~ pi over shapes 1..K and 0 for none of these,   T the placement of the shape,
                g a Gaussian process, the residual
     mean       m_k = h tanh(d_k / h), d_k the signed distance of shape k, h half the rise of f across the surface
-    weights    w_k proportional to exp(-beta E_k) over distinct fits (`Hypotheses.is_mode`),  w_0 to exp(-beta E_0)
+    weights    w_k proportional to exp(-beta E_k) over distinct fits (`Hypotheses.is_distinct`),  w_0 to exp(-beta E_0)
     sample     shapes by systematic resampling of w; then f about the mean m_k, or for k = 0 a sample of the model
                without known shapes
 
@@ -141,7 +141,7 @@ class KnownShapes(SurfaceModel):
 @program
 def _weights(fits: Hypotheses, inverse_temperature: float, misfit_of_none: float) -> Float[Array, " h_and_none"]:
     misfit = jnp.append(fits.misfit, misfit_of_none)
-    return jax.nn.softmax(-inverse_temperature * misfit, where=jnp.append(fits.is_mode, True))
+    return jax.nn.softmax(-inverse_temperature * misfit, where=jnp.append(fits.is_distinct, True))
 
 
 class Hypothesis(NamedTuple):
@@ -179,17 +179,17 @@ class KnownShapesPosterior(SurfacePosterior):
         # Transfer all rows to the host at once.
         fits, weights = jax.tree.map(np.asarray, self.fits), np.asarray(self.weights)
         names = self.model.bank.names
-        of_shapes = [
+        hypotheses = [
             Hypothesis(
                 names[fits.shape[row]],
                 float(weights[row]),
                 float(fits.misfit[row]),
                 jax.tree.map(lambda rows, row=row: rows[row], self.fits.placement),
             )
-            for row in np.flatnonzero(fits.is_mode)
+            for row in np.flatnonzero(fits.is_distinct)
         ]
         none = Hypothesis(NONE, float(weights[-1]), self.model.misfit_of_none, None)
-        return sorted([*of_shapes, none], key=lambda one: -one.weight)
+        return sorted([*hypotheses, none], key=lambda one: -one.weight)
 
     def kinds(self) -> dict[str, float]:
         """Return the probability of each kind of shape, most likely first.
@@ -204,9 +204,9 @@ class KnownShapesPosterior(SurfacePosterior):
 
     def names_of_samples(self, key: PRNGKeyArray, num_samples: int) -> list[str]:
         """Return the name of the shape of each sample that `sample` draws with this key."""
-        of_bank = self.model.bank.names
-        names = [*(of_bank[index] for index in np.asarray(self.fits.shape)), NONE]
-        return [names[index] for index in np.asarray(_drawn(self, key, num_samples))]
+        bank_names = self.model.bank.names
+        names = [*(bank_names[index] for index in np.asarray(self.fits.shape)), NONE]
+        return [names[index] for index in np.asarray(_draw_indices(self, key, num_samples))]
 
     @sampling_method
     def sample(self, key: PRNGKeyArray, num_samples: int) -> "MixtureFields":
@@ -218,24 +218,24 @@ class KnownShapesPosterior(SurfacePosterior):
 def _sample(posterior: KnownShapesPosterior, key: PRNGKeyArray, num_samples: int) -> "MixtureFields":
     _, residual_key, none_key = jax.random.split(key, 3)
     fits, bank = posterior.fits, posterior.model.bank
-    index = _drawn(posterior, key, num_samples)
+    index = _draw_indices(posterior, key, num_samples)
     is_none = index == len(fits.shape)
     row = jnp.where(is_none, 0, index)
     solids = bank.shape(fits.shape[row]).solid
     placement = jax.tree.map(lambda rows: rows[row], fits.placement)
-    means = PlacedShapes(solids, placement, posterior.residual.half_jump)
-    about_shapes = posterior.residual.sample_about(means, residual_key, posterior.model.noise_scale)
+    means = PlacedShapes(solids, placement, posterior.residual.value_unit)
+    shape_fields = posterior.residual.sample_about(means, residual_key, posterior.model.noise_scale)
 
     def draw():
         return posterior.of_none.sample(none_key, num_samples)
 
-    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), eqx.filter_eval_shape(draw))
-    of_none = jax.lax.cond(jnp.any(is_none), draw, lambda: nothing)
-    return MixtureFields(about_shapes, of_none, posterior.of_none.level, is_none)
+    zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), eqx.filter_eval_shape(draw))
+    of_none = jax.lax.cond(jnp.any(is_none), draw, lambda: zeros)
+    return MixtureFields(shape_fields, of_none, posterior.of_none.level, is_none)
 
 
 @program
-def _drawn(posterior: KnownShapesPosterior, key: PRNGKeyArray, num_samples: int) -> Int[Array, " s"]:
+def _draw_indices(posterior: KnownShapesPosterior, key: PRNGKeyArray, num_samples: int) -> Int[Array, " s"]:
     """Draw the index of each sample's hypothesis. The last index is "none of these"."""
     shape_key, order_key = jax.random.split(jax.random.split(key, 3)[0])
     index = systematic_resampling(shape_key, posterior.weights, num_samples)
@@ -253,9 +253,9 @@ def systematic_resampling(
     key: PRNGKeyArray, weights: Float[Array, " n"], num_samples: int
 ) -> Int[Array, " num_samples"]:
     """Draw indices in proportion to weights, each within one of its expected count (Kitagawa 1996)."""
-    places = (jnp.arange(num_samples) + jax.random.uniform(key)) / num_samples
+    positions = (jnp.arange(num_samples) + jax.random.uniform(key)) / num_samples
     total = jnp.cumsum(weights)
-    return jnp.clip(jnp.searchsorted(total / total[-1], places, side="right"), 0, len(weights) - 1)
+    return jnp.clip(jnp.searchsorted(total / total[-1], positions, side="right"), 0, len(weights) - 1)
 
 
 class PlacedShapes(Fields):
@@ -264,19 +264,19 @@ class PlacedShapes(Fields):
     They are bounded by h, and at the surface their gradient equals that of d.
 
     - `solids`, `placements`: the solids and their placements, both along a leading axis.
-    - `width`: h, in scene units.
+    - `bound`: h, in scene units.
     """
 
     solids: SignedDistance
     placements: Placement
-    width: Float[Array, ""]
+    bound: Float[Array, ""]
 
     def __call__(self, x: Float[AnyArray, "n 3"]) -> Float[Array, "s n"]:
-        def one(placed, x, width):
-            solid, placement = placed
-            return width * jnp.tanh(placement.distance(solid, x) / width)
+        def values(shape, x, bound):
+            solid, placement = shape
+            return bound * jnp.tanh(placement.distance(solid, x) / bound)
 
-        return shared_map(one, (self.solids, self.placements), jnp.asarray(x), self.width)
+        return shared_map(values, (self.solids, self.placements), jnp.asarray(x), self.bound)
 
 
 class MixtureFields(Fields):
@@ -293,15 +293,15 @@ class MixtureFields(Fields):
     is_none: Bool[Array, " s"]
 
     def __call__(self, x: Float[AnyArray, "n 3"]) -> Float[Array, "s n"]:
-        return self._merged(lambda fields: fields(x))
+        return self._merge(lambda fields: fields(x))
 
     def gradient(self, x: Float[AnyArray, "n 3"]) -> Float[Array, "s n 3"]:
-        return self._merged(lambda fields: fields.gradient(x), relative=False)
+        return self._merge(lambda fields: fields.gradient(x), relative=False)
 
     def on_grid(self, axis: Float[AnyArray, " g"]) -> Float[Array, "s g g g"]:
-        return self._merged(lambda fields: fields.on_grid(axis))
+        return self._merge(lambda fields: fields.on_grid(axis))
 
-    def _merged(self, evaluate: Any, relative: bool = True) -> Array:
+    def _merge(self, evaluate: Any, relative: bool = True) -> Array:
         shape = jax.eval_shape(lambda: evaluate(self.of_shapes))
         zero = jnp.zeros(shape.shape, shape.dtype)
         # Do not evaluate a batch that contributes no sample.

@@ -37,22 +37,22 @@ from jaxnbv.surfaces.registration import Hypotheses
 from jaxnbv.surfaces.shape_bank import ShapeBank
 
 # Smallest tau in scene units, tau in standard deviations of the noise, and the multiple of tau at which l is clipped.
-LEAST_TAU, _TAU_OF_NOISE, _FAR = 0.03, 2.0, 4.0
-MOST = math.log1p(_FAR**2 / 2.0)
+MIN_TAU, _TAU_PER_NOISE, _CLIP_TAUS = 0.03, 2.0, 4.0
+MAX_MISFIT = math.log1p(_CLIP_TAUS**2 / 2.0)
 # Standard deviation of a normal distribution divided by the lower quartile of its absolute value. A median would
 # overestimate the noise on a thin object, where more than half of the differences cross the object's edges.
-_BY_QUARTILE = 1.0 / 0.31864
+_NOISE_PER_QUARTILE = 1.0 / 0.31864
 # Smallest stride along a ray in scene units, and number of strides.
-_STRIDE, _NUM_STRIDES = 0.04, 40
+_MIN_STRIDE, _NUM_STRIDES = 0.04, 40
 # Largest number of rays used from all views together.
-_NUM_RAYS = 4096
+_MAX_RAYS = 4096
 # Rays closer together than this on the object have dependent errors; scene units.
-_APART = 0.12
+_CORRELATION_LENGTH = 0.12
 # e_0, the misfit of "none of these" per ray. The mean misfit per ray is up to 0.15 for the correct part, and in most
 # cases at least 0.3 for the best part if the object is none of the parts.
 _NONE_MISFIT = 0.25
 # Largest fraction of points that is assumed to belong to a different object.
-_STRAY = 0.2
+_MAX_STRAY = 0.2
 
 
 class Rays(NamedTuple):
@@ -61,7 +61,7 @@ class Rays(NamedTuple):
     - `sight`: length of each ray in scene units; infinite without a return, zero for padding.
     - `is_object`: whether the ray ended on the object.
     - `weight`: number of independent rays that the ray counts as. The weight is lower if rays are closer together than
-      `_APART`, and higher if the ray also represents rays that were left out.
+      `_CORRELATION_LENGTH`, and higher if the ray also represents rays that were left out.
     - `empty_nodes`: mask of the nodes of `grid` that were seen to be empty.
     - `tau`: scale of residuals in the misfit, in scene units, see `misfit_of`.
     """
@@ -87,43 +87,43 @@ class Rays(NamedTuple):
         returned = jnp.isfinite(sight) & (sight > 0)
         points = origins + jnp.where(returned, sight, 0.0)[:, None] * directions
         is_object = returned & (looks(points) <= looks.grid.spacing)
-        noise = _noise_of(looks.sight, is_object, looks.camera)
-        away = jnp.sum(jnp.where(is_object, sight, 0.0)) / jnp.maximum(jnp.sum(is_object), 1)
+        noise = _estimate_noise(looks.sight, is_object, looks.camera)
+        distance = jnp.sum(jnp.where(is_object, sight, 0.0)) / jnp.maximum(jnp.sum(is_object), 1)
 
         enter, leave = ray_interval(list(origins.T), list(directions.T), box.low, box.high)
-        is_known = (sight > 0) & (leave > jnp.maximum(enter, 0.0))
+        is_usable = (sight > 0) & (leave > jnp.maximum(enter, 0.0))
         order = jnp.asarray(np.random.default_rng(0).permutation(count))
-        chosen, weights = [], []
-        for kind in (is_known & is_object, is_known & ~is_object):
-            (rows,) = jnp.nonzero(kind[order], size=_NUM_RAYS // 2, fill_value=count)
-            chosen.append(order.at[rows].get(mode="fill", fill_value=count))
-            share = jnp.maximum(2.0 * jnp.sum(kind) / _NUM_RAYS, 1.0)
-            weights.append(jnp.broadcast_to(share * jnp.minimum(weight_of(away, looks.camera), 1.0), rows.shape))
+        indices, weights = [], []
+        for kind in (is_usable & is_object, is_usable & ~is_object):
+            (rows,) = jnp.nonzero(kind[order], size=_MAX_RAYS // 2, fill_value=count)
+            indices.append(order.at[rows].get(mode="fill", fill_value=count))
+            factor = jnp.maximum(2.0 * jnp.sum(kind) / _MAX_RAYS, 1.0)
+            weights.append(jnp.broadcast_to(factor * jnp.minimum(ray_weight(distance, looks.camera), 1.0), rows.shape))
         # Rays that met the object alternate with the other rays, so that the first few rays contain both kinds.
-        picked, weight = (jnp.stack(parts, axis=1).reshape(-1) for parts in (chosen, weights))
-        at = jnp.minimum(picked, count - 1)
+        index, weight = (jnp.stack(parts, axis=1).reshape(-1) for parts in (indices, weights))
+        row = jnp.minimum(index, count - 1)
         return cls(
-            origins[at],
-            directions[at],
-            jnp.where(picked < count, sight[at], 0.0),
-            is_object[at] & (picked < count),
+            origins[row],
+            directions[row],
+            jnp.where(index < count, sight[row], 0.0),
+            is_object[row] & (index < count),
             weight,
             observations.empty_nodes,
             looks.grid,
-            jnp.maximum(LEAST_TAU, _TAU_OF_NOISE * noise),
+            jnp.maximum(MIN_TAU, _TAU_PER_NOISE * noise),
         )
 
     def first(self, count: int) -> "Rays":
         """Return the first `count` rays, with weights increased to represent all rays."""
-        weight, holds = self.weight[:count], self.sight > 0
-        for kind in (self.is_object & holds, ~self.is_object & holds):
-            share = jnp.sum(kind) / jnp.maximum(jnp.sum(kind[:count]), 1)
-            weight = jnp.where(kind[:count], share * weight, weight)
+        weight, is_filled = self.weight[:count], self.sight > 0
+        for kind in (self.is_object & is_filled, ~self.is_object & is_filled):
+            factor = jnp.sum(kind) / jnp.maximum(jnp.sum(kind[:count]), 1)
+            weight = jnp.where(kind[:count], factor * weight, weight)
         origins, directions, sight, is_object = (leaf[:count] for leaf in self[:4])
         return Rays(origins, directions, sight, is_object, weight, self.empty_nodes, self.grid, self.tau)
 
 
-def _noise_of(
+def _estimate_noise(
     sight: Float[Array, "views rays"], is_object: Bool[Array, " all_rays"], camera: Camera
 ) -> Float[Array, ""]:
     """Return the standard deviation of the noise in the ray lengths on the object; zero without data.
@@ -132,10 +132,10 @@ def _noise_of(
     zero on a surface of low curvature.
     """
     images = jnp.where(is_object, sight.reshape(-1), jnp.nan).reshape(-1, camera.height, camera.width)
-    changes = [jnp.diff(images, 3, axis=axis).reshape(-1) for axis in (1, 2)]
+    differences = [jnp.diff(images, 3, axis=axis).reshape(-1) for axis in (1, 2)]
     # The squares of the coefficients 1, 3, 3, 1 sum to 20.
-    quartile = jnp.nanquantile(jnp.abs(jnp.concatenate(changes)), 0.25)
-    return jnp.nan_to_num(_BY_QUARTILE / math.sqrt(20.0) * quartile)
+    quartile = jnp.nanquantile(jnp.abs(jnp.concatenate(differences)), 0.25)
+    return jnp.nan_to_num(_NOISE_PER_QUARTILE / math.sqrt(20.0) * quartile)
 
 
 @program
@@ -143,40 +143,40 @@ def evidence(bank: ShapeBank, hypotheses: Hypotheses, rays: Rays) -> tuple[Float
     """Return the misfit L of each hypothesis, summed over the rays, and the misfit of "none of these"."""
     points = rays.origins + jnp.where(rays.is_object, rays.sight, 0.0)[:, None] * rays.directions
 
-    def of_part(one):
+    def misfit_of_part(one):
         solid = bank.shape(one.shape).solid
 
         def distance(x):
             return one.placement.distance(solid, x)
 
-        off = jnp.where(rays.is_object, misfit_of(distance(points), rays.tau), 0.0)
-        through, counts = _deepest(distance, rays)
-        through = jnp.where(counts, misfit_of(through, rays.tau), 0.0)
-        return jnp.sum(rays.weight * jnp.where(rays.sight > 0, off + through, 0.0)), off
+        point_misfit = jnp.where(rays.is_object, misfit_of(distance(points), rays.tau), 0.0)
+        penetration, is_evidence = _deepest_penetration(distance, rays)
+        penetration = jnp.where(is_evidence, misfit_of(penetration, rays.tau), 0.0)
+        return jnp.sum(rays.weight * jnp.where(rays.sight > 0, point_misfit + penetration, 0.0)), point_misfit
 
-    misfits, off = jax.lax.map(of_part, hypotheses, batch_size=8)
-    met = jnp.where(rays.is_object, rays.weight, 0.0)
-    stray = jnp.sum(met * jnp.maximum(jnp.min(off, axis=0) - _NONE_MISFIT, 0.0))
-    return misfits, _NONE_MISFIT * jnp.sum(met) + jnp.minimum(stray, _STRAY * MOST * jnp.sum(met))
+    misfits, point_misfits = jax.lax.map(misfit_of_part, hypotheses, batch_size=8)
+    weight = jnp.where(rays.is_object, rays.weight, 0.0)
+    stray = jnp.sum(weight * jnp.maximum(jnp.min(point_misfits, axis=0) - _NONE_MISFIT, 0.0))
+    return misfits, _NONE_MISFIT * jnp.sum(weight) + jnp.minimum(stray, _MAX_STRAY * MAX_MISFIT * jnp.sum(weight))
 
 
-def weight_of(away: Float[Array, ""], camera: Camera) -> Float[Array, ""]:
+def ray_weight(distance: Float[Array, ""], camera: Camera) -> Float[Array, ""]:
     """Return the number of independent rays that one ray of a camera counts as, at this distance.
 
     The number is the ray's area on the object divided by the area within which rays have dependent errors.
 
-    - `away`: distance from the camera to the object, in scene units.
+    - `distance`: distance from the camera to the object, in scene units.
     """
-    across, down = camera.focal_lengths
-    return away**2 / (across * down * _APART**2)
+    fx, fy = camera.focal_lengths
+    return distance**2 / (fx * fy * _CORRELATION_LENGTH**2)
 
 
 def misfit_of(distance: Float[Array, "*n"], tau: Float[Array, ""]) -> Float[Array, "*n"]:
     """Return log(1 + d^2 / (2 tau^2)) for distances d in scene units, clipped at its value for d = 4 tau."""
-    return jnp.minimum(jnp.log1p(distance**2 / (2.0 * tau**2)), MOST)
+    return jnp.minimum(jnp.log1p(distance**2 / (2.0 * tau**2)), MAX_MISFIT)
 
 
-def _deepest(
+def _deepest_penetration(
     distance: Callable[[Float[Array, "n 3"]], Float[Array, " n"]], rays: Rays
 ) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
     """Return the smallest signed distance along each ray before its end, and whether it is evidence.
@@ -186,15 +186,15 @@ def _deepest(
     """
 
     def stride(state, _):
-        along, deepest, place = state
-        here = distance(rays.origins + along[:, None] * rays.directions)
-        is_deeper = (along < rays.sight - rays.tau) & (here < deepest)
-        deepest, place = jnp.where(is_deeper, here, deepest), jnp.where(is_deeper, along, place)
-        return (along + jnp.maximum(jnp.abs(here), _STRIDE), deepest, place), None
+        length, deepest, deepest_length = state
+        value = distance(rays.origins + length[:, None] * rays.directions)
+        is_deeper = (length < rays.sight - rays.tau) & (value < deepest)
+        deepest, deepest_length = jnp.where(is_deeper, value, deepest), jnp.where(is_deeper, length, deepest_length)
+        return (length + jnp.maximum(jnp.abs(value), _MIN_STRIDE), deepest, deepest_length), None
 
     zero = jnp.zeros_like(rays.sight)
-    (_, deepest, place), _ = jax.lax.scan(stride, (zero, zero, zero), length=_NUM_STRIDES)
-    points = rays.origins + place[:, None] * rays.directions
+    (_, deepest, deepest_length), _ = jax.lax.scan(stride, (zero, zero, zero), length=_NUM_STRIDES)
+    points = rays.origins + deepest_length[:, None] * rays.directions
     node = jnp.round((points + rays.grid.half_extent) / rays.grid.spacing).astype(jnp.int32)
     node = jnp.where(jnp.all(node >= 0, axis=-1, keepdims=True), node, rays.grid.resolution)
     was_empty = rays.empty_nodes.at[tuple(node.T)].get(mode="fill", fill_value=False)

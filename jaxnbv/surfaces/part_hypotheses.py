@@ -11,7 +11,7 @@ from jaxnbv.geometry.volume import Box
 from jaxnbv.observations import Observations
 from jaxnbv.programs import program
 from jaxnbv.scanning import Grid, GridSurface
-from jaxnbv.surfaces.part_evidence import LEAST_TAU, Rays, evidence
+from jaxnbv.surfaces.part_evidence import MIN_TAU, Rays, evidence
 from jaxnbv.surfaces.part_search import placeholder_hypotheses, search_parts
 from jaxnbv.surfaces.placement import Placement, ShapePoses
 from jaxnbv.surfaces.registration import NUM_POINTS, FitTargets, Hypotheses
@@ -41,7 +41,7 @@ class PartHypotheses(eqx.Module):
 
     def surfaces(self, grid: Grid, count: int) -> GridSurface:
         """Return the first `count` placed parts as surfaces on a grid, along a leading axis."""
-        return _on_grid(self, grid, count)
+        return _evaluate_on_grid(self, grid, count)
 
     @property
     def shape_weights(self) -> Float[Array, " k"]:
@@ -58,10 +58,10 @@ class PartHypotheses(eqx.Module):
 
         Parts without a hypothesis are left out.
         """
-        each = np.asarray(self.shape_weights, np.float64)
-        listed = {name: float(weight) for name, weight in zip(self.bank.names, each, strict=True) if weight > 0}
-        listed[NONE] = float(self.weights[-1])
-        return dict(sorted(listed.items(), key=lambda item: -item[1]))
+        weights = np.asarray(self.shape_weights, np.float64)
+        probability = {name: float(weight) for name, weight in zip(self.bank.names, weights, strict=True) if weight > 0}
+        probability[NONE] = float(self.weights[-1])
+        return dict(sorted(probability.items(), key=lambda item: -item[1]))
 
     @property
     def most_likely(self) -> tuple[int, Placement]:
@@ -93,35 +93,35 @@ def identify(
     - `previous`: the hypotheses after the previous view, which are kept while they fit; None for the first view.
     """
     targets = FitTargets.of(observations)
-    placed = placeholder_hypotheses(targets.points.dtype) if previous is None else previous.placed
+    starts = placeholder_hypotheses(targets.points.dtype) if previous is None else previous.placed
     rays = Rays.of(observations, box)
-    return _weighted(bank, search_parts(bank, poses, box, targets, rays, placed, _NUM_STARTS), rays)
+    return _weigh(bank, search_parts(bank, poses, box, targets, rays, starts, _NUM_STARTS), rays)
 
 
 @program
-def _weighted(bank: ShapeBank, placed: Hypotheses, rays: Rays | None) -> PartHypotheses:
+def _weigh(bank: ShapeBank, hypotheses: Hypotheses, rays: Rays | None) -> PartHypotheses:
     if rays is None:
-        misfit, misfit_of_none = _NUM_RAYS * placed.misfit, jnp.asarray(_NUM_RAYS * _NONE_MISFIT)
-        tau = jnp.asarray(LEAST_TAU)
+        misfit, misfit_of_none = _NUM_RAYS * hypotheses.misfit, jnp.asarray(_NUM_RAYS * _NONE_MISFIT)
+        tau = jnp.asarray(MIN_TAU)
     else:
-        misfit, misfit_of_none = evidence(bank, placed, rays)
+        misfit, misfit_of_none = evidence(bank, hypotheses, rays)
         tau = rays.tau
-    misfit = jnp.where(placed.is_mode, misfit, jnp.inf)
+    misfit = jnp.where(hypotheses.is_distinct, misfit, jnp.inf)
     weights = jax.nn.softmax(-jnp.append(misfit, misfit_of_none))
     order = jnp.argsort(misfit, stable=True)
-    placed = jax.tree.map(lambda rows: rows[order], placed)
-    return PartHypotheses(bank, placed, jnp.append(weights[:-1][order], weights[-1]), tau)
+    hypotheses = jax.tree.map(lambda rows: rows[order], hypotheses)
+    return PartHypotheses(bank, hypotheses, jnp.append(weights[:-1][order], weights[-1]), tau)
 
 
 @program
-def _on_grid(hypotheses: PartHypotheses, grid: Grid, count: int) -> GridSurface:
+def _evaluate_on_grid(hypotheses: PartHypotheses, grid: Grid, count: int) -> GridSurface:
     first = jax.tree.map(lambda rows: rows[:count], hypotheses.placed)
     solids = hypotheses.bank.shape(first.shape).solid
     axis = jnp.asarray(grid.axis, first.misfit.dtype)
     nodes = jnp.stack(jnp.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
 
-    def values(placed):
-        solid, placement = placed
+    def values(part):
+        solid, placement = part
         return placement.distance(solid, nodes)
 
     distances = jax.lax.map(values, (solids, first.placement))

@@ -11,20 +11,20 @@ from jaxnbv.geometry.frame import Frame
 from jaxnbv.observations import Observations
 from jaxnbv.programs import program
 from jaxnbv.surfaces.part_hypotheses import PartHypotheses
-from jaxnbv.surfaces.part_search import SAME
+from jaxnbv.surfaces.part_search import TOLERANCE
 from jaxnbv.surfaces.placement import Placement
 from jaxnbv.surfaces.registration import FitTargets
 from jaxnbv.surfaces.shape_bank import Shape, values_and_gradients
 
 _NUM_PROBES = 4096
 # Step between the rotation angles about each axis that are tested as symmetries of a part.
-_STEP = np.radians(5.0)
+_ANGLE_STEP = np.radians(5.0)
 # Prior standard deviations of a rotation (radians) and a shift (scene units). They matter in directions that the points
 # do not constrain.
-_UNKNOWN_TURN, _UNKNOWN_SHIFT = np.pi / np.sqrt(3.0), 1.0
+_ROTATION_DEVIATION, _SHIFT_DEVIATION = np.pi / np.sqrt(3.0), 1.0
 # Smallest error of the points in scene units, which is the accuracy of a part's surface on its grid; and the standard
 # deviation of a normal distribution divided by the median of its absolute value.
-_LEAST_ERROR, _BY_MEDIAN = 0.005, 1.4826
+_MIN_ERROR, _ERROR_PER_MEDIAN = 0.005, 1.4826
 
 
 class ObjectPose(eqx.Module):
@@ -53,11 +53,11 @@ def object_pose(hypotheses: PartHypotheses, observations: Observations, frame: F
     from_mesh = np.eye(4) if bank.from_mesh is None else np.asarray(bank.from_mesh[part], np.float64)
     to_scene = _matrix(np.asarray(placement.rotation), np.asarray(placement.shift))
     to_world = np.linalg.inv(_matrix(frame.scale * frame.rotation, -frame.scale * frame.rotation @ frame.center))
-    turns = symmetries(shape)
-    matrices = np.stack([_rigid(to_world @ to_scene @ _matrix(turn, np.zeros(3)) @ from_mesh) for turn in turns])
+    rotations = symmetries(shape)
+    matrices = np.stack([_make_rigid(to_world @ to_scene @ _matrix(one, np.zeros(3)) @ from_mesh) for one in rotations])
     covariance = _covariance(shape, placement, FitTargets.of(observations))
-    back = np.kron(np.eye(2), frame.rotation.T) * np.repeat([1.0, 1.0 / frame.scale], 3)[:, None]
-    return ObjectPose(bank.names[part], matrices[0], back @ covariance @ back.T, matrices)
+    jacobian = np.kron(np.eye(2), frame.rotation.T) * np.repeat([1.0, 1.0 / frame.scale], 3)[:, None]
+    return ObjectPose(bank.names[part], matrices[0], jacobian @ covariance @ jacobian.T, matrices)
 
 
 def surface_error(hypotheses: PartHypotheses, observations: Observations) -> float:
@@ -72,21 +72,21 @@ def surface_error(hypotheses: PartHypotheses, observations: Observations) -> flo
     covariance = _covariance(shape, placement, FitTargets.of(observations))
     points = np.asarray(placement.rotation) @ np.asarray(shape.extremes).T + np.asarray(placement.shift)[:, None]
     surface = jnp.asarray(points.T, jnp.float32)
-    off = np.asarray(distances_to(hypotheses, surface), np.float64)
+    distances = np.asarray(distances_to(hypotheses, surface), np.float64)
     _, gradient = values_and_gradients(lambda x: placement.distance(shape.solid, x), surface)
     # Only motion along the normal counts, since motion along the surface leaves the surface in place.
     normals = np.asarray(gradient, np.float64)
     rows = np.concatenate([np.cross(normals, points.T - np.asarray(placement.shift)), -normals], axis=1)
-    by_points = float(np.mean(np.einsum("ni,ij,nj->n", rows, covariance, rows)))
-    by_others = float(np.asarray(hypotheses.weights, np.float64)[:-1] @ np.mean(off**2, axis=1))
-    return float(np.sqrt(by_points + by_others))
+    pose_variance = float(np.mean(np.einsum("ni,ij,nj->n", rows, covariance, rows)))
+    hypothesis_variance = float(np.asarray(hypotheses.weights, np.float64)[:-1] @ np.mean(distances**2, axis=1))
+    return float(np.sqrt(pose_variance + hypothesis_variance))
 
 
 @program
 def distances_to(hypotheses: PartHypotheses, points: Float[Array, "p 3"]) -> Float[Array, "h p"]:
     """Return the signed distances of points to the placed part of each hypothesis."""
     solids = hypotheses.bank.shape(hypotheses.placed.shape).solid
-    return jax.lax.map(lambda placed: placed[1].distance(placed[0], points), (solids, hypotheses.placed.placement))
+    return jax.lax.map(lambda part: part[1].distance(part[0], points), (solids, hypotheses.placed.placement))
 
 
 def symmetries(shape: Shape) -> Float[np.ndarray, "n 3 3"]:
@@ -95,28 +95,28 @@ def symmetries(shape: Shape) -> Float[np.ndarray, "n 3 3"]:
     The function tests rotations by multiples of five degrees about each axis, and the rotations of a cube onto itself.
     The result contains all products of a symmetry about an axis and a symmetry among the rotations of the cube.
     """
-    vectors = [angle * axis for axis in np.eye(3) for angle in np.arange(0.0, 2.0 * np.pi, _STEP)]
+    vectors = [angle * axis for axis in np.eye(3) for angle in np.arange(0.0, 2.0 * np.pi, _ANGLE_STEP)]
     about_axes, of_cube = Rotation.from_rotvec(vectors).as_matrix(), Rotation.create_group("O").as_matrix()
-    turns = np.concatenate([about_axes, of_cube])
-    reach = 1.1 * float(jnp.max(jnp.linalg.norm(shape.extremes, axis=-1)))
-    probes = reach * (2.0 * np.random.default_rng(0).random((_NUM_PROBES, 3)) - 1.0)
-    change = _largest_change(shape, jnp.asarray(turns, shape.extremes.dtype), jnp.asarray(probes, shape.extremes.dtype))
-    is_symmetry = np.asarray(change) < SAME
-    left, right = about_axes[is_symmetry[: len(about_axes)]], of_cube[is_symmetry[len(about_axes) :]]
+    rotations = np.concatenate([about_axes, of_cube])
+    half_side = 1.1 * float(jnp.max(jnp.linalg.norm(shape.extremes, axis=-1)))
+    probes = half_side * (2.0 * np.random.default_rng(0).random((_NUM_PROBES, 3)) - 1.0)
+    change = _max_change(shape, jnp.asarray(rotations, shape.extremes.dtype), jnp.asarray(probes, shape.extremes.dtype))
+    is_symmetry = np.asarray(change) < TOLERANCE
+    axial, cubic = about_axes[is_symmetry[: len(about_axes)]], of_cube[is_symmetry[len(about_axes) :]]
     # A product of two symmetries is a symmetry too.
-    both = np.concatenate([np.eye(3)[None], np.einsum("aij,bjk->abik", left, right).reshape(-1, 3, 3)])
-    _, first = np.unique(np.round(both, 6).reshape(-1, 9) + 0.0, axis=0, return_index=True)
-    return both[np.sort(first)]
+    products = np.concatenate([np.eye(3)[None], np.einsum("aij,bjk->abik", axial, cubic).reshape(-1, 3, 3)])
+    _, rows = np.unique(np.round(products, 6).reshape(-1, 9) + 0.0, axis=0, return_index=True)
+    return products[np.sort(rows)]
 
 
 @program
-def _largest_change(shape: Shape, turns: Float[Array, "n 3 3"], probes: Float[Array, "p 3"]) -> Float[Array, " n"]:
-    before = shape.solid(probes)
+def _max_change(shape: Shape, rotations: Float[Array, "n 3 3"], probes: Float[Array, "p 3"]) -> Float[Array, " n"]:
+    distances = shape.solid(probes)
 
-    def change(turn):
-        return jnp.max(jnp.abs(shape.solid(jnp.matmul(probes, turn.T, precision="highest")) - before))
+    def change(rotation):
+        return jnp.max(jnp.abs(shape.solid(jnp.matmul(probes, rotation.T, precision="highest")) - distances))
 
-    return jax.lax.map(change, turns)
+    return jax.lax.map(change, rotations)
 
 
 def _covariance(shape: Shape, placement: Placement, targets: FitTargets) -> Float[np.ndarray, "6 6"]:
@@ -128,11 +128,11 @@ def _covariance(shape: Shape, placement: Placement, targets: FitTargets) -> Floa
     distance, gradient = values_and_gradients(lambda x: placement.distance(shape.solid, x), targets.points)
     mask = np.asarray(targets.mask)
     distance, gradient = np.asarray(distance, np.float64)[mask], np.asarray(gradient, np.float64)[mask]
-    away = np.asarray(targets.points, np.float64)[mask] - np.asarray(placement.shift, np.float64)
-    rows = np.concatenate([np.cross(gradient, away), -gradient], axis=1)
-    error = max(_LEAST_ERROR, _BY_MEDIAN * float(np.median(np.abs(distance)))) if len(distance) else 1.0
-    unknown = np.repeat([_UNKNOWN_TURN**-2, _UNKNOWN_SHIFT**-2], 3)
-    return np.linalg.inv(rows.T @ rows / error**2 + np.diag(unknown))
+    arms = np.asarray(targets.points, np.float64)[mask] - np.asarray(placement.shift, np.float64)
+    rows = np.concatenate([np.cross(gradient, arms), -gradient], axis=1)
+    error = max(_MIN_ERROR, _ERROR_PER_MEDIAN * float(np.median(np.abs(distance)))) if len(distance) else 1.0
+    prior_precision = np.repeat([_ROTATION_DEVIATION**-2, _SHIFT_DEVIATION**-2], 3)
+    return np.linalg.inv(rows.T @ rows / error**2 + np.diag(prior_precision))
 
 
 def _matrix(linear: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
@@ -141,7 +141,7 @@ def _matrix(linear: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"]) -> 
     return matrix
 
 
-def _rigid(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+def _make_rigid(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
     """Return the matrix with its linear part, which has rounding errors, replaced by the nearest rotation."""
     left, _, right = np.linalg.svd(matrix[:3, :3])
     return _matrix(left @ right, matrix[:3, 3])

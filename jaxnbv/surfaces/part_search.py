@@ -24,26 +24,26 @@ from jaxnbv.surfaces.registration import (
     Hypotheses,
     Prior,
     evaluate,
-    first_of_each,
+    keep_first,
     reevaluate,
     refine,
-    turned_alike,
+    similar_rotations,
 )
 from jaxnbv.surfaces.shape_bank import ShapeBank
 
 NUM_HYPOTHESES = 32
 # Number of positions tried for each rotation.
-_PLACES = 4
+_NUM_POSITIONS = 4
 # Starts per part, points and steps, for the first and for the second refinement; number of placements tried with all
 # parts; steps of the last refinement.
-_COARSE, _FINE, _SHARED, _LAST = (10, 48, 5), (4, 128, 10), 16, 3
+_COARSE, _FINE, _NUM_SHARED, _LAST = (10, 48, 5), (4, 128, 10), 16, 3
 # Before the last stage, placements with nearly equal rotations count as equal if their shifts differ by less than this,
 # in scene units.
-_MOVE = 0.15
+_MAX_SHIFT = 0.15
 # How far a part may extend beyond the box, and the difference of surfaces below which placements of a part count as
 # equal, in scene units.
-_ROOM, SAME = 0.2, 0.03
-_NUM_PROBES, _FEW_RAYS = 4096, 1024
+_MARGIN, TOLERANCE = 0.2, 0.03
+_NUM_PROBES, _NUM_RAYS = 4096, 1024
 
 
 def placeholder_hypotheses(dtype: Any) -> Hypotheses:
@@ -52,8 +52,8 @@ def placeholder_hypotheses(dtype: Any) -> Hypotheses:
     Each placeholder is the first part at the identity placement with infinite misfit. As an extra start of the search,
     it does no harm.
     """
-    still = Placement(jnp.eye(3, dtype=dtype), jnp.zeros(3, dtype), jnp.ones(3, dtype))
-    one = Hypotheses(jnp.zeros((), int), still, jnp.asarray(jnp.inf, dtype), jnp.asarray(False))
+    identity = Placement(jnp.eye(3, dtype=dtype), jnp.zeros(3, dtype), jnp.ones(3, dtype))
+    one = Hypotheses(jnp.zeros((), int), identity, jnp.asarray(jnp.inf, dtype), jnp.asarray(False))
     return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (NUM_HYPOTHESES, *leaf.shape)), one)
 
 
@@ -80,26 +80,26 @@ def search_parts(
     """
     prior = Prior(poses, box, is_true_size=True)
     few, some = targets.first(_COARSE[1]), targets.first(_FINE[1])
-    starts = _of_each(evaluate(bank, prior, _starts(bank, prior, targets, num_starts), few), len(bank))
-    best = jax.vmap(lambda own: own.best(_COARSE[0]))(starts)
-    coarse = refine(bank, prior, _flat(best), few, _COARSE[2])
-    fine = _flat(jax.vmap(lambda own: _apart(own, _FINE[0]))(_of_each(coarse, len(bank))))
+    starts = _group(evaluate(bank, prior, _starts(bank, prior, targets, num_starts), few), len(bank))
+    best = jax.vmap(lambda one: one.best(_COARSE[0]))(starts)
+    coarse = refine(bank, prior, _flatten(best), few, _COARSE[2])
+    fine = _flatten(jax.vmap(lambda one: _keep_distinct(one, _FINE[0]))(_group(coarse, len(bank))))
     fine = refine(bank, prior, jax.tree.map(lambda *rows: jnp.concatenate(rows), fine, previous), some, _FINE[2])
-    everywhere = jax.tree.map(lambda rows: jnp.stack(len(bank) * [rows]), _apart(fine, _SHARED).placement)
-    exchanged = _of_each(reevaluate(bank, prior, evaluate(bank, prior, everywhere, some), some), len(bank))
-    own = jax.tree.map(lambda rows: rows[:-NUM_HYPOTHESES], fine)
-    kept = jax.tree.map(lambda rows: rows[-NUM_HYPOTHESES:], fine)
-    both = jax.tree.map(lambda *rows: jnp.concatenate(rows, axis=1), _of_each(own, len(bank)), exchanged)
-    both = jax.vmap(lambda each: _apart(each, _FINE[0]))(both)
-    last = refine(bank, prior, jax.tree.map(lambda *rows: jnp.concatenate(rows), _flat(both), kept), some, _LAST)
+    placements = jax.tree.map(lambda rows: jnp.stack(len(bank) * [rows]), _keep_distinct(fine, _NUM_SHARED).placement)
+    swapped = _group(reevaluate(bank, prior, evaluate(bank, prior, placements, some), some), len(bank))
+    new = jax.tree.map(lambda rows: rows[:-NUM_HYPOTHESES], fine)
+    old = jax.tree.map(lambda rows: rows[-NUM_HYPOTHESES:], fine)
+    pool = jax.tree.map(lambda *rows: jnp.concatenate(rows, axis=1), _group(new, len(bank)), swapped)
+    pool = jax.vmap(lambda one: _keep_distinct(one, _FINE[0]))(pool)
+    last = refine(bank, prior, jax.tree.map(lambda *rows: jnp.concatenate(rows), _flatten(pool), old), some, _LAST)
     if rays is None:
         last = reevaluate(bank, prior, last, targets)
     else:
-        last = dataclasses.replace(last, misfit=evidence(bank, last, rays.first(_FEW_RAYS))[0])
-    return _distinct(bank, box, last.best(2 * NUM_HYPOTHESES)).best(NUM_HYPOTHESES)
+        last = dataclasses.replace(last, misfit=evidence(bank, last, rays.first(_NUM_RAYS))[0])
+    return _mark_repeats(bank, box, last.best(2 * NUM_HYPOTHESES)).best(NUM_HYPOTHESES)
 
 
-def _of_each(hypotheses: Hypotheses, num_shapes: int) -> Hypotheses:
+def _group(hypotheses: Hypotheses, num_shapes: int) -> Hypotheses:
     """Reshape hypotheses to a first axis of shapes, and a second axis of the hypotheses of one shape.
 
     The hypotheses must be sorted by shape, with the same number for each shape.
@@ -107,20 +107,20 @@ def _of_each(hypotheses: Hypotheses, num_shapes: int) -> Hypotheses:
     return jax.tree.map(lambda rows: rows.reshape(num_shapes, -1, *rows.shape[1:]), hypotheses)
 
 
-def _flat(hypotheses: Hypotheses) -> Hypotheses:
+def _flatten(hypotheses: Hypotheses) -> Hypotheses:
     return jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), hypotheses)
 
 
-def _apart(hypotheses: Hypotheses, count: int) -> Hypotheses:
+def _keep_distinct(hypotheses: Hypotheses, count: int) -> Hypotheses:
     """Return the best `count` hypotheses with distinct placements, regardless of their shapes.
 
     If there are fewer distinct placements, the remaining rows are hypotheses with infinite misfit.
     """
-    ordered = hypotheses.best(len(hypotheses.misfit))
-    shift = ordered.placement.shift
-    moved = jnp.linalg.norm(shift[:, None] - shift, axis=-1)
-    modes = first_of_each(turned_alike(ordered.placement.rotation) & (moved < _MOVE))
-    return dataclasses.replace(ordered, misfit=jnp.where(modes, ordered.misfit, jnp.inf)).best(count)
+    ranked = hypotheses.best(len(hypotheses.misfit))
+    shift = ranked.placement.shift
+    distances = jnp.linalg.norm(shift[:, None] - shift, axis=-1)
+    is_distinct = keep_first(similar_rotations(ranked.placement.rotation) & (distances < _MAX_SHIFT))
+    return dataclasses.replace(ranked, misfit=jnp.where(is_distinct, ranked.misfit, jnp.inf)).best(count)
 
 
 def _starts(bank: ShapeBank, prior: Prior, targets: FitTargets, num_starts: int) -> Placement:
@@ -131,55 +131,55 @@ def _starts(bank: ShapeBank, prior: Prior, targets: FitTargets, num_starts: int)
     spread over all positions that contain the scan, so they differ much if the scan is a small patch of the shape.
     """
     dtype = targets.points.dtype
-    rotations = jnp.asarray(prior.poses.rotations_of(len(bank), max(1, num_starts // _PLACES)), dtype)
+    rotations = jnp.asarray(prior.poses.rotations_of(len(bank), max(1, num_starts // _NUM_POSITIONS)), dtype)
     count = rotations.shape[1]
     # A low-discrepancy sequence (Roberts 2018). The first position centres the scan and puts it on the shape's front.
-    steps = np.array([0.8191725134, 0.6710436067, 0.5497004779])
-    spread = (0.5 + np.arange(1, count * (_PLACES - 1) + 1)[:, None] * steps) % 1.0
-    middle = np.tile([[[0.5, 0.5, 1.0]]], (1, count, 1))
-    shares = jnp.asarray(np.concatenate([middle, spread.reshape(_PLACES - 1, count, 3)]), dtype)
+    increments = np.array([0.8191725134, 0.6710436067, 0.5497004779])
+    sequence = (0.5 + np.arange(1, count * (_NUM_POSITIONS - 1) + 1)[:, None] * increments) % 1.0
+    first = np.tile([[[0.5, 0.5, 1.0]]], (1, count, 1))
+    fractions = jnp.asarray(np.concatenate([first, sequence.reshape(_NUM_POSITIONS - 1, count, 3)]), dtype)
 
     axes = _axes_of_sight(targets)
-    along = jnp.matmul(targets.points, axes.T, precision="highest")
-    least = jnp.min(jnp.where(targets.mask[:, None], along, jnp.inf), axis=0)
-    most = jnp.max(jnp.where(targets.mask[:, None], along, -jnp.inf), axis=0)
-    low, high = jnp.asarray(prior.box.low, dtype) - _ROOM, jnp.asarray(prior.box.high, dtype) + _ROOM
+    coordinates = jnp.matmul(targets.points, axes.T, precision="highest")
+    scan_low = jnp.min(jnp.where(targets.mask[:, None], coordinates, jnp.inf), axis=0)
+    scan_high = jnp.max(jnp.where(targets.mask[:, None], coordinates, -jnp.inf), axis=0)
+    low, high = jnp.asarray(prior.box.low, dtype) - _MARGIN, jnp.asarray(prior.box.high, dtype) + _MARGIN
 
-    def place(shape, rotation, share):
-        turned = jnp.matmul(shape.extremes, rotation.T, precision="highest")
-        own = jnp.matmul(turned, axes.T, precision="highest")
-        first, last = most - jnp.max(own, axis=0), least - jnp.min(own, axis=0)
-        shift = jnp.matmul(last + share * (first - last), axes, precision="highest")
-        inside = jnp.clip(shift, low - jnp.min(turned, axis=0), high - jnp.max(turned, axis=0))
-        return Placement(rotation, inside, jnp.ones(3, dtype))
+    def place(shape, rotation, fraction):
+        extremes = jnp.matmul(shape.extremes, rotation.T, precision="highest")
+        extents = jnp.matmul(extremes, axes.T, precision="highest")
+        shift_high, shift_low = scan_high - jnp.max(extents, axis=0), scan_low - jnp.min(extents, axis=0)
+        shift = jnp.matmul(shift_low + fraction * (shift_high - shift_low), axes, precision="highest")
+        clipped = jnp.clip(shift, low - jnp.min(extremes, axis=0), high - jnp.max(extremes, axis=0))
+        return Placement(rotation, clipped, jnp.ones(3, dtype))
 
-    def of_shape(shape, own_rotations):
-        of_share = jax.vmap(place, (None, 0, 0))
-        places = jax.vmap(of_share, (None, None, 0))(shape, own_rotations, shares)
-        return jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), places)
+    def place_shape(shape, shape_rotations):
+        place_rotations = jax.vmap(place, (None, 0, 0))
+        placements = jax.vmap(place_rotations, (None, None, 0))(shape, shape_rotations, fractions)
+        return jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), placements)
 
-    each = jnp.broadcast_to(rotations, (len(bank), *rotations.shape[1:]))
-    return jax.vmap(of_shape)(bank.shapes, each)
+    all_rotations = jnp.broadcast_to(rotations, (len(bank), *rotations.shape[1:]))
+    return jax.vmap(place_shape)(bank.shapes, all_rotations)
 
 
 def _axes_of_sight(targets: FitTargets) -> Float[Array, "3 3"]:
     """Return as rows two directions across the line of sight, and the mean normal, which faces the sensor."""
     mean = jnp.sum(jnp.where(targets.mask[:, None], targets.normals, 0.0), axis=0)
     length = jnp.linalg.norm(mean)
-    ahead = jnp.where(length > 0, mean / jnp.where(length > 0, length, 1.0), jnp.eye(3, dtype=mean.dtype)[2])
-    aside = jnp.cross(ahead, jnp.eye(3, dtype=mean.dtype)[jnp.argmin(jnp.abs(ahead))])
-    aside = aside / jnp.linalg.norm(aside)
-    return jnp.stack([aside, jnp.cross(ahead, aside), ahead])
+    normal = jnp.where(length > 0, mean / jnp.where(length > 0, length, 1.0), jnp.eye(3, dtype=mean.dtype)[2])
+    tangent = jnp.cross(normal, jnp.eye(3, dtype=mean.dtype)[jnp.argmin(jnp.abs(normal))])
+    tangent = tangent / jnp.linalg.norm(tangent)
+    return jnp.stack([tangent, jnp.cross(normal, tangent), normal])
 
 
-def _distinct(bank: ShapeBank, box: Box, hypotheses: Hypotheses) -> Hypotheses:
+def _mark_repeats(bank: ShapeBank, box: Box, hypotheses: Hypotheses) -> Hypotheses:
     """Mark each hypothesis that has the same surface as a better hypothesis of the same part.
 
-    Returns all hypotheses. Those marked have `is_mode` False and an infinite misfit. The hypotheses must be sorted,
+    Returns all hypotheses. Those marked have `is_distinct` False and an infinite misfit. The hypotheses must be sorted,
     best first.
     """
     dtype = hypotheses.misfit.dtype
-    low, high = jnp.asarray(box.low, dtype) - _ROOM, jnp.asarray(box.high, dtype) + _ROOM
+    low, high = jnp.asarray(box.low, dtype) - _MARGIN, jnp.asarray(box.high, dtype) + _MARGIN
     probes = low + (high - low) * jnp.asarray(np.random.default_rng(0).random((_NUM_PROBES, 3)), dtype)
 
     def distances(one):
@@ -187,9 +187,11 @@ def _distinct(bank: ShapeBank, box: Box, hypotheses: Hypotheses) -> Hypotheses:
 
     values = jax.lax.map(distances, hypotheses, batch_size=8)
 
-    def off(row):
+    def gap(row):
         return jnp.max(jnp.abs(values - row), axis=1)
 
-    is_same = (jax.lax.map(off, values, batch_size=4) < SAME) & (hypotheses.shape[:, None] == hypotheses.shape)
-    modes = first_of_each(is_same)
-    return dataclasses.replace(hypotheses, is_mode=modes, misfit=jnp.where(modes, hypotheses.misfit, jnp.inf))
+    is_same = (jax.lax.map(gap, values, batch_size=4) < TOLERANCE) & (hypotheses.shape[:, None] == hypotheses.shape)
+    is_distinct = keep_first(is_same)
+    return dataclasses.replace(
+        hypotheses, is_distinct=is_distinct, misfit=jnp.where(is_distinct, hypotheses.misfit, jnp.inf)
+    )

@@ -37,10 +37,10 @@ class Placement(eqx.Module):
 
     def to_shape(self, x: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
         """Map points of the scene to the shape's own frame."""
-        away = x - self.shift
+        offset = x - self.shift
         # R^T x is written as a sum, because XLA fuses a sum with the next operations, but not a matrix product.
-        turned = sum(away[..., i, None] * self.rotation[i] for i in range(3))
-        return turned / self.scale
+        rotated = sum(offset[..., i, None] * self.rotation[i] for i in range(3))
+        return rotated / self.scale
 
     def distance(self, solid: SignedDistance, x: Float[Array, "n 3"]) -> Float[Array, " n"]:
         """Return the signed distance of the placed solid at points of the scene."""
@@ -73,31 +73,31 @@ class ShapePoses(eqx.Module):
 
     def __check_init__(self):
         check_fields(self)
-        least, most = self.scale
-        require(0 < least <= most, f"the scales are {self.scale}; give the smallest (above 0) and the largest")
+        smallest, largest = self.scale
+        require(0 < smallest <= largest, f"the scales are {self.scale}; give the smallest (above 0) and the largest")
 
     @abstractmethod
     def rotations(self, count: int) -> Float[AnyArray, "m 3 3"]:
         """Return at most `count` start rotations, spread evenly over the possible rotations."""
 
     @abstractmethod
-    def turns(self) -> Float[np.ndarray, "3 k"]:
+    def rotation_axes(self) -> Float[np.ndarray, "3 k"]:
         """Return the axes about which a placement can rotate, as columns."""
 
     @property
-    def moves(self) -> Float[np.ndarray, "9 k"]:
-        """Basis, as columns, of the ways in which a placement of fixed scale may change, see `steps`."""
-        return scipy.linalg.block_diag(self.turns(), np.eye(3), np.zeros((3, 0)))
+    def rigid_basis(self) -> Float[np.ndarray, "9 k"]:
+        """Basis, as columns, of the ways in which a placement of fixed scale may change, see `step_basis`."""
+        return scipy.linalg.block_diag(self.rotation_axes(), np.eye(3), np.zeros((3, 0)))
 
     @property
-    def steps(self) -> Float[np.ndarray, "9 k"]:
+    def step_basis(self) -> Float[np.ndarray, "9 k"]:
         """Basis, as columns, of the ways in which a placement may change: rotation, shift and scale.
 
         Each column is an argument of `Placement.moved`: a rotation vector, a shift, and logarithms of scale factors.
         """
-        least, most = self.scale
-        scales = np.zeros((3, 0)) if least == most else np.eye(3) if self.by_axis else np.full((3, 1), 3**-0.5)
-        return scipy.linalg.block_diag(self.turns(), np.eye(3), scales)
+        smallest, largest = self.scale
+        scales = np.zeros((3, 0)) if smallest == largest else np.eye(3) if self.by_axis else np.full((3, 1), 3**-0.5)
+        return scipy.linalg.block_diag(self.rotation_axes(), np.eye(3), scales)
 
     def rotations_of(self, num_shapes: int, count: int) -> Float[AnyArray, "k m 3 3"]:
         """Return at most `count` start rotations for each of the first `num_shapes` shapes of a bank.
@@ -118,7 +118,7 @@ class FreeRotation(ShapePoses):
         x, y, z, w = inner * np.sin(a), inner * np.cos(a), outer * np.sin(b), outer * np.cos(b)
         return Rotation.from_quat(np.stack([x, y, z, w], axis=1)).as_matrix()
 
-    def turns(self) -> Float[np.ndarray, "3 k"]:
+    def rotation_axes(self) -> Float[np.ndarray, "3 k"]:
         return np.eye(3)
 
 
@@ -145,7 +145,7 @@ class Upright(ShapePoses):
         angles = self.within * ((2.0 * np.arange(count) + 1.0) / count - 1.0)
         return Rotation.from_rotvec(angles[:, None] * self._unit).as_matrix()
 
-    def turns(self) -> Float[np.ndarray, "3 k"]:
+    def rotation_axes(self) -> Float[np.ndarray, "3 k"]:
         return self._unit[:, None]
 
     @property
@@ -159,5 +159,5 @@ class AsGiven(ShapePoses):
     def rotations(self, count: int) -> Float[np.ndarray, "m 3 3"]:
         return np.eye(3)[None]
 
-    def turns(self) -> Float[np.ndarray, "3 k"]:
+    def rotation_axes(self) -> Float[np.ndarray, "3 k"]:
         return np.zeros((3, 0))

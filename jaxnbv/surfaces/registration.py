@@ -33,14 +33,14 @@ _MARGIN = 0.05
 _FIRST_TAU, _LAST_TAU = 0.12, 0.03
 # Prior standard deviations of the shift (scene units) and of the logarithm of the scale, relative to the placement that
 # fills the box, and the weight of this prior in E.
-_SHIFT, _STRETCH, _PRIOR = 0.2, 0.15, 0.02
+_SHIFT_DEVIATION, _STRETCH_DEVIATION, _PRIOR_WEIGHT = 0.2, 0.15, 0.02
 # Number of hypotheses, points and steps in the first, the second and the last refinement.
 _COARSE, _FINE, _LAST = (192, 48, 4), (48, 128, 8), (96, 128, 8)
 # Number of placements that are tried with all shapes.
 _NUM_SHARED = 4
-_AT_ONCE = 256
+_BATCH_SIZE = 256
 _DAMPING = 1e-3
-_LARGEST_STEP = 0.3
+_MAX_STEP = 0.3
 
 
 class FitTargets(NamedTuple):
@@ -59,7 +59,7 @@ class FitTargets(NamedTuple):
     def of(cls, observations: Observations) -> "FitTargets":
         """Choose points of the cloud (farthest point sampling), and random nodes where the object cannot be."""
         cloud = farthest_point_subsample(observations.cloud, NUM_POINTS)
-        empty, is_empty = _some_empty(observations)
+        empty, is_empty = _choose_empty_points(observations)
         return cls(cloud.points, cloud.normals, cloud.mask, empty.astype(cloud.points.dtype), is_empty)
 
     def first(self, count: int) -> "FitTargets":
@@ -67,26 +67,26 @@ class FitTargets(NamedTuple):
         return FitTargets(*(rows[:count] for rows in self))
 
 
-def _some_empty(observations: Observations) -> tuple[Float[Array, "m 3"], Bool[Array, " m"]]:
+def _choose_empty_points(observations: Observations) -> tuple[Float[Array, "m 3"], Bool[Array, " m"]]:
     if observations.empty_nodes is None or observations.grid is None:
         return jnp.zeros((_NUM_EMPTY, 3)), jnp.zeros(_NUM_EMPTY, bool)
     empty = observations.empty_nodes
     if observations.obstacle_nodes is not None:
         empty = empty | observations.obstacle_nodes
     order = np.random.default_rng(0).permutation(empty.size)
-    node, is_empty = _first_empty(empty, order)
+    node, is_empty = _first_empty_nodes(empty, order)
     return jnp.asarray(observations.grid.axis)[node], is_empty
 
 
 @jax.jit
-def _first_empty(
+def _first_empty_nodes(
     empty_nodes: Bool[Array, "g g g"], order: Int[Array, " nodes"]
 ) -> tuple[Int[Array, "m 3"], Bool[Array, " m"]]:
     """Return the grid indices of the first empty nodes in the given order, and a mask of the filled rows."""
     is_empty = empty_nodes.reshape(-1)[order]
-    place = jnp.where(is_empty, jnp.cumsum(is_empty) - 1, _NUM_EMPTY)
-    chosen = jnp.zeros(_NUM_EMPTY, jnp.int32).at[place].set(order, mode="drop")
-    return jnp.stack(jnp.unravel_index(chosen, empty_nodes.shape), axis=-1), jnp.arange(_NUM_EMPTY) < jnp.sum(is_empty)
+    row = jnp.where(is_empty, jnp.cumsum(is_empty) - 1, _NUM_EMPTY)
+    indices = jnp.zeros(_NUM_EMPTY, jnp.int32).at[row].set(order, mode="drop")
+    return jnp.stack(jnp.unravel_index(indices, empty_nodes.shape), axis=-1), jnp.arange(_NUM_EMPTY) < jnp.sum(is_empty)
 
 
 class Hypotheses(eqx.Module):
@@ -96,14 +96,14 @@ class Hypotheses(eqx.Module):
     - `placement`: placement of each shape.
     - `misfit`: how badly each placed shape fits the scan. It is E (see `surfaces/registration.py`), or for parts it may
       be L (see `surfaces/part_evidence.py`).
-    - `is_mode`: False for a hypothesis that nearly repeats a better hypothesis of the same shape. For `register`, the
-      rotations of the two differ by less than 15 degrees. For `search_parts`, the two have the same surface.
+    - `is_distinct`: False for a hypothesis that nearly repeats a better hypothesis of the same shape. For `register`,
+      the rotations of the two differ by less than 15 degrees. For `search_parts`, the two have the same surface.
     """
 
     shape: Int[Array, "*h"]
     placement: Placement
     misfit: Float[Array, "*h"]
-    is_mode: Bool[Array, "*h"]
+    is_distinct: Bool[Array, "*h"]
 
     def best(self, count: int) -> "Hypotheses":
         """Return the `count` hypotheses of smallest misfit, best first."""
@@ -124,17 +124,17 @@ class Prior(NamedTuple):
     is_true_size: bool = False
 
     @property
-    def steps(self) -> Float[np.ndarray, "9 k"]:
-        """Basis, as columns, of the ways in which a placement may change, see `ShapePoses.steps`."""
-        return self.poses.moves if self.is_true_size else self.poses.steps
+    def step_basis(self) -> Float[np.ndarray, "9 k"]:
+        """Basis, as columns, of the ways in which a placement may change, see `ShapePoses.step_basis`."""
+        return self.poses.rigid_basis if self.is_true_size else self.poses.step_basis
 
-    def filling(self, shape: Shape, rotation: Float[Array, "3 3"]) -> Placement:
+    def fill_box(self, shape: Shape, rotation: Float[Array, "3 3"]) -> Placement:
         """Return the placement with this rotation that centres the shape in the box, as large as fits."""
-        turned = jnp.matmul(shape.extremes, rotation.T, precision="highest")
-        low, high = jnp.min(turned, axis=0), jnp.max(turned, axis=0)
-        least, most = jnp.asarray(self.box.low, turned.dtype), jnp.asarray(self.box.high, turned.dtype)
-        scale = jnp.min((most - least) / (high - low))
-        return Placement(rotation, 0.5 * (least + most) - 0.5 * scale * (low + high), jnp.broadcast_to(scale, 3))
+        extremes = jnp.matmul(shape.extremes, rotation.T, precision="highest")
+        low, high = jnp.min(extremes, axis=0), jnp.max(extremes, axis=0)
+        box_low, box_high = jnp.asarray(self.box.low, extremes.dtype), jnp.asarray(self.box.high, extremes.dtype)
+        scale = jnp.min((box_high - box_low) / (high - low))
+        return Placement(rotation, 0.5 * (box_low + box_high) - 0.5 * scale * (low + high), jnp.broadcast_to(scale, 3))
 
     def deviation(self, shape: Shape, placement: Placement) -> Float[Array, "9"]:
         """Return the step of `Placement.moved` from the placement that fills the box to this placement.
@@ -143,20 +143,20 @@ class Prior(NamedTuple):
         """
         if self.is_true_size:
             return jnp.zeros(9, placement.shift.dtype)
-        usual = self.filling(shape, placement.rotation)
-        shift, stretch = placement.shift - usual.shift, jnp.log(placement.scale / usual.scale)
+        reference = self.fill_box(shape, placement.rotation)
+        shift, stretch = placement.shift - reference.shift, jnp.log(placement.scale / reference.scale)
         return jnp.concatenate([jnp.zeros_like(shift), shift, stretch])
 
-    def within(self, shape: Shape, placement: Placement) -> Placement:
+    def clip_scale(self, shape: Shape, placement: Placement) -> Placement:
         """Return the placement with its scale clipped to the possible range."""
         if self.is_true_size:
             return placement
-        usual = self.filling(shape, placement.rotation).scale
-        least, most = self.poses.scale
-        return eqx.tree_at(lambda p: p.scale, placement, jnp.clip(placement.scale, least * usual, most * usual))
+        reference = self.fill_box(shape, placement.rotation).scale
+        low, high = self.poses.scale
+        return eqx.tree_at(lambda p: p.scale, placement, jnp.clip(placement.scale, low * reference, high * reference))
 
 
-_PRECISION = _PRIOR * np.array([0.0] * 3 + [_SHIFT**-2] * 3 + [_STRETCH**-2 / 3.0] * 3)
+_PRECISION = _PRIOR_WEIGHT * np.array([0.0] * 3 + [_SHIFT_DEVIATION**-2] * 3 + [_STRETCH_DEVIATION**-2 / 3.0] * 3)
 
 
 @program
@@ -169,47 +169,47 @@ def register(bank: ShapeBank, prior: Prior, targets: FitTargets, num_starts: int
     - `num_starts`: number of rotations tried, all shapes together.
     """
     few, some = targets.first(_COARSE[1]), targets.first(_FINE[1])
-    turned = _turned(bank, prior, few, num_starts)
-    coarse = refine(bank, prior, turned.best(_COARSE[0]), few, _COARSE[2])
+    starts = _rotated_starts(bank, prior, few, num_starts)
+    coarse = refine(bank, prior, starts.best(_COARSE[0]), few, _COARSE[2])
     fine = refine(bank, prior, coarse.best(_FINE[0]), some, _FINE[2])
-    others = _exchanged(bank, prior, fine, few).best(_LAST[0])
-    both = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), fine, others)
-    last = refine(bank, prior, both.best(_LAST[0]), some, _LAST[2])
+    swapped = _swap_shapes(bank, prior, fine, few).best(_LAST[0])
+    candidates = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), fine, swapped)
+    last = refine(bank, prior, candidates.best(_LAST[0]), some, _LAST[2])
     fits = reevaluate(bank, prior, last, targets).best(_LAST[0])
-    return dataclasses.replace(fits, is_mode=_modes(fits.shape, fits.placement.rotation))
+    return dataclasses.replace(fits, is_distinct=_find_distinct(fits.shape, fits.placement.rotation))
 
 
-def _turned(bank: ShapeBank, prior: Prior, targets: FitTargets, num_starts: int) -> Hypotheses:
+def _rotated_starts(bank: ShapeBank, prior: Prior, targets: FitTargets, num_starts: int) -> Hypotheses:
     """Compute the misfit of each shape in several rotations, scaled to fill the box."""
-    all_of_them = jnp.asarray(prior.poses.rotations(num_starts), targets.points.dtype)
-    count = max(1, min(len(all_of_them), num_starts // len(bank)))
+    all_rotations = jnp.asarray(prior.poses.rotations(num_starts), targets.points.dtype)
+    count = max(1, min(len(all_rotations), num_starts // len(bank)))
     # Each shape gets evenly spaced rotations with its own offset. Together the shapes cover the rotations without gaps.
     offsets = np.random.default_rng(0).permutation(len(bank)) / len(bank)
-    places = (np.arange(count) + offsets[:, None]) * len(all_of_them) / count
+    positions = (np.arange(count) + offsets[:, None]) * len(all_rotations) / count
 
-    def of_shape(shape, rotations):
-        return jax.vmap(lambda one: prior.filling(shape, one))(rotations)
+    def fill_boxes(shape, rotations):
+        return jax.vmap(lambda one: prior.fill_box(shape, one))(rotations)
 
-    starts = jax.vmap(of_shape)(bank.shapes, all_of_them[places.astype(int)])
+    starts = jax.vmap(fill_boxes)(bank.shapes, all_rotations[positions.astype(int)])
     return evaluate(bank, prior, starts, targets)
 
 
-def _exchanged(bank: ShapeBank, prior: Prior, first: Hypotheses, targets: FitTargets) -> Hypotheses:
+def _swap_shapes(bank: ShapeBank, prior: Prior, hypotheses: Hypotheses, targets: FitTargets) -> Hypotheses:
     """Compute the misfit of each shape in the placements of some good hypotheses of different rotation.
 
     Each shape takes the rotation of the hypothesis. Its shift and scale, relative to the placement that fills the box,
     are also those of the hypothesis.
     """
-    ordered = first.best(len(first.misfit))
-    mode = _modes(jnp.zeros_like(ordered.shape), ordered.placement.rotation)
-    few = jax.tree.map(lambda leaf: leaf[jnp.argsort(~mode, stable=True)[:_NUM_SHARED]], ordered)
-    where = few.placement
-    step = jax.vmap(lambda index, placement: prior.deviation(bank.shape(index), placement))(few.shape, where)
+    ranked = hypotheses.best(len(hypotheses.misfit))
+    is_distinct = _find_distinct(jnp.zeros_like(ranked.shape), ranked.placement.rotation)
+    seeds = jax.tree.map(lambda leaf: leaf[jnp.argsort(~is_distinct, stable=True)[:_NUM_SHARED]], ranked)
+    placements = seeds.placement
+    steps = jax.vmap(lambda index, placement: prior.deviation(bank.shape(index), placement))(seeds.shape, placements)
 
-    def of_shape(shape):
-        return jax.vmap(lambda one, step: prior.filling(shape, one.rotation).moved(step))(where, step)
+    def place_shape(shape):
+        return jax.vmap(lambda one, step: prior.fill_box(shape, one.rotation).moved(step))(placements, steps)
 
-    return evaluate(bank, prior, jax.vmap(of_shape)(bank.shapes), targets)
+    return evaluate(bank, prior, jax.vmap(place_shape)(bank.shapes), targets)
 
 
 def evaluate(bank: ShapeBank, prior: Prior, placements: Placement, targets: FitTargets) -> Hypotheses:
@@ -219,11 +219,11 @@ def evaluate(bank: ShapeBank, prior: Prior, placements: Placement, targets: FitT
     """
     num_shapes, count = placements.scale.shape[:2]
 
-    def of_shape(one):
-        shape, where = one
-        return jax.vmap(lambda placement: _misfit(shape, prior, placement, targets, _FIRST_TAU))(where)
+    def misfits_of_shape(one):
+        shape, shape_placements = one
+        return jax.vmap(lambda placement: _misfit(shape, prior, placement, targets, _FIRST_TAU))(shape_placements)
 
-    misfit = jax.lax.map(of_shape, (bank.shapes, placements), batch_size=max(1, _AT_ONCE // count))
+    misfit = jax.lax.map(misfits_of_shape, (bank.shapes, placements), batch_size=max(1, _BATCH_SIZE // count))
     flat = jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), placements)
     shape = jnp.repeat(jnp.arange(num_shapes), count)
     return Hypotheses(shape, flat, misfit.reshape(-1), jnp.ones(len(shape), bool))
@@ -235,23 +235,23 @@ def refine(bank: ShapeBank, prior: Prior, starts: Hypotheses, targets: FitTarget
     Returns for each start the iterate of smallest E. This comparison evaluates E at the last tau.
     """
     taus = jnp.append(jnp.geomspace(_FIRST_TAU, _LAST_TAU, num_steps), _LAST_TAU)
-    basis = jnp.asarray(prior.steps, targets.points.dtype)
+    basis = jnp.asarray(prior.step_basis, targets.points.dtype)
 
     def refine_one(start):
         shape = bank.shape(start.shape)
 
         def advance(state, tau):
-            current, best, least = state
+            current, best, smallest = state
             step, misfit = _newton_step(shape, prior, current, targets, tau, basis)
-            best = jax.tree.map(lambda a, b: jnp.where(misfit < least, a, b), current, best)
+            best = jax.tree.map(lambda a, b: jnp.where(misfit < smallest, a, b), current, best)
             # E is computed before each step. So the placement after the last step is never evaluated, and is dropped.
-            return (prior.within(shape, current.moved(step)), best, jnp.minimum(misfit, least)), None
+            return (prior.clip_scale(shape, current.moved(step)), best, jnp.minimum(misfit, smallest)), None
 
         state = start.placement, start.placement, jnp.asarray(jnp.inf, targets.points.dtype)
-        (_, best, least), _ = jax.lax.scan(advance, state, taus)
-        return Hypotheses(start.shape, best, least, start.is_mode)
+        (_, best, smallest), _ = jax.lax.scan(advance, state, taus)
+        return Hypotheses(start.shape, best, smallest, start.is_distinct)
 
-    return jax.lax.map(refine_one, starts, batch_size=_AT_ONCE)
+    return jax.lax.map(refine_one, starts, batch_size=_BATCH_SIZE)
 
 
 def reevaluate(bank: ShapeBank, prior: Prior, hypotheses: Hypotheses, targets: FitTargets) -> Hypotheses:
@@ -260,7 +260,7 @@ def reevaluate(bank: ShapeBank, prior: Prior, hypotheses: Hypotheses, targets: F
     def judge(one):
         return _misfit(bank.shape(one.shape), prior, one.placement, targets, _LAST_TAU)
 
-    return dataclasses.replace(hypotheses, misfit=jax.lax.map(judge, hypotheses, batch_size=_AT_ONCE))
+    return dataclasses.replace(hypotheses, misfit=jax.lax.map(judge, hypotheses, batch_size=_BATCH_SIZE))
 
 
 def _mean(values: Float[Array, " n"], mask: Bool[Array, " n"]) -> Float[Array, ""]:
@@ -273,10 +273,10 @@ def _misfit(
     """Return the misfit E of a placed shape. `jax.jvp` computes all n_j . grad d(x_j) in one pass."""
     distance, slope = jax.jvp(lambda x: placement.distance(shape.solid, x), (targets.points,), (targets.normals,))
     empty = placement.distance(shape.solid, targets.empty)
-    return _summed(distance, slope, empty, prior.deviation(shape, placement), targets, tau)
+    return _sum_terms(distance, slope, empty, prior.deviation(shape, placement), targets, tau)
 
 
-def _summed(
+def _sum_terms(
     distance: Float[Array, " n"],
     slope: Float[Array, " n"],
     empty: Float[Array, " m"],
@@ -284,10 +284,10 @@ def _summed(
     targets: FitTargets,
     tau: Float[Array, ""] | float,
 ) -> Float[Array, ""]:
-    of_data = jnp.log1p(distance**2 / (2.0 * tau**2)) + 0.5 * (1.0 - jnp.clip(slope, -1.0, 1.0))
-    of_empty = jnp.log1p(jnp.minimum(empty + _MARGIN, 0.0) ** 2 / tau**2)
-    of_prior = 0.5 * jnp.sum(jnp.asarray(_PRECISION, deviation.dtype) * deviation**2)
-    return _mean(of_data, targets.mask) + 2.0 * _mean(of_empty, targets.is_empty) + of_prior
+    data_terms = jnp.log1p(distance**2 / (2.0 * tau**2)) + 0.5 * (1.0 - jnp.clip(slope, -1.0, 1.0))
+    empty_terms = jnp.log1p(jnp.minimum(empty + _MARGIN, 0.0) ** 2 / tau**2)
+    prior_term = 0.5 * jnp.sum(jnp.asarray(_PRECISION, deviation.dtype) * deviation**2)
+    return _mean(data_terms, targets.mask) + 2.0 * _mean(empty_terms, targets.is_empty) + prior_term
 
 
 def _newton_step(
@@ -302,72 +302,77 @@ def _newton_step(
 
     The step is limited in size and uses the given `tau`. Its term for the normals n is |n - grad d|^2 / 4.
 
-    - `basis`: the ways in which a placement may change, see `ShapePoses.steps`.
+    - `basis`: the ways in which a placement may change, see `ShapePoses.step_basis`.
     """
     points = jnp.concatenate([targets.points, targets.empty])
     distance, gradient = values_and_gradients(lambda x: placement.distance(shape.solid, x), points)
     count = len(targets.points)
     # Derivatives of the distance at fixed points of the scene with respect to a rotation of the shape about t, its
     # shift, and the logarithm of its scale.
-    away = points - placement.shift
-    own = jnp.matmul(away, placement.rotation, precision="highest")
-    own_gradient = jnp.matmul(gradient, placement.rotation, precision="highest")
-    by_scale = distance[:, None] / 3.0 - own * own_gradient
-    rows = jnp.concatenate([jnp.cross(gradient, away), -gradient, by_scale], axis=1)
+    arms = points - placement.shift
+    local_arms = jnp.matmul(arms, placement.rotation, precision="highest")
+    local_gradient = jnp.matmul(gradient, placement.rotation, precision="highest")
+    scale_rows = distance[:, None] / 3.0 - local_arms * local_gradient
+    rows = jnp.concatenate([jnp.cross(gradient, arms), -gradient, scale_rows], axis=1)
     rows = jnp.matmul(rows, basis, precision="highest")
 
-    of_data = jnp.where(targets.mask, 1.0, 0.0) / jnp.maximum(jnp.sum(targets.mask), 1)
-    of_empty = jnp.where(targets.is_empty, 4.0, 0.0) / jnp.maximum(jnp.sum(targets.is_empty), 1)
-    within = jnp.minimum(distance[count:] + _MARGIN, 0.0)
-    residuals = jnp.concatenate([distance[:count], within])
+    data_weights = jnp.where(targets.mask, 1.0, 0.0) / jnp.maximum(jnp.sum(targets.mask), 1)
+    empty_weights = jnp.where(targets.is_empty, 4.0, 0.0) / jnp.maximum(jnp.sum(targets.is_empty), 1)
+    depth = jnp.minimum(distance[count:] + _MARGIN, 0.0)
+    residuals = jnp.concatenate([distance[:count], depth])
     weights = jnp.concatenate(
-        [of_data / (tau**2 + 0.5 * distance[:count] ** 2), jnp.where(within < 0, of_empty, 0.0) / (tau**2 + within**2)]
+        [
+            data_weights / (tau**2 + 0.5 * distance[:count] ** 2),
+            jnp.where(depth < 0, empty_weights, 0.0) / (tau**2 + depth**2),
+        ]
     )
 
     # On flat parts of the surface, the gradient rotates with the shape: d(grad d) = omega x grad d.
     length = jnp.maximum(jnp.linalg.norm(gradient[:count], axis=1, keepdims=True), 1e-6)
     unit = gradient[:count] / length
-    turning = jnp.cross(jnp.eye(3, dtype=unit.dtype), unit[:, None])
-    turning = jnp.einsum("nad,ak->ndk", turning, basis[:3], precision="highest")
+    normal_rows = jnp.cross(jnp.eye(3, dtype=unit.dtype), unit[:, None])
+    normal_rows = jnp.einsum("nad,ak->ndk", normal_rows, basis[:3], precision="highest")
     precision, deviation = jnp.asarray(_PRECISION, rows.dtype), prior.deviation(shape, placement)
 
-    normal = jnp.einsum("n,nk,nl->kl", weights, rows, rows, precision="highest")
-    normal = normal + 0.5 * jnp.einsum("n,ndk,ndl->kl", of_data, turning, turning, precision="highest")
-    normal = normal + jnp.matmul(basis.T, precision[:, None] * basis, precision="highest")
-    slope = jnp.einsum("n,n,nk->k", weights, residuals, rows, precision="highest")
-    slope = slope - 0.5 * jnp.einsum("n,nd,ndk->k", of_data, targets.normals - unit, turning, precision="highest")
-    slope = slope + jnp.matmul(basis.T, precision * deviation, precision="highest")
+    matrix = jnp.einsum("n,nk,nl->kl", weights, rows, rows, precision="highest")
+    matrix = matrix + 0.5 * jnp.einsum("n,ndk,ndl->kl", data_weights, normal_rows, normal_rows, precision="highest")
+    matrix = matrix + jnp.matmul(basis.T, precision[:, None] * basis, precision="highest")
+    vector = jnp.einsum("n,n,nk->k", weights, residuals, rows, precision="highest")
+    vector = vector - 0.5 * jnp.einsum(
+        "n,nd,ndk->k", data_weights, targets.normals - unit, normal_rows, precision="highest"
+    )
+    vector = vector + jnp.matmul(basis.T, precision * deviation, precision="highest")
 
-    normal = normal + _DAMPING * jnp.trace(normal) * jnp.eye(len(normal), dtype=normal.dtype)
-    step = jnp.matmul(basis, jnp.linalg.solve(normal, -slope), precision="highest")
-    along = jnp.sum(targets.normals * gradient[:count], axis=1)
-    misfit = _summed(distance[:count], along, distance[count:], deviation, targets, _LAST_TAU)
-    return step * jnp.minimum(1.0, _LARGEST_STEP / jnp.maximum(jnp.max(jnp.abs(step)), 1e-9)), misfit
+    matrix = matrix + _DAMPING * jnp.trace(matrix) * jnp.eye(len(matrix), dtype=matrix.dtype)
+    step = jnp.matmul(basis, jnp.linalg.solve(matrix, -vector), precision="highest")
+    agreement = jnp.sum(targets.normals * gradient[:count], axis=1)
+    misfit = _sum_terms(distance[:count], agreement, distance[count:], deviation, targets, _LAST_TAU)
+    return step * jnp.minimum(1.0, _MAX_STEP / jnp.maximum(jnp.max(jnp.abs(step)), 1e-9)), misfit
 
 
-def _modes(shape: Int[Array, " h"], rotation: Float[Array, "h 3 3"]) -> Bool[Array, " h"]:
+def _find_distinct(shape: Int[Array, " h"], rotation: Float[Array, "h 3 3"]) -> Bool[Array, " h"]:
     """Return a mask of the modes: hypotheses more than 15 degrees from all better modes of the same shape.
 
     The hypotheses must be sorted, best first.
     """
-    return first_of_each(turned_alike(rotation) & (shape[:, None] == shape))
+    return keep_first(similar_rotations(rotation) & (shape[:, None] == shape))
 
 
-def turned_alike(rotation: Float[Array, "h 3 3"]) -> Bool[Array, "h h"]:
+def similar_rotations(rotation: Float[Array, "h 3 3"]) -> Bool[Array, "h h"]:
     """Return for each pair of rotations whether they differ by less than 15 degrees."""
     trace = jnp.einsum("aij,bij->ab", rotation, rotation, precision="highest")
     return 0.5 * (trace - 1.0) > np.cos(np.radians(15.0))
 
 
-def first_of_each(is_same: Bool[Array, "h h"]) -> Bool[Array, " h"]:
+def keep_first(is_same: Bool[Array, "h h"]) -> Bool[Array, " h"]:
     """Return the mask of rows to keep. A row is dropped if it equals an earlier row that is kept.
 
     - `is_same`: for each pair of rows, whether they are equal.
     """
     order = jnp.arange(is_same.shape[0])
 
-    def keep(modes, index):
-        covered = jnp.any(is_same[index] & modes & (order < index))
-        return modes.at[index].set(~covered), None
+    def keep(is_first, index):
+        is_repeat = jnp.any(is_same[index] & is_first & (order < index))
+        return is_first.at[index].set(~is_repeat), None
 
     return jax.lax.scan(keep, jnp.zeros(len(order), bool), order)[0]

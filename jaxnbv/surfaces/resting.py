@@ -14,7 +14,7 @@ from jaxnbv.surfaces.shape_bank import ShapeBank
 
 # Largest number of stable poses per part, and the angle (radians) between upward directions below which two poses count
 # as equal.
-_MOST, _NEAR = 8, np.radians(10.0)
+_MAX_POSES, _MIN_ANGLE = 8, np.radians(10.0)
 _NODES = 32
 # Rotation from trimesh's upward axis z to y.
 _UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
@@ -39,10 +39,10 @@ class Resting(ShapePoses):
         **Raises:** `ValueError` for an empty bank.
         """
         require(len(bank) > 0, "the bank is empty: give one with parts")
-        each = [_stable_poses(bank, index) for index in range(len(bank))]
-        most = max(len(poses) for poses in each)
+        poses_of_parts = [_stable_poses(bank, index) for index in range(len(bank))]
+        num_poses = max(len(poses) for poses in poses_of_parts)
         # If a part has fewer poses than other parts, repeat its poses.
-        rows = [poses[np.arange(most) % len(poses)] for poses in each]
+        rows = [poses[np.arange(num_poses) % len(poses)] for poses in poses_of_parts]
         return cls(jnp.asarray(np.stack(rows), jnp.result_type(float)))
 
     def rotations(self, count: int) -> Float[AnyArray, "m 3 3"]:
@@ -52,13 +52,13 @@ class Resting(ShapePoses):
     def rotations_of(self, num_shapes: int, count: int) -> Float[AnyArray, "k m 3 3"]:
         """Return, for each part, its stable poses rotated by evenly spaced angles about the vertical."""
         stable = self.stable[:num_shapes]
-        num_turns = max(1, count // stable.shape[1])
-        angles = 2.0 * np.pi * np.arange(num_turns) / num_turns
-        turns = Rotation.from_rotvec(angles[:, None] * np.array([0.0, 1.0, 0.0])).as_matrix()
-        starts = jnp.einsum("tij,kpjl->kptil", jnp.asarray(turns, stable.dtype), stable, precision="highest")
+        num_angles = max(1, count // stable.shape[1])
+        angles = 2.0 * np.pi * np.arange(num_angles) / num_angles
+        rotations = Rotation.from_rotvec(angles[:, None] * np.array([0.0, 1.0, 0.0])).as_matrix()
+        starts = jnp.einsum("tij,kpjl->kptil", jnp.asarray(rotations, stable.dtype), stable, precision="highest")
         return starts.reshape(len(stable), -1, 3, 3)
 
-    def turns(self) -> Float[np.ndarray, "3 k"]:
+    def rotation_axes(self) -> Float[np.ndarray, "3 k"]:
         return np.eye(3)
 
 
@@ -71,10 +71,10 @@ def _stable_poses(bank: ShapeBank, index: int) -> Float[np.ndarray, "p 3 3"]:
     center = inside.mean(axis=0) if len(inside) else points.mean(axis=0)
     hull = cast(trimesh.Trimesh, trimesh.convex.convex_hull(points))
     transforms, probabilities = trimesh.poses.compute_stable_poses(hull, center_mass=center)
-    chosen: list[np.ndarray] = []
+    rotations: list[np.ndarray] = []
     for transform in transforms[np.argsort(-probabilities)]:
         rotation = _UPRIGHT @ transform[:3, :3]
         # Poses that differ only by a rotation about the vertical have the same upward direction in the part's frame.
-        if all(rotation[1] @ other[1] < np.cos(_NEAR) for other in chosen):
-            chosen.append(rotation)
-    return np.stack(chosen[:_MOST]) if chosen else np.eye(3)[None]
+        if all(rotation[1] @ other[1] < np.cos(_MIN_ANGLE) for other in rotations):
+            rotations.append(rotation)
+    return np.stack(rotations[:_MAX_POSES]) if rotations else np.eye(3)[None]

@@ -247,7 +247,7 @@ def test_look_alikes_share_a_placement():
     for carried, all_parts in ((before, set(range(5))), (placeholder_hypotheses(jnp.float32), set())):
         placements = search_parts(bank, FreeRotation(), box, seen, rays, carried, 4)
         off = (TURN.inv() * Rotation.from_matrix(placements.placement.rotation)).magnitude()
-        there = np.asarray(placements.is_mode) & (off < np.radians(3.0))
+        there = np.asarray(placements.is_distinct) & (off < np.radians(3.0))
         assert set(np.asarray(placements.shape)[there]) == all_parts
 
 

@@ -85,6 +85,6 @@ def test_upright_rotations_turn_about_the_vertical_within_their_range():
     ],
 )
 def test_steps_are_independent_and_of_unit_length(poses, count):
-    steps = poses.steps
+    steps = poses.step_basis
     assert steps.shape == (9, count)
     np.testing.assert_allclose(steps.T @ steps, np.eye(count), atol=1e-12)
