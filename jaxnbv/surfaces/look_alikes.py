@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from jaxnbv.surfaces.mesh_shapes import MeshShape
 
 # Number of random points, and the distance from the surface (in grid cells) within which points are compared.
-_PROBES, _NEAR = 8192, 3.0
+_NUM_PROBES, _MAX_DISTANCE = 8192, 3.0
 # The rotations of a cube onto itself are tested, because files often store equal parts along different axes.
-_TURNS = Rotation.create_group("O").as_matrix()
+_ROTATIONS = Rotation.create_group("O").as_matrix()
 
 
 def warn_of_look_alikes(
@@ -26,10 +26,10 @@ def warn_of_look_alikes(
     """
     grids = [_Grid(shape) for shape in shapes]
     for one, other in itertools.combinations(range(len(shapes)), 2):
-        off = _difference(grids[one], grids[other], float(sizes[other] / sizes[one]))
-        if off < grids[one].spacing:
+        gap = _difference(grids[one], grids[other], float(sizes[other] / sizes[one]))
+        if gap < grids[one].spacing:
             warnings.warn(
-                f"{names[one]} and {names[other]} are the same up to {off * sizes[one]:.2g}: no view will tell them "
+                f"{names[one]} and {names[other]} are the same up to {gap * sizes[one]:.2g}: no view will tell them "
                 "apart. Leave one out, or raise the resolution if they differ by a detail that is smaller than a cell",
                 stacklevel=stacklevel + 1,
             )
@@ -41,11 +41,11 @@ class _Grid:
     def __init__(self, shape: MeshShape):
         solid = shape.solid
         self.values, self.low, self.spacing = (np.asarray(each) for each in (solid.values, solid.low, solid.spacing))
-        self.half = np.abs(shape.extremes).max(axis=0)
+        self.half_sides = np.abs(shape.extremes).max(axis=0)
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        places = ((points - self.low) / self.spacing).T
-        return map_coordinates(self.values, places, order=1, mode="nearest")
+        indices = ((points - self.low) / self.spacing).T
+        return map_coordinates(self.values, indices, order=1, mode="nearest")
 
 
 def _difference(one: _Grid, other: _Grid, ratio: float) -> float:
@@ -56,12 +56,12 @@ def _difference(one: _Grid, other: _Grid, ratio: float) -> float:
 
     - `ratio`: factor that scales `other` to the units of `one`.
     """
-    least, points = np.inf, None
-    for turn in _TURNS:
-        if np.abs(ratio * np.abs(turn) @ other.half - one.half).max() > 0.5 * one.spacing:
+    smallest, points = np.inf, None
+    for rotation in _ROTATIONS:
+        if np.abs(ratio * np.abs(rotation) @ other.half_sides - one.half_sides).max() > 0.5 * one.spacing:
             continue
         if points is None:
-            probes = np.random.default_rng(0).uniform(-1.0, 1.0, (_PROBES, 3)) * (one.half + one.spacing)
-            points = probes[np.abs(one(probes)) < _NEAR * one.spacing]
-        least = min(least, float(np.abs(one(points) - ratio * other(points @ turn / ratio)).max()))
-    return least
+            probes = np.random.default_rng(0).uniform(-1.0, 1.0, (_NUM_PROBES, 3)) * (one.half_sides + one.spacing)
+            points = probes[np.abs(one(probes)) < _MAX_DISTANCE * one.spacing]
+        smallest = min(smallest, float(np.abs(one(points) - ratio * other(points @ rotation / ratio)).max()))
+    return smallest

@@ -52,8 +52,8 @@ def mesh_paths(meshes: str | Path | Sequence[str | Path | trimesh.Trimesh]) -> l
         require(os.path.isdir(folder), f"there is no folder {folder}: give one that holds meshes, or a list of files")
         formats = trimesh.available_formats()
         meshes = [path for path in sorted(folder.rglob("*")) if path.suffix[1:].lower() in formats and path.is_file()]
-        ends = ", ".join(sorted(formats))
-        require(len(meshes) > 0, f"the folder {folder} holds no mesh: its files must end in {ends}")
+        extensions = ", ".join(sorted(formats))
+        require(len(meshes) > 0, f"the folder {folder} holds no mesh: its files must end in {extensions}")
     items = as_tuple(meshes, "the meshes")
     require(len(items) > 0, "no meshes are named: give their files, or a folder")
     for path in items:
@@ -100,12 +100,12 @@ def shapes_of_meshes(
 
 def _shape(mesh: Path | trimesh.Trimesh, resolution: int, sheet: float, num_extremes: int, up: str) -> MeshShape:
     settings = resolution, sheet, num_extremes
-    arrays = _kept(mesh, *settings, up) if isinstance(mesh, Path) else _sampled(load_mesh(mesh, up), *settings)
+    arrays = _load_cached(mesh, *settings, up) if isinstance(mesh, Path) else _sample(load_mesh(mesh, up), *settings)
     solid = Sampled(*(jnp.asarray(arrays[name]) for name in ("values", "low", "spacing", "padding")))
     return MeshShape(solid, arrays["extremes"], arrays["from_mesh"])
 
 
-def _kept(path: Path, resolution: int, sheet: float, num_extremes: int, up: str) -> dict[str, np.ndarray]:
+def _load_cached(path: Path, resolution: int, sheet: float, num_extremes: int, up: str) -> dict[str, np.ndarray]:
     require(os.path.isfile(path), f"cannot read {path}: there is no file")
     try:
         content = path.read_bytes()
@@ -115,12 +115,12 @@ def _kept(path: Path, resolution: int, sheet: float, num_extremes: int, up: str)
     file = platformdirs.user_cache_path("jaxnbv") / "shapes" / f"{hashlib.sha256(settings + content).hexdigest()}.npz"
     arrays = _read(file)
     if arrays is None:
-        arrays = _sampled(load_mesh(path, up), resolution, sheet, num_extremes)
-        _keep(file, arrays)
+        arrays = _sample(load_mesh(path, up), resolution, sheet, num_extremes)
+        _write(file, arrays)
     return arrays
 
 
-def _sampled(mesh: TriangleMesh, resolution: int, sheet: float, num_extremes: int) -> dict[str, np.ndarray]:
+def _sample(mesh: TriangleMesh, resolution: int, sheet: float, num_extremes: int) -> dict[str, np.ndarray]:
     solid = solid_of_mesh(mesh.vertices, mesh.faces, resolution, sheet, cubic=True)
     require(
         bool((np.asarray(solid.values) < 0).any()), "it is thinner than the grid: raise the resolution or the sheet"
@@ -138,13 +138,13 @@ def _sampled(mesh: TriangleMesh, resolution: int, sheet: float, num_extremes: in
 def _read(file: Path) -> dict[str, np.ndarray] | None:
     """Read cached arrays, or return None if the file is missing or damaged."""
     try:
-        with np.load(file) as stored:
-            return {name: stored[name] for name in _ARRAYS}
+        with np.load(file) as archive:
+            return {name: archive[name] for name in _ARRAYS}
     except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile, zlib.error):
         return None
 
 
-def _keep(file: Path, arrays: dict[str, Any]) -> None:
+def _write(file: Path, arrays: dict[str, Any]) -> None:
     """Write arrays to the cache, or warn if writing fails, for example on a full disk."""
     partial = file.with_suffix(f".{secrets.token_hex(8)}.npz")
     try:

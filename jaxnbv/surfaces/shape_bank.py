@@ -20,8 +20,8 @@ from jaxnbv.scanning.sdf import Scaled, SignedDistance
 from jaxnbv.surfaces.look_alikes import warn_of_look_alikes
 from jaxnbv.surfaces.mesh_shapes import as_tuple, mesh_paths, shapes_of_meshes
 
-NUM_EXTREMES, _FAR, _STRIDES, _ARRIVED = 128, 4.0, 40, 0.01
-_LONGEST_NAME = 64
+NUM_EXTREMES, _START_RADIUS, _NUM_STRIDES, _MAX_DISTANCE = 128, 4.0, 40, 0.01
+_MAX_NAME_BYTES = 64
 # Lengths, in metres, of the units that meshes may use.
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 
@@ -86,7 +86,7 @@ class ShapeBank(eqx.Module):
         names = tuple(map(str, range(len(solids)))) if names is None else _as_names(names)
         require(len(names) == len(solids), f"there are {len(names)} names for {len(solids)} solids: give one for each")
         if not solids:
-            return cls(None, jnp.zeros((0, NUM_EXTREMES, 3)), encoded(names))
+            return cls(None, jnp.zeros((0, NUM_EXTREMES, 3)), encode_names(names))
         kinds = {jax.tree.structure(solid): index for index, solid in reversed(list(enumerate(solids)))}
         require(
             len(kinds) == 1,
@@ -95,7 +95,7 @@ class ShapeBank(eqx.Module):
         )
         joined = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *solids)
         from_mesh = jnp.tile(jnp.eye(4), (len(solids), 1, 1)) if is_true_size else None
-        return cls(joined, _extremes(joined), encoded(names), from_mesh, is_true_size)
+        return cls(joined, _extremes(joined), encode_names(names), from_mesh, is_true_size)
 
     @classmethod
     @checked
@@ -141,23 +141,23 @@ class ShapeBank(eqx.Module):
             names = [path.stem if folder is None else str(path.relative_to(folder).with_suffix("")) for path in files]
         names = _as_names(names)
         require(len(names) == len(paths), f"there are {len(names)} names for {len(paths)} meshes: give one for each")
-        shapes, used = shapes_of_meshes(paths, resolution, sheet, NUM_EXTREMES, up, progress)
+        shapes, rows = shapes_of_meshes(paths, resolution, sheet, NUM_EXTREMES, up, progress)
         joined, extremes, from_mesh = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *shapes)
-        bank = cls(joined, extremes, encoded([names[index] for index in used]), from_mesh)
+        bank = cls(joined, extremes, encode_names([names[index] for index in rows]), from_mesh)
         if factor is None:
             return bank
         sizes = factor / jnp.cbrt(jnp.linalg.det(from_mesh[:, :3, :3]))
         warn_of_look_alikes(shapes, bank.names, np.asarray(sizes), stacklevel=3)
-        return dataclasses.replace(bank, is_true_size=True)._resized(sizes)
+        return dataclasses.replace(bank, is_true_size=True)._resize(sizes)
 
     def in_scene(self, frame: Frame) -> "ShapeBank":
         """Return a copy with true sizes converted from a frame's world units to scene units.
 
         A bank without true sizes is returned unchanged.
         """
-        return self._resized(jnp.full(len(self), frame.scale)) if self.is_true_size else self
+        return self._resize(jnp.full(len(self), frame.scale)) if self.is_true_size else self
 
-    def _resized(self, factors: Float[Array, " k"]) -> "ShapeBank":
+    def _resize(self, factors: Float[Array, " k"]) -> "ShapeBank":
         """Return a copy with each shape scaled by its factor."""
         if self.solids is None:
             return self
@@ -227,10 +227,10 @@ def _as_names(names: Sequence[str]) -> tuple[str, ...]:
     return strings
 
 
-def encoded(names: Sequence[str]) -> UInt8[Array, "k c"]:
+def encode_names(names: Sequence[str]) -> UInt8[Array, "k c"]:
     """Encode names as rows of `ShapeBank.codes`, cut after 64 bytes."""
-    rows = [name.encode()[:_LONGEST_NAME].ljust(_LONGEST_NAME, b"\0") for name in names]
-    return jnp.asarray(np.frombuffer(b"".join(rows), np.uint8).reshape(-1, _LONGEST_NAME))
+    rows = [name.encode()[:_MAX_NAME_BYTES].ljust(_MAX_NAME_BYTES, b"\0") for name in names]
+    return jnp.asarray(np.frombuffer(b"".join(rows), np.uint8).reshape(-1, _MAX_NAME_BYTES))
 
 
 @program
@@ -239,7 +239,7 @@ def _extremes(solids: SignedDistance) -> Float[Array, "k p 3"]:
 
     They start on a large sphere around the solid, and move along the gradient of its signed distance by Newton steps.
     """
-    start = fibonacci_sphere(NUM_EXTREMES, _FAR)
+    start = fibonacci_sphere(NUM_EXTREMES, _START_RADIUS)
 
     def of_solid(solid):
         def stride(points, _):
@@ -247,11 +247,11 @@ def _extremes(solids: SignedDistance) -> Float[Array, "k p 3"]:
             square = jnp.sum(gradient**2, axis=-1)
             return points - (distance / jnp.where(square > 0, square, 1.0))[:, None] * gradient, None
 
-        points = jax.lax.scan(stride, start, length=_STRIDES)[0]
+        points = jax.lax.scan(stride, start, length=_NUM_STRIDES)[0]
         # If a solid gives only a bound of the distance, some points may not reach the surface. A point that did reach
         # the surface replaces each of them.
-        arrived = jnp.abs(solid(points)) < _ARRIVED
-        return jnp.where(arrived[:, None], points, points[jnp.argmax(arrived)])
+        is_on_surface = jnp.abs(solid(points)) < _MAX_DISTANCE
+        return jnp.where(is_on_surface[:, None], points, points[jnp.argmax(is_on_surface)])
 
     return jax.lax.map(of_solid, solids, batch_size=16)
 
@@ -263,6 +263,6 @@ def values_and_gradients(
 
     - `function`: maps points to values. The value at a point must depend on this point alone.
     """
-    values, along = jax.linearize(function, points)
-    columns = [along(jnp.broadcast_to(direction, points.shape)) for direction in jnp.eye(3, dtype=points.dtype)]
+    values, derivative = jax.linearize(function, points)
+    columns = [derivative(jnp.broadcast_to(direction, points.shape)) for direction in jnp.eye(3, dtype=points.dtype)]
     return values, jnp.stack(columns, axis=-1)

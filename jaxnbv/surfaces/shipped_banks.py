@@ -12,7 +12,7 @@ import numpy as np
 from jaxnbv.checks import check_type, require
 from jaxnbv.scanning.sdf import UNUSED, ImprintedPyramid, LabelledSolid, Sampled, SignedDistance
 from jaxnbv.surfaces.placement import FreeRotation, ShapePoses, Upright
-from jaxnbv.surfaces.shape_bank import ShapeBank, encoded
+from jaxnbv.surfaces.shape_bank import ShapeBank, encode_names
 
 # Unit of the stored distances of a mesh, which are clipped to 127 units.
 QUANTUM = 0.008
@@ -31,28 +31,28 @@ class ShippedBank(NamedTuple):
     poses: ShapePoses
 
 
-def _labelled() -> LabelledSolid:
+def _labelled_form() -> LabelledSolid:
     points, numbers = jnp.zeros((1, 3)), jnp.zeros(1)
     shape = points, jnp.eye(3)[None], points, numbers, numbers, numbers
     return LabelledSolid(jnp.full(1, UNUSED), jnp.zeros(1, bool), *shape)
 
 
-def _pyramid() -> ImprintedPyramid:
-    one, place = jnp.ones(()), jnp.zeros(2)
-    return ImprintedPyramid(jnp.asarray(0), one, one, place, one, one, jnp.eye(3), one, jnp.zeros(3))
+def _pyramid_form() -> ImprintedPyramid:
+    one, point = jnp.ones(()), jnp.zeros(2)
+    return ImprintedPyramid(jnp.asarray(0), one, one, point, one, one, jnp.eye(3), one, jnp.zeros(3))
 
 
-def _sampled() -> Sampled:
+def _sampled_form() -> Sampled:
     return Sampled(jnp.zeros((2, 2, 2)), jnp.zeros(3), 1.0, 1.0)
 
 
 SHIPPED_BANKS = {
-    "pyramid": ShippedBank(_pyramid, FreeRotation()),
-    "truck": ShippedBank(_labelled, FreeRotation()),
-    "household": ShippedBank(_labelled, _FURNITURE),
-    "parts": ShippedBank(_labelled, Upright(within=0.35, by_axis=True)),
-    "heat": ShippedBank(_labelled, _FURNITURE),
-    "household-real": ShippedBank(_sampled, _FURNITURE),
+    "pyramid": ShippedBank(_pyramid_form, FreeRotation()),
+    "truck": ShippedBank(_labelled_form, FreeRotation()),
+    "household": ShippedBank(_labelled_form, _FURNITURE),
+    "parts": ShippedBank(_labelled_form, Upright(within=0.35, by_axis=True)),
+    "heat": ShippedBank(_labelled_form, _FURNITURE),
+    "household-real": ShippedBank(_sampled_form, _FURNITURE),
 }
 """The banks that ship with jaxnbv, keyed by name."""
 
@@ -66,8 +66,8 @@ def shape_bank(name: str) -> ShapeBank:
     **Raises:** `ValueError` for an unknown name.
     """
     check_type(name, str, "the bank's name")
-    there = ", ".join(SHIPPED_BANKS)
-    require(name in SHIPPED_BANKS, f"there is no bank of shapes {name!r}: choose from {there}, or make one")
+    choices = ", ".join(SHIPPED_BANKS)
+    require(name in SHIPPED_BANKS, f"there is no bank of shapes {name!r}: choose from {choices}, or make one")
     with resources.as_file(resources.files("jaxnbv.surfaces") / "shapes" / f"{name}.npz") as path:
         return read_bank(path, SHIPPED_BANKS[name].form())
 
@@ -85,11 +85,11 @@ def read_bank(path: Path, like: SignedDistance) -> ShapeBank:
 
     - `like`: a solid with the same PyTree structure as the bank's solids.
     """
-    wide = {"f": np.float32, "i": np.int32, "b": np.bool_}
-    with np.load(path) as stored:
-        names = [str(one) for one in stored["names"]]
-        *leaves, extremes = (stored[key] for key in sorted(stored.files) if key != "names")
+    dtypes = {"f": np.float32, "i": np.int32, "b": np.bool_}
+    with np.load(path) as archive:
+        names = [str(one) for one in archive["names"]]
+        *leaves, extremes = (archive[key] for key in sorted(archive.files) if key != "names")
     if isinstance(like, Sampled):
         leaves[0] = QUANTUM * np.cumsum(leaves[0], axis=-1, dtype=np.int8).astype(np.float32)
-    arrays = [jnp.asarray(leaf.astype(wide[leaf.dtype.kind])) for leaf in (*leaves, extremes)]
-    return ShapeBank(jax.tree.unflatten(jax.tree.structure(like), arrays[:-1]), arrays[-1], encoded(names))
+    arrays = [jnp.asarray(leaf.astype(dtypes[leaf.dtype.kind])) for leaf in (*leaves, extremes)]
+    return ShapeBank(jax.tree.unflatten(jax.tree.structure(like), arrays[:-1]), arrays[-1], encode_names(names))
