@@ -22,31 +22,31 @@ from jaxnbv.programs import program
 HALF_WIDTH = 0.5 * math.pi
 """Scattered points must lie in [-HALF_WIDTH, HALF_WIDTH]^3, the cube that the paper scales a scene into."""
 
-_ESTIMATED_BY = 64
+_NUM_SAMPLES = 64
 
 
-def _on_torus(has_shape: Callable[[Any], bool], wanted: str) -> Callable[..., Any]:
+def _on_torus(has_shape: Callable[[Any], bool], description: str) -> Callable[..., Any]:
     """Make a decorator that checks that a method's arguments are arrays of coordinates in [-pi, pi].
 
     Sampled functions have the period 2 pi, so points outside [-pi, pi]^3 would only repeat points inside. The scene is
     [-pi/2, pi/2]^3, an eighth of this cube, and surfaces lie only in the scene.
 
-    - `has_shape`, `wanted`: whether an array has the right shape, and this shape in words for the error message.
+    - `has_shape`, `description`: whether an array has the right shape, and this shape in words for the error message.
     """
 
-    def checking(method: Callable[..., Any]) -> Callable[..., Any]:
+    def decorate(method: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(method)
         def call(self: Any, *arrays: Any) -> Any:
             arrays = tuple(map(native, arrays))
             for array in arrays:
                 coordinates = array if is_traced(array) else as_numbers(array, "the coordinates", None)
-                require(has_shape(coordinates), f"the coordinates have shape {coordinates.shape}: give {wanted}")
+                require(has_shape(coordinates), f"the coordinates have shape {coordinates.shape}: give {description}")
                 if is_traced(coordinates, self) or not coordinates.size:
                     continue
-                furthest = float(np.abs(coordinates).max())
+                largest = float(np.abs(coordinates).max())
                 require(
-                    furthest <= 2.0 * HALF_WIDTH + 1e-6,
-                    f"a point has a coordinate of {furthest:.4g}, outside [-pi, pi]^3, where surfaces only repeat; the "
+                    largest <= 2.0 * HALF_WIDTH + 1e-6,
+                    f"a point has a coordinate of {largest:.4g}, outside [-pi, pi]^3, where surfaces only repeat; the "
                     "scene is [-pi/2, pi/2]^3: bring the points there with Frame.to_scene",
                 )
             with own_settings():
@@ -54,7 +54,7 @@ def _on_torus(has_shape: Callable[[Any], bool], wanted: str) -> Callable[..., An
 
         return call
 
-    return checking
+    return decorate
 
 
 on_torus = _on_torus(lambda x: x.ndim == 2 and x.shape[1] == 3, "points (n, 3)")
@@ -93,11 +93,11 @@ class Fields(eqx.Module):
         """
         x = jnp.asarray(x)
 
-        def along(direction):
+        def derivative(direction):
             # The value at a point depends on this point alone, so one sweep differentiates at all points.
             return jax.jvp(self, (x,), (jnp.broadcast_to(direction, x.shape),))[1]
 
-        return jnp.moveaxis(jax.vmap(along)(jnp.eye(3, dtype=x.dtype)), 0, -1)
+        return jnp.moveaxis(jax.vmap(derivative)(jnp.eye(3, dtype=x.dtype)), 0, -1)
 
     @on_grid_of_torus
     def on_grid(self, axis: Float[AnyArray, " g"]) -> Float[Array, "s g g g"]:
@@ -140,15 +140,15 @@ class SurfacePosterior(eqx.Module):
 
     def mean(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
         """Return E f(x). The default is the mean of 64 samples, with standard error sqrt(Var f(x) / 64)."""
-        return jnp.mean(self._kept()(x), axis=0)
+        return jnp.mean(self._draw_samples()(x), axis=0)
 
     def variance(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
         """Return Var f(x). The default is the variance of 64 samples, with denominator 63."""
-        return jnp.var(self._kept()(x), axis=0, ddof=1)
+        return jnp.var(self._draw_samples()(x), axis=0, ddof=1)
 
     def probability_inside(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
         """Return P(f(x) < level). The default is the fraction of 64 samples that are below the level at x."""
-        return jnp.mean(self._kept()(x) < self.level, axis=0)
+        return jnp.mean(self._draw_samples()(x) < self.level, axis=0)
 
     @on_grid_of_torus
     @program
@@ -156,10 +156,10 @@ class SurfacePosterior(eqx.Module):
         """Return E f on the tensor grid axis x axis x axis (scene coordinates)."""
         if self.has_closed_forms:
             return on_tensor_grid(self.mean, axis)
-        return jnp.mean(self._kept().on_grid(axis), axis=0)
+        return jnp.mean(self._draw_samples().on_grid(axis), axis=0)
 
-    def _kept(self) -> Fields:
-        return self.sample(jax.random.key(0), _ESTIMATED_BY)
+    def _draw_samples(self) -> Fields:
+        return self.sample(jax.random.key(0), _NUM_SAMPLES)
 
 
 class SurfaceModel(eqx.Module):

@@ -65,15 +65,15 @@ def _lattice_sum(nu: float, a: Float[Array, ""]) -> Float[Array, ""]:
 
 def normal_covariance(x: Float[Array, "n 3"], y: Float[Array, "m 3"], spectrum: Spectra) -> Float[Array, "n m"]:
     """Return the prior covariance of each component of the normal field. The components are independent."""
-    return _over_scales(lambda of_scale: _normal_covariance(x, y, of_scale), spectrum)
+    return _sum_scales(lambda single: _normal_covariance(x, y, single), spectrum)
 
 
-def _over_scales(covariance, spectra: Spectra):
-    return functools.reduce(jnp.add, [covariance(of_scale) for of_scale in jnp.atleast_2d(spectra)])
+def _sum_scales(covariance, spectra: Spectra):
+    return functools.reduce(jnp.add, [covariance(single) for single in jnp.atleast_2d(spectra)])
 
 
 def _normal_covariance(x, y, spectrum: Spectrum):
-    even = [_even(x[:, axis], y[:, axis], spectrum) for axis in range(3)]
+    even = [_cosine_sum(x[:, axis], y[:, axis], spectrum) for axis in range(3)]
     return even[0] * even[1] * even[2]
 
 
@@ -84,20 +84,20 @@ def function_normal_covariance(
 
     def products(damped):
         odd_spectrum = damped * jnp.arange(damped.size, dtype=damped.dtype)
-        even = [_even(x[:, axis], y[:, axis], damped) for axis in range(3)]
-        odd = [_odd(x[:, axis], y[:, axis], odd_spectrum) for axis in range(3)]
+        even = [_cosine_sum(x[:, axis], y[:, axis], damped) for axis in range(3)]
+        odd = [_sine_sum(x[:, axis], y[:, axis], odd_spectrum) for axis in range(3)]
         return jnp.stack([odd[0] * even[1] * even[2], even[0] * odd[1] * even[2], even[0] * even[1] * odd[2]])
 
-    return _over_scales(lambda of_scale: _over_squared_frequency(products, of_scale), spectrum)
+    return _sum_scales(lambda single: _inverse_square_sum(products, single), spectrum)
 
 
 def function_covariance(x: Float[Array, "n 3"], y: Float[Array, "m 3"], spectrum: Spectra) -> Float[Array, "n m"]:
     """Return the prior cov(f(x), f(y)) of the implicit function f."""
 
-    def of_one(spectrum):
-        return _over_squared_frequency(lambda damped: _normal_covariance(x, y, damped) - spectrum[0] ** 3, spectrum)
+    def covariance(spectrum):
+        return _inverse_square_sum(lambda damped: _normal_covariance(x, y, damped) - spectrum[0] ** 3, spectrum)
 
-    return _over_scales(of_one, spectrum)
+    return _sum_scales(covariance, spectrum)
 
 
 def function_variance(spectrum: Spectra) -> Float[Array, ""]:
@@ -116,14 +116,14 @@ def mode_variance(spectrum: Spectra) -> Float[Array, "a a a"]:
     return jnp.sum(jax.vmap(of_one)(jnp.atleast_2d(spectrum)), axis=0)
 
 
-def _even(x: Float[Array, " n"], y: Float[Array, " m"], spectrum: Spectrum) -> Float[Array, "n m"]:
+def _cosine_sum(x: Float[Array, " n"], y: Float[Array, " m"], spectrum: Spectrum) -> Float[Array, "n m"]:
     """Return the sum over n = -L, ..., L of s1(|n|) cos(n (x - y)), where `spectrum` is s1(0), ..., s1(L)."""
     truncation = spectrum.shape[0] - 1
     weighted = circle_basis(x, truncation) * basis_variance(spectrum)
     return jnp.matmul(weighted, circle_basis(y, truncation).T, precision="highest")
 
 
-def _odd(x: Float[Array, " n"], y: Float[Array, " m"], spectrum: Spectrum) -> Float[Array, "n m"]:
+def _sine_sum(x: Float[Array, " n"], y: Float[Array, " m"], spectrum: Spectrum) -> Float[Array, "n m"]:
     """Return the sum over n = -L, ..., L of s1(|n|) sign(n) sin(n (x - y)).
 
     Here `spectrum` is s1(0), ..., s1(L). The sum uses sin(n (x - y)) = sin(n x) cos(n y) - cos(n x) sin(n y).
@@ -135,7 +135,7 @@ def _odd(x: Float[Array, " n"], y: Float[Array, " m"], spectrum: Spectrum) -> Fl
     return jnp.matmul(swapped * basis_variance(spectrum), circle_basis(y, truncation).T, precision="highest")
 
 
-def _over_squared_frequency(products, spectrum: Spectrum):
+def _inverse_square_sum(products, spectrum: Spectrum):
     """Return a sum over frequency vectors n in which each term is divided by |n|^2.
 
     - `products`: returns the undivided sum for a spectrum s1. Its term n is proportional to s1(n_1) s1(n_2) s1(n_3).
@@ -165,6 +165,6 @@ def _inverse_quadrature(spectrum: Spectrum) -> tuple[np.ndarray, np.ndarray]:
     weight = step * rate
     # Merge the slowest rates into one exponential at their weighted mean rate, which is accurate to third order.
     slow = rate < tolerance ** (1 / 3) / largest
-    together = weight[slow].sum()
-    mean = (weight * rate)[slow].sum() / together
-    return np.append(mean, rate[~slow]), np.append(together, weight[~slow])
+    slow_weight = weight[slow].sum()
+    mean = (weight * rate)[slow].sum() / slow_weight
+    return np.append(mean, rate[~slow]), np.append(slow_weight, weight[~slow])

@@ -35,7 +35,7 @@ class NormalDraws(NamedTuple):
     """Draws from the prior: coefficients of the normal field v, and v(X) plus noise at the points X of D."""
 
     coefficients: Float[Array, "s 3 a a a"]
-    at_data: Float[Array, "s n 3"]
+    noisy_normals: Float[Array, "s n 3"]
 
 
 class GeometricSPSRPosterior(TrigonometricPosterior):
@@ -94,7 +94,7 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
         points = fill_rows(self.cloud.points, self.cloud.mask)
         return DataPoints(points, points)
 
-    def level_about(self, means: MeansAtData) -> Float[Array, " s"]:
+    def level_shift(self, means: MeansAtData) -> Float[Array, " s"]:
         """Return the change of the level that each mean function m_s causes.
 
         The change is the mean of m_s(x_j) over the data, minus the level if grad m_s(x_j) were the normals. The level
@@ -118,32 +118,32 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
 
         return shared_map(prior, (field_keys, noise_keys), scale, self.solver.noise, transform)
 
-    def conditioned(self, draws: NormalDraws, means: MeansAtData) -> Float[Array, "s a a a"]:
+    def condition_draws(self, draws: NormalDraws, means: MeansAtData) -> Float[Array, "s a a a"]:
         """Condition the draws on the normals, and return the coefficients of the samples.
 
         A sample is Poisson(v + k(., X) A^-1 (n - grad m(X) - v(X) - eps)). Here v and eps are draws of the normal field
         and of the noise, n are the normals at the points X, m is a mean function, and A is the covariance of n.
         """
-        return self._reconstructed(draws.coefficients, self.solver.solve(self._residual(draws, means)))
+        return self._reconstruct_samples(draws.coefficients, self.solver.solve(self._residual(draws, means)))
 
     def _residual(self, draws: NormalDraws, means: MeansAtData) -> Float[Array, "s n 3"]:
         """Return the normals minus the means' gradients and the drawn normals, with zeros in unfilled rows."""
-        return jnp.where(self.cloud.mask[:, None], self.cloud.normals - means.gradients - draws.at_data, 0.0)
+        return jnp.where(self.cloud.mask[:, None], self.cloud.normals - means.gradients - draws.noisy_normals, 0.0)
 
     def whitened_residual(self, draws: NormalDraws, means: MeansAtData) -> Float[Array, "s n 3"]:
         """Return C^-1 times the result of `_residual`, with C the Cholesky factor of the normals' covariance."""
         return self.solver.whiten(self._residual(draws, means))
 
-    def updated(
+    def update_draws(
         self, coefficients: Float[Array, "s 3 a a a"], whitened: Float[Array, "s n 3"]
     ) -> Float[Array, "s a a a"]:
         """Return the coefficients of Poisson(v + k(., X) C^-T z) for each sample.
 
         `coefficients` are those of the drawn normal field v, and `whitened` is z, the result of `whitened_residual`.
         """
-        return self._reconstructed(coefficients, self.solver.unwhiten(whitened))
+        return self._reconstruct_samples(coefficients, self.solver.unwhiten(whitened))
 
-    def _reconstructed(
+    def _reconstruct_samples(
         self, coefficients: Float[Array, "s 3 a a a"], weights: Float[Array, "s n 3"]
     ) -> Float[Array, "s a a a"]:
         transform = NonuniformTransform(self.cloud.points, self.truncation)
@@ -156,7 +156,7 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
 
 
 @program
-def given_normals(cloud: PointCloud, spectrum: Spectra, noise: Scalar) -> GeometricSPSRPosterior:
+def condition_on_normals(cloud: PointCloud, spectrum: Spectra, noise: Scalar) -> GeometricSPSRPosterior:
     """Return the posterior p(f | D), with a solver that suits the cloud's capacity."""
     # Unfilled rows may hold NaN, and become zero so that NaN does not spread through products.
     points, normals = (jnp.where(cloud.mask[:, None], rows, 0.0) for rows in (cloud.points, cloud.normals))
@@ -187,8 +187,8 @@ def mean_at_data(
 
     - `transform`: transform at the points of the cloud.
     """
-    at_data = transform.evaluate(coefficients[None])[:, 0]
-    return jnp.sum(jnp.where(cloud.mask, at_data, 0.0)) / jnp.sum(cloud.mask)
+    values = transform.evaluate(coefficients[None])[:, 0]
+    return jnp.sum(jnp.where(cloud.mask, values, 0.0)) / jnp.sum(cloud.mask)
 
 
 @program
@@ -204,7 +204,7 @@ def _level_slope(posterior: GeometricSPSRPosterior) -> Float[Array, "n 3"]:
         return solve_poisson(mode_variance(spectrum) * fields)
 
     # `adjoint` and `evaluate` are transposes of each other, and ten times as fast as the transposes that JAX derives.
-    at_data = transform.adjoint(cloud.mask[:, None] / jnp.sum(cloud.mask))[0]
-    fields = jax.ShapeDtypeStruct((3, *at_data.shape), at_data.dtype)
-    slope = transform.evaluate(jax.linear_transpose(damped, fields)(at_data)[0])
+    coefficients = transform.adjoint(cloud.mask[:, None] / jnp.sum(cloud.mask))[0]
+    fields = jax.ShapeDtypeStruct((3, *coefficients.shape), coefficients.dtype)
+    slope = transform.evaluate(jax.linear_transpose(damped, fields)(coefficients)[0])
     return posterior.solver.solve(jnp.where(cloud.mask[:, None], slope, 0.0)[None])[0]

@@ -38,12 +38,12 @@ class MeansAtData(NamedTuple):
 class DataPoints(NamedTuple):
     """The data points where `sample_about` evaluates the mean functions of the samples.
 
-    - `gradients`: points where the gradients of the mean functions are subtracted from the observed normals.
-    - `values`: points where the values of the mean functions are used, for observed values of f or for the level.
+    - `gradient_points`: points where the gradients of the mean functions are subtracted from the observed normals.
+    - `value_points`: points where the values of the mean functions are used, for observed values of f or for the level.
     """
 
-    gradients: Float[Array, "n 3"]
-    values: Float[Array, "m 3"]
+    gradient_points: Float[Array, "n 3"]
+    value_points: Float[Array, "m 3"]
 
 
 class FieldsAbout(Fields):
@@ -106,8 +106,8 @@ class TrigonometricPosterior(SurfacePosterior):
     @sampling_method
     def sample(self, key: PRNGKeyArray, num_samples: int) -> TrigonometricFields:
         """Draw `num_samples` samples of the function f by pathwise conditioning."""
-        about_zero = _at_data(_Zeros(num_samples), self.data_points())
-        return TrigonometricFields(_sampled(self, key, about_zero, None))
+        means = _evaluate_means(_Zeros(num_samples), self.data_points())
+        return TrigonometricFields(_sample_coefficients(self, key, means, None))
 
     @checked
     def sample_about(
@@ -127,24 +127,24 @@ class TrigonometricPosterior(SurfacePosterior):
         of noise scales that differs from the number of mean functions, or means that are not finite at the data.
         """
         check_key(key)
-        at_data = _at_data(means, self.data_points())
+        means_at_data = _evaluate_means(means, self.data_points())
         scale = as_floats(noise_scale, "the noise scale").astype(self.mean_coefficients.dtype)
-        count = len(at_data.values)
+        count = len(means_at_data.values)
         require(
             scale.shape in ((), (count,)),
             f"the noise scale has shape {scale.shape}, but there are {count} mean functions: give one number, or one "
             "for each",
         )
         if not is_traced(scale):
-            least, most = float(np.min(scale)), float(np.max(scale))
-            require(least >= 0, f"a noise scale is {least:.4g}; it must not be negative")
-            require(most < np.inf, f"a noise scale is {most:.4g}; it must be finite")
-        unscaled = not is_traced(scale) and least == most == 1.0
-        coefficients = _sampled(self, key, at_data, None if unscaled else scale)
-        levels = self.level_about(at_data)
+            smallest, largest = float(np.min(scale)), float(np.max(scale))
+            require(smallest >= 0, f"a noise scale is {smallest:.4g}; it must not be negative")
+            require(largest < np.inf, f"a noise scale is {largest:.4g}; it must be finite")
+        is_unscaled = not is_traced(scale) and smallest == largest == 1.0
+        coefficients = _sample_coefficients(self, key, means_at_data, None if is_unscaled else scale)
+        levels = self.level_shift(means_at_data)
         if not is_traced(levels, coefficients):
-            finite = jnp.isfinite(coefficients).all(axis=(1, 2, 3)) & jnp.isfinite(levels)
-            bad = np.flatnonzero(~np.asarray(finite))
+            is_finite = jnp.isfinite(coefficients).all(axis=(1, 2, 3)) & jnp.isfinite(levels)
+            bad = np.flatnonzero(~np.asarray(is_finite))
             require(
                 bad.size == 0,
                 f"{bad.size} of the {count} mean functions, the first of them number {bad[:1]}, have values or "
@@ -158,7 +158,7 @@ class TrigonometricPosterior(SurfacePosterior):
         """Return the data points where `sample_about` needs gradients and values of mean functions."""
 
     @abstractmethod
-    def level_about(self, means: MeansAtData) -> Float[Array, " s"]:
+    def level_shift(self, means: MeansAtData) -> Float[Array, " s"]:
         """Return, for each mean function, the level of samples about it minus the level about zero."""
 
     @abstractmethod
@@ -169,7 +169,7 @@ class TrigonometricPosterior(SurfacePosterior):
         """
 
     @abstractmethod
-    def conditioned(self, draws: Any, means: MeansAtData) -> Float[Array, "s a a a"]:
+    def condition_draws(self, draws: Any, means: MeansAtData) -> Float[Array, "s a a a"]:
         """Condition the draws on the data minus the means, and return the coefficients of the samples.
 
         The result is jointly linear in the draws, the data and the means. It does not include the means themselves.
@@ -201,22 +201,22 @@ def fill_rows(points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Float[Arr
 
 
 @program
-def _at_data(means: Fields, points: DataPoints) -> MeansAtData:
-    dtype, count = points.gradients.dtype, len(points.values)
-    values = means(points.values)
+def _evaluate_means(means: Fields, points: DataPoints) -> MeansAtData:
+    dtype, count = points.gradient_points.dtype, len(points.value_points)
+    values = means(points.value_points)
     require(
         values.ndim == 2 and values.shape[1] == count,
         f"the mean functions give values {values.shape} at {count} points: Fields give one row for each function",
     )
-    return MeansAtData(means.gradient(points.gradients).astype(dtype), values.astype(dtype))
+    return MeansAtData(means.gradient(points.gradient_points).astype(dtype), values.astype(dtype))
 
 
 @program
-def _sampled(
+def _sample_coefficients(
     posterior: TrigonometricPosterior, key: PRNGKeyArray, means: MeansAtData, scale: Float[Array, "*s"] | None
 ) -> Float[Array, "s a a a"]:
     draws = posterior.prior_draws(key, len(means.values))
     # Do not multiply by a scale of one, which would change how XLA rounds the neighbouring sums.
     if scale is not None:
         draws = jax.tree.map(lambda draw: draw * scale.reshape(-1, *(1,) * (draw.ndim - 1)), draws)
-    return posterior.conditioned(draws, means)
+    return posterior.condition_draws(draws, means)

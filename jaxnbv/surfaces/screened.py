@@ -36,12 +36,12 @@ from jaxnbv.surfaces.covariance import function_covariance, function_variance, m
 from jaxnbv.surfaces.factor import CholeskyFactor
 from jaxnbv.surfaces.given_normals import GeometricSPSRPosterior, NormalDraws
 from jaxnbv.surfaces.pathwise import DataPoints, MeansAtData, TrigonometricPosterior, fill_rows
-from jaxnbv.surfaces.solver import MOST_FACTORISED, points_at_once
+from jaxnbv.surfaces.solver import MAX_DENSE_CAPACITY, points_per_batch
 from jaxnbv.surfaces.spsr import GeometricSPSR
 from jaxnbv.surfaces.trigonometric import NonuniformTransform, inverse_laplacian, solve_poisson
 from jaxnbv.surfaces.values import EmptySpace, OnSurface, OutsideBoundary, ValueRows, ValueSource, concatenate_rows
 
-_JUMP_POINTS = 256
+_NUM_UNIT_POINTS = 256
 
 
 class ScreenedSPSR(SurfaceModel):
@@ -94,8 +94,8 @@ class ScreenedSPSR(SurfaceModel):
         observations = as_observations(observations)
         capacity = observations.cloud.capacity
         require(
-            capacity <= MOST_FACTORISED,
-            f"the cloud has room for {capacity} points, and this model takes {MOST_FACTORISED} at most: lower the "
+            capacity <= MAX_DENSE_CAPACITY,
+            f"the cloud has room for {capacity} points, and this model takes {MAX_DENSE_CAPACITY} at most: lower the "
             "planner's capacity, or use GeometricSPSR, which takes more",
         )
         posterior = _condition(self, self.base.condition(observations), observations)
@@ -116,40 +116,40 @@ def _condition(
     # `base.cloud` has zeros in unfilled rows, where the cloud may hold NaN.
     observations = eqx.tree_at(lambda e: e.cloud, observations, base.cloud)
     spectrum, rows = model.base.spectrum, concatenate_rows(model.values, observations)
-    half_jump = _half_jump(base, model.offset)
+    value_unit = _value_unit(base, model.offset)
     whitened = jnp.where(rows.mask, base.solver.whitened_cross(rows.points), 0.0)
     explained = jnp.einsum("dnk,dnl->kl", whitened, whitened, precision="highest")
     level_variance = model.level_deviation**2
     covariance = function_covariance(rows.points, rows.points, spectrum) - explained + level_variance
-    block = jnp.where(rows.mask[:, None] & rows.mask, covariance, 0.0)
+    covariances = jnp.where(rows.mask[:, None] & rows.mask, covariance, 0.0)
     # An unfilled row is a row of the identity, and its weight is zero.
-    factor = CholeskyFactor.of(block + jnp.diag(jnp.where(rows.mask, (half_jump * rows.noise) ** 2, 1.0)))
+    factor = CholeskyFactor.of(covariances + jnp.diag(jnp.where(rows.mask, (value_unit * rows.noise) ** 2, 1.0)))
 
     # This is the posterior given the normals alone. The weights of the values and the mean replace its fields below.
-    level, nothing = jnp.zeros_like(base.level), jnp.zeros_like(rows.values)
+    level, zeros = jnp.zeros_like(base.level), jnp.zeros_like(rows.values)
     posterior = ScreenedSPSRPosterior(
-        level, base.mean_coefficients, model, base, rows, half_jump, whitened, factor, nothing
+        level, base.mean_coefficients, model, base, rows, value_unit, whitened, factor, zeros
     )
     transform = NonuniformTransform(rows.points, model.base.truncation)
-    at_rows = transform.evaluate(base.mean_coefficients[None])[:, 0]
-    weights = posterior.solve(half_jump * rows.values - at_rows)
-    no_draw = jnp.zeros((1, 3, *base.mean_coefficients.shape), at_rows.dtype)
+    row_values = transform.evaluate(base.mean_coefficients[None])[:, 0]
+    weights = posterior.solve(value_unit * rows.values - row_values)
+    zero_draw = jnp.zeros((1, 3, *base.mean_coefficients.shape), row_values.dtype)
     normals = base.solver.whiten(base.cloud.normals[None])
-    mean = posterior._updated(no_draw, normals, jnp.zeros(1, at_rows.dtype), weights[None])[0]
+    mean = posterior._update_draws(zero_draw, normals, jnp.zeros(1, row_values.dtype), weights[None])[0]
     return eqx.tree_at(lambda p: (p.weights, p.mean_coefficients), posterior, (weights, mean))
 
 
-def _half_jump(base: GeometricSPSRPosterior, offset: float) -> Float[Array, ""]:
+def _value_unit(base: GeometricSPSRPosterior, offset: float) -> Float[Array, ""]:
     """Return h, half the median rise of E f across the surface, given the normals alone.
 
     The rise is from `offset` behind each point to `offset` in front of it, along its normal. h is at least half the
     prior standard deviation of f.
     """
-    chosen = some_rows(base.cloud, _JUMP_POINTS)
-    points, step = base.cloud.points[chosen], offset * base.cloud.normals[chosen]
+    rows = some_rows(base.cloud, _NUM_UNIT_POINTS)
+    points, step = base.cloud.points[rows], offset * base.cloud.normals[rows]
     mean = base.mean_field
-    least = 0.5 * jnp.sqrt(function_variance(base.spectrum))
-    return jnp.maximum(0.5 * jnp.median(mean(points + step)[0] - mean(points - step)[0]), least)
+    smallest = 0.5 * jnp.sqrt(function_variance(base.spectrum))
+    return jnp.maximum(0.5 * jnp.median(mean(points + step)[0] - mean(points - step)[0]), smallest)
 
 
 class ScreenedDraws(NamedTuple):
@@ -167,7 +167,7 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
     - `mean_coefficients`: coefficients of E g, see `surfaces/trigonometric.py`.
     - `base`: the posterior p(f | normals).
     - `rows`: the observed values.
-    - `half_jump`: h, the unit of the values: half the rise of the mean of f across the surface.
+    - `value_unit`: h, the unit of the values: half the rise of the mean of f across the surface.
     - `whitened`: C^-1 K_df, where A = C C^T is the covariance of the normals, and K_df their covariance with f at the
       points of `rows`.
     - `factor`: the Cholesky factor of S, the covariance of the values given the normals.
@@ -179,7 +179,7 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
     model: ScreenedSPSR
     base: GeometricSPSRPosterior
     rows: ValueRows
-    half_jump: Float[Array, ""]
+    value_unit: Float[Array, ""]
     whitened: Float[Array, "3 n m"]
     factor: CholeskyFactor
     weights: Float[Array, " m"]
@@ -199,13 +199,13 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
             values = self.factor.whiten(jnp.where(self.rows.mask[:, None], cross, 0.0))
             return jnp.maximum(prior - jnp.sum(normals**2) - jnp.sum(values**2), 0.0)
 
-        return jax.lax.map(at_point, x, batch_size=points_at_once(len(x), self.base.cloud.capacity))
+        return jax.lax.map(at_point, x, batch_size=points_per_batch(len(x), self.base.cloud.capacity))
 
     def data_points(self) -> DataPoints:
         """Return the cloud's points for gradients of mean functions, and the values' points for values."""
-        return DataPoints(self.base.data_points().gradients, fill_rows(self.rows.points, self.rows.mask))
+        return DataPoints(self.base.data_points().gradient_points, fill_rows(self.rows.points, self.rows.mask))
 
-    def level_about(self, means: MeansAtData) -> Float[Array, " s"]:
+    def level_shift(self, means: MeansAtData) -> Float[Array, " s"]:
         """Return zero for each mean function, because g is measured relative to the level."""
         return jnp.zeros(len(means.values), self.weights.dtype)
 
@@ -213,12 +213,12 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
         """Draw the normal field and its noise, the level c, and the noise e of the values from the prior."""
         base_key, level_key, noise_key = jax.random.split(key, 3)
         normals = self.base.prior_draws(base_key, num_samples)
-        dtype, shape = normals.at_data.dtype, self.rows.noise.shape
+        dtype, shape = normals.noisy_normals.dtype, self.rows.noise.shape
         level = self.model.level_deviation * jax.random.normal(level_key, (num_samples,), dtype)
-        noise = self.half_jump * self.rows.noise * jax.random.normal(noise_key, (num_samples, *shape), dtype)
+        noise = self.value_unit * self.rows.noise * jax.random.normal(noise_key, (num_samples, *shape), dtype)
         return ScreenedDraws(normals, level, noise)
 
-    def conditioned(self, draws: ScreenedDraws, means: MeansAtData) -> Float[Array, "s a a a"]:
+    def condition_draws(self, draws: ScreenedDraws, means: MeansAtData) -> Float[Array, "s a a a"]:
         """Condition the draws on the normals and then on the values. Return the coefficients of the samples.
 
         The samples are of g = f - c, where c is the level of f. The gradients of `means` are subtracted from the
@@ -227,17 +227,17 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
         residual = self.base.whitened_residual(draws.normals, means)
         coefficients, level, noise = draws.normals.coefficients, draws.level, draws.noise
         transform = NonuniformTransform(self.rows.points, self.model.base.truncation)
-        at_rows = shared_map(_values, coefficients, transform)
+        row_values = shared_map(_evaluate, coefficients, transform)
         # Condition f at the values' points Y on the normals. Their residual r adds k(Y, X) A^-1 r, computed whitened.
-        at_rows = at_rows + jnp.einsum("dnm,snd->sm", self.whitened, residual, precision="highest") + means.values
-        weights = jax.vmap(self.solve)(self.half_jump * self.rows.values - at_rows + level[:, None] - noise)
-        return self._updated(coefficients, residual, -level, weights)
+        row_values = row_values + jnp.einsum("dnm,snd->sm", self.whitened, residual, precision="highest") + means.values
+        weights = jax.vmap(self.solve)(self.value_unit * self.rows.values - row_values + level[:, None] - noise)
+        return self._update_draws(coefficients, residual, -level, weights)
 
     def solve(self, residual: Float[Array, " m"]) -> Float[Array, " m"]:
         """Return the weights S^-1 r of a residual r whose covariance is S, with zeros in unfilled rows."""
         return self.factor.solve(jnp.where(self.rows.mask, residual, 0.0))
 
-    def _updated(
+    def _update_draws(
         self,
         coefficients: Float[Array, "s 3 a a a"],
         residual: Float[Array, "s n 3"],
@@ -251,17 +251,17 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
         - `constant`: the level c of the draw, negated.
         - `weights`: the weights w of the values.
         """
-        moved = residual - jnp.einsum("dnm,sm->snd", self.whitened, weights, precision="highest")
-        fields = self.base.updated(coefficients, moved)
+        remainder = residual - jnp.einsum("dnm,sm->snd", self.whitened, weights, precision="highest")
+        fields = self.base.update_draws(coefficients, remainder)
         transform = NonuniformTransform(self.rows.points, self.model.base.truncation)
         variance = mode_variance(self.model.base.spectrum)
-        direct = shared_map(_reconstructed, weights, transform, variance)
+        value_part = shared_map(_reconstruct, weights, transform, variance)
         middle = fields.shape[-1] // 2
         constant = constant + self.model.level_deviation**2 * jnp.sum(weights, axis=1)
-        return (fields - direct).at[:, middle, middle, middle].add(constant)
+        return (fields - value_part).at[:, middle, middle, middle].add(constant)
 
 
-def _values(normals: Float[Array, "3 a a a"], transform: NonuniformTransform) -> Float[Array, " m"]:
+def _evaluate(normals: Float[Array, "3 a a a"], transform: NonuniformTransform) -> Float[Array, " m"]:
     """Return the values of f = Poisson(v) at the points of the transform.
 
     - `normals`: coefficients of the normal field v.
@@ -269,7 +269,7 @@ def _values(normals: Float[Array, "3 a a a"], transform: NonuniformTransform) ->
     return transform.evaluate(solve_poisson(normals)[None])[:, 0]
 
 
-def _reconstructed(
+def _reconstruct(
     weights: Float[Array, " m"], transform: NonuniformTransform, variance: Float[Array, "a a a"]
 ) -> Float[Array, "a a a"]:
     """Return the coefficients of -cov(f, f(Y)) w, where Y are the transform's points, and w the weights.

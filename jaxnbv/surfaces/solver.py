@@ -31,12 +31,12 @@ from jaxnbv.surfaces.covariance import (
 from jaxnbv.surfaces.factor import CholeskyFactor
 from jaxnbv.surfaces.trigonometric import NonuniformTransform
 
-MOST_FACTORISED = 16384
+MAX_DENSE_CAPACITY = 16384
 """Largest capacity for which A is factorised. A then takes 1.1 GB in float32, and 2.2 GB during factorisation."""
 
 _CHUNK_VALUES = 2**24
-_ALWAYS_WHOLE = 2048
-_MOST_PRODUCTS = 2000
+_SMALL_CAPACITY = 2048
+_MAX_PRODUCTS = 2000
 
 
 class Solver(eqx.Module):
@@ -62,20 +62,20 @@ class Solver(eqx.Module):
         """
 
     @abstractmethod
-    def solve(self, blocks: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
-        """Apply the inverse covariance A^-1 to the columns of blocks, which must be zero in unfilled rows."""
+    def solve(self, matrices: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
+        """Apply the inverse covariance A^-1 to the columns of matrices, which must be zero in unfilled rows."""
 
     @abstractmethod
     def explained_variance(self, x: Float[Array, "n 3"]) -> Float[Array, " n"]:
         """Return how much the data reduce Var f(x), at points in scene coordinates."""
 
-    def whiten(self, blocks: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
-        """Apply C^-1 to the columns of each block, where C is the Cholesky factor of the covariance."""
-        return _of_columns(self.factor.whiten, blocks)
+    def whiten(self, matrices: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
+        """Apply C^-1 to the columns of each matrix, where C is the Cholesky factor of the covariance."""
+        return _apply_to_columns(self.factor.whiten, matrices)
 
-    def unwhiten(self, blocks: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
-        """Apply C^-T to the columns of each block, where C is the Cholesky factor of the covariance."""
-        return _of_columns(self.factor.unwhiten, blocks)
+    def unwhiten(self, matrices: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
+        """Apply C^-T to the columns of each matrix, where C is the Cholesky factor of the covariance."""
+        return _apply_to_columns(self.factor.unwhiten, matrices)
 
     def whitened_cross(self, x: Float[Array, "n 3"]) -> Float[Array, "3 capacity n"]:
         """Return C^-1 cov(v_d(X), f(x)) for each component d of the normal field v at the cloud's points X.
@@ -85,13 +85,13 @@ class Solver(eqx.Module):
         """
         capacity, factor = self.cloud.capacity, self.factor
 
-        def leading(size: int):
+        def whiten_rows(size: int):
             cross = function_normal_covariance(x, self.cloud.points[:size], self.spectrum)
             cross = jnp.where(self.cloud.mask[:size], cross, 0.0)
-            solved = _of_columns(factor.leading(size).whiten, jnp.swapaxes(cross, 1, 2))
-            return jnp.pad(solved, ((0, 0), (0, capacity - size), (0, 0)))
+            whitened = _apply_to_columns(factor.leading(size).whiten, jnp.swapaxes(cross, 1, 2))
+            return jnp.pad(whitened, ((0, 0), (0, capacity - size), (0, 0)))
 
-        return _on_filled_rows(self.cloud, leading)
+        return _call_on_leading_rows(self.cloud, whiten_rows)
 
 
 class DenseSolver(Solver):
@@ -107,28 +107,28 @@ class DenseSolver(Solver):
         """Factorise the covariance of the normals of a cloud. See `Solver` for the arguments."""
         capacity = cloud.capacity
 
-        def leading(size: int):
+        def factorise(size: int):
             points, mask = cloud.points[:size], cloud.mask[:size]
             kernel = jnp.where(mask[:, None] & mask, normal_covariance(points, points, spectrum), 0.0)
-            block = kernel + jnp.diag(jnp.where(mask, noise**2, 1.0))
-            upper = CholeskyFactor.of(block).upper
+            covariance = kernel + jnp.diag(jnp.where(mask, noise**2, 1.0))
+            upper = CholeskyFactor.of(covariance).upper
             return jnp.eye(capacity, dtype=upper.dtype).at[:size, :size].set(upper)
 
-        return cls(cloud, spectrum, noise, CholeskyFactor(_on_filled_rows(cloud, leading)))
+        return cls(cloud, spectrum, noise, CholeskyFactor(_call_on_leading_rows(cloud, factorise)))
 
     @property
     def factor(self) -> CholeskyFactor:
         return self.cholesky
 
-    def solve(self, blocks: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
-        return _of_columns(self.cholesky.solve, blocks)
+    def solve(self, matrices: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
+        return _apply_to_columns(self.cholesky.solve, matrices)
 
     def explained_variance(self, x: Float[Array, "n 3"]) -> Float[Array, " n"]:
         """Return how much the data reduce Var f(x). The cost grows with (number of points) x (capacity)^2."""
         return jax.lax.map(
             lambda point: jnp.sum(self.whitened_cross(point[None]) ** 2),
             x,
-            batch_size=points_at_once(len(x), self.cloud.capacity),
+            batch_size=points_per_batch(len(x), self.cloud.capacity),
         )
 
 
@@ -147,23 +147,25 @@ class ConjugateGradientSolver(Solver):
     def factor(self) -> CholeskyFactor:
         """Not available. **Raises:** `ValueError`, because this solver does not factorise A."""
         raise InputError(
-            f"covariances and likelihoods need a factorisation, which is done for at most {MOST_FACTORISED} points: "
+            f"covariances and likelihoods need a factorisation, which is done for at most {MAX_DENSE_CAPACITY} points: "
             "keep fewer points"
         )
 
-    def solve(self, blocks: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
-        tolerance = float(jnp.finfo(blocks.dtype).eps) ** 0.8
+    def solve(self, matrices: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
+        tolerance = float(jnp.finfo(matrices.dtype).eps) ** 0.8
 
-        def solved(rows, transform, variance, noise, mask):
+        def solve(rows, transform, variance, noise, mask):
             def product(rows):
                 return jnp.where(mask, transform.evaluate(variance * transform.adjoint(rows)), 0.0) + noise**2 * rows
 
-            solution, _ = cg(product, rows, tol=tolerance, maxiter=_MOST_PRODUCTS)
-            left = jnp.linalg.norm(rows - product(solution)) / jnp.linalg.norm(rows)
-            return jnp.where(left < 10 * tolerance, solution, jnp.nan)
+            solution, _ = cg(product, rows, tol=tolerance, maxiter=_MAX_PRODUCTS)
+            error = jnp.linalg.norm(rows - product(solution)) / jnp.linalg.norm(rows)
+            return jnp.where(error < 10 * tolerance, solution, jnp.nan)
 
         transform = NonuniformTransform(self.cloud.points, self.spectrum.shape[-1] - 1)
-        return shared_map(solved, blocks, transform, mode_variance(self.spectrum), self.noise, self.cloud.mask[:, None])
+        return shared_map(
+            solve, matrices, transform, mode_variance(self.spectrum), self.noise, self.cloud.mask[:, None]
+        )
 
     def explained_variance(self, x: Float[Array, "n 3"]) -> Float[Array, " n"]:
         """Return how much the data reduce Var f(x). Each point takes one solve."""
@@ -177,34 +179,34 @@ class ConjugateGradientSolver(Solver):
 
 
 def solver_of(cloud: PointCloud, spectrum: Spectra, noise: Scalar) -> Solver:
-    """Return a `DenseSolver` up to a capacity of `MOST_FACTORISED`, else a `ConjugateGradientSolver`."""
-    if cloud.capacity > MOST_FACTORISED:
+    """Return a `DenseSolver` up to a capacity of `MAX_DENSE_CAPACITY`, else a `ConjugateGradientSolver`."""
+    if cloud.capacity > MAX_DENSE_CAPACITY:
         return ConjugateGradientSolver(cloud, spectrum, noise)
     return DenseSolver.of(cloud, spectrum, noise)
 
 
-def points_at_once(count: int, capacity: int) -> int:
+def points_per_batch(count: int, capacity: int) -> int:
     """Return how many of `count` points to whiten together, so that memory stays bounded."""
     return max(1, min(count, _CHUNK_VALUES // capacity))
 
 
-def _on_filled_rows(cloud: PointCloud, leading: Callable[[int], Float[Array, "*of"]]) -> Float[Array, "*of"]:
-    """Call `leading(size)` with the smallest of a few sizes for which the first rows hold all points.
+def _call_on_leading_rows(cloud: PointCloud, compute: Callable[[int], Float[Array, "*of"]]) -> Float[Array, "*of"]:
+    """Call `compute(size)` with the smallest of a few sizes for which the first rows hold all points.
 
     The time thus depends on the number of filled rows, although array shapes are fixed. A small cloud always uses its
     capacity as the size, because each size is compiled separately.
     """
     capacity = cloud.capacity
-    if capacity <= _ALWAYS_WHOLE:
-        return leading(capacity)
+    if capacity <= _SMALL_CAPACITY:
+        return compute(capacity)
     sizes = [-(-capacity * eighths // 8) for eighths in (2, 3, 4, 5, 6, 8)]
     filled = jnp.max(jnp.where(cloud.mask, jnp.arange(capacity) + 1, 0))
     return jax.lax.switch(
-        jnp.searchsorted(jnp.asarray(sizes), filled), [functools.partial(leading, size) for size in sizes]
+        jnp.searchsorted(jnp.asarray(sizes), filled), [functools.partial(compute, size) for size in sizes]
     )
 
 
-def _of_columns(function: Callable[[Array], Array], blocks: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
-    """Apply a function that maps the columns of a matrix to the columns of all blocks, in a single call."""
-    columns = jnp.moveaxis(blocks, 0, 1)
+def _apply_to_columns(function: Callable[[Array], Array], matrices: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
+    """Apply a function that maps the columns of a matrix to the columns of all matrices, in a single call."""
+    columns = jnp.moveaxis(matrices, 0, 1)
     return jnp.moveaxis(function(columns.reshape(len(columns), -1)).reshape(columns.shape), 1, 0)

@@ -31,10 +31,10 @@ from jaxnbv.observations import Observations, as_observations
 from jaxnbv.programs import program
 from jaxnbv.surfaces.base import HALF_WIDTH, SurfaceModel
 from jaxnbv.surfaces.covariance import Scalar, Spectra, circle_spectrum
-from jaxnbv.surfaces.given_normals import GeometricSPSRPosterior, given_normals
+from jaxnbv.surfaces.given_normals import GeometricSPSRPosterior, condition_on_normals
 from jaxnbv.surfaces.trigonometric import basis_variance
 
-_SPARSE = 2.5
+_MAX_SPACING = 2.5
 
 # The converter also accepts numbers and tuples, which mypy cannot see.
 if TYPE_CHECKING:
@@ -86,12 +86,12 @@ class GeometricSPSR(SurfaceModel):
             return
         for name in ("lengthscale", "variance", "noise"):
             value = np.asarray(getattr(self, name))
-            positive = bool(np.all((value > 0) & (value < math.inf)))
-            require(positive, f"{name} is {value}; it must be positive and finite")
-        kept = float(self.kept_variance)
-        if kept < 1 / 3:
+            is_positive = bool(np.all((value > 0) & (value < math.inf)))
+            require(is_positive, f"{name} is {value}; it must be positive and finite")
+        fraction = float(self.kept_variance)
+        if fraction < 1 / 3:
             warnings.warn(
-                f"truncation={self.truncation} keeps {kept:.0%} of the prior's variance at "
+                f"truncation={self.truncation} keeps {fraction:.0%} of the prior's variance at "
                 f"lengthscale={np.asarray(self.lengthscale)}: raise the truncation or the lengthscale",
                 stacklevel=3,
             )
@@ -99,10 +99,10 @@ class GeometricSPSR(SurfaceModel):
     @property
     def spectrum(self) -> Spectra:
         """Matern spectrum of one axis at frequencies 0, ..., L, with a leading axis for several lengthscales."""
-        of_one = functools.partial(circle_spectrum, self.nu, truncation=self.truncation)
+        spectrum_of_scale = functools.partial(circle_spectrum, self.nu, truncation=self.truncation)
         if jnp.ndim(self.lengthscale) == 0:
-            return of_one(self.lengthscale, self.variance)
-        return jax.vmap(of_one)(self.lengthscale, self.variance)
+            return spectrum_of_scale(self.lengthscale, self.variance)
+        return jax.vmap(spectrum_of_scale)(self.lengthscale, self.variance)
 
     @property
     def kept_variance(self) -> Float[Array, ""]:
@@ -120,7 +120,7 @@ class GeometricSPSR(SurfaceModel):
             return
         spacing = float(np.median(cKDTree(points).query(points, k=2)[0][:, 1]))
         lengthscale = 2.0 * math.pi * float(np.max(self.lengthscale))
-        if spacing > _SPARSE * lengthscale:
+        if spacing > _MAX_SPACING * lengthscale:
             warnings.warn(
                 f"points are {spacing:.2g} apart, {spacing / lengthscale:.1f} times the model's longest lengthscale of "
                 f"{lengthscale:.2g} (scene units): samples hardly follow them. Scan more densely, or raise the "
@@ -141,7 +141,7 @@ class GeometricSPSR(SurfaceModel):
         cloud = as_observations(observations).cloud
         if not is_traced(cloud):
             check_oriented(cloud, "the cloud", HALF_WIDTH, unit=False)
-        posterior = given_normals(cloud, self.spectrum, self.noise)
+        posterior = condition_on_normals(cloud, self.spectrum, self.noise)
         if not is_traced(posterior.level):
             require(
                 bool(jnp.isfinite(posterior.level)),
@@ -153,5 +153,5 @@ class GeometricSPSR(SurfaceModel):
 
 @program
 def _kept_variance(model: GeometricSPSR) -> Float[Array, ""]:
-    kept = jnp.sum(jax.vmap(basis_variance)(jnp.atleast_2d(model.spectrum))[:, model.truncation :], axis=1)
-    return jnp.sum(kept**3) / jnp.sum(model.variance**3)
+    axis_variances = jnp.sum(jax.vmap(basis_variance)(jnp.atleast_2d(model.spectrum))[:, model.truncation :], axis=1)
+    return jnp.sum(axis_variances**3) / jnp.sum(model.variance**3)

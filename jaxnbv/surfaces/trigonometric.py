@@ -144,8 +144,8 @@ class NonuniformTransform(eqx.Module):
         self.start = (first + window // 2).astype(jnp.int32)
         weights = jnp.i0(beta * jnp.sqrt(radicand)) / float(i0(beta))
         # JAX clamps a slice that starts outside its array, and would use the wrong nodes. Such points give NaN instead.
-        in_grid = (self.start >= 0) & (self.start <= 2 * truncation + 1)
-        self.weights = jnp.where(in_grid[..., None], weights, jnp.nan)
+        is_in_grid = (self.start >= 0) & (self.start <= 2 * truncation + 1)
+        self.weights = jnp.where(is_in_grid[..., None], weights, jnp.nan)
         self.truncation = truncation
 
     def evaluate(self, coefficients: Float[Array, "k a a a"]) -> Float[Array, "n k"]:
@@ -156,8 +156,8 @@ class NonuniformTransform(eqx.Module):
     def adjoint(self, values: Float[Array, "n k"]) -> Float[Array, "k a a a"]:
         """Apply `evaluate` transposed: sum over points j of values_j phi_a(x_j1) phi_b(x_j2) phi_c(x_j3)."""
         basis = self._node_basis(values.dtype)
-        spread = self._spread(values, basis.shape[0])
-        return evaluate_on_grid(jnp.moveaxis(spread, -1, 0), basis.T)
+        node_values = self._spread(values, basis.shape[0])
+        return evaluate_on_grid(jnp.moveaxis(node_values, -1, 0), basis.T)
 
     def _interpolate(self, grid: Float[Array, "g g g k"]) -> Float[Array, "n k"]:
         def at_point(start, weights):

@@ -25,7 +25,7 @@ def cloud(capacity: int) -> nbv.PointCloud:
 @pytest.fixture
 def few(monkeypatch):
     """Capacities above 36 are not factorised. No other file has these capacities, because compiled programs stay."""
-    monkeypatch.setattr(solver, "MOST_FACTORISED", 36)
+    monkeypatch.setattr(solver, "MAX_DENSE_CAPACITY", 36)
 
 
 def test_every_method_equals_the_factorisation_and_weight_space(x64, few):
@@ -42,9 +42,9 @@ def test_every_method_equals_the_factorisation_and_weight_space(x64, few):
     solve = eqx.filter_jit(lambda posterior, rows: posterior.solver.solve(rows))
     np.testing.assert_allclose(solve(posterior, rows)[:, :36], solve(factorised, rows[:, :36]), atol=1e-8)
     draws = eqx.filter_jit(posterior.prior_draws)(key, 2)
-    same = draws._replace(at_data=draws.at_data[:, :36])
+    same = draws._replace(noisy_normals=draws.noisy_normals[:, :36])
     none = MeansAtData(jnp.zeros(()), jnp.zeros(()))
-    conditioned = eqx.filter_jit(lambda posterior, draws: posterior.conditioned(draws, none))
+    conditioned = eqx.filter_jit(lambda posterior, draws: posterior.condition_draws(draws, none))
     np.testing.assert_allclose(conditioned(posterior, draws), conditioned(factorised, same), atol=1e-8)
 
 
@@ -67,14 +67,14 @@ def test_float32_is_exact_to_a_ten_thousandth(monkeypatch):
     model = nbv.GeometricSPSR(lengthscale=0.03, truncation=12)
     with jax.enable_x64(True):
         expected = model.condition(nbv.PointCloud.from_arrays(0.5 * points, points)).mean(queries)
-    monkeypatch.setattr(solver, "MOST_FACTORISED", 499)
+    monkeypatch.setattr(solver, "MAX_DENSE_CAPACITY", 499)
     mean = model.condition(nbv.PointCloud.from_arrays(0.5 * points, points)).mean(queries)
     np.testing.assert_allclose(mean, expected, atol=1e-4 * np.abs(expected).max())
 
 
 def test_what_does_not_converge_is_refused(few, monkeypatch):
     """Two steps for thirty points, with a capacity that no other test compiles."""
-    monkeypatch.setattr(solver, "_MOST_PRODUCTS", 2)
+    monkeypatch.setattr(solver, "_MAX_PRODUCTS", 2)
     with pytest.raises(ValueError, match=r"singular in float32: raise the noise"):
         nbv.GeometricSPSR(0.1, 0.8, 4, noise=0.01).condition(cloud(41))
 
@@ -85,6 +85,6 @@ def test_what_needs_the_factor_is_refused(few, monkeypatch):
         model.condition(cloud(42)).log_marginal_likelihood()
     with pytest.raises(ValueError, match=r"need a factorisation, which is done for at most 36 points"):
         model.condition(cloud(42)).covariance(QUERIES, QUERIES)
-    monkeypatch.setattr("jaxnbv.surfaces.screened.MOST_FACTORISED", 36)
+    monkeypatch.setattr("jaxnbv.surfaces.screened.MAX_DENSE_CAPACITY", 36)
     with pytest.raises(ValueError, match=r"room for 39 points.*36 at most: lower the planner's capacity"):
         nbv.ScreenedSPSR(model).condition(cloud(39))

@@ -72,8 +72,8 @@ def regression(posterior, scales, s, x, noise=0.2):
     """Mean (n,) and covariance (n, n) about mean function s, relative to the posterior's level."""
     parts = [WeightSpace(ell, variance, noise, 1.5, 3) for ell, variance in zip(*SCALES[scales], strict=True)]
     less = NORMALS - exact(s, POINTS)[1]
-    if hasattr(posterior, "half_jump"):
-        h = float(posterior.half_jump)
+    if hasattr(posterior, "value_unit"):
+        h = float(posterior.value_unit)
         data = POINTS, less, noise, AT[:-1], h * VALUES[:-1] - exact(s, AT[:-1])[0], h * VALUE_NOISE[:-1]
         mean, covariance = JointWeightSpace(parts, 0.7).posterior(data, x)
         return exact(s, x)[0] + mean, covariance

@@ -37,7 +37,7 @@ def problem(hyperparameters, capacity=27):
     posterior = nbv.ScreenedSPSR(base, (source,), level_deviation=0.7).condition(cloud(POINTS, NORMALS, capacity))
     ells, variances = (np.atleast_1d(hyperparameters[name]) for name in ("lengthscale", "variance"))
     scales = [WeightSpace(ell, variance, 0.2, 1.5, 3) for ell, variance in zip(ells, variances, strict=True)]
-    h = float(posterior.half_jump)
+    h = float(posterior.value_unit)
     data = POINTS, NORMALS, 0.2, at[:-1], h * values[:-1], abs(h) * noise[:-1]
     return posterior, JointWeightSpace(scales, 0.7).posterior(data, QUERIES)
 
@@ -80,7 +80,7 @@ def test_the_unit_of_values_is_half_the_rise_of_the_mean_across_the_data():
     mean, (points, normals) = base.condition(data).mean, data.to_numpy()
     rise = np.asarray(mean(points + 0.2 * normals) - mean(points - 0.2 * normals))
     # 256 rows are drawn from 60, so that each occurs four or five times.
-    assert 0.5 * np.quantile(rise, 0.4) < float(posterior.half_jump) < 0.5 * np.quantile(rise, 0.6)
+    assert 0.5 * np.quantile(rise, 0.4) < float(posterior.value_unit) < 0.5 * np.quantile(rise, 0.6)
 
 
 def test_values_are_reached_where_they_are_said_to_be():
@@ -89,7 +89,7 @@ def test_values_are_reached_where_they_are_said_to_be():
         nbv.GeometricSPSR((0.03, 0.1), (0.2, 0.4), truncation=8),
         (nbv.surfaces.OutsideBoundary(num_points=60, noise=0.02), nbv.surfaces.OnSurface(30, noise=0.02)),
     ).condition(data)
-    h, rows = float(posterior.half_jump), posterior.rows
+    h, rows = float(posterior.value_unit), posterior.rows
     assert h > 0
     np.testing.assert_allclose(np.asarray(posterior.mean(rows.points)), h * np.asarray(rows.values), atol=0.1 * h)
     radius = np.linalg.norm(rows.points, axis=1)

@@ -176,7 +176,7 @@ def test_points_where_functions_only_repeat_are_refused():
 @pytest.mark.parametrize("count", [1, 10, 11, 29, 40])
 def test_a_large_capacity_gives_what_its_filled_rows_give(x64, monkeypatch, count):
     """Above the capacity limit only the leading share of the rows is processed: a quarter of 40 is 10."""
-    monkeypatch.setattr("jaxnbv.surfaces.solver._ALWAYS_WHOLE", 30)
+    monkeypatch.setattr("jaxnbv.surfaces.solver._SMALL_CAPACITY", 30)
     rng = np.random.default_rng(count)
     points, normals = rng.uniform(-1.3, 1.3, (count, 3)), rng.standard_normal((count, 3))
     oracle, posterior = WeightSpace(**SETTINGS), nbv.GeometricSPSR(**SETTINGS).condition(cloud(points, normals, 40))
