@@ -17,7 +17,7 @@ from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning import Grid, GridSurface, scan
 from jaxnbv.scanning.grid import samples_at_once
 from jaxnbv.sharding import shared_map
-from jaxnbv.surfaces.part_evidence import MOST, misfit_of, weight_of
+from jaxnbv.surfaces.part_evidence import MAX_MISFIT, misfit_of, ray_weight
 from jaxnbv.surfaces.part_hypotheses import NONE, PartHypotheses, hypotheses_of
 from jaxnbv.surfaces.shape_bank import ShapeBank
 from jaxnbv.utility import Answer, Quantity
@@ -163,7 +163,7 @@ def _image(surface: GridSurface, camera: Camera, poses: Pose, barrier: Float[Arr
 def _information(images: _Image, context: ImaginedParts, camera: Camera) -> Float[Array, ""]:
     """Return the expected information of one pose, given the images of all hypotheses from this pose."""
     (reach, _, hits), weights = images, context.weights
-    weight = weight_of(jnp.sum(jnp.where(hits, reach, 0.0)) / jnp.maximum(jnp.sum(hits), 1), camera)
+    weight = ray_weight(jnp.sum(jnp.where(hits, reach, 0.0)) / jnp.maximum(jnp.sum(hits), 1), camera)
 
     def after(image):
         misfit = weight * jnp.sum(_misfits(image, images, context.tau), axis=-1)
@@ -182,13 +182,13 @@ def _information(images: _Image, context: ImaginedParts, camera: Camera) -> Floa
 def _misfits(image: _Image, others: _Image, tau: Float[Array, ""]) -> Float[Array, "h rays"]:
     """Return each ray's misfit between the image of one hypothesis and the images of all hypotheses.
 
-    The misfit grows with the distance between the surfaces. It is the upper bound `MOST` if the ray hits only one of
-    the two surfaces.
+    The misfit grows with the distance between the surfaces. It is the upper bound `MAX_MISFIT` if the ray hits only one
+    of the two surfaces.
     """
     (reach, _, hits), (expected, cosine, are_expected) = image, others
     both = hits & are_expected
     apart = misfit_of(jnp.where(both, (reach - expected) * cosine, 0.0), tau)
-    return jnp.where(both, apart, jnp.where(hits ^ are_expected, MOST, 0.0))
+    return jnp.where(both, apart, jnp.where(hits ^ are_expected, MAX_MISFIT, 0.0))
 
 
 def entropy(weights: Float[Array, "*n c"]) -> Float[Array, "*n"]:

@@ -237,16 +237,16 @@ def _registered(
 ) -> Float[np.ndarray, "4 4"]:
     start = None if pose is None else np.linalg.inv(pose)
     result = register_scan(points, normals, model, is_solid, start)
-    if result.median > _POOR * _diameter(model.vertices):
+    if result.median_distance > _POOR * _diameter(model.vertices):
         warnings.warn(
-            f"the CAD fits the scan poorly: the median distance is {result.median:.4g}. Give pose=, and check that it "
-            "is this part, that the scan shows little else, and that its faces are wound outward",
+            f"the CAD fits the scan poorly: the median distance is {result.median_distance:.4g}. Give pose=, and check "
+            "that it is this part, that the scan shows little else, and that its faces are wound outward",
             stacklevel=4,
         )
-    if result.rival > 0:
+    if result.ambiguity > 0:
         warnings.warn(
             "the CAD fits the scan nearly as well in another pose, where its surface is off by "
-            f"{result.rival:.4g} on average: scan more of the part, or give pose=",
+            f"{result.ambiguity:.4g} on average: scan more of the part, or give pose=",
             stacklevel=4,
         )
     return np.linalg.inv(result.matrix)
