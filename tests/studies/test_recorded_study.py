@@ -377,7 +377,7 @@ def test_every_method_is_measured_by_what_its_frames_show(study):
     best = record["methods"][ORACLE]
     assert gain[best["frames"][1]] == max(gain)
     assert all(method["covered"][1] <= best["covered"][1] for method in record["methods"].values())
-    of_new = study.measures[1].of(record, NEW_AREA)
+    of_new = study.measures[1].compute(record, NEW_AREA)
     own = record["methods"][NEW_AREA]["covered"]
     assert of_new[3] == pytest.approx((own[2] - own[0]) / (best["covered"][2] - best["covered"][0]))
 
