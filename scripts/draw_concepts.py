@@ -19,16 +19,16 @@ from jaxnbv.studies.scenes import Split, demo_object, hidden_view, pyramid_scene
 from jaxnbv.surfaces.known_shapes import kind_of
 from jaxnbv.viz.choice import draw_acquisition
 from jaxnbv.viz.figures import STYLE
-from jaxnbv.viz.imagined import look, look_picture
-from jaxnbv.viz.render import Still, beside, draw_items, frame
-from jaxnbv.viz.scene import seen_items
+from jaxnbv.viz.imagined import colour_image, shaded_image
+from jaxnbv.viz.render import Still, crop, draw_items, eye_beside
+from jaxnbv.viz.scene import scene_items
 from jaxnbv.viz.style import BEFORE, GREY, INK, NEW, VALUE
 
-SHOWN = 4
+NUM_SAMPLES = 4
 PIXELS = 160
 
 
-def drawn(figure: Figure, dpi: int) -> Image.Image:
+def to_image(figure: Figure, dpi: int) -> Image.Image:
     """A figure as an image."""
     figure.set_dpi(dpi)
     canvas = FigureCanvasAgg(figure)
@@ -38,7 +38,7 @@ def drawn(figure: Figure, dpi: int) -> Image.Image:
 
 def save(figure: Figure, path: Path) -> None:
     """Write a figure with few colours, which makes the file small."""
-    drawn(figure, 170).quantize(128, dither=Image.Dither.NONE).save(path, optimize=True)
+    to_image(figure, 170).quantize(128, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
 def draw_posterior(
@@ -56,21 +56,21 @@ def draw_posterior(
     figure = Figure(figsize=(9.6, 3.5))
     first, second, third = (figure.add_axes((left, 0.02, 0.32, 0.86)) for left in (0.0, 0.34, 0.67))
     pose = observations.poses.rows[0]
-    still = Still(beside(pose), None, 500, 2.5)
+    still = Still(eye_beside(pose), None, 500, 2.5)
     points, _ = observations.cloud.to_numpy()
-    frame(first, still, draw_items(first, still, seen_items(points[:0], points, [pose], planner.camera)))
+    crop(first, still, draw_items(first, still, scene_items(points[:0], points, [pose], planner.camera)))
     first.axis("off")
-    for sample in np.asarray(surfaces.values[:SHOWN, middle]):
+    for sample in np.asarray(surfaces.values[:NUM_SAMPLES, middle]):
         second.contour(axis, axis, sample, levels=[0.0], colors=[BEFORE], linewidths=0.9, alpha=0.75)
     extent = (axis[0], axis[-2]) * 2
     third.imshow(inside, VALUE, vmin=0, vmax=1, origin="lower", extent=extent, interpolation="bilinear")
-    heads = "D, what one view saw", f"cross-section of {SHOWN} samples", "probability of being inside"
+    heads = "D, what one view saw", f"cross-section of {NUM_SAMPLES} samples", "probability of being inside"
     for panel, head in zip((first, second, third), heads, strict=True):
         figure.text(panel.get_position().x0 + 0.01, 0.94, head, fontsize=10)
-    near = np.abs(points[:, 0] - axis[middle]) < 0.03
+    is_near = np.abs(points[:, 0] - axis[middle]) < 0.03
     for panel in (second, third):
         panel.contour(axis[::2], axis[::2], truth, levels=[0.0], colors=[GREY], linewidths=1.0, linestyles=":")
-        panel.scatter(points[near, 2], points[near, 1], s=5.0, color=NEW, linewidths=0, zorder=5)
+        panel.scatter(points[is_near, 2], points[is_near, 1], s=5.0, color=NEW, linewidths=0, zorder=5)
         panel.set(xlim=(-1.5, 1.5), ylim=(-1.35, 1.35), aspect="equal")
         panel.axis("off")
     return figure
@@ -84,21 +84,21 @@ def draw_utility(
 ) -> Figure:
     """Draw imagined scans of the best candidate and of one of the worst tenth, coloured by the worth of each point."""
     order = np.argsort(np.asarray(proposal.values))
-    chosen = np.array([order[-1], order[len(order) // 10]])
-    poses = proposal.candidates[jnp.asarray(chosen)]
+    indices = np.array([order[-1], order[len(order) // 10]])
+    poses = proposal.candidates[jnp.asarray(indices)]
     camera = dataclasses.replace(planner.camera, height=PIXELS, width=PIXELS)
-    few = jax.tree.map(lambda rows: rows[:SHOWN], surfaces)
+    few = jax.tree.map(lambda rows: rows[:NUM_SAMPLES], surfaces)
     fine, coarse = (nbv.scanning.scan_samples(few, one, poses) for one in (camera, planner.camera))
     context = context_of(planner.acquisition, observations)
     figure = Figure(figsize=(9.6, 5.2))
     highest = 0.0
-    squares = np.zeros((2, SHOWN, PIXELS**2))
+    squares = np.zeros((2, NUM_SAMPLES, PIXELS**2))
     for row in range(2):
-        for column in range(SHOWN):
+        for column in range(NUM_SAMPLES):
             squares[row, column] = nearest_squared_distance(fine.points[column, row], observations.cloud)
             highest = max(highest, float(np.quantile(squares[row, column][np.asarray(fine.mask[column, row])], 0.98)))
     for row, name in enumerate(("the chosen view", "a poor view")):
-        expected = float(proposal.values[chosen[row]])
+        expected = float(proposal.values[indices[row]])
         figure.text(
             0.012,
             0.955 - 0.49 * row,
@@ -106,7 +106,7 @@ def draw_utility(
             color=INK,
             fontsize=10,
         )
-        for column in range(SHOWN):
+        for column in range(NUM_SAMPLES):
             axes = figure.add_axes((0.01 + 0.222 * column, 0.55 - 0.49 * row, 0.21, 0.385))
             mask = np.asarray(fine.mask[column, row])
             normals = np.asarray(fine.normals[column, row])
@@ -117,8 +117,8 @@ def draw_utility(
             colours[mask] = (VALUE(np.clip(squares[row, column] / highest, 0, 1))[:, :3] * lit[:, None])[mask]
             axes.imshow(np.clip(colours, 0, 1).reshape(PIXELS, PIXELS, 3), interpolation="bilinear")
             axes.set(xticks=[], yticks=[])
-            own = jax.tree.map(lambda rows, i=(column, row): rows[i], coarse)
-            worth = float(planner.acquisition.score(context, ImaginedView(own, planner.camera, poses[row])))
+            coarse_scan = jax.tree.map(lambda rows, i=(column, row): rows[i], coarse)
+            worth = float(planner.acquisition.score(context, ImaginedView(coarse_scan, planner.camera, poses[row])))
             axes.set_xlabel(f"worth {worth:.0f}", labelpad=2)
     bar = figure.add_axes((0.91, 0.2, 0.014, 0.55))
     scale = mpl.cm.ScalarMappable(mpl.colors.Normalize(0.0, highest), VALUE)
@@ -149,25 +149,30 @@ def draw_known() -> Figure:
     camera = nbv.Camera(height=PIXELS, width=PIXELS)
     posterior, key = with_bank.posterior(observations), jax.random.key(0)
     names = [kind_of(name) for name in posterior.names_of_samples(key, with_bank.num_samples)]
-    other = [names.index(name) for name in dict.fromkeys(names)][:SHOWN]
+    sample_indices = [names.index(name) for name in dict.fromkeys(names)][:NUM_SAMPLES]
     rows = (
-        ("by the Gaussian process", plain.sample(observations, key), range(SHOWN), [""] * SHOWN),
-        ("with known shapes", with_bank.sample(observations, key, posterior), other, [names[index] for index in other]),
+        ("by the Gaussian process", plain.sample(observations, key), range(NUM_SAMPLES), [""] * NUM_SAMPLES),
+        (
+            "with known shapes",
+            with_bank.sample(observations, key, posterior),
+            sample_indices,
+            [names[index] for index in sample_indices],
+        ),
     )
     cloud = observations.cloud.to_numpy()[0]
     figure = Figure(figsize=(9.6, 4.6))
-    for row, (head, surfaces, chosen, labels) in enumerate(rows):
+    for row, (head, surfaces, indices, labels) in enumerate(rows):
         figure.text(0.012, 0.955 - 0.49 * row, head, color=INK, fontsize=10)
         scans = nbv.scanning.scan_samples(surfaces, camera, below[None])
-        for column, (index, label) in enumerate(zip(chosen, labels, strict=True)):
+        for column, (index, label) in enumerate(zip(indices, labels, strict=True)):
             axes = figure.add_axes((0.01 + 0.2 * column, 0.55 - 0.49 * row, 0.19, 0.385))
-            image = look(jax.tree.map(lambda leaf, i=index: leaf[i, 0], scans), camera, below, cloud)
-            axes.imshow(look_picture(image, "#5b8fc7"))
+            image = shaded_image(jax.tree.map(lambda leaf, i=index: leaf[i, 0], scans), camera, below, cloud)
+            axes.imshow(colour_image(image, "#5b8fc7"))
             axes.axis("off")
             axes.text(0.5, -0.02, label, ha="center", va="top", transform=axes.transAxes)
     axes = figure.add_axes((0.81, 0.305, 0.18, 0.385))
-    seen = nbv.scan(nbv.SDFSurface(pyramid), camera, below)
-    axes.imshow(look_picture(look(seen, camera, below, cloud), NEW))
+    true_scan = nbv.scan(nbv.SDFSurface(pyramid), camera, below)
+    axes.imshow(colour_image(shaded_image(true_scan, camera, below, cloud), NEW))
     axes.axis("off")
     axes.text(0.5, -0.02, "the truth", ha="center", va="top", transform=axes.transAxes)
     return figure

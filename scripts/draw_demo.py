@@ -7,25 +7,25 @@ from pathlib import Path
 import jax
 import matplotlib as mpl
 import numpy as np
-from draw_concepts import drawn
+from draw_concepts import to_image
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
 import jaxnbv as nbv
-from jaxnbv.cli.play import DEMO, imagined, planner_of, rule
+from jaxnbv.cli.play import DEMO, planner_of, sampler_of, stop_rule_of
 from jaxnbv.cli.tasks import TASKS
-from jaxnbv.viz.charts import over_views
+from jaxnbv.viz.charts import set_view_axis
 from jaxnbv.viz.data import ReportData, report_data
 from jaxnbv.viz.figures import STYLE
-from jaxnbv.viz.imagined import Tile, look_picture, looks
-from jaxnbv.viz.render import draw_scene, painted
+from jaxnbv.viz.imagined import Tile, colour_image, image_tiles
+from jaxnbv.viz.render import draw_scene, render_view
 from jaxnbv.viz.style import GREY, NEW
 
 SIZE, DPI, COLOURS = (9.2, 3.5), 120, 128
 # The demo's own seed.
 SEED = 2
-MOST_VIEWS, RACE_VIEWS = 5, 10
+MAX_VIEWS, MAX_RIVAL_VIEWS = 5, 10
 # Milliseconds of the frames with a guess, with the answer, and at the end.
 GUESS, ANSWER, END = 700, 1800, 5000
 
@@ -33,17 +33,17 @@ GUESS, ANSWER, END = 700, 1800, 5000
 def demo_episode(seed: int, search: str, views: int) -> nbv.Episode:
     """An episode of the demo by a search of the command line, until the demo's stop rule or after `views` views."""
     task = TASKS["cross-entropy"]
-    subject, enough = task.demo(0, seed), rule(task.until)
-    sampler = dataclasses.replace(imagined("screened", False, subject.bank), grid=subject.grid)
+    subject, stop_rule = task.demo(0, seed), stop_rule_of(task.until)
+    sampler = dataclasses.replace(sampler_of("screened", False, subject.bank), grid=subject.grid)
     planner = planner_of(task.setting(), subject.acquisition, search, sampler, DEMO)
-    return nbv.simulate(planner, subject.surface, subject.first, views, jax.random.key(seed), until=enough)
+    return nbv.simulate(planner, subject.surface, subject.first, views, jax.random.key(seed), until=stop_rule)
 
 
 class Film:
     """Frames of one size, each shown for a time."""
 
     def __init__(self, data: ReportData):
-        self.data, self.stills = data, [painted(data, index) for index in range(len(data.views))]
+        self.data, self.stills = data, [render_view(data, index) for index in range(len(data.views))]
         self.frames: list[Image.Image] = []
         self.times: list[int] = []
 
@@ -60,7 +60,7 @@ class Film:
         axes.spines[:].set(visible=True, color=GREY)
         figure.text(0.84, 0.95, f"probability of a {self._true_name}", ha="center", fontsize=10)
         self._answers(figure.add_axes((0.72, 0.16, 0.26, 0.7)), view, view if rival is None else rival)
-        self.frames.append(drawn(figure, DPI))
+        self.frames.append(to_image(figure, DPI))
         self.times.append(time)
 
     @property
@@ -68,17 +68,20 @@ class Film:
         (chart,) = self.data.task.charts
         return chart.names[int(np.argmax(chart.true))]
 
-    def _answers(self, axes: Axes, drawn: int, rival: int) -> None:
+    def _answers(self, axes: Axes, num_views: int, num_rival_views: int) -> None:
         task = self.data.task
         assert task.rival is not None
         (chart,), (other,) = task.charts, task.rival.charts
         true = int(np.argmax(chart.true))
-        lines = (other.values[:rival], GREY, "s--", task.rival.name), (chart.values[:drawn], NEW, "o-", "jaxnbv")
+        lines = (
+            (other.values[:num_rival_views], GREY, "s--", task.rival.name),
+            (chart.values[:num_views], NEW, "o-", "jaxnbv"),
+        )
         for values, colour, marks, name in lines:
             axes.plot(range(1, len(values) + 1), values[:, true], marks, color=colour, lw=1.8, ms=5, label=name)
         axes.axhline(chart.goal, color=GREY, lw=0.8, ls=":")
         axes.set(ylim=(0.0, 1.06))
-        over_views(axes, max(len(chart.values), len(other.values)))
+        set_view_axis(axes, max(len(chart.values), len(other.values)))
         axes.legend(loc="lower center", bbox_to_anchor=(0.5, 0.98), ncols=2, frameon=False, fontsize=9)
 
     def save(self, path: Path) -> None:
@@ -88,9 +91,9 @@ class Film:
         colours = [*palette.getpalette()[: 3 * (COLOURS - 1)], 255, 255, 255]
         frames = []
         for frame in self.frames:
-            places = np.array(frame.quantize(palette=palette, dither=Image.Dither.NONE))
-            places[(np.asarray(frame) == 255).all(axis=-1)] = COLOURS - 1
-            frames.append(Image.fromarray(places, "P"))
+            indices = np.array(frame.quantize(palette=palette, dither=Image.Dither.NONE))
+            indices[(np.asarray(frame) == 255).all(axis=-1)] = COLOURS - 1
+            frames.append(Image.fromarray(indices, "P"))
             frames[-1].putpalette(colours)
         frames[0].save(path, save_all=True, append_images=frames[1:], duration=self.times, loop=0, optimize=True)
 
@@ -99,17 +102,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "docs", help="folder of the picture")
     out: Path = parser.parse_args().out
-    episode, rival = demo_episode(SEED, "halving", MOST_VIEWS), demo_episode(SEED, "farthest", RACE_VIEWS)
+    episode, rival = demo_episode(SEED, "halving", MAX_VIEWS), demo_episode(SEED, "farthest", MAX_RIVAL_VIEWS)
     data = report_data(episode, progress=False, rival=rival)
     views, film = data.views, Film(data)
     with mpl.rc_context(STYLE):
         for number, view in enumerate(views, start=1):
-            assert view.look is not None
+            assert view.image is not None
             if view.imagined is not None:
-                for tile in looks(view.imagined, None):
+                for tile in image_tiles(view.imagined, None):
                     guess = Tile(tile.name.rstrip(" 0123456789") + "?", tile.picture)
                     film.add(number - 1, guess, f"imagined from view {number}", GUESS)
-            scan_tile = Tile("scanned", look_picture(view.look, plain=True))
+            scan_tile = Tile("scanned", colour_image(view.image, is_plain=True))
             film.add(number, scan_tile, f"seen from view {number}", ANSWER)
         assert data.task.rival is not None
         film.add(len(views), scan_tile, f"seen from view {len(views)}", END, len(data.task.rival.charts[0].values))

@@ -22,8 +22,8 @@ from jaxnbv.studies.scenes import Split, demo_object, household_scene, part_scen
 from jaxnbv.viz.choice import draw_acquisition
 from jaxnbv.viz.data import ReportData, report_data
 from jaxnbv.viz.figures import STYLE
-from jaxnbv.viz.imagined import looks
-from jaxnbv.viz.render import draw_scene, painted
+from jaxnbv.viz.imagined import image_tiles
+from jaxnbv.viz.render import draw_scene, render_view
 from jaxnbv.viz.style import GREY
 
 VIEWS, RAYS, CANDIDATES = 4, 48, 60
@@ -66,8 +66,8 @@ def draw_gallery(figure: Figure, columns: int = 4) -> None:
         row, column = divmod(index, columns)
         bottom = 1.0 - (row + 1) / rows
         axes = figure.add_axes((column / columns, bottom + 0.08 / rows, 1.0 / columns, 0.92 / rows))
-        draw_scene(axes, data, VIEWS - 1, painted(data, VIEWS - 1), weight=0.8, inset=False)
-        text = f"{name}, {data.views[-1].seen.amount} covered"
+        draw_scene(axes, data, VIEWS - 1, render_view(data, VIEWS - 1), weight=0.8, inset=False)
+        text = f"{name}, {data.views[-1].coverage.amount} covered"
         figure.text((column + 0.5) / columns, bottom + 0.04 / rows, text, ha="center", va="center", fontsize=9)
 
 
@@ -81,7 +81,7 @@ def draw_hero(figure: Figure) -> None:
         ("a truck: what does it carry?", "pale is known, dark is guessed"),
         ("what may be there", "four guesses; blue: not seen yet"),
         ("what each view is worth", "purple: may change the answer"),
-        ("the next view, and the answer", data.task.found.partition(". ")[0]),
+        ("the next view, and the answer", data.task.answer_text.partition(". ")[0]),
     )
     widths = (3.0, 2.6, 2.6, 3.0)
     total, left = sum(widths), 0.0
@@ -91,9 +91,9 @@ def draw_hero(figure: Figure) -> None:
         figure.text(x + 0.5 * w, 0.875, below, ha="center", va="center", color=GREY, fontsize=10.5)
         if place in (0, 3):
             index = 0 if place == 0 else 1
-            draw_scene(figure.add_axes((x, 0.0, w, 0.86)), data, index, painted(data, index), inset=False)
+            draw_scene(figure.add_axes((x, 0.0, w, 0.86)), data, index, render_view(data, index), inset=False)
         elif place == 1:
-            for number, tile in enumerate(looks(sketch, None)):
+            for number, tile in enumerate(image_tiles(sketch, None)):
                 down, across = divmod(number, 2)
                 box = (x + (0.04 + 0.48 * across) * w, 0.43 - 0.42 * down, 0.44 * w, 0.4)
                 _tile(figure.add_axes(box), tile.picture)

@@ -7,7 +7,7 @@ import subprocess
 import sys
 from unittest import mock
 
-from jaxnbv.cli import answer
+from jaxnbv.cli import run_app
 
 TERMINAL = {"COLUMNS": "200", "NO_COLOR": "1"}
 
@@ -29,7 +29,7 @@ def run_command(*arguments: str, cwd) -> subprocess.CompletedProcess:
         mock.patch.object(sys, "argv", ["jaxnbv", *arguments]),
     ):
         try:
-            answer()
+            run_app()
         except SystemExit as leaving:
             code = leaving.code or 0
     return subprocess.CompletedProcess(arguments, code, stdout.getvalue(), stderr.getvalue())

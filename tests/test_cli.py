@@ -72,14 +72,14 @@ def test_the_help_of_studies_is_an_overview_and_that_of_a_study_has_its_options_
 
 
 def test_equal_warnings_are_printed_once_with_their_number(tmp_path, monkeypatch):
-    def play(*arguments, **settings):
+    def run_episode(*arguments, **settings):
         for place in ("here", "there", "here", "here"):
             warnings.warn(f"the mesh is {place}", stacklevel=2)
             # Libraries do this, and then Python's own filter prints every warning again.
             with warnings.catch_warnings():
                 warnings.simplefilter("always")
 
-    monkeypatch.setattr("jaxnbv.cli.play.play", play)
+    monkeypatch.setattr("jaxnbv.cli.play.run_episode", run_episode)
     with warnings.catch_warnings():
         warnings.simplefilter("default")
         result = run_command("demo", "--task", "coverage", cwd=tmp_path)
@@ -251,7 +251,7 @@ def simulate(*arguments, each=None, **settings):
     assert racing.wait(300)
     raise KeyboardInterrupt
 
-play.simulate, play.Lines = simulate, lambda planner: print
+play.simulate, play.ViewPrinter = simulate, lambda planner: print
 TASKS["coverage"].until = ("seconds=1e6",)
 sys.argv = ["jaxnbv", "demo", "--task", "coverage", "--no-report"]
 main()
@@ -298,7 +298,7 @@ def test_no_posterior_waits_for_a_rival_or_for_an_earlier_drawing(tmp_path, monk
         return episode
 
     monkeypatch.setattr(TASKS["coverage"], "until", ("seconds=1e6",))
-    changes = {"simulate": simulate, "Lines": lambda planner: print, "race_words": lambda *episodes: "a race"}
+    changes = {"simulate": simulate, "ViewPrinter": lambda planner: print, "rival_text": lambda *episodes: "a race"}
     monkeypatch.setattr(play.viz, "Sketches", Drawings)
     monkeypatch.setattr(play.viz, "write_report", lambda *arguments, **settings: "report.html")
     with mock.patch.multiple(play, **changes):

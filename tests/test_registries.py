@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from commands import run_process
 
-from jaxnbv.cli.play import rule, search_of
+from jaxnbv.cli.play import search_of, stop_rule_of
 from jaxnbv.cli.registry import SEARCHES, STOPS
 from jaxnbv.cli.tasks import TASKS
 from jaxnbv.planning.stopping import StopRule
@@ -22,12 +22,12 @@ from jaxnbv.studies.registry import studies
 def test_a_task_has_a_sensor_and_ends_by_rules_that_exist(name):
     task = TASKS[name]
     assert task.setting().radius > 1.5
-    assert (rule(task.until) is not None) == bool(task.until)
+    assert (stop_rule_of(task.until) is not None) == bool(task.until)
 
 
 @pytest.mark.parametrize("name", STOPS)
 def test_a_rule_is_made_of_a_number(name):
-    assert isinstance(rule([f"{name}=0.5" if name != "parts-found" else "parts-found=5"]), StopRule)
+    assert isinstance(stop_rule_of([f"{name}=0.5" if name != "parts-found" else "parts-found=5"]), StopRule)
 
 
 @pytest.mark.parametrize("name", SEARCHES)

@@ -78,7 +78,7 @@ def _add_commands() -> None:
 _add_commands()
 
 
-def answer() -> None:
+def run_app() -> None:
     """Run the command line with the arguments of this process.
 
     Prints an `InputError` as one line, without a traceback.
@@ -97,7 +97,7 @@ def answer() -> None:
 def main() -> None:
     """Entry point: run the command line, then end the process even if a background thread still runs."""
     try:
-        answer()
+        run_app()
     except SystemExit as end:
         if is_working():
             end_process(end.code if isinstance(end.code, int) else 0)

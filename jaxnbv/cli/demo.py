@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from jaxnbv.cli.episode import EpisodeOptions, SearchOption, SeedOption, TaskOption, by_task
-from jaxnbv.cli.options import asking, command, listed
+from jaxnbv.cli.options import command, help_sentence, task_option
 from jaxnbv.cli.tasks import TASKS
 
 
@@ -14,7 +14,7 @@ class DemoOptions(EpisodeOptions):
     search: SearchOption = "halving"
     seed: SeedOption = 2
     scene: Annotated[
-        int, asking(metavar="N", min=0, max=2**31 - 1, help="Number of the scene, which selects the object.")
+        int, task_option(metavar="N", min=0, max=2**31 - 1, help="Number of the scene, which selects the object.")
     ] = 0
 
 
@@ -23,13 +23,14 @@ def demo(options: DemoOptions) -> None:
     from jaxnbv.checks import check_device
 
     check_device()
-    from jaxnbv.cli.play import DEMO, first_pose, play
+    from jaxnbv.cli.play import DEMO, check_options, first_pose, run_episode
 
+    check_options(options)
     task = TASKS[options.task]
     subject = task.demo(options.scene, options.seed)
     if options.first is not None:
         subject = subject._replace(first=first_pose(options.first, subject.surface))
-    play(options, subject, task.setting(), DEMO, task.until)
+    run_episode(options, subject, task.setting(), DEMO, task.until)
 
 
 demo.__doc__ = "\n\n".join(
@@ -37,6 +38,6 @@ demo.__doc__ = "\n\n".join(
         "Find out what a truck carries, which the first view does not show. Needs no file and no network.",
         "Farthest view, a baseline that ignores the task, starts from the same view.",
         "The object for each --task: "
-        + listed((names, example) for example, names in by_task(lambda task: task.example).items()),
+        + help_sentence((names, example) for example, names in by_task(lambda task: task.example).items()),
     ]
 )

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from jaxnbv.cli.options import asking, command, running, seeing
+from jaxnbv.cli.options import command, run_option, sensor_option, task_option
 from jaxnbv.cli.registry import STOPS
 from jaxnbv.errors import InputError
 from jaxnbv.studies.entries import RECORDING
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from jaxnbv.readers.recorded import RecordedFrames
     from jaxnbv.surfaces.part_pose import ObjectPose
 
-_NAMES_SAID, _BAR = 4, 24
+_NUM_NAMES, _BAR_WIDTH = 4, 24
 # A frame with fewer points than this in the box shows no object.
-_FEWEST = 20
+_MIN_POINTS = 20
 _NO_FOLDER = (
     "is a file: identify needs depth images with the poses of the camera, since the empty space along rays also tells "
     "parts apart. Give the folder of a recording (frames.json, 7-Scenes or TUM RGB-D), or scan a mesh with "
@@ -34,31 +34,35 @@ class IdentifyOptions:
     recording: Annotated[
         Path, typer.Argument(metavar="RECORDING", help="Folder of depth images with poses, see RecordedFrames.")
     ]
-    parts: Annotated[Path, asking(metavar="FOLDER", help="Folder with a mesh of each part that the object may be.")]
+    parts: Annotated[
+        Path, task_option(metavar="FOLDER", help="Folder with a mesh of each part that the object may be.")
+    ]
     parts_scale: Annotated[
         str,
-        asking(metavar="UNIT", help="Unit of the parts: mm, cm, m, in or ft if poses are in metres, else a number."),
+        task_option(
+            metavar="UNIT", help="Unit of the parts: mm, cm, m, in or ft if poses are in metres, else a number."
+        ),
     ] = "m"
-    upright: Annotated[bool, asking("--upright", help="The object stands as its part's mesh does.")] = False
-    parts_up: Annotated[str, asking(metavar="AXIS", help="Upward axis of the parts, for --upright.")] = "y"
-    views: Annotated[int, asking(metavar="N", min=1, help="Number of frames to use, evenly spaced.")] = 8
+    upright: Annotated[bool, task_option("--upright", help="The object stands as its part's mesh does.")] = False
+    parts_up: Annotated[str, task_option(metavar="AXIS", help="Upward axis of the parts, for --upright.")] = "y"
+    views: Annotated[int, task_option(metavar="N", min=1, help="Number of frames to use, evenly spaced.")] = 8
     until: Annotated[
         list[str] | None,
-        asking(
+        task_option(
             metavar="RULE=N",
             help=f"End when a rule holds: identified={STOPS['identified'].about}, placed={STOPS['placed'].about}.",
             show_default="never",
         ),
     ] = None
     up: Annotated[
-        str, seeing(metavar="AXIS", help="Upward axis of the recording: x, y or z, or one of these with a -.")
+        str, sensor_option(metavar="AXIS", help="Upward axis of the recording: x, y or z, or one of these with a -.")
     ] = "z"
-    several: Annotated[bool, asking("--several", help="Several objects stand apart from each other on a table.")] = (
-        False
-    )
+    several: Annotated[
+        bool, task_option("--several", help="Several objects stand apart from each other on a table.")
+    ] = False
     masks: Annotated[
         Path | None,
-        asking(
+        task_option(
             metavar="FOLDER",
             help="Folder of label images: FRAME.png with an object number in each pixel, or FRAME.OBJECT.png, a mask "
             "for each object.",
@@ -67,7 +71,7 @@ class IdentifyOptions:
     ] = None
     out: Annotated[
         Path | None,
-        running(
+        run_option(
             metavar="DIR", help="Output folder for identity.json and a report of each object.", show_default="none"
         ),
     ] = None
@@ -89,7 +93,7 @@ def identify(options: IdentifyOptions, box: Any, intrinsics: Any, depth_scale: A
     check_device()
     import numpy as np
 
-    from jaxnbv.cli.play import rule
+    from jaxnbv.cli.play import stop_rule_of
     from jaxnbv.cli.tasks.identification import as_unit, bank_of
     from jaxnbv.planning.planner import Planner
     from jaxnbv.planning.session import Session
@@ -107,7 +111,7 @@ def identify(options: IdentifyOptions, box: Any, intrinsics: Any, depth_scale: A
     planner = dataclasses.replace(planner, max_views=len(indices))
     masks = None if options.masks is None else Segmentation(options.masks, frames.files)
     kind = Session if masks is None and not options.several else Sessions
-    sessions = kind(frames.camera, corners, planner, options.up, until=rule(options.until or ()))
+    sessions = kind(frames.camera, corners, planner, options.up, until=stop_rule_of(options.until or ()))
     names: dict[int, str] = {} if masks is None else masks.names
     for index in indices:
         labels = None if masks is None else masks.labels(index)
@@ -120,7 +124,7 @@ def identify(options: IdentifyOptions, box: Any, intrinsics: Any, depth_scale: A
         else:
             sessions.add(*image)
         for name, session in _objects(sessions, names).items():
-            likely = ", ".join(f"{part} {100 * share:.0f} %" for part, share in _likely(session))
+            likely = ", ".join(f"{part} {100 * p:.0f} %" for part, p in _likely_names(session))
             typer.echo(f"frame {index:<5} {f'{name}: ' if name else ''}{likely}")
         if (reason := sessions.done()) is not None:
             typer.echo(f"enough      {reason}")
@@ -134,7 +138,7 @@ def identify(options: IdentifyOptions, box: Any, intrinsics: Any, depth_scale: A
     unit = "m" if isinstance(as_unit(options.parts_scale), str) else None
     answers = {}
     for name, session in _objects(sessions, names).items():
-        answers[name or "object"] = _say(name, session, unit)
+        answers[name or "object"] = _print_answer(name, session, unit)
         if options.out is not None:
             _write(options.out / name, name or options.recording.resolve().name, session)
     if options.out is not None:
@@ -144,7 +148,7 @@ def identify(options: IdentifyOptions, box: Any, intrinsics: Any, depth_scale: A
 
 
 def _shows(frames: "RecordedFrames", index: int, corners: "np.ndarray") -> bool:
-    """Return whether a frame shows at least `_FEWEST` points in a box."""
+    """Return whether a frame shows at least `_MIN_POINTS` points in a box."""
     import numpy as np
 
     from jaxnbv.geometry.pose import Pose
@@ -152,8 +156,8 @@ def _shows(frames: "RecordedFrames", index: int, corners: "np.ndarray") -> bool:
 
     image = Image.from_arrays(frames.depth(index), frames.matrices[index], frames.depth_scale, None)
     points = image.points(frames.camera, Pose.from_matrix(image.matrix))
-    inside = (image.depth > 0) & np.all((points > corners[0]) & (points < corners[1]), axis=-1)
-    return int(inside.sum()) >= _FEWEST
+    is_inside = (image.depth > 0) & np.all((points > corners[0]) & (points < corners[1]), axis=-1)
+    return int(is_inside.sum()) >= _MIN_POINTS
 
 
 def _objects(sessions: Any, names: dict[int, str]) -> "dict[str, Session]":
@@ -164,18 +168,18 @@ def _objects(sessions: Any, names: dict[int, str]) -> "dict[str, Session]":
     return {names.get(number, str(number)): session for number, session in objects.items()}
 
 
-def _likely(session: "Session") -> list[tuple[str, float]]:
-    return list(session.identity.items())[:_NAMES_SAID]
+def _likely_names(session: "Session") -> list[tuple[str, float]]:
+    return list(session.identity.items())[:_NUM_NAMES]
 
 
-def _say(name: str, session: "Session", unit: str | None) -> dict[str, Any]:
+def _print_answer(name: str, session: "Session", unit: str | None) -> dict[str, Any]:
     """Print which part an object is and where it lies, and return both for a JSON file."""
     from jaxnbv.surfaces.part_hypotheses import NONE
 
     if name:
         typer.echo(f"\n{name}")
-    for part, share in _likely(session):
-        typer.echo(f"{'█' * round(_BAR * share):{_BAR}} {100 * share:3.0f} %  {part}")
+    for part, p in _likely_names(session):
+        typer.echo(f"{'█' * round(_BAR_WIDTH * p):{_BAR_WIDTH}} {100 * p:3.0f} %  {part}")
     pose, is_none = session.object_pose, next(iter(session.identity)) == NONE
     typer.echo("It is most likely none of these." if is_none else pose_text(pose, unit or session.frame.unit))
     arrays = {field: getattr(pose, field).tolist() for field in ("matrix", "covariance", "alternatives")}
@@ -189,16 +193,18 @@ def pose_text(pose: "ObjectPose", unit: str) -> str:
     """
     import numpy as np
 
-    turn, shift = np.sqrt(np.diag(pose.covariance)).reshape(2, 3).max(axis=1).tolist()
+    angle, shift = np.sqrt(np.diag(pose.covariance)).reshape(2, 3).max(axis=1).tolist()
     length = f"{1000.0 * shift:.2g} mm" if unit == "m" else f"{shift:.2g} {unit}"
     count = len(pose.alternatives)
-    alike = f"{count} poses are equally right: the part is symmetric." if count > 1 else "No other pose is as right."
+    symmetry_text = (
+        f"{count} poses are equally right: the part is symmetric." if count > 1 else "No other pose is as right."
+    )
     return "\n".join(
         [
             f"{pose.name}: from its mesh, in the unit of the world, to the world",
             *("  ".join(f"{value:+.5f}" for value in row) for row in pose.matrix),
-            f"Standard deviations along and about the least certain axes: {length}, {np.degrees(turn):.2g} degrees.",
-            alike,
+            f"Standard deviations along and about the least certain axes: {length}, {np.degrees(angle):.2g} degrees.",
+            symmetry_text,
         ]
     )
 

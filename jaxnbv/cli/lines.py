@@ -8,10 +8,10 @@ from tqdm import tqdm
 from jaxnbv.planning.loop import View
 from jaxnbv.planning.planner import Planner
 from jaxnbv.utility import Answer
-from jaxnbv.viz.answers import label_of, number, words_of
+from jaxnbv.viz.answers import label_of, number_text, words_of
 
 
-class Lines:
+class ViewPrinter:
     """Prints two lines of at most 100 columns for each view: position and choice, then the answer."""
 
     def __init__(self, planner: Planner):
@@ -23,7 +23,9 @@ class Lines:
             _print(f"views are chosen by {label_of(self.planner.quantity)}")
         self.count += 1
         position = ", ".join(f"{value:+.2f}" for value in np.asarray(view.pose.position))
-        _print(f"view {self.count:<3} ({position})   {int(view.scan.count):,} points   {_why(self.planner, view)}")
+        _print(
+            f"view {self.count:<3} ({position})   {int(view.scan.count):,} points   {_choice_text(self.planner, view)}"
+        )
         answer = view.answer(self.planner.acquisition)
         if answer is not None:
             _print(f"         {words_of(answer).said(self.before)}")
@@ -35,7 +37,7 @@ def _print(line: str) -> None:
     tqdm.write(line, file=sys.stdout)
 
 
-def _why(planner: Planner, view: View) -> str:
+def _choice_text(planner: Planner, view: View) -> str:
     """Return why a view was chosen, as text: its value, and the rank of this value among the candidates."""
     if view.proposal is None:
         return "given"
@@ -45,8 +47,10 @@ def _why(planner: Planner, view: View) -> str:
         return f"drawn from {len(values)}"
     if view.proposal.trajectories is not None:
         best = float(values.max(initial=-np.inf))
-        return f"{number(value)}, " + ("no ascent found more" if value <= best else f"by ascent from {number(best)}")
+        return f"{number_text(value)}, " + (
+            "no ascent found more" if value <= best else f"by ascent from {number_text(best)}"
+        )
     rank, tied = 1 + int(np.sum(values > value)), view.proposal.num_tied
     ties = f", tied with {tied}" if tied else ""
-    stands = "best" if rank == 1 else f"number {rank}"
-    return f"{number(value)}, {stands} of {len(values)} (median {number(float(np.median(values)))}){ties}"
+    rank_text = "best" if rank == 1 else f"number {rank}"
+    return f"{number_text(value)}, {rank_text} of {len(values)} (median {number_text(float(np.median(values)))}){ties}"

@@ -16,15 +16,15 @@ Position: TypeAlias = tuple[float, float, float]
 T = TypeVar("T")
 
 # A kind of option for each group of options in the help.
-asking = partial(typer.Option, rich_help_panel="Task")
-seeing = partial(typer.Option, rich_help_panel="Sensor")
-imagining = partial(typer.Option, rich_help_panel="Imagined surfaces")
-finding = partial(typer.Option, rich_help_panel="Search")
-running = partial(typer.Option, rich_help_panel="Run")
-planning = partial(typer.Option, rich_help_panel="Planner")
+task_option = partial(typer.Option, rich_help_panel="Task")
+sensor_option = partial(typer.Option, rich_help_panel="Sensor")
+sampler_option = partial(typer.Option, rich_help_panel="Imagined surfaces")
+search_option = partial(typer.Option, rich_help_panel="Search")
+run_option = partial(typer.Option, rich_help_panel="Run")
+planner_option = partial(typer.Option, rich_help_panel="Planner")
 
 
-def listed(choices: Iterable[tuple[str, str]]) -> str:
+def help_sentence(choices: Iterable[tuple[str, str]]) -> str:
     """Join names and their meanings to one sentence, "name: meaning; ...", for the help."""
     return "; ".join(f"{name}: {about}" for name, about in choices) + "."
 

@@ -21,7 +21,7 @@ from jaxnbv.acquisition import Acquisition
 from jaxnbv.checks import InputError, require
 from jaxnbv.cli.background import in_background
 from jaxnbv.cli.episode import EpisodeOptions
-from jaxnbv.cli.lines import Lines
+from jaxnbv.cli.lines import ViewPrinter
 from jaxnbv.cli.options import Position
 from jaxnbv.cli.registry import STOPS
 from jaxnbv.cli.tasks.base import Subject
@@ -39,7 +39,7 @@ from jaxnbv.studies.engine import searches
 from jaxnbv.surfaces import FreeRotation, ShapeBank, Upright
 from jaxnbv.surfaces.shipped_banks import SHIPPED_BANKS, bank_poses, shape_bank
 from jaxnbv.tasks import Coverage
-from jaxnbv.viz.task import race_words
+from jaxnbv.viz.task import rival_text
 
 
 class Sizes(NamedTuple):
@@ -62,10 +62,10 @@ class Sizes(NamedTuple):
 USUAL, QUICK = Sizes(16, None, 8192), Sizes(4, 40, 1024, Grid(56), 24)
 DEMO = Sizes(16, 60, 2048)
 # Maximum number of views of the baseline in the demo.
-_RACE_VIEWS = 10
+_MAX_RIVAL_VIEWS = 10
 
 
-def rule(texts: Sequence[str]) -> StopRule | None:
+def stop_rule_of(texts: Sequence[str]) -> StopRule | None:
     """Make a stop rule from texts such as "sure=0.95", or None for "never".
 
     The rule holds when one of the rules in the texts holds.
@@ -97,27 +97,27 @@ def search_of(name: str, radius: float, count: int) -> Search:
     return searches.search_of(name, candidates, count, radius, num_starts=6, iterations=20)
 
 
-def imagined(model: str, quick: bool, known: str | ShapeBank | None) -> SurfaceSampler:
+def sampler_of(model: str, quick: bool, bank: str | ShapeBank | None) -> SurfaceSampler:
     """Make the sampler of imagined surfaces, with a bank of known shapes if given.
 
     - `model`: name of the model, one of `MODELS`.
-    - `known`: name of a shipped bank, a folder of upright meshes, or a bank of parts in any rotation. None or "none"
+    - `bank`: name of a shipped bank, a folder of upright meshes, or a bank of parts in any rotation. None or "none"
       for no bank.
 
     **Raises:** `ValueError` if there is no such bank or folder, or if no mesh in the folder can be used.
     """
     sampler = SurfaceSampler.preset(model, quick=quick)
-    if known is None or known == "none":
+    if bank is None or bank == "none":
         return sampler
-    if isinstance(known, ShapeBank):
-        return sampler.with_bank(known, FreeRotation())
-    if known in SHIPPED_BANKS:
-        return sampler.with_bank(shape_bank(known), bank_poses(known))
+    if isinstance(bank, ShapeBank):
+        return sampler.with_bank(bank, FreeRotation())
+    if bank in SHIPPED_BANKS:
+        return sampler.with_bank(shape_bank(bank), bank_poses(bank))
     require(
-        os.path.isdir(known),
-        f"--known {known}: there is no such folder of meshes: give one, or {', '.join(SHIPPED_BANKS)} or none",
+        os.path.isdir(bank),
+        f"--known {bank}: there is no such folder of meshes: give one, or {', '.join(SHIPPED_BANKS)} or none",
     )
-    return sampler.with_bank(ShapeBank.from_meshes(known), Upright(by_axis=True))
+    return sampler.with_bank(ShapeBank.from_meshes(bank), Upright(by_axis=True))
 
 
 def planner_of(
@@ -141,7 +141,22 @@ def first_pose(place: Position, surface: Surface) -> Pose:
     return pose
 
 
-def play(options: EpisodeOptions, subject: Subject, setting: Setting, sizes: Sizes, until: Sequence[str] = ()) -> None:
+def check_options(options: EpisodeOptions) -> None:
+    """Check options that could only fail after the object and the known shapes were made, which takes seconds.
+
+    **Raises:** `ValueError` for fewer than one view, an invalid stop rule, or known shapes for the paper's model.
+    """
+    require(options.views >= 1, f"asked for {options.views} views; ask for at least one")
+    stop_rule_of(options.until or ())
+    require(
+        options.model != "paper" or options.known in (None, "none"),
+        f"--known {options.known}: the paper's model has no known shapes: leave it out, or give --model screened",
+    )
+
+
+def run_episode(
+    options: EpisodeOptions, subject: Subject, setting: Setting, sizes: Sizes, until: Sequence[str] = ()
+) -> None:
     """Simulate an episode, print each view when it is finished, and write the episode and a report.
 
     - `subject`: the object, the acquisition and the first pose.
@@ -150,58 +165,53 @@ def play(options: EpisodeOptions, subject: Subject, setting: Setting, sizes: Siz
     - `until`: texts of stop rules, the default of `--until`. If there are any, the baseline farthest view also runs
       from the same first view for comparison.
     """
-    began = time.perf_counter()
+    start_time = time.perf_counter()
     if options.quick:
         typer.echo("--quick: small settings. Leave it out for the usual ones.")
         sizes = QUICK
     if subject.note:
         typer.echo(subject.note)
-    bank = options.known or subject.bank
-    if options.model == "paper":
-        require(
-            options.known in (None, "none"),
-            f"--known {options.known}: the paper's model has no known shapes: leave it out, or give --model screened",
-        )
-        bank = "none"
-    sampler = dataclasses.replace(imagined(options.model, options.quick, bank), grid=subject.grid or Grid())
+    bank = "none" if options.model == "paper" else options.known or subject.bank
+    sampler = dataclasses.replace(sampler_of(options.model, options.quick, bank), grid=subject.grid or Grid())
     planner, rival = (
         planner_of(setting, subject.acquisition, search, sampler, sizes) for search in (options.search, "farthest")
     )
-    folder, enough = options.out or Path("runs") / _folder_name(options, subject), rule(options.until or until)
-    races = bool(until) and enough is not None and options.search != "farthest"
+    folder = options.out or Path("runs") / _folder_name(options, subject)
+    stop_rule = stop_rule_of(options.until or until)
+    has_rival = bool(until) and stop_rule is not None and options.search != "farthest"
     key, noise = jax.random.key(options.seed), SensorNoise(options.noise, options.noise)
-    lines = Lines(planner)
+    print_view = ViewPrinter(planner)
     sketches = (
         viz.Sketches(Episode(planner, subject.surface, noise, subject.first, key, ())) if options.report else None
     )
-    race: Future[Episode] | None = None
-    drawing: Future[None] | None = None
+    rival_run: Future[Episode] | None = None
+    sketch_run: Future[None] | None = None
 
     # Drawing and the baseline run in the background while the next view is planned.
     def report_step(step: Step) -> None:
-        nonlocal race, drawing
-        lines(step.view)
+        nonlocal rival_run, sketch_run
+        print_view(step.view)
         if sketches is not None:
             # Draw only one step at a time, because each step that waits to be drawn keeps its posterior in memory.
-            if drawing is not None:
-                drawing.result()
-            drawing = in_background(sketches.add, step)
+            if sketch_run is not None:
+                sketch_run.result()
+            sketch_run = in_background(sketches.add, step)
         # Start the baseline only after the first view. Before, both threads would compile the same programs.
-        if race is None and races:
-            start = subject.surface, subject.first, _RACE_VIEWS, key, noise, folder / "farthest"
-            race = in_background(simulate, rival, *start, progress=False, until=enough)
+        if rival_run is None and has_rival:
+            start = subject.surface, subject.first, _MAX_RIVAL_VIEWS, key, noise, folder / "farthest"
+            rival_run = in_background(simulate, rival, *start, progress=False, until=stop_rule)
 
     start = subject.surface, subject.first, options.views, key, noise, folder
-    episode = simulate(planner, *start, until=enough, each=report_step)
-    rival_episode = None if race is None else race.result()
-    if drawing is not None:
-        drawing.result()
+    episode = simulate(planner, *start, until=stop_rule, each=report_step)
+    rival_episode = None if rival_run is None else rival_run.result()
+    if sketch_run is not None:
+        sketch_run.result()
     if episode.stop_reason is not None:
         views, saved = len(episode.views), options.views - len(episode.views)
         typer.echo(f"enough   after view {views}: {episode.stop_reason}. Views saved: {saved} of {options.views}")
     if rival_episode is not None:
-        words = race_words(rival_episode, episode)
-        typer.echo(textwrap.fill(words, 100, initial_indent="race     ", subsequent_indent="         "))
+        text = rival_text(rival_episode, episode)
+        typer.echo(textwrap.fill(text, 100, initial_indent="race     ", subsequent_indent="         "))
     if options.report:
         page = viz.write_report(
             episode,
@@ -212,7 +222,7 @@ def play(options: EpisodeOptions, subject: Subject, setting: Setting, sizes: Siz
             question=subject.question,
         )
         typer.echo(f"report   {page}")
-    typer.echo(f"episode  {folder}   ({time.perf_counter() - began:.0f} s)")
+    typer.echo(f"episode  {folder}   ({time.perf_counter() - start_time:.0f} s)")
 
 
 def _folder_name(options: EpisodeOptions, subject: Subject) -> str:

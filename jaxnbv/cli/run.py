@@ -7,9 +7,9 @@ from typing import Annotated, Any, get_type_hints
 import typer
 
 from jaxnbv.cli.episode import EpisodeOptions, SearchOption, TaskOption
-from jaxnbv.cli.options import command, seeing
+from jaxnbv.cli.options import command, sensor_option
 from jaxnbv.cli.tasks import TASKS
-from jaxnbv.cli.tasks.base import Task, usual_first
+from jaxnbv.cli.tasks.base import Task, default_first_pose
 from jaxnbv.errors import InputError
 
 
@@ -20,12 +20,12 @@ class RunOptions(EpisodeOptions):
     ]
     task: TaskOption = "coverage"
     search: SearchOption = "discrete"
-    up: Annotated[str, seeing(metavar="AXIS", help="Upward axis of the mesh: x, y or z, or one of these with a -.")] = (
-        "y"
-    )
+    up: Annotated[
+        str, sensor_option(metavar="AXIS", help="Upward axis of the mesh: x, y or z, or one of these with a -.")
+    ] = "y"
     paper: Annotated[
         bool,
-        seeing(
+        sensor_option(
             "--paper",
             help="The paper's camera, which sees a patch of the mesh: 30 degrees wide, and 2 to 3 scene units away, "
             "depending on the task.",
@@ -33,7 +33,7 @@ class RunOptions(EpisodeOptions):
     ] = False
 
 
-_OF_TASKS = {
+_TASK_OPTIONS = {
     name: hint
     for task in TASKS.values()
     for name, hint in get_type_hints(task, include_extras=True).items()
@@ -42,30 +42,31 @@ _OF_TASKS = {
 """Annotations of the options that belong to single tasks, keyed by option."""
 
 
-@command(RunOptions, _OF_TASKS)
-def run(options: RunOptions, **of_tasks: Any) -> None:
+@command(RunOptions, _TASK_OPTIONS)
+def run(options: RunOptions, **task_options: Any) -> None:
     """Choose views of a mesh, scanned by a simulated depth camera.
 
     The mesh may be open, a soup of triangles or inconsistently wound. It is scaled and centred so that its longest side
     is 2.5 scene units. Without --paper, cameras stand far enough from the centre to see the whole mesh.
     """
-    task = _task(options.task, {name: value for name, value in of_tasks.items() if value is not None})
+    task = _task(options.task, {name: value for name, value in task_options.items() if value is not None})
 
     from jaxnbv.checks import check_device
 
     check_device()
-    from jaxnbv.cli.play import USUAL, first_pose, play
+    from jaxnbv.cli.play import USUAL, check_options, first_pose, run_episode
     from jaxnbv.cli.tasks.base import Subject
     from jaxnbv.scanning import load_mesh
     from jaxnbv.scanning.sensors import fit_distance
 
+    check_options(options)
     surface, setting = load_mesh(options.mesh, options.up), task.setting()
     if not options.paper:
         setting = fit_distance(setting, surface.bounding_radius)
-    usual = usual_first(None if options.paper else setting.radius)
-    first = usual if options.first is None else first_pose(options.first, surface)
+    default_pose = default_first_pose(None if options.paper else setting.radius)
+    first = default_pose if options.first is None else first_pose(options.first, surface)
     acquisition = task.acquisition(surface, setting.camera, first)
-    play(options, Subject(options.mesh.stem, surface, acquisition, first, task.bank(surface)), setting, USUAL)
+    run_episode(options, Subject(options.mesh.stem, surface, acquisition, first, task.bank(surface)), setting, USUAL)
 
 
 def _task(name: str, settings: dict[str, Any]) -> Task:

@@ -43,7 +43,7 @@ def run_study(name: str, options: StudyOptions, **settings: Any) -> None:
     usual_model = "paper" if is_paper else entry.model
     model = options.model or usual_model
     names = None if options.methods is None else [name.strip() for name in options.methods.split(",")]
-    methods, own = methods_of(kind, names, model), {text: _own(text) for text in options.own or ()}
+    methods, own = methods_of(kind, names, model), {text: _import_method(text) for text in options.own or ()}
     scenes = _scenes(
         str(kind.quick_scenes if options.quick else entry.scenes) if options.scenes is None else options.scenes
     )
@@ -53,10 +53,10 @@ def run_study(name: str, options: StudyOptions, **settings: Any) -> None:
         typer.echo("--quick: small settings and few scenes. This is not the full study. Leave it out for that.")
     failures: dict[str, str] = {}
     count = 0
-    given = {option: value for option, value in settings.items() if value is not None}
-    planned = _planned(kind, options)
-    views = options.views or planned.pop("views", entry.views)
-    studies_by_part = kind.configured(model, views, options.quick, **planned | given)
+    own_settings = {option: value for option, value in settings.items() if value is not None}
+    overrides = _overrides(kind, options)
+    views = options.views or overrides.pop("views", entry.views)
+    studies_by_part = kind.configured(model, views, options.quick, **overrides | own_settings)
     sources = _sources(options.join or (), studies_by_part)
     with _executor(options) as executor:
         for part, study in studies_by_part.items():
@@ -109,7 +109,7 @@ def _sources(folders: Iterable[Path], parts: Iterable[str]) -> dict[str, list[Pa
     return sources
 
 
-def _planned(kind: type[Study], options: StudyOptions) -> dict[str, Any]:
+def _overrides(kind: type[Study], options: StudyOptions) -> dict[str, Any]:
     """Return settings that replace those of the study: first from `--settings`, then from single options.
 
     **Raises:** `ValueError` if a quick run has the paper's settings.
@@ -134,7 +134,7 @@ def _scenes(text: str) -> Sequence[int]:
     return scenes
 
 
-def _own(text: str) -> Factory:
+def _import_method(text: str) -> Factory:
     """Import the function of a user that a text "module:function" names. It may be in the current folder."""
     if (here := os.getcwd()) not in sys.path:
         sys.path.insert(0, here)

@@ -62,7 +62,7 @@ def each_warning_once() -> Iterator[None]:
     Python's own filter is not enough: whenever a library changes the filters, Python forgets which warnings it printed.
     """
     counts: Counter[str] = Counter()
-    usual = warnings.showwarning
+    show_warning = warnings.showwarning
 
     def show(message: Warning | str, category: type[Warning], filename: str, lineno: int, *_: Any, **__: Any) -> None:
         is_ours = issubclass(category, UserWarning)
@@ -75,7 +75,7 @@ def each_warning_once() -> Iterator[None]:
     try:
         yield
     finally:
-        warnings.showwarning = usual
+        warnings.showwarning = show_warning
         for text, count in counts.items():
             if count > 1:
                 typer.echo(f"warning, {count} times in all: {text}", err=True)

@@ -25,9 +25,9 @@ study = typer.Typer(
 def _add(name: str, entry: Entry) -> None:
     """Add the command of a study to `jaxnbv study`."""
     common = {field.name for field in dataclasses.fields(StudyOptions)}
-    own = {option: hint for option, hint in entry.options.items() if option not in common}
+    own_options = {option: hint for option, hint in entry.options.items() if option not in common}
 
-    @command(StudyOptions, own)
+    @command(StudyOptions, own_options)
     def run(options: StudyOptions, **settings: Any) -> None:
         from jaxnbv.checks import check_device
 
@@ -36,10 +36,14 @@ def _add(name: str, entry: Entry) -> None:
 
         run_study(name, options, **settings)
 
-    usual = f"The default is {entry.scenes} scenes with {entry.views} views each."
+    default_text = f"The default is {entry.scenes} scenes with {entry.views} views each."
     question = entry.question.partition("?")[0]
     study.command(
-        name, cls=Command, help=f"{entry.question}\n\n{usual}", short_help=f"{question}?", rich_help_panel="Studies"
+        name,
+        cls=Command,
+        help=f"{entry.question}\n\n{default_text}",
+        short_help=f"{question}?",
+        rich_help_panel="Studies",
     )(run)
 
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from jaxnbv.cli.options import listed, one_of, planning, running
+from jaxnbv.cli.options import help_sentence, one_of, planner_option, run_option
 from jaxnbv.cli.registry import STUDY_MODELS, STUDY_SETTINGS
 
 
@@ -38,50 +38,50 @@ class StudyOptions:
     ] = None
     settings: Annotated[
         str,
-        planning(
+        planner_option(
             parser=one_of(STUDY_SETTINGS),
             metavar="SETTINGS",
-            help="Settings of the planner and number of views. " + listed(STUDY_SETTINGS.items()),
+            help="Settings of the planner and number of views. " + help_sentence(STUDY_SETTINGS.items()),
         ),
     ] = "usual"
     candidates: Annotated[
-        int | None, planning(min=2, help="Number of candidate poses.", show_default="that of the settings")
+        int | None, planner_option(min=2, help="Number of candidate poses.", show_default="that of the settings")
     ] = None
     samples: Annotated[
-        int | None, planning(min=1, help="Number of posterior samples.", show_default="that of the settings")
+        int | None, planner_option(min=1, help="Number of posterior samples.", show_default="that of the settings")
     ] = None
     grid: Annotated[
         int | None,
-        planning(min=2, help="Nodes of the samples' grid along each axis.", show_default="that of the settings"),
+        planner_option(min=2, help="Nodes of the samples' grid along each axis.", show_default="that of the settings"),
     ] = None
     capacity: Annotated[
-        int | None, planning(min=1, help="Number of points to keep in D.", show_default="that of the settings")
+        int | None, planner_option(min=1, help="Number of points to keep in D.", show_default="that of the settings")
     ] = None
     model: Annotated[
         str | None,
-        planning(
+        planner_option(
             parser=one_of(STUDY_MODELS),
             metavar="MODEL",
-            help="Model of the imagined surfaces. " + listed(STUDY_MODELS.items()),
+            help="Model of the imagined surfaces. " + help_sentence(STUDY_MODELS.items()),
             show_default="known if the study has known shapes; with --settings paper: paper",
         ),
     ] = None
     out: Annotated[
         Path | None,
-        running(
+        run_option(
             help="Output folder. Scenes that it already has are not run again.",
             show_default="runs/study-NAME[-MODEL][-quick]; with --settings paper: runs/study-NAME-paper-settings",
         ),
     ] = None
     quick: Annotated[
-        bool, running("--quick", help="Small settings and few scenes. Takes minutes, and is not the full study.")
+        bool, run_option("--quick", help="Small settings and few scenes. Takes minutes, and is not the full study.")
     ] = False
     workers: Annotated[
-        int, running(min=1, help="Number of processes, which run one scene each at a time and share the cores.")
+        int, run_option(min=1, help="Number of processes, which run one scene each at a time and share the cores.")
     ] = 1
     cluster: Annotated[
         str | None,
-        running(
+        run_option(
             metavar="tcp://HOST:PORT",
             help="Address of a Dask scheduler. Its workers run the scenes, and this process writes the records.",
             show_default=False,
@@ -89,7 +89,7 @@ class StudyOptions:
     ] = None
     join: Annotated[
         list[Path] | None,
-        running(
+        run_option(
             metavar="FOLDER...",
             help="Output folders of the same study. Their records are first copied into this run's folder.",
             show_default=False,

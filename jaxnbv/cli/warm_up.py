@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from jaxnbv.cli.options import command, seeing
+from jaxnbv.cli.options import command, sensor_option
 from jaxnbv.compiled import keep_compiled
 
 _BOX = (-0.15, -0.15, 0.0, 0.15, 0.15, 0.3)
@@ -14,16 +14,21 @@ _BOX = (-0.15, -0.15, 0.0, 0.15, 0.15, 0.3)
 @dataclass(frozen=True, kw_only=True)
 class WarmUpOptions:
     intrinsics: Annotated[
-        tuple[float, float, float, float], seeing(metavar="FX FY CX CY", help="Intrinsics of the camera, in pixels.")
+        tuple[float, float, float, float],
+        sensor_option(metavar="FX FY CX CY", help="Intrinsics of the camera, in pixels."),
     ]
-    size: Annotated[tuple[int, int], seeing(metavar="HEIGHT WIDTH", help="Number of rows and columns of an image.")]
-    nearest: Annotated[float, seeing(min=0.0, help="Least depth that the camera measures, in world units.")] = 0.0
+    size: Annotated[
+        tuple[int, int], sensor_option(metavar="HEIGHT WIDTH", help="Number of rows and columns of an image.")
+    ]
+    nearest: Annotated[float, sensor_option(min=0.0, help="Least depth that the camera measures, in world units.")] = (
+        0.0
+    )
     farthest: Annotated[
-        float | None, seeing(help="Largest depth that the camera measures.", show_default="no limit")
+        float | None, sensor_option(help="Largest depth that the camera measures.", show_default="no limit")
     ] = None
     box: Annotated[
         tuple[float, float, float, float, float, float],
-        seeing(
+        sensor_option(
             metavar="LOW HIGH", help="Two corners of the object's box, z up. Needed only with --nearest or --farthest."
         ),
     ] = _BOX

@@ -25,11 +25,11 @@ from jaxnbv.tasks.segmentation import PartAnswer
 from jaxnbv.utility import Answer, Quantity
 
 # An answer is reliable if it changed by less than this fraction since the previous view.
-_SETTLED = 0.05
+_MAX_CHANGE = 0.05
 # Numbers of classes and of kinds of known shapes that a text names.
-_CLASSES_SAID, _KINDS_SAID = 3, 4
+_NUM_CLASSES_NAMED, _NUM_KINDS_NAMED = 3, 4
 # Number of parts in a chart.
-_PARTS_SHOWN = 6
+_MAX_PARTS = 6
 
 # Function that returns whether a stop rule held after a view, given the index of the view from 0.
 Holds: TypeAlias = Callable[[Sure, int], bool]
@@ -41,7 +41,8 @@ class Chart(NamedTuple):
     - `label`: label of the vertical axis, with the unit.
     - `names`, `values`: names of the numbers, and their values after each view.
     - `true`: values of the numbers if all of the surface had been seen; None if they are not known.
-    - `one_true`: whether `true` only marks one of the names as the true one. Otherwise `true` has values to reach.
+    - `marks_true_name`: whether `true` only marks one of the names as the true one. Otherwise `true` has values to
+      reach.
     - `goal`: a value that the numbers should reach; None for no such value.
     """
 
@@ -49,7 +50,7 @@ class Chart(NamedTuple):
     names: tuple[str, ...]
     values: Float[np.ndarray, "views n"]
     true: Float[np.ndarray, " n"] | None = None
-    one_true: bool = False
+    marks_true_name: bool = False
     goal: float | None = None
 
 
@@ -76,11 +77,11 @@ class Words:
     def said(self, before: Answer | None = None) -> str:
         """Return the shown numbers as text, with their values in the answer `before` this one if given."""
 
-        def one(index: int) -> str:
+        def text_of(index: int) -> str:
             was = "" if before is None else f" (was {self.value(before, index)})"
             return f"{self.answer.names[index]} {self.value(self.answer, index)}{was}"
 
-        return ", ".join(map(one, self.shown))
+        return ", ".join(map(text_of, self.shown))
 
     @property
     def found(self) -> str:
@@ -90,7 +91,7 @@ class Words:
     @property
     def settled_means(self) -> str:
         """The condition of `settled` as text."""
-        return f"within {100 * _SETTLED:.0f} % of the view before"
+        return f"within {100 * _MAX_CHANGE:.0f} % of the view before"
 
     def settled(self, answers: Sequence[Answer], holds: Holds) -> list[bool]:
         """Return, for each view, whether the answer after this view is reliable.
@@ -98,7 +99,7 @@ class Words:
         - `answers`: answers after all views. The last one is this answer.
         - `holds`: function that returns whether a stop rule held after a view, given the index of the view from 0.
         """
-        return [False, *(np.allclose(now.values, was.values, rtol=_SETTLED) for was, now in pairwise(answers))]
+        return [False, *(np.allclose(now.values, was.values, rtol=_MAX_CHANGE) for was, now in pairwise(answers))]
 
     def charts(self, answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...]:
         """Return charts of the answers over the views.
@@ -130,7 +131,7 @@ class _ClassWords(Words):
 
     @property
     def shown(self) -> Sequence[int]:
-        return np.argsort(-self.answer.values)[:_CLASSES_SAID].tolist()
+        return np.argsort(-self.answer.values)[:_NUM_CLASSES_NAMED].tolist()
 
     def value(self, answer: Answer, index: int) -> str:
         return f"{100 * answer.values[index]:.0f} %"
@@ -146,16 +147,18 @@ class _ClassWords(Words):
 
         The result is also False if the rule held after the previous view for a different class.
         """
-        sure = [holds(self.rule, index) for index in range(len(answers))]
+        is_sure = [holds(self.rule, index) for index in range(len(answers))]
         best = [int(np.argmax(answer.values)) for answer in answers]
-        contradicted = [False, *(was and a != b for was, (a, b) in zip(sure, pairwise(best), strict=False))]
-        return [now and not other for now, other in zip(sure, contradicted, strict=True)]
+        is_contradicted = [False, *(was and a != b for was, (a, b) in zip(is_sure, pairwise(best), strict=False))]
+        return [now and not other for now, other in zip(is_sure, is_contradicted, strict=True)]
 
     def charts(self, answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...]:
         """Return a chart of the probabilities of all classes. If it is known, the true class is marked."""
         true = None if truth is None else truth.values
         return (
-            Chart("probability", self.answer.names, _rows(answers), true, one_true=True, goal=self.rule.probability),
+            Chart(
+                "probability", self.answer.names, _rows(answers), true, marks_true_name=True, goal=self.rule.probability
+            ),
         )
 
 
@@ -164,19 +167,19 @@ class _IdentityWords(_ClassWords):
     """Words about part probabilities. They name the three likeliest parts, or "none of these"."""
 
     question = "Which part is it?"
-    least = Identified().probability
-    settled_means = f"probability {least} or more"
+    min_probability = Identified().probability
+    settled_means = f"probability {min_probability} or more"
 
     def settled(self, answers: Sequence[Answer], holds: Holds) -> list[bool]:
-        """Return the same as `_ClassWords.settled`, for the rule that the highest probability reaches `least`."""
-        return super().settled(answers, lambda _, index: bool(answers[index].values.max() >= self.least))
+        """Return the same as `_ClassWords.settled`, for the rule that a probability reaches `min_probability`."""
+        return super().settled(answers, lambda _, index: bool(answers[index].values.max() >= self.min_probability))
 
     def charts(self, answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...]:
         """Return a chart of the parts that had the highest probabilities after any view, six at most."""
         values = _rows(answers)
-        kept = np.sort(np.argsort(-values.max(axis=0), kind="stable")[:_PARTS_SHOWN])
-        names = tuple(self.answer.names[index] for index in kept)
-        return (Chart("probability", names, values[:, kept], goal=self.least),)
+        rows = np.sort(np.argsort(-values.max(axis=0), kind="stable")[:_MAX_PARTS])
+        names = tuple(self.answer.names[index] for index in rows)
+        return (Chart("probability", names, values[:, rows], goal=self.min_probability),)
 
 
 @words_of.register(PartAnswer)
@@ -209,16 +212,16 @@ class _PartWords(Words):
 
     def charts(self, answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...]:
         """Return a chart of the number of parts with `target` points or more, and one of each part's points."""
-        known = answers if truth is None else [*answers, truth]
-        shown = sorted({index for answer in known for index in words_of(answer).shown})
-        values, target = _rows(answers)[:, shown], self.answer.target
-        found = np.sum(values >= target, axis=1, keepdims=True).astype(np.float64)
-        there = None
+        all_answers = answers if truth is None else [*answers, truth]
+        parts = sorted({index for answer in all_answers for index in words_of(answer).shown})
+        values, target = _rows(answers)[:, parts], self.answer.target
+        num_found = np.sum(values >= target, axis=1, keepdims=True).astype(np.float64)
+        num_true = None
         if isinstance(truth, PartAnswer):
-            there = np.array([np.sum(truth.values >= truth.target)], np.float64)
-        names = tuple(self.answer.names[index] for index in shown)
+            num_true = np.array([np.sum(truth.values >= truth.target)], np.float64)
+        names = tuple(self.answer.names[index] for index in parts)
         points = Chart("points predicted of each part", names, values, goal=target)
-        return Chart(f"parts found ({target:g} points or more)", ("parts",), found, there), points
+        return Chart(f"parts found ({target:g} points or more)", ("parts",), num_found, num_true), points
 
 
 @words_of.register(Coldest)
@@ -229,9 +232,9 @@ class _ColdestWords(Words):
     question = "Where does it stay coldest while it is heated?"
 
     def said(self, before: Answer | None = None) -> str:
-        was = "" if before is None else f" (was {number(float(before.values[0]))})"
-        place = coordinates(self.answer.point, self.answer.frame)
-        return f"coldest at {place}, {number(float(self.answer.values[0]))} degrees{was}"
+        was = "" if before is None else f" (was {number_text(float(before.values[0]))})"
+        position = point_text(self.answer.point, self.answer.frame)
+        return f"coldest at {position}, {number_text(float(self.answer.values[0]))} degrees{was}"
 
     def charts(self, answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...]:
         """Return a chart of the lowest temperature.
@@ -244,9 +247,9 @@ class _ColdestWords(Words):
             return (temperature,)
         frame = self.answer.frame
         points = np.stack([answer.point for answer in answers if isinstance(answer, Coldest)])
-        away = frame.length_to_world(np.linalg.norm(points - truth.point, axis=1))
+        distances = frame.length_to_world(np.linalg.norm(points - truth.point, axis=1))
         label = f"distance to the true coldest point ({frame.unit})"
-        return temperature, Chart(label, ("distance",), np.array(away)[:, None], goal=0.0)
+        return temperature, Chart(label, ("distance",), np.array(distances)[:, None], goal=0.0)
 
 
 class CoverageAnswer(Answer):
@@ -258,7 +261,7 @@ class CoverageAnswer(Answer):
     def amount(self) -> str:
         """The amount as text, with its unit."""
         value = float(self.values[0])
-        return f"{value:.0f} %" if self.unit == "%" else f"{number(value)} {self.unit}"
+        return f"{value:.0f} %" if self.unit == "%" else f"{number_text(value)} {self.unit}"
 
 
 @words_of.register(CoverageAnswer)
@@ -279,18 +282,18 @@ def label_of(quantity: Quantity, frame: Frame = Frame()) -> str:  # noqa: B008
     return f"{quantity.name} ({unit})" if unit else quantity.name
 
 
-def shown_value(quantity: Quantity, value: float, frame: Frame) -> str:
+def value_text(quantity: Quantity, value: float, frame: Frame) -> str:
     """Return a value in world units as text, with its unit if it is a length or an area."""
-    return f"{number(value)} {quantity.unit_in(frame)}" if quantity.length_power else number(value)
+    return f"{number_text(value)} {quantity.unit_in(frame)}" if quantity.length_power else number_text(value)
 
 
-def coordinates(point: Float[np.ndarray, "3"], frame: Frame = Frame()) -> str:  # noqa: B008
+def point_text(point: Float[np.ndarray, "3"], frame: Frame = Frame()) -> str:  # noqa: B008
     """Convert a point from scene to world coordinates, and return it as text "(x, y, z)"."""
-    x, y, z = (fixed(coordinate, frame) for coordinate in frame.to_world(np.asarray(point)))
+    x, y, z = (length_text(coordinate, frame) for coordinate in frame.to_world(np.asarray(point)))
     return f"({x}, {y}, {z})"
 
 
-def fixed(length: float, frame: Frame) -> str:
+def length_text(length: float, frame: Frame) -> str:
     """Return a length in world units as text, rounded to a hundredth of a scene unit or finer."""
     return f"{length:.{max(0, 2 + math.ceil(math.log10(frame.scale)))}f}".replace("-", "−")
 
@@ -300,17 +303,17 @@ def capital(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
-def number(value: float) -> str:
+def number_text(value: float) -> str:
     """Return a number as text: three significant digits, or no decimals from 1,000 to 10 million."""
     text = f"{value:,.0f}" if 999.5 <= abs(value) < 1e7 else f"{value:.3g}"
     return text.replace("-", "−")
 
 
-def may_be_words(kinds: Sequence[tuple[str, float]]) -> str:
+def kinds_text(kinds: Sequence[tuple[str, float]]) -> str:
     """Return a sentence with the probabilities of the kinds of known shapes that the samples show.
 
     - `kinds`: name and probability of each kind, the likeliest first.
     """
-    shown = [f"{name} {100 * weight:.0f} %" for name, weight in kinds[:_KINDS_SAID]]
-    rest = sum(weight for _, weight in kinds[_KINDS_SAID:])
-    return f"Imagined, as known shapes fit: {', '.join(shown)}{f', others {100 * rest:.0f} %' if rest else ''}."
+    named = [f"{name} {100 * weight:.0f} %" for name, weight in kinds[:_NUM_KINDS_NAMED]]
+    rest = sum(weight for _, weight in kinds[_NUM_KINDS_NAMED:])
+    return f"Imagined, as known shapes fit: {', '.join(named)}{f', others {100 * rest:.0f} %' if rest else ''}."

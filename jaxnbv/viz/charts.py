@@ -9,39 +9,41 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-from jaxnbv.viz.answers import Chart, label_of, number
-from jaxnbv.viz.choice import best_first
+from jaxnbv.viz.answers import Chart, label_of, number_text
+from jaxnbv.viz.choice import descending_values
 from jaxnbv.viz.data import ReportData
 from jaxnbv.viz.style import GREY, INK, LINE, NEW, SERIES
 
 # Maximum number of lines, of letters in a name, and of views for which a chart prints the values.
-_MOST_NAMES, _LONGEST_NAME, _MOST_NUMBERS = 6, 22, 10
+_MAX_LINES, _MAX_LETTERS, _MAX_VIEWS = 6, 22, 10
 # Lines that differ by less than this fraction of the range of values look like one line.
-_SAME_LINE = 0.02
+_MIN_DIFFERENCE = 0.02
 # Sizes in inches. On a phone (390 pixels wide), the letters of a large chart are eleven pixels tall.
 _LARGE, _SMALL = (4.0, 2.6), (3.1, 2.6)
-_BELOW: dict[str, Any] = {"loc": "outside lower center", "frameon": False, "fontsize": 9, "handlelength": 1.4}
+_LEGEND: dict[str, Any] = {"loc": "outside lower center", "frameon": False, "fontsize": 9, "handlelength": 1.4}
 
 
-def shown_names(chart: Chart) -> dict[int, int]:
+def visible_lines(chart: Chart) -> dict[int, int]:
     """Return the indices of the numbers to draw, each with the number of other lines that its line hides.
 
     A line that nearly coincides with a drawn line is hidden. At most six lines are drawn: those whose largest value, or
     true value, is highest.
     """
-    reached = chart.values.max(axis=0)
-    reached = reached if chart.true is None else np.maximum(reached, chart.true)
-    near = _SAME_LINE * max(float(np.ptp(chart.values)), 1e-12)
-    hidden = dict[int, int]()
-    for index in np.argsort(-reached, kind="stable").tolist():
-        same = (other for other in hidden if np.abs(chart.values[:, other] - chart.values[:, index]).max() < near)
+    largest = chart.values.max(axis=0)
+    largest = largest if chart.true is None else np.maximum(largest, chart.true)
+    tolerance = _MIN_DIFFERENCE * max(float(np.ptp(chart.values)), 1e-12)
+    num_hidden = dict[int, int]()
+    for index in np.argsort(-largest, kind="stable").tolist():
+        coinciding = (
+            other for other in num_hidden if np.abs(chart.values[:, other] - chart.values[:, index]).max() < tolerance
+        )
         # The line of the true name hides no other line. Lines that each have a true value are never hidden.
-        over = next(same, None) if chart.true is None or chart.one_true else None
-        if over is not None and not (chart.one_true and chart.true is not None and chart.true[over] > 0):
-            hidden[over] += 1
-        elif len(hidden) < _MOST_NAMES:
-            hidden[index] = 0
-    return dict(sorted(hidden.items()))
+        front = next(coinciding, None) if chart.true is None or chart.marks_true_name else None
+        if front is not None and not (chart.marks_true_name and chart.true is not None and chart.true[front] > 0):
+            num_hidden[front] += 1
+        elif len(num_hidden) < _MAX_LINES:
+            num_hidden[index] = 0
+    return dict(sorted(num_hidden.items()))
 
 
 def draw_chart(axes: Axes, chart: Chart, rival: Chart | None = None, rival_name: str = "") -> list[Line2D]:
@@ -51,60 +53,64 @@ def draw_chart(axes: Axes, chart: Chart, rival: Chart | None = None, rival_name:
     - `rival_name`: name of this search in the legend.
     """
     views, is_one = np.arange(1, len(chart.values) + 1), len(chart.names) == 1
-    marked = None if chart.true is None or not chart.one_true else int(np.argmax(chart.true))
-    others, handles = iter(SERIES * 2), list[Line2D]()
-    for index, num_hidden in shown_names(chart).items():
-        name = textwrap.shorten(chart.names[index], _LONGEST_NAME, placeholder="…")
+    true_index = None if chart.true is None or not chart.marks_true_name else int(np.argmax(chart.true))
+    colours, handles = iter(SERIES * 2), list[Line2D]()
+    for index, num_hidden in visible_lines(chart).items():
+        name = textwrap.shorten(chart.names[index], _MAX_LETTERS, placeholder="…")
         name += f" and {num_hidden} more" if num_hidden else ""
-        colour, label = (NEW, f"{name} (true)") if index == marked else (next(others), name)
+        colour, label = (NEW, f"{name} (true)") if index == true_index else (next(colours), name)
         style: dict[str, Any] = {"color": colour, "lw": 1.6, "marker": "o", "ms": 5, "markeredgecolor": "white"}
         lines = axes.plot(views, chart.values[:, index], label=label, zorder=3, **style)
         handles += [] if is_one else lines
-        if chart.true is not None and not chart.one_true:
+        if chart.true is not None and not chart.marks_true_name:
             axes.axhline(chart.true[index], color=colour, lw=1.2, ls="--", zorder=1)
-    if chart.true is not None and not chart.one_true:
+    if chart.true is not None and not chart.marks_true_name:
         handles.append(Line2D([], [], color=GREY, lw=1.2, ls="--", label="in truth"))
-    if is_one and len(views) <= _MOST_NUMBERS:
+    if is_one and len(views) <= _MAX_VIEWS:
         for view, value in zip(views.tolist(), chart.values[:, 0].tolist(), strict=True):
-            axes.annotate(number(value), (view, value), (0, 6), textcoords="offset points", ha="center", fontsize=8)
-    about = 0 if is_one else marked
-    if rival is not None and about is not None:
+            axes.annotate(
+                number_text(value), (view, value), (0, 6), textcoords="offset points", ha="center", fontsize=8
+            )
+    rival_index = 0 if is_one else true_index
+    if rival is not None and rival_index is not None:
         style = {"color": GREY, "lw": 1.4, "ls": (0, (4, 2)), "marker": "s", "ms": 3.5}
-        count = np.arange(1, len(rival.values) + 1)
-        handles += axes.plot(count, rival.values[:, about], label=rival_name, zorder=2, **style)
+        rival_views = np.arange(1, len(rival.values) + 1)
+        handles += axes.plot(rival_views, rival.values[:, rival_index], label=rival_name, zorder=2, **style)
     if chart.goal is not None:
         axes.axhline(chart.goal, color=GREY, lw=1.0, ls=":", zorder=1)
     low, high = axes.get_ylim()
     axes.set_ylim(min(low, 0.0) if chart.values.min() >= 0 else low, high + 0.1 * (high - low))
-    over_views(axes, len(chart.values) if rival is None else max(len(chart.values), len(rival.values)))
+    set_view_axis(axes, len(chart.values) if rival is None else max(len(chart.values), len(rival.values)))
     return handles
 
 
-def over_views(axes: Axes, count: int) -> None:
+def set_view_axis(axes: Axes, count: int) -> None:
     """Let the horizontal axis run over views 1 to `count`, with a margin of half a view on both sides."""
     axes.set(xlabel="view", xlim=(0.5, count + 0.5))
     axes.xaxis.set_major_locator(MaxNLocator(min(count, 10), integer=True, min_n_ticks=1))
     axes.yaxis.set_major_locator(MaxNLocator(5))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: number(value)))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: number_text(value)))
 
 
 def draw_values(axes: Axes, data: ReportData) -> list[Line2D]:
     """Draw values of chosen views with standard errors, and of median candidates. Return legend entries."""
-    for view, shown in enumerate(data.views, start=1):
-        if shown.proposal is None:
+    for view, view_data in enumerate(data.views, start=1):
+        if view_data.proposal is None:
             axes.annotate("given", (view, 0), (0, 4), textcoords="offset points", ha="center", color=GREY, fontsize=8)
             continue
-        value, error = float(shown.proposal.value), shown.proposal.standard_error
+        value, error = float(view_data.proposal.value), view_data.proposal.standard_error
         axes.vlines(view, 0.0, value, color=LINE, lw=1.5, zorder=1)
         if error is not None and np.isfinite(error):
             axes.errorbar(view, value, error, color=INK, lw=1.2, capsize=3, zorder=2)
         axes.plot(view, value, "*", color=NEW, ms=11, markeredgecolor="white", zorder=3)
-        if len(others := best_first(shown.proposal)):
-            axes.plot(view, np.median(others), "_", color=INK, ms=11, mew=1.4, zorder=2)
+        if len(values := descending_values(view_data.proposal)):
+            axes.plot(view, np.median(values), "_", color=INK, ms=11, mew=1.4, zorder=2)
     low, high = axes.get_ylim()
     axes.set_ylim(min(low, 0.0), high * 1.12)
-    over_views(axes, len(data.views))
-    has_errors = any(shown.proposal.standard_error is not None for shown in data.views if shown.proposal is not None)
+    set_view_axis(axes, len(data.views))
+    has_errors = any(
+        view_data.proposal.standard_error is not None for view_data in data.views if view_data.proposal is not None
+    )
     label = "chosen view" + " ± standard error" * has_errors
     star = Line2D([], [], ls="none", marker="*", color=NEW, ms=9, label=label)
     return [star, Line2D([], [], ls="none", marker="_", color=INK, ms=9, mew=1.4, label="median candidate")]
@@ -114,27 +120,33 @@ def task_charts(data: ReportData) -> list[tuple[str, Figure]]:
     """Return the charts of the task with their titles."""
     task, size = data.task, _LARGE if len(data.task.charts) == 1 else _SMALL
     others = [None] * len(task.charts) if task.rival is None else task.rival.charts
-    return [_drawn(data, chart, other, size) for chart, other in zip(task.charts, others, strict=True)]
+    return [_labelled_figure(data, chart, other, size) for chart, other in zip(task.charts, others, strict=True)]
 
 
 def other_charts(data: ReportData) -> list[tuple[str, Figure]]:
     """Return charts with titles: surface seen (unless that is the task), and values of the chosen views."""
     task, charts = data.task, []
     if not task.is_coverage:
-        charts.append(_drawn(data, task.seen, None if task.rival is None else task.rival.seen, _LARGE))
+        charts.append(
+            _labelled_figure(
+                data, task.coverage_chart, None if task.rival is None else task.rival.coverage_chart, _LARGE
+            )
+        )
     if any(view.proposal is not None for view in data.views):
         figure = Figure(figsize=_LARGE, layout="constrained")
-        figure.legend(handles=draw_values(figure.subplots(), data), ncols=2, **_BELOW)
+        figure.legend(handles=draw_values(figure.subplots(), data), ncols=2, **_LEGEND)
         charts.append((label_of(data.quantity, data.episode.frame), figure))
     return charts
 
 
-def _drawn(data: ReportData, chart: Chart, rival: Chart | None, size: tuple[float, float]) -> tuple[str, Figure]:
+def _labelled_figure(
+    data: ReportData, chart: Chart, rival: Chart | None, size: tuple[float, float]
+) -> tuple[str, Figure]:
     figure = Figure(figsize=size, layout="constrained")
     handles = draw_chart(figure.subplots(), chart, rival, "" if data.task.rival is None else data.task.rival.name)
     if handles:
         # An inch holds twelve letters. A mark with its gap is six letters wide.
         longest = max(len(str(handle.get_label())) for handle in handles) + 6
         columns = max(1, min(len(handles), int(12 * size[0]) // longest))
-        figure.legend(handles=handles, ncols=columns, columnspacing=1.2, **_BELOW)
+        figure.legend(handles=handles, ncols=columns, columnspacing=1.2, **_LEGEND)
     return chart.label, figure

@@ -16,13 +16,13 @@ from jaxnbv.geometry.pose import Pose
 from jaxnbv.search import Proposal
 from jaxnbv.utility import Quantity
 from jaxnbv.viz import sphere
-from jaxnbv.viz.answers import number
+from jaxnbv.viz.answers import number_text
 from jaxnbv.viz.style import GREY, INK, LINE, NEW, VALUE
 
 # With fewer candidates than this, the map is not coloured between them.
-_FEWEST_OF_A_MAP = 12
+_MIN_CANDIDATES = 12
 # Letters in a line of the caption.
-_LETTERS = 56
+_MAX_LETTERS = 56
 
 
 def open_values(proposal: Proposal) -> Float[np.ndarray, " c"]:
@@ -31,7 +31,7 @@ def open_values(proposal: Proposal) -> Float[np.ndarray, " c"]:
     return np.where(np.isfinite(values), values, np.nan)
 
 
-def best_first(proposal: Proposal) -> Float[np.ndarray, " o"]:
+def descending_values(proposal: Proposal) -> Float[np.ndarray, " o"]:
     """Return the values of the candidates that were not excluded, the highest first."""
     values = open_values(proposal)
     return np.sort(values[~np.isnan(values)])[::-1]
@@ -53,10 +53,10 @@ def has_rings(proposal: Proposal) -> bool:
 
 def marks(*proposals: Proposal) -> list[str]:
     """Return legend entries for the optional marks (visited, tied, ascent) on the maps of these proposals."""
-    visited = any(np.isnan(open_values(proposal)).any() for proposal in proposals)
-    entries = ["× visited"] * visited + ["◯ tied with the best"] * any(map(has_rings, proposals))
-    climbed = any(proposal.trajectories is not None for proposal in proposals)
-    return entries + ["○ start, ● end of an ascent"] * climbed
+    has_visited = any(np.isnan(open_values(proposal)).any() for proposal in proposals)
+    entries = ["× visited"] * has_visited + ["◯ tied with the best"] * any(map(has_rings, proposals))
+    has_ascents = any(proposal.trajectories is not None for proposal in proposals)
+    return entries + ["○ start, ● end of an ascent"] * has_ascents
 
 
 def draw_choice(figure: Figure, proposal: Proposal | None, quantity: Quantity, frame: Frame) -> None:
@@ -72,16 +72,16 @@ def draw_choice(figure: Figure, proposal: Proposal | None, quantity: Quantity, f
     bar = figure.colorbar(colours, cax=figure.add_axes((0.14, 0.155, 0.72, 0.024)), orientation="horizontal")
     bar.outline.set_visible(False)
     bar.locator = MaxNLocator(5)
-    bar.formatter = FuncFormatter(lambda value, _: number(value))
+    bar.formatter = FuncFormatter(lambda value, _: number_text(value))
     errors = "" if proposal.standard_errors is None else ", lines: standard errors"
     unit = f" in {quantity.unit_in(frame)}" if quantity.length_power else ""
     caption = f"all candidates by their value{unit}, best on top{errors}"
-    figure.text(0.5, 0.04, textwrap.fill(caption, _LETTERS), ha="center", va="center")
+    figure.text(0.5, 0.04, textwrap.fill(caption, _MAX_LETTERS), ha="center", va="center")
 
 
 def draw_candidates(axes: Axes, proposal: Proposal) -> None:
     """Draw each candidate's value and standard error in its own row, below a star for the chosen pose."""
-    best = best_first(proposal)
+    best = descending_values(proposal)
     order = np.argsort(-open_values(proposal))[: len(best)]
     rows = -np.arange(len(best))
     if proposal.standard_errors is not None:
@@ -116,15 +116,15 @@ def draw_acquisition(
         return None
     values, directions = open_values(proposal), directions_of(proposal.candidates)
     colours, is_open = ScalarMappable(Normalize(*colour_range(values)), VALUE), ~np.isnan(values)
-    if quantity.smooth and np.sum(is_open) >= _FEWEST_OF_A_MAP:
+    if quantity.smooth and np.sum(is_open) >= _MIN_CANDIDATES:
         globe.pcolormesh(*sphere.smooth_map(directions, values), cmap=VALUE, norm=colours.norm)
     places = sphere.on_map(directions)
     dots: dict[str, Any] = {"s": 14 * weight, "edgecolors": GREY, "linewidths": 0.6 * weight, "clip_on": False}
     globe.scatter(*places[is_open].T, c=colours.to_rgba(values[is_open]), **dots, zorder=3)
     if has_rings(proposal):
-        tied = np.asarray(proposal.tied_with_best()) & is_open
+        is_tied = np.asarray(proposal.tied_with_best()) & is_open
         rings: dict[str, Any] = {"s": 52 * weight, "facecolors": "none", "edgecolors": INK, "clip_on": False}
-        globe.scatter(*places[tied].T, linewidths=1.0 * weight, **rings, zorder=4)
+        globe.scatter(*places[is_tied].T, linewidths=1.0 * weight, **rings, zorder=4)
     globe.scatter(*places[~is_open].T, marker="x", c=INK, s=26 * weight, linewidths=1.2 * weight, zorder=4)
     if proposal.trajectories is not None:
         _draw_ascents(globe, directions_of(proposal.trajectories.poses), weight)
@@ -142,9 +142,9 @@ def directions_of(poses: Pose) -> Float[np.ndarray, "*n 3"]:
 def _draw_ascents(globe: Any, ascents: Float[np.ndarray, "starts steps 3"], weight: float) -> None:
     """Draw each gradient ascent on the map as a line from a ring (start) to a dot (end)."""
     for directions in ascents:
-        way = sphere.path(directions).T
-        globe.plot(*way, color="white", lw=2.2 * weight, zorder=6)
-        globe.plot(*way, color=INK, lw=1.1 * weight, zorder=7)
+        line = sphere.path(directions).T
+        globe.plot(*line, color="white", lw=2.2 * weight, zorder=6)
+        globe.plot(*line, color=INK, lw=1.1 * weight, zorder=7)
     mark: dict[str, Any] = {"ls": "none", "marker": "o", "clip_on": False}
     starts, ends = (sphere.on_map(ascents[:, step]).T for step in (0, -1))
     globe.plot(*starts, ms=4.6 * weight, mew=1.0 * weight, mfc="white", mec=INK, zorder=8, **mark)

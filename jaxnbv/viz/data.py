@@ -20,15 +20,15 @@ from jaxnbv.search import Proposal
 from jaxnbv.surfaces.part_hypotheses import PartHypotheses
 from jaxnbv.utility import Quantity
 from jaxnbv.viz.answers import CoverageAnswer, capital, words_of
-from jaxnbv.viz.imagined import Imagined, Look, taken_look
+from jaxnbv.viz.imagined import Imagined, ShadedImage, view_image
 from jaxnbv.viz.mean_surface import MeanSurface
 from jaxnbv.viz.placed_shape import PlacedShape
 from jaxnbv.viz.sketches import Sketch, Sketches, sketches_of
-from jaxnbv.viz.stage import Stage, stage_of
 from jaxnbv.viz.style import middle_range
-from jaxnbv.viz.task import Task, task_of
-from jaxnbv.viz.unmeasured import unmeasured_words
-from jaxnbv.viz.words import told
+from jaxnbv.viz.task import TaskReport, task_of
+from jaxnbv.viz.unmeasured import unmeasured_text
+from jaxnbv.viz.viewpoint import Viewpoint, viewpoint_of
+from jaxnbv.viz.words import sentences_about
 
 
 class ViewData(eqx.Module):
@@ -39,19 +39,19 @@ class ViewData(eqx.Module):
     - `surface`: the surface after the view: the likeliest known shape, or else the pieces of the posterior mean's
       surface near points. None if the grid holds no surface. Its deviation (world units) grows with the distance from
       points.
-    - `seen`: amount of surface seen after the view.
-    - `told`: sentences about the view, keyed by heading.
+    - `coverage`: amount of surface seen after the view.
+    - `sentences`: sentences about the view, keyed by heading.
     - `imagined`: surfaces imagined before the view; None for a given view.
-    - `look`: picture of the view's scan; None if the scan is not an image.
+    - `image`: picture of the view's scan; None if the scan is not an image.
     """
 
     view: View
     before: Float[np.ndarray, "n 3"]
     surface: MeanSurface | None
-    seen: CoverageAnswer
-    told: dict[str, str]
+    coverage: CoverageAnswer
+    sentences: dict[str, str]
     imagined: Imagined | None
-    look: Look | None
+    image: ShadedImage | None
 
     @property
     def has_shape(self) -> bool:
@@ -79,8 +79,8 @@ class ReportData(eqx.Module):
     episode: Episode
     views: tuple[ViewData, ...]
     quantity: Quantity
-    task: Task
-    stage: Stage
+    task: TaskReport
+    viewpoint: Viewpoint
 
     @property
     def camera(self) -> Camera:
@@ -134,34 +134,37 @@ def report_data(
     planner, frame = episode.planner, episode.frame
     if truth is None and episode.scene is not None:
         truth = truth_points(episode.scene, jax.random.key(0))
-    replayed = tuple(episode.observations())
-    task = task_of(episode, truth, rival, replayed)
-    held = {} if sketches is None else sketches.held
-    following = progress_bar(
-        sketches_of(episode, replayed, held, imagine), progress, desc="drawing views", total=len(episode.views)
+    all_observations = tuple(episode.observations())
+    task = task_of(episode, truth, rival, all_observations)
+    by_view = {} if sketches is None else sketches.held
+    next_sketches = progress_bar(
+        sketches_of(episode, all_observations, by_view, imagine),
+        progress,
+        desc="drawing views",
+        total=len(episode.views),
     )
-    power, drawn = planner.quantity.length_power, list[ViewData]()
+    power, view_data = planner.quantity.length_power, list[ViewData]()
     views = [
         view if view.proposal is None else dataclasses.replace(view, proposal=view.proposal.in_world(frame, power))
         for view in episode.views
     ]
-    leading = Sketch(None, None)
+    sketch = Sketch(None, None)
     # Only for such an acquisition can one view gain what its value promises.
-    actual = episode.actual_scores(replayed) if planner.acquisition.gains_once else itertools.repeat(None)
-    for index, (next_one, gain) in enumerate(zip(following, actual, strict=False)):
+    gains = episode.actual_scores(all_observations) if planner.acquisition.gains_once else itertools.repeat(None)
+    for index, (next_sketch, gain) in enumerate(zip(next_sketches, gains, strict=False)):
         view, gain = views[index], None if gain is None else float(frame.length_to_world(gain, power))
-        words = told(planner.quantity, views[: index + 1], task.amounts[: index + 1], frame, gain)
+        sentences = sentences_about(planner.quantity, views[: index + 1], task.amounts[: index + 1], frame, gain)
         if not task.is_coverage:
-            answered = words_of(task.answers[index]).said(task.answers[index - 1] if index else None)
-            words["What came"] += f" {capital(answered)}."
+            answer_text = words_of(task.answers[index]).said(task.answers[index - 1] if index else None)
+            sentences["What came"] += f" {capital(answer_text)}."
         before = episode.views[index - 1].cloud.to_numpy()[0] if index else np.zeros((0, 3), np.float32)
-        if next_one.unmeasured:
-            words["Never measured"] = unmeasured_words(next_one.unmeasured, frame)
-        look = taken_look(view, before)
-        surface = next_one.surface
+        if next_sketch.unmeasured:
+            sentences["Never measured"] = unmeasured_text(next_sketch.unmeasured, frame)
+        image = view_image(view, before)
+        surface = next_sketch.surface
         if surface is not None:
             surface = dataclasses.replace(surface, deviation=frame.length_to_world(surface.deviation))
-        drawn.append(ViewData(view, before, surface, task.amounts[index], words, leading.imagined, look))
-        leading = next_one
-    means = [view.surface.mesh for view in drawn if view.surface is not None]
-    return ReportData(episode, tuple(drawn), planner.quantity, task, stage_of(episode, means))
+        view_data.append(ViewData(view, before, surface, task.amounts[index], sentences, sketch.imagined, image))
+        sketch = next_sketch
+    means = [view.surface.mesh for view in view_data if view.surface is not None]
+    return ReportData(episode, tuple(view_data), planner.quantity, task, viewpoint_of(episode, means))

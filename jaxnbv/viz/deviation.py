@@ -24,19 +24,19 @@ from jaxnbv.scanning.sdf.sampled import checked_triangles
 from jaxnbv.surfaces.rigid import orient_outward, register_scan
 
 # Points sampled from a scanned mesh, least number of points of a cloud, points of the CAD at which coverage is tested.
-_POINTS, _FEWEST, _SAMPLES = 50_000, 10, 20_000
+_POINTS, _MIN_POINTS, _SAMPLES = 50_000, 10, 20_000
 # A scan that is this many times larger or smaller than the CAD must be in different units.
-_LARGER, _SMALLER = 8.0, 50.0
+_LARGE_RATIO, _SMALL_RATIO = 8.0, 50.0
 # Fractions of the CAD's diameter: least distance between worst places, largest distance at which a scanned point covers
 # the CAD, median distance above which a fit is poor.
-_APART, _FAR, _POOR = 0.05, 0.05, 0.02
+_MIN_DISTANCE, _MAX_DISTANCE, _POOR_MEDIAN = 0.05, 0.05, 0.02
 # Number of nearest points over which a median smooths the deviation.
 _NEIGHBOURS = 9
 # A place on the CAD is covered by this many points within a radius (relative to the distance between a point and its
 # fourth neighbour). The cosine of the angle between the normals must exceed the last value.
-_COVERING, _RADIUS, _FACING = 3, 1.5, 0.3
+_MIN_COVERING, _RADIUS, _MIN_COSINE = 3, 1.5, 0.3
 # Numbered places are this many times worse than the median. End of the colours if nothing deviates.
-_STANDS_OUT, _LEAST = 4.0, 1e-9
+_MIN_OUTLIER_RATIO, _MIN_LIMIT = 4.0, 1e-9
 
 _Mesh: TypeAlias = trimesh.Trimesh | trimesh.Scene | str | Path
 
@@ -60,19 +60,19 @@ class Deviation(eqx.Module):
     - `pose`: pose of the CAD, from its coordinates to the scan's.
     - `points`: points of the scan, uniform by area if it is a mesh.
     - `distances`: signed distance from the CAD to each point, positive outside (too much material).
-    - `feet`, `normals`: for each point, the nearest point of the CAD and its outward normal.
+    - `nearest_points`, `normals`: for each point, the nearest point of the CAD and its outward normal.
     - `cad`: the CAD at this pose.
     - `area`, `missing_area`: area of the CAD that the scan covers, and area that it does not cover. There are no
       distances for the latter.
     - `imagined`: fraction of the scanned mesh that no view measured. This part is left out.
-    - `radius`: a place on the CAD is covered if at least three of the four nearest `feet` are within this distance, on
-      the same side of a wall.
+    - `radius`: a place on the CAD is covered if at least three of the four nearest rows of `nearest_points` are within
+      this distance, on the same side of a wall.
     """
 
     pose: Float[np.ndarray, "4 4"]
     points: Float[np.ndarray, "n 3"]
     distances: Float[np.ndarray, " n"]
-    feet: Float[np.ndarray, "n 3"]
+    nearest_points: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
     cad: TriangleMesh
     area: float
@@ -95,34 +95,34 @@ class Deviation(eqx.Module):
         return float(np.percentile(np.abs(self.distances), share))
 
     @checked
-    def worst(self, count: int = 5, apart: float | None = None) -> tuple[WorstPlace, ...]:
+    def worst(self, count: int = 5, min_distance: float | None = None) -> tuple[WorstPlace, ...]:
         """Return at most `count` places with the largest deviations, the worst first.
 
         Two extremes count as one place if the deviation between them stays above half of the smaller extreme.
 
-        - `apart`: least distance between two places; 5 % of the CAD's diameter by default.
+        - `min_distance`: least distance between two places; 5 % of the CAD's diameter by default.
 
         **Raises:** `ValueError` for a count below 1 or a negative distance.
         """
         require(count >= 1, f"the number of places is {count}; ask for at least one")
-        apart = _APART * _diameter(self.cad.vertices) if apart is None else apart
-        require(apart >= 0, f"places are {apart} apart; give a positive length")
+        min_distance = _MIN_DISTANCE * _diameter(self.cad.vertices) if min_distance is None else min_distance
+        require(min_distance >= 0, f"places are {min_distance} apart; give a positive length")
         tree = cKDTree(self.points)
         _, near = tree.query(self.points, k=_NEIGHBOURS)
         smooth = np.median(self.distances[near], axis=1)
         size, num = np.abs(smooth), len(smooth)
         edges = np.repeat(np.arange(num), _NEIGHBOURS - 1), near[:, 1:].ravel()
         graph = coo_array((np.ones(len(edges[0]), bool), edges), (num, num)).tocsr()
-        places, rows, is_left = list[WorstPlace](), list[int](), np.ones(num, bool)
-        while len(places) < count and is_left.any():
-            row = int(np.argmax(np.where(is_left, size, -1.0)))
+        places, rows, is_candidate = list[WorstPlace](), list[int](), np.ones(num, bool)
+        while len(places) < count and is_candidate.any():
+            row = int(np.argmax(np.where(is_candidate, size, -1.0)))
             high = np.flatnonzero((size >= 0.5 * size[row]) & (np.sign(smooth) == np.sign(smooth[row])))
             _, labels = connected_components(graph[high][:, high], directed=False)
             region = high[labels == labels[np.searchsorted(high, row)]]
-            is_left[region] = False
+            is_candidate[region] = False
             if not np.isin(rows, region).any():
                 rows.append(row)
-                is_left[tree.query_ball_point(self.points[row], apart)] = False
+                is_candidate[tree.query_ball_point(self.points[row], min_distance)] = False
                 places.append(WorstPlace(self.points[row], float(smooth[row]), _diameter(self.points[region])))
         return tuple(places)
 
@@ -132,16 +132,16 @@ class Deviation(eqx.Module):
         - `places`, `normals`: points of `cad` and the outward normals there. A scan of one side of a wall does not
           cover the other side.
         """
-        rows = np.flatnonzero(np.abs(self.distances) < _FAR * _diameter(self.cad.vertices))
+        rows = np.flatnonzero(np.abs(self.distances) < _MAX_DISTANCE * _diameter(self.cad.vertices))
         if len(rows) == 0:
             return np.full(len(places), np.nan)
-        gaps, near = cKDTree(self.feet[rows]).query(places, k=[1, 2, 3, 4], distance_upper_bound=self.radius)
+        gaps, near = cKDTree(self.nearest_points[rows]).query(places, k=[1, 2, 3, 4], distance_upper_bound=self.radius)
         near = rows[np.minimum(near, len(rows) - 1)]
-        is_facing = np.einsum("mki,mi->mk", self.normals[near], normals) > _FACING
+        is_facing = np.einsum("mki,mi->mk", self.normals[near], normals) > _MIN_COSINE
         is_near = np.isfinite(gaps) & is_facing
         weight = np.where(is_near, 1.0 / (np.where(is_near, gaps, 0.0) + 0.1 * self.radius), 0.0)
         mean = np.sum(weight * self.distances[near], axis=1) / np.maximum(weight.sum(axis=1), 1e-30)
-        return np.where(is_near.sum(axis=1) >= _COVERING, mean, np.nan)
+        return np.where(is_near.sum(axis=1) >= _MIN_COVERING, mean, np.nan)
 
     @checked
     def figure(
@@ -170,16 +170,18 @@ class Deviation(eqx.Module):
             from jaxnbv.viz.deviation_figure import Mark, deviation_figure
         require(scale > 0, f"the scale is {scale}; it must be positive")
         first, *others = self.worst(count)
-        places = [first, *(place for place in others if abs(place.distance) >= _STANDS_OUT * self.median)]
+        places = [first, *(place for place in others if abs(place.distance) >= _MIN_OUTLIER_RATIO * self.median)]
         distances = [scale * place.distance for place in places]
-        limit = max(abs(distances[0]), _LEAST) if limit is None else limit
+        limit = max(abs(distances[0]), _MIN_LIMIT) if limit is None else limit
         require(limit > 0, f"the colours end at {limit}; give a positive deviation")
         _, rows = cKDTree(self.points).query([place.position for place in places])
-        middle, most = (scale * self.percentile(share) for share in (50.0, 90.0))
+        middle, upper = (scale * self.percentile(percent) for percent in (50.0, 90.0))
         missing = 100.0 * self.missing_area / (self.area + self.missing_area)
-        caption = f"median {middle:.3g},  90 % within {most:.3g};  {missing:.0f} % of the CAD not scanned"
-        marks = [Mark(*mark) for mark in zip(self.feet[rows], self.normals[rows], distances, strict=True)]
-        return deviation_figure(self.cad, lambda *at: scale * self.values_at(*at), marks, limit, unit, caption, up)
+        caption = f"median {middle:.3g},  90 % within {upper:.3g};  {missing:.0f} % of the CAD not scanned"
+        marks = [Mark(*mark) for mark in zip(self.nearest_points[rows], self.normals[rows], distances, strict=True)]
+        return deviation_figure(
+            self.cad, lambda *arguments: scale * self.values_at(*arguments), marks, limit, unit, caption, up
+        )
 
 
 @checked
@@ -210,25 +212,27 @@ def deviation(
     model, is_solid = orient_outward(_mesh_of(cad))
     points, normals, imagined = _points_of(mesh)
     _check_units(_diameter(points), _diameter(model.vertices))
-    matrix = _checked_pose(pose)
+    matrix = _rigid_matrix(pose)
     if register:
-        matrix = _registered(points, normals, model, is_solid, None if pose is None else matrix)
-    turn, faces = matrix[:3, :3], np.ascontiguousarray(model.faces, np.int64)
-    vertices = np.ascontiguousarray(model.vertices @ turn.T + matrix[:3, 3])
+        matrix = _register(points, normals, model, is_solid, None if pose is None else matrix)
+    rotation, faces = matrix[:3, :3], np.ascontiguousarray(model.faces, np.int64)
+    vertices = np.ascontiguousarray(model.vertices @ rotation.T + matrix[:3, 3])
     # Pseudonormals give a sign on open meshes too, where winding numbers have no inside.
     igl = optional("igl")
     kind = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
-    distances, rows, feet, _ = igl.signed_distance(np.ascontiguousarray(points), vertices, faces, kind)
+    distances, rows, nearest_points, _ = igl.signed_distance(np.ascontiguousarray(points), vertices, faces, kind)
     gaps, _ = cKDTree(points).query(points, k=5)
-    radius, outer = _RADIUS * float(np.quantile(gaps[:, 4], 0.9)), model.face_normals @ turn.T
-    cad_here, area = TriangleMesh(vertices, faces, Frame()), float(model.area)
-    result = Deviation(matrix, points, distances, feet, outer[rows], cad_here, area, 0.0, imagined, radius)
-    samples, rows = trimesh.sample.sample_surface(cad_here.to_trimesh(), _SAMPLES, seed=0)
-    missing = area * float(np.mean(np.isnan(result.values_at(np.asarray(samples), outer[rows]))))
+    radius, outer_normals = _RADIUS * float(np.quantile(gaps[:, 4], 0.9)), model.face_normals @ rotation.T
+    posed_cad, area = TriangleMesh(vertices, faces, Frame()), float(model.area)
+    result = Deviation(
+        matrix, points, distances, nearest_points, outer_normals[rows], posed_cad, area, 0.0, imagined, radius
+    )
+    samples, rows = trimesh.sample.sample_surface(posed_cad.to_trimesh(), _SAMPLES, seed=0)
+    missing = area * float(np.mean(np.isnan(result.values_at(np.asarray(samples), outer_normals[rows]))))
     return dataclasses.replace(result, area=area - missing, missing_area=missing)
 
 
-def _registered(
+def _register(
     points: Float[np.ndarray, "n 3"],
     normals: Float[np.ndarray, "n 3"],
     model: trimesh.Trimesh,
@@ -237,7 +241,7 @@ def _registered(
 ) -> Float[np.ndarray, "4 4"]:
     start = None if pose is None else np.linalg.inv(pose)
     result = register_scan(points, normals, model, is_solid, start)
-    if result.median_distance > _POOR * _diameter(model.vertices):
+    if result.median_distance > _POOR_MEDIAN * _diameter(model.vertices):
         warnings.warn(
             f"the CAD fits the scan poorly: the median distance is {result.median_distance:.4g}. Give pose=, and check "
             "that it is this part, that the scan shows little else, and that its faces are wound outward",
@@ -252,21 +256,21 @@ def _registered(
     return np.linalg.inv(result.matrix)
 
 
-def _mesh_of(thing: _Mesh | TriangleMesh) -> trimesh.Trimesh:
+def _mesh_of(source: _Mesh | TriangleMesh) -> trimesh.Trimesh:
     """Convert to a trimesh mesh in its own units, with the attribute `measured` of faces if there is one."""
-    if isinstance(thing, TriangleMesh):
-        return trimesh.Trimesh(thing.frame.to_world(thing.vertices), thing.faces, process=False)
-    parts = [part for _, part in read_nodes(thing)]
+    if isinstance(source, TriangleMesh):
+        return trimesh.Trimesh(source.frame.to_world(source.vertices), source.faces, process=False)
+    parts = [part for _, part in read_nodes(source)]
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     corners = [part.faces + start for part, start in zip(parts, starts[:-1], strict=True)]
     vertices, faces = checked_triangles(np.concatenate([part.vertices for part in parts]), np.concatenate(corners))
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     require(mesh.area > 0, f"all {len(faces)} faces of the mesh have zero area: there is no surface")
     marks: Any = None
-    if isinstance(thing, trimesh.Trimesh):
-        marks = thing.face_attributes.get("measured")
-    elif isinstance(thing, str | Path) and Path(thing).suffix.lower() == ".ply":
-        raw = trimesh.load(thing, process=False).metadata.get("_ply_raw", {}).get("face", {}).get("data")
+    if isinstance(source, trimesh.Trimesh):
+        marks = source.face_attributes.get("measured")
+    elif isinstance(source, str | Path) and Path(source).suffix.lower() == ".ply":
+        raw = trimesh.load(source, process=False).metadata.get("_ply_raw", {}).get("face", {}).get("data")
         marks = raw["measured"] if "measured" in (getattr(raw, "dtype", np.dtype(int)).names or ()) else None
     if marks is not None and len(marks) == len(faces):
         mesh.face_attributes["measured"] = np.asarray(marks).astype(bool)
@@ -278,7 +282,7 @@ def _points_of(scan: _Mesh | PointCloud) -> tuple[Float[np.ndarray, "n 3"], Floa
     if isinstance(scan, PointCloud):
         check_single(scan)
         points, normals = (rows.astype(np.float64) for rows in scan.to_numpy())
-        require(len(points) >= _FEWEST, f"the scan has {len(points)} points: give at least {_FEWEST}")
+        require(len(points) >= _MIN_POINTS, f"the scan has {len(points)} points: give at least {_MIN_POINTS}")
         require(bool(np.isfinite(points).all()), "the scan has points that are not finite: drop them")
         return points, normals, 0.0
     mesh = _mesh_of(scan)
@@ -290,15 +294,15 @@ def _points_of(scan: _Mesh | PointCloud) -> tuple[Float[np.ndarray, "n 3"], Floa
 
 
 def _check_units(scan: float, cad: float) -> None:
-    times = max(scan, cad) / max(min(scan, cad), 1e-30)
+    ratio = max(scan, cad) / max(min(scan, cad), 1e-30)
     require(
-        times < (_LARGER if scan > cad else _SMALLER),
-        f"the scan is {scan:.4g} across and the CAD {cad:.4g}, a factor of {times:.3g}: their units differ, such as "
+        ratio < (_LARGE_RATIO if scan > cad else _SMALL_RATIO),
+        f"the scan is {scan:.4g} across and the CAD {cad:.4g}, a factor of {ratio:.3g}: their units differ, such as "
         "millimetres and metres (1000). Scale one, as by cad.apply_scale(0.001), or crop the scan to the part",
     )
 
 
-def _checked_pose(pose: Float[AnyArray, "4 4"] | list | None) -> Float[np.ndarray, "4 4"]:
+def _rigid_matrix(pose: Float[AnyArray, "4 4"] | list | None) -> Float[np.ndarray, "4 4"]:
     """Convert a pose to a rigid matrix, and None to the identity.
 
     **Raises:** `ValueError` unless the pose is a rigid (4, 4) matrix.
@@ -314,5 +318,5 @@ def _checked_pose(pose: Float[AnyArray, "4 4"] | list | None) -> Float[np.ndarra
 
 def _diameter(points: Float[np.ndarray, "n 3"]) -> float:
     """Return the approximate distance between the two points that are farthest apart."""
-    far = points[np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1))]
-    return float(np.linalg.norm(points - far, axis=1).max())
+    farthest = points[np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1))]
+    return float(np.linalg.norm(points - farthest, axis=1).max())

@@ -16,7 +16,7 @@ from jaxnbv.scanning.mesh import TriangleMesh
 from jaxnbv.scanning.triangle_rays import first_faces
 from jaxnbv.viz.figures import STYLE
 from jaxnbv.viz.imagined import lamp
-from jaxnbv.viz.render import Still, frame
+from jaxnbv.viz.render import Still, crop
 from jaxnbv.viz.sphere import unit
 from jaxnbv.viz.style import INK
 
@@ -26,10 +26,10 @@ _COLOURS, _BLANK = mpl.colormaps["RdBu_r"], "#76808f"
 _SIZE, _WIDTH, _HEIGHT = 640, 7.2, 3.7
 # Number of viewing directions to choose from, and their largest height. Number of points on the CAD whose visibility
 # decides, and distance from the surface at which their rays to the viewer start.
-_EYES, _HIGHEST, _SAMPLES, _CLEAR = 120, 0.7, 400, 0.02
+_NUM_EYES, _MAX_HEIGHT, _NUM_SAMPLES, _CLEARANCE = 120, 0.7, 400, 0.02
 # Weight of the visibility of a numbered place (a fully scanned surface has weight 1 in all), and of a point that was
 # not scanned relative to a scanned point.
-_PLACE, _UNSCANNED = 1.0, 1.0 / 3.0
+_PLACE_WEIGHT, _UNSCANNED_WEIGHT = 1.0, 1.0 / 3.0
 
 # Function that returns the deviations at places on the CAD, given the places and their normals. NaN if not scanned.
 Values = Callable[[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]], Float[np.ndarray, " m"]]
@@ -59,10 +59,10 @@ def deviation_figure(
         figure = Figure(figsize=(_WIDTH, _HEIGHT))
         for side, eye in enumerate(_two_eyes(scene, values_at, positions, normals)):
             axes = figure.add_axes((0.01 + 0.43 * side, 0.16, 0.42, 0.82))
-            still = _painted(scene, eye, values_at, colours)
+            still = _render(scene, eye, values_at, colours)
             axes.imshow(still.image, interpolation="bilinear", zorder=1)
             pixels = still.project(scene.vertices)[0]
-            frame(axes, still, [pixels])
+            crop(axes, still, [pixels])
             _number(axes, still, positions, pixels.mean(axis=0))
         bar = figure.colorbar(colours, cax=figure.add_axes((0.89, 0.22, 0.016, 0.68)))
         bar.ax.ticklabel_format(scilimits=(-2, 4))
@@ -83,22 +83,22 @@ def _two_eyes(
     - `positions`, `outward`: numbered places and the outward normals there, in scene coordinates.
     """
     mesh = scene.to_trimesh()
-    samples, rows = trimesh.sample.sample_surface(mesh, _SAMPLES, seed=0)
+    samples, rows = trimesh.sample.sample_surface(mesh, _NUM_SAMPLES, seed=0)
     normals = mesh.face_normals[rows]
     is_scanned = np.isfinite(values_at(*_to_world(scene, samples, normals)))
-    weight = np.where(is_scanned, 1.0, _UNSCANNED) / _SAMPLES
+    weight = np.where(is_scanned, 1.0, _UNSCANNED_WEIGHT) / _NUM_SAMPLES
     samples, normals = np.concatenate([samples, positions]), np.concatenate([normals, outward])
-    weight = np.concatenate([weight, np.full(len(positions), _PLACE)])
-    eyes = np.asarray(fibonacci_sphere(_EYES), np.float64)
-    eyes = eyes[np.abs(eyes[:, 1]) < _HIGHEST]
+    weight = np.concatenate([weight, np.full(len(positions), _PLACE_WEIGHT)])
+    eyes = np.asarray(fibonacci_sphere(_NUM_EYES), np.float64)
+    eyes = eyes[np.abs(eyes[:, 1]) < _MAX_HEIGHT]
     rays = np.repeat(eyes[None], len(samples), axis=0)
-    origins = samples[:, None] + _CLEAR * (rays + normals[:, None])
+    origins = samples[:, None] + _CLEARANCE * (rays + normals[:, None])
     hits, _ = first_faces(scene.vertices, scene.faces)(origins.reshape(-1, 3), rays.reshape(-1, 3))
     # Oblique surface counts less.
     visible = np.clip(normals @ eyes.T, 0.0, 1.0) * (hits < 0).reshape(len(samples), -1)
     first = int(np.argmax(weight @ visible))
-    more = np.maximum(visible - visible[:, [first]], 0.0)
-    return eyes[[first, int(np.argmax(weight @ more))]]
+    gain = np.maximum(visible - visible[:, [first]], 0.0)
+    return eyes[[first, int(np.argmax(weight @ gain))]]
 
 
 def _to_world(
@@ -107,7 +107,7 @@ def _to_world(
     return np.asarray(scene.frame.to_world(points)), normals @ scene.frame.rotation
 
 
-def _painted(scene: TriangleMesh, eye: Float[np.ndarray, "3"], values_at: Values, colours: ScalarMappable) -> Still:
+def _render(scene: TriangleMesh, eye: Float[np.ndarray, "3"], values_at: Values, colours: ScalarMappable) -> Still:
     still = Still(eye, None, _SIZE, scene.bounding_radius)
     directions = np.asarray(still.fine_camera.pixel_directions()) @ np.asarray(still.pose.rotation).T
     origin = np.asarray(still.pose.position, np.float64)
@@ -122,22 +122,22 @@ def _painted(scene: TriangleMesh, eye: Float[np.ndarray, "3"], values_at: Values
     return still
 
 
-def _number(axes: Any, still: Still, positions: Float[np.ndarray, "k 3"], middle: Float[np.ndarray, "2"]) -> None:
+def _number(axes: Any, still: Still, positions: Float[np.ndarray, "k 3"], center: Float[np.ndarray, "2"]) -> None:
     """Write the number of each visible place beside it, on the side away from the centre of the object.
 
     - `positions`: places in scene coordinates, in the order of their numbers.
-    - `middle`: mean pixel of the object's vertices.
+    - `center`: mean pixel of the object's vertices.
     """
     pixels, in_front = still.project(positions)
     for number, (pixel, is_visible) in enumerate(zip(pixels, in_front, strict=True), start=1):
         if not is_visible:
             continue
-        away = (pixel - middle) / max(float(np.linalg.norm(pixel - middle)), 1.0)
+        direction = (pixel - center) / max(float(np.linalg.norm(pixel - center)), 1.0)
         style: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 8, "fontweight": "bold", "zorder": 5}
         axes.annotate(
             str(number),
             pixel,
-            (16 * away[0], -16 * away[1]),
+            (16 * direction[0], -16 * direction[1]),
             textcoords="offset points",
             bbox={"boxstyle": "circle,pad=0.25", "fc": "white", "ec": INK, "lw": 0.8},
             arrowprops={"arrowstyle": "-", "color": INK, "lw": 0.8, "shrinkA": 0, "shrinkB": 0},

@@ -15,10 +15,10 @@ from jaxnbv.planning.episode import Episode
 from jaxnbv.sampler import StepInputs, SurfaceSampler
 from jaxnbv.storage.files import write_bytes
 from jaxnbv.surfaces.part_hypotheses import PartHypotheses
-from jaxnbv.viz.mean_surface import MeanSurface, as_shown, mean_surface
+from jaxnbv.viz.mean_surface import MeanSurface, mean_surface, near_points
 from jaxnbv.viz.placed_shape import likeliest_part
 
-_CLOUDS, _MESHES = ("ply", "obj", "glb", "xyz"), ("ply", "obj", "glb", "stl", "off")
+_CLOUD_FORMATS, _MESH_FORMATS = ("ply", "obj", "glb", "xyz"), ("ply", "obj", "glb", "stl", "off")
 
 
 @checked
@@ -54,13 +54,13 @@ def surface_mesh(episode: Episode, imagined: bool = True) -> trimesh.Trimesh:
         raise InputError("the sampler's grid holds no surface with points: give a finer one, or another view")
     vertices = np.asarray(frame.to_world(surface.vertices), np.float64)
     mesh = trimesh.Trimesh(vertices, surface.faces, process=False)
-    away, _ = cKDTree(cloud.to_numpy()[0]).query(vertices)
+    distances, _ = cKDTree(cloud.to_numpy()[0]).query(vertices)
     cell = float(frame.length_to_world(planner.sampler.grid.spacing))
     mesh.vertex_attributes["deviation"] = np.asarray(frame.length_to_world(surface.deviation), np.float32)
-    measured = (away[mesh.faces] < cell).all(axis=1)
-    mesh.face_attributes["measured"] = measured.astype(np.uint8)
+    is_measured = (distances[mesh.faces] < cell).all(axis=1)
+    mesh.face_attributes["measured"] = is_measured.astype(np.uint8)
     if not imagined:
-        mesh.update_faces(measured)
+        mesh.update_faces(is_measured)
         mesh.remove_unreferenced_vertices()
     return mesh
 
@@ -89,11 +89,11 @@ def missing_regions(episode: Episode, smallest: float = 0.0) -> list[Region]:
     **Raises:** `ValueError` as `surface_mesh` does.
     """
     mesh, planner, frame = surface_mesh(episode), episode.planner, episode.frame
-    measured = np.asarray(mesh.face_attributes["measured"], bool)
-    is_missing = ~measured
+    is_measured = np.asarray(mesh.face_attributes["measured"], bool)
+    is_missing = ~is_measured
     if (obstacles := planner.obstacles) is not None:
-        near = obstacles.margin + planner.sampler.grid.spacing
-        is_missing &= np.asarray(obstacles.distance(frame.to_scene(mesh.triangles_center))) > near
+        min_distance = obstacles.margin + planner.sampler.grid.spacing
+        is_missing &= np.asarray(obstacles.distance(frame.to_scene(mesh.triangles_center))) > min_distance
     neighbours = mesh.face_adjacency[is_missing[mesh.face_adjacency].all(axis=1)]
     parts = trimesh.graph.connected_components(neighbours, nodes=np.flatnonzero(is_missing))
     regions = [_region(mesh, faces) for faces in parts]
@@ -118,12 +118,12 @@ def save_cloud(episode: Episode, path: str | Path) -> Path:
     **Raises:** `ValueError` as `scanned_cloud` does, for a different suffix, or if the file cannot be written.
     """
     points, normals = scanned_cloud(episode).to_numpy()
-    kind = _kind(path, _CLOUDS)
+    kind = _kind(path, _CLOUD_FORMATS)
     if kind == "ply":
         # Clouds of trimesh have no normals.
-        bare = trimesh.Trimesh(points, vertex_normals=normals, process=False)
-        return _written(path, trimesh.exchange.ply.export_ply(bare, vertex_normal=True))
-    return _written(path, trimesh.PointCloud(points).export(file_type=kind))
+        mesh = trimesh.Trimesh(points, vertex_normals=normals, process=False)
+        return _write(path, trimesh.exchange.ply.export_ply(mesh, vertex_normal=True))
+    return _write(path, trimesh.PointCloud(points).export(file_type=kind))
 
 
 @checked
@@ -134,23 +134,25 @@ def save_mesh(episode: Episode, path: str | Path, imagined: bool = True) -> Path
 
     **Raises:** `ValueError` as `surface_mesh` does, for a different suffix, or if the file cannot be written.
     """
-    kind = _kind(path, _MESHES)
-    return _written(path, surface_mesh(episode, imagined).export(file_type=kind))
+    kind = _kind(path, _MESH_FORMATS)
+    return _write(path, surface_mesh(episode, imagined).export(file_type=kind))
 
 
 def _surface(sampler: SurfaceSampler, observations: Observations) -> MeanSurface | None:
     if isinstance(observations.hypotheses, PartHypotheses):
         return likeliest_part(observations.hypotheses)
     inputs = StepInputs(observations, sampler.posterior(observations))
-    return as_shown(mean_surface(sampler, inputs), observations.cloud)
+    return near_points(mean_surface(sampler, inputs), observations.cloud)
 
 
 def _kind(path: str | Path, kinds: tuple[str, ...]) -> str:
     kind = Path(path).suffix[1:].lower()
-    require(kind in kinds, f"{path} does not say a format: end it with one of {', '.join('.' + one for one in kinds)}")
+    require(
+        kind in kinds, f"{path} does not say a format: end it with one of {', '.join('.' + suffix for suffix in kinds)}"
+    )
     return kind
 
 
-def _written(path: str | Path, content: Any) -> Path:
+def _write(path: str | Path, content: Any) -> Path:
     write_bytes(Path(path), content.encode() if isinstance(content, str) else content)
     return Path(path)

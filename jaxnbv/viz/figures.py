@@ -9,7 +9,7 @@ from matplotlib.ticker import NullLocator
 
 from jaxnbv.viz.choice import draw_acquisition, marks
 from jaxnbv.viz.data import ReportData
-from jaxnbv.viz.render import draw_scene, painted
+from jaxnbv.viz.render import draw_scene, render_view
 from jaxnbv.viz.style import BEFORE, DEVIATION, GREY, INK, NEW, PART, bar_ticks
 
 STYLE: dict[Any, Any] = {
@@ -29,40 +29,42 @@ STYLE: dict[Any, Any] = {
     "axes.titlelocation": "left",
     "figure.facecolor": "white",
 }
-_ROW, _LINE = 5.0, 0.26
+_ROW_HEIGHT, _LINE_HEIGHT = 5.0, 0.26
 
 
 def overview_figure(data: ReportData) -> Figure:
     """Draw each view's scene above its map of the acquisition, at most five views in a row, and a legend."""
     columns = min(len(data.views), 5)
     rows, width = -(-len(data.views) // columns), max(3.0 * columns, 6.0)
-    chosen = [view.proposal for view in data.views if view.proposal is not None]
+    proposals = [view.proposal for view in data.views if view.proposal is not None]
     shapes = [("■ scanned", PART), ("■ imagined", "#a5cfc0"), ("■ others disagree", "#b3a9dc")]
     legend = shapes if data.has_shapes else []
     legend += [("● points before", BEFORE), ("● new points and camera", NEW), ("★ chosen view", NEW)]
-    legend += [(mark, INK) for mark in marks(*chosen)]
-    beside = int(width // 3)
-    foot = 1.3 + _LINE * -(-len(legend) // beside)
-    figure = Figure(figsize=(width, _ROW * rows + foot))
-    heights, whole = [*[_ROW] * rows, foot], {"left": 0, "right": 1, "bottom": 0, "top": 1}
-    grid = figure.add_gridspec(rows + 1, columns, **whole, hspace=0, wspace=0, height_ratios=heights)
+    legend += [(mark, INK) for mark in marks(*proposals)]
+    legend_columns = int(width // 3)
+    legend_height = 1.3 + _LINE_HEIGHT * -(-len(legend) // legend_columns)
+    figure = Figure(figsize=(width, _ROW_HEIGHT * rows + legend_height))
+    heights, margins = [*[_ROW_HEIGHT] * rows, legend_height], {"left": 0, "right": 1, "bottom": 0, "top": 1}
+    grid = figure.add_gridspec(rows + 1, columns, **margins, hspace=0, wspace=0, height_ratios=heights)
     for index, view in enumerate(data.views):
-        part = figure.add_subfigure(grid[divmod(index, columns)])
-        draw_scene(part.add_axes((0.0, 0.32, 1.0, 0.6)), data, index, painted(data, index), weight=1.3)
-        part.text(0.04, 0.95, f"View {index + 1}", fontsize=15, fontweight="bold", va="center")
-        seen = f"{view.seen.amount}{' seen' * (view.seen.unit == '%')}"
-        part.text(0.96, 0.95, seen, fontsize=14, ha="right", va="center")
-        draw_acquisition(part.add_axes((0.03, 0.01, 0.94, 0.3)), view.proposal, data.quantity, weight=1.2)
-    below = figure.add_subfigure(grid[rows, :])
+        panel = figure.add_subfigure(grid[divmod(index, columns)])
+        draw_scene(panel.add_axes((0.0, 0.32, 1.0, 0.6)), data, index, render_view(data, index), weight=1.3)
+        panel.text(0.04, 0.95, f"View {index + 1}", fontsize=15, fontweight="bold", va="center")
+        coverage_text = f"{view.coverage.amount}{' seen' * (view.coverage.unit == '%')}"
+        panel.text(0.96, 0.95, coverage_text, fontsize=14, ha="right", va="center")
+        draw_acquisition(panel.add_axes((0.03, 0.01, 0.94, 0.3)), view.proposal, data.quantity, weight=1.2)
+    legend_panel = figure.add_subfigure(grid[rows, :])
     if data.has_deviations:
-        _draw_deviations(below.add_axes((0.15, 1.0 - 0.25 / foot, 0.7, 0.13 / foot)), data)
+        _draw_deviations(legend_panel.add_axes((0.15, 1.0 - 0.25 / legend_height, 0.7, 0.13 / legend_height)), data)
     maps = f"Maps: {data.quantity.name}; dark is high"
     # Ten letters of this size take an inch.
-    below.text(0.04, 1.0 - 1.0 / foot, maps, fontsize=12.0 * min(1.0, 9.0 * width / len(maps)), va="center")
+    legend_panel.text(
+        0.04, 1.0 - 1.0 / legend_height, maps, fontsize=12.0 * min(1.0, 9.0 * width / len(maps)), va="center"
+    )
     for number, (mark, colour) in enumerate(legend):
-        row, column = divmod(number, beside)
-        place = 0.04 + 0.94 * column / beside, 1.0 - (1.28 + _LINE * row) / foot
-        below.text(*place, mark, color=colour, fontsize=12, va="center")
+        row, column = divmod(number, legend_columns)
+        position = 0.04 + 0.94 * column / legend_columns, 1.0 - (1.28 + _LINE_HEIGHT * row) / legend_height
+        legend_panel.text(*position, mark, color=colour, fontsize=12, va="center")
     return figure
 
 

@@ -23,25 +23,25 @@ from jaxnbv.viz.placed_shape import placed_parts
 from jaxnbv.viz.sphere import unit
 from jaxnbv.viz.style import BEFORE, NEW
 
-SHOWN = 4
+NUM_SHOWN = 4
 _PIXELS = 96
 # Colours of surface seen before, and of other imagined surface. The latter is light, so that its shape shows.
-_KNOWN, _UNSEEN = "#c3c9d2", "#5b8fc7"
+_SEEN_COLOUR, _UNSEEN_COLOUR = "#c3c9d2", "#5b8fc7"
 # A point counts as seen before if it is nearer to the cloud than this (scene units) or this many spacings of the cloud.
-_SEEN, _SPACINGS = 0.05, 3.0
+_MAX_DISTANCE, _MAX_SPACINGS = 0.05, 3.0
 
 
-class Look(eqx.Module):
+class ShadedImage(eqx.Module):
     """A shaded picture of a surface from a camera.
 
     - `mask`: whether each ray hits the surface.
-    - `lit`: brightness by a lamp beside the camera, in [0, 1].
-    - `known`: whether an earlier view saw the surface at this pixel.
+    - `brightness`: brightness by a lamp beside the camera, in [0, 1].
+    - `is_seen`: whether an earlier view saw the surface at this pixel.
     """
 
     mask: Bool[np.ndarray, "h w"]
-    lit: Float[np.ndarray, "h w"]
-    known: Bool[np.ndarray, "h w"]
+    brightness: Float[np.ndarray, "h w"]
+    is_seen: Bool[np.ndarray, "h w"]
 
 
 class Imagined(eqx.Module):
@@ -52,12 +52,12 @@ class Imagined(eqx.Module):
     - `kinds`: kinds of known shapes with their probabilities. Empty without known shapes.
     """
 
-    samples: tuple[Look, ...]
+    samples: tuple[ShadedImage, ...]
     names: tuple[str, ...] = eqx.field(static=True)
     kinds: tuple[tuple[str, float], ...] = eqx.field(static=True)
 
 
-def imagined(episode: Episode, index: int, inputs: StepInputs) -> Imagined | None:
+def render_imagined(episode: Episode, index: int, inputs: StepInputs) -> Imagined | None:
     """Return pictures of the surfaces imagined before view `index` (from 0); None for a given view.
 
     - `inputs`: inputs of the step that chose the view, with the samples.
@@ -66,47 +66,49 @@ def imagined(episode: Episode, index: int, inputs: StepInputs) -> Imagined | Non
     parts = inputs.observations.hypotheses if planner.acquisition.needs_hypotheses else None
     if view.proposal is None or (inputs.surfaces is None and parts is None):
         return None
-    camera, cloud = _finer(planner.camera), inputs.observations.cloud.to_numpy()[0]
-    barrier, samples = barrier_of(planner.obstacles, camera, view.pose), list[Look]()
+    camera, cloud = _fine_camera(planner.camera), inputs.observations.cloud.to_numpy()[0]
+    barrier, samples = barrier_of(planner.obstacles, camera, view.pose), list[ShadedImage]()
     # Scan triangles: other scans must be compiled, which takes too long for a picture of this size.
     if isinstance(parts, PartHypotheses):
-        likely = placed_parts(parts, SHOWN)
+        likely = placed_parts(parts, NUM_SHOWN)
         names, kinds = [part.name for part in likely], parts.names()
         meshes: list[TriangleMesh | None] = [TriangleMesh(part.vertices, part.faces, Frame()) for part in likely]
     else:
         assert inputs.surfaces is not None
         assert inputs.posterior is not None
-        found = [level_triangles(values, sampler.grid) for values in np.array(inputs.surfaces.values[:SHOWN])]
-        meshes = [None if triangles is None else TriangleMesh(*triangles[:2], Frame()) for triangles in found]
+        all_triangles = [
+            level_triangles(values, sampler.grid) for values in np.array(inputs.surfaces.values[:NUM_SHOWN])
+        ]
+        meshes = [None if triangles is None else TriangleMesh(*triangles[:2], Frame()) for triangles in all_triangles]
         sample_key, *_ = view_keys(episode.key, index)
         shapes = inputs.posterior.names_of_samples(sample_key, sampler.num_samples)[: len(meshes)]
         names = [shape or f"imagined {number}" for number, shape in enumerate(shapes, start=1)]
         kinds = inputs.posterior.kinds()
     for mesh in meshes:
         if mesh is None:
-            nothing = np.zeros((camera.height, camera.width))
-            samples.append(Look(nothing > 0, nothing, nothing > 0))
+            empty = np.zeros((camera.height, camera.width))
+            samples.append(ShadedImage(empty > 0, empty, empty > 0))
             continue
-        samples.append(look(scan(mesh, camera, view.pose, barrier), camera, view.pose, cloud))
+        samples.append(shaded_image(scan(mesh, camera, view.pose, barrier), camera, view.pose, cloud))
     return Imagined(tuple(samples), tuple(names), tuple(kinds.items()))
 
 
-def taken_look(view: View, cloud: Float[np.ndarray, "n 3"]) -> Look | None:
+def view_image(view: View, cloud: Float[np.ndarray, "n 3"]) -> ShadedImage | None:
     """Return the picture of a view's scan; None if the scan is not an image. `cloud`: points seen before."""
     is_image = view.scan.capacity == view.camera.num_rays
-    return look(view.scan, view.camera, view.pose, cloud) if is_image else None
+    return shaded_image(view.scan, view.camera, view.pose, cloud) if is_image else None
 
 
-def look(seen: PointCloud, camera: Camera, pose: Pose, cloud: Float[np.ndarray, "n 3"]) -> Look:
+def shaded_image(view_scan: PointCloud, camera: Camera, pose: Pose, cloud: Float[np.ndarray, "n 3"]) -> ShadedImage:
     """Return the picture of a scan that has one row per pixel. `cloud`: points seen before."""
-    points, normals = (np.asarray(rows, np.float64) for rows in (seen.points, seen.normals))
-    mask = np.asarray(seen.mask)
-    lit = np.clip(0.35 + 0.65 * normals @ lamp(pose), 0.0, 1.0)
+    points, normals = (np.asarray(rows, np.float64) for rows in (view_scan.points, view_scan.normals))
+    mask = np.asarray(view_scan.mask)
+    brightness = np.clip(0.35 + 0.65 * normals @ lamp(pose), 0.0, 1.0)
     tree = cKDTree(cloud)
     spacing = np.median(tree.query(cloud, k=2)[0][:, 1]) if len(cloud) > 1 else 0.0
-    known = mask & (tree.query(points)[0] < max(_SEEN, _SPACINGS * spacing))
+    is_seen = mask & (tree.query(points)[0] < max(_MAX_DISTANCE, _MAX_SPACINGS * spacing))
     shape = camera.height, camera.width
-    return Look(mask.reshape(shape), lit.reshape(shape), known.reshape(shape))
+    return ShadedImage(mask.reshape(shape), brightness.reshape(shape), is_seen.reshape(shape))
 
 
 def lamp(pose: Pose) -> Float[np.ndarray, "3"]:
@@ -115,20 +117,20 @@ def lamp(pose: Pose) -> Float[np.ndarray, "3"]:
     return unit(-forward - 0.5 * right - 0.7 * down)
 
 
-def _finer(camera: Camera) -> Camera:
+def _fine_camera(camera: Camera) -> Camera:
     """Return the camera with a multiple of its pixels: at least `_PIXELS` along the longer side."""
     factor = math.ceil(_PIXELS / max(camera.height, camera.width))
     return camera if factor == 1 else camera.resized(factor * camera.height, factor * camera.width)
 
 
-def look_picture(look: Look, hidden: str = BEFORE, plain: bool = False) -> UInt8[np.ndarray, "h w 3"]:
-    """Colour a picture: grey where seen before, `hidden` elsewhere on the surface, white without a hit.
+def colour_image(image: ShadedImage, new_colour: str = BEFORE, is_plain: bool = False) -> UInt8[np.ndarray, "h w 3"]:
+    """Colour a picture: grey where seen before, `new_colour` elsewhere on the surface, white without a hit.
 
-    - `plain`: whether to make the whole surface grey.
+    - `is_plain`: whether to make the whole surface grey.
     """
-    tints = np.array([mpl.colors.to_rgb(colour) for colour in (hidden, _KNOWN)])
-    colours = tints[(look.known | plain).astype(int)] * (0.25 + 0.75 * look.lit[..., None])
-    return np.round(255.0 * np.where(look.mask[..., None], colours, 1.0)).astype(np.uint8)
+    tints = np.array([mpl.colors.to_rgb(colour) for colour in (new_colour, _SEEN_COLOUR)])
+    colours = tints[(image.is_seen | is_plain).astype(int)] * (0.25 + 0.75 * image.brightness[..., None])
+    return np.round(255.0 * np.where(image.mask[..., None], colours, 1.0)).astype(np.uint8)
 
 
 class Tile(NamedTuple):
@@ -138,8 +140,8 @@ class Tile(NamedTuple):
     picture: UInt8[np.ndarray, "h w 3"]
 
 
-def looks(imagined: Imagined, taken: Look | None) -> list[Tile]:
+def image_tiles(imagined: Imagined, view_image: ShadedImage | None) -> list[Tile]:
     """Return pictures of the imagined surfaces from the chosen pose, and of what the view then saw."""
     pairs = zip(imagined.names, imagined.samples, strict=True)
-    tiles = [Tile(name, look_picture(sample, _UNSEEN)) for name, sample in pairs]
-    return tiles if taken is None else [*tiles, Tile("then seen", look_picture(taken, NEW))]
+    tiles = [Tile(name, colour_image(sample, _UNSEEN_COLOUR)) for name, sample in pairs]
+    return tiles if view_image is None else [*tiles, Tile("then seen", colour_image(view_image, NEW))]

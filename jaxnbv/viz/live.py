@@ -29,25 +29,25 @@ from jaxnbv.search import Proposal
 from jaxnbv.storage.files import write_text
 from jaxnbv.surfaces.part_hypotheses import PartHypotheses
 from jaxnbv.utility import Quantity
-from jaxnbv.viz.answers import capital, may_be_words, shown_value, words_of
+from jaxnbv.viz.answers import capital, kinds_text, value_text, words_of
 from jaxnbv.viz.choice import colour_range, open_values
 from jaxnbv.viz.mean_surface import MeanSurface
 from jaxnbv.viz.placed_shape import PlacedShape, placed_parts
-from jaxnbv.viz.scene import Cameras, Points, seen_items
+from jaxnbv.viz.scene import Cameras, Points, scene_items
 from jaxnbv.viz.shown_surface import shown_surface
-from jaxnbv.viz.style import BEFORE, DEVIATION, GHOST, GREY, IMAGINED, NEW, OPEN, PART, VALUE, gradient, middle_range
-from jaxnbv.viz.task import seen_after
-from jaxnbv.viz.words import place
+from jaxnbv.viz.style import BEFORE, DEVIATION, DISPUTED, GREY, IMAGINED, NEW, OPEN, PART, VALUE, gradient, middle_range
+from jaxnbv.viz.task import coverage_answers
+from jaxnbv.viz.words import pose_text
 
 # Vertices and faces; kinds of object with their probabilities.
 Triangles: TypeAlias = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
 Kinds: TypeAlias = tuple[tuple[str, float], ...]
 
-_SAMPLES = 4
-_NEXT = "#009e73"
+_NUM_SAMPLES = 4
+_NEXT_COLOUR = "#009e73"
 _EYE = (2.6, 1.7, 2.6)
-_POINT, _CANDIDATE, _FRUSTUM = 0.012, 0.05, 0.22
-_ASIDE = (
+_POINT_SIZE, _CANDIDATE_SIZE, _FRUSTUM_SIZE = 0.012, 0.05, 0.22
+_PANEL_STYLE = (
     "position:fixed;left:0;top:0;max-height:100vh;overflow:auto;max-width:22em;padding:0 1em;background:#fffd;"
     "color:#222;font:15px sans-serif"
 )
@@ -75,7 +75,7 @@ class LiveView:
         self._legend = self._server.gui.add_html("")
         self._image: Any = None
         self._slider: Any = None
-        self._drawn: list[Any] = []
+        self._handles: list[Any] = []
         # A reader may move the slider while the next view is drawn.
         self._drawing = threading.RLock()
 
@@ -125,28 +125,30 @@ class LiveView:
         with self._drawing:
             # Points appear at once; surfaces take longer.
             with self._server.atomic():
-                for handle in self._drawn:
+                for handle in self._handles:
                     handle.remove()
-                self._drawn = _drawn(scene, seen_items(before, new, [view.pose for view in views], episode.sensor))
+                self._handles = _draw_items(
+                    scene, scene_items(before, new, [view.pose for view in views], episode.sensor)
+                )
             observations = episode.observations_after(len(views)) if observations is None else observations
             key, *_ = view_keys(episode.key, len(views))
             surface, imagined, kinds = _surfaces(sampler, observations, key)
             with self._server.atomic():
-                self._drawn += [*_surface(scene, surface), *_imagined(scene, imagined)]
+                self._handles += [*_draw_surface(scene, surface), *_draw_imagined(scene, imagined)]
                 if proposal is not None:
-                    self._drawn += _choice(scene, planner.camera, proposal, picture)
+                    self._handles += _draw_choice(scene, planner.camera, proposal, picture)
                 if self._image is not None:
                     self._image.remove()
                 label = "depth expected there"
                 self._image = None if picture is None else self._server.gui.add_image(picture, label=label)
-                self._text.content = _told(episode, kinds, proposal)
+                self._text.content = _live_text(episode, kinds, proposal)
                 self._legend.content = _legend(surface, proposal, planner.quantity, episode.frame)
 
     def save(self, path: str | Path) -> Path:
         """Write the present scene with its text and legend to one HTML file, which opens offline."""
         page, end, rest = self._server.get_scene_serializer().as_html().rpartition("</body>")
-        said = "".join(f"<p>{html.escape(line.replace('**', ''))}</p>" for line in self._text.content.split("\n\n"))
-        write_text(Path(path), f'{page}<aside style="{_ASIDE}">{said}{self._legend.content}</aside>{end}{rest}')
+        text = "".join(f"<p>{html.escape(line.replace('**', ''))}</p>" for line in self._text.content.split("\n\n"))
+        write_text(Path(path), f'{page}<aside style="{_PANEL_STYLE}">{text}{self._legend.content}</aside>{end}{rest}')
         return Path(path)
 
     def stop(self) -> None:
@@ -162,7 +164,7 @@ def _surfaces(
     With known parts, the imagined surfaces are the likeliest parts.
     """
     if isinstance(observations.hypotheses, PartHypotheses):
-        parts = placed_parts(observations.hypotheses, _SAMPLES)
+        parts = placed_parts(observations.hypotheses, _NUM_SAMPLES)
         surface = shown_surface(sampler, StepInputs(observations))
         return surface, [(part.name, (part.vertices, part.faces)) for part in parts], ()
     inputs = sampler.step_inputs(observations, key)
@@ -171,34 +173,36 @@ def _surfaces(
     assert samples is not None
     surface = shown_surface(sampler, inputs)
     # Marching cubes needs a writable array.
-    meshes = [level_triangles(values, sampler.grid) for values in np.array(samples.values[:_SAMPLES])]
+    meshes = [level_triangles(values, sampler.grid) for values in np.array(samples.values[:_NUM_SAMPLES])]
     names = posterior.names_of_samples(key, sampler.num_samples)
     imagined = [(name, triangles[:2]) for name, triangles in zip(names, meshes, strict=False) if triangles is not None]
     return surface, imagined, tuple(posterior.kinds().items())
 
 
-def _told(episode: Episode, kinds: Kinds, proposal: Proposal | None) -> str:
+def _live_text(episode: Episode, kinds: Kinds, proposal: Proposal | None) -> str:
     """Return the answer, the next view, the amount seen and the kinds of known shapes, as Markdown.
 
     - `proposal`: the next view, with values in world units.
     """
-    views, quantity, frame = len(episode.views), episode.planner.quantity, episode.frame
+    num_views, quantity, frame = len(episode.views), episode.planner.quantity, episode.frame
     answer, lines = episode.views[-1].answer(episode.planner.acquisition), list[str]()
     if answer is not None:
         words = words_of(answer.in_world(frame))
         lines += [f"**{words.question} {capital(words.found)}.**", f"{capital(words.said())}."]
     if proposal is not None:
         error = proposal.standard_error
-        about = "" if error is None else f" ± {float(error):.2g}"
-        value = shown_value(quantity, float(proposal.value), frame)
-        lines.append(f"**The next view** looks from {place(proposal.pose, frame)}: {quantity.name} {value}{about}.")
-    seen = seen_after(episode, None)[-1]
-    lines.append(f"**{views} view{'s' if views > 1 else ''}**, {seen.amount} of surface seen")
-    lines += [may_be_words(kinds)] if kinds else []
+        error_text = "" if error is None else f" ± {float(error):.2g}"
+        value = value_text(quantity, float(proposal.value), frame)
+        lines.append(
+            f"**The next view** looks from {pose_text(proposal.pose, frame)}: {quantity.name} {value}{error_text}."
+        )
+    coverage = coverage_answers(episode, None)[-1]
+    lines.append(f"**{num_views} view{'s' if num_views > 1 else ''}**, {coverage.amount} of surface seen")
+    lines += [kinds_text(kinds)] if kinds else []
     return "\n\n".join(lines)
 
 
-def _drawn(scene: Any, items: Iterable[Points | Cameras]) -> list[Any]:
+def _draw_items(scene: Any, items: Iterable[Points | Cameras]) -> list[Any]:
     handles = []
     for item in items:
         if isinstance(item, Cameras):
@@ -207,32 +211,34 @@ def _drawn(scene: Any, items: Iterable[Points | Cameras]) -> list[Any]:
                 # Removing the camera removes its number too.
                 scene.add_label(f"/cameras/view {number}/number", str(number))
         elif len(item.places):
-            settings: dict[str, Any] = {"point_size": _POINT, "point_shape": "circle"}
+            settings: dict[str, Any] = {"point_size": _POINT_SIZE, "point_shape": "circle"}
             handles.append(scene.add_point_cloud(f"/{item.name}", item.places, to_rgb(item.colour), **settings))
     return handles
 
 
-def _surface(scene: Any, surface: MeanSurface | None) -> list[Any]:
+def _draw_surface(scene: Any, surface: MeanSurface | None) -> list[Any]:
     if surface is None:
         return []
     if isinstance(surface, PlacedShape):
         measured, agreed = surface.measured[:, None], surface.agreed[:, None]
-        scanned, imagined, rest = (np.array(to_rgb(colour)) for colour in (PART, IMAGINED, OPEN))
-        colours = measured * scanned + (1.0 - measured) * (agreed * imagined + (1.0 - agreed) * rest)
+        scanned, imagined, disputed = (np.array(to_rgb(colour)) for colour in (PART, IMAGINED, OPEN))
+        colours = measured * scanned + (1.0 - measured) * (agreed * imagined + (1.0 - agreed) * disputed)
         vertex_colors = np.round(255.0 * colours).astype(np.uint8)
         mesh = trimesh.Trimesh(surface.vertices, surface.faces, vertex_colors=vertex_colors, process=False)
         name = f"/likeliest {'part' if surface.is_part else 'shape'}, {surface.caption}"
         handles = [scene.add_mesh_trimesh(name, mesh)]
-        if (ghost := surface.ghost) is not None:
-            glass: dict[str, Any] = {"color": to_rgb(GHOST), "opacity": 0.25}
-            handles.append(scene.add_mesh_simple("/other shapes", ghost.vertices, ghost.faces, **glass))
+        if (disputed_space := surface.disputed_space) is not None:
+            glass: dict[str, Any] = {"color": to_rgb(DISPUTED), "opacity": 0.25}
+            handles.append(
+                scene.add_mesh_simple("/other shapes", disputed_space.vertices, disputed_space.faces, **glass)
+            )
         return handles
     colours = DEVIATION(LogNorm(*middle_range(surface.deviation))(surface.deviation), bytes=True)
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, vertex_colors=colours, process=False)
     return [scene.add_mesh_trimesh("/surface of the mean", mesh)]
 
 
-def _imagined(scene: Any, surfaces: Iterable[tuple[str, Triangles]]) -> list[Any]:
+def _draw_imagined(scene: Any, surfaces: Iterable[tuple[str, Triangles]]) -> list[Any]:
     """Add imagined surfaces to the scene, hidden at first, and return their handles."""
     settings: dict[str, Any] = {"color": to_rgb("#8fb8d8"), "opacity": 0.9, "visible": False}
     return [
@@ -247,32 +253,32 @@ def _depth_picture(depth: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"
     return colours(Normalize(*colour_range(depth))(depth), bytes=True)[..., :3]
 
 
-def _choice(scene: Any, camera: Camera, proposal: Proposal, picture: np.ndarray | None) -> list[Any]:
+def _draw_choice(scene: Any, camera: Camera, proposal: Proposal, picture: np.ndarray | None) -> list[Any]:
     values, handles = open_values(proposal), []
     is_open = np.isfinite(values)
     if is_open.any():
         places = np.asarray(proposal.candidates.position)[is_open]
         colours = VALUE(Normalize(*colour_range(values))(values[is_open]), bytes=True)[:, :3]
-        settings: dict[str, Any] = {"point_size": _CANDIDATE, "point_shape": "circle"}
+        settings: dict[str, Any] = {"point_size": _CANDIDATE_SIZE, "point_shape": "circle"}
         handles.append(scene.add_point_cloud("/candidates", places, colours, **settings))
-    return [*handles, _frustum(scene, "/next view", camera, proposal.pose, _NEXT, picture)]
+    return [*handles, _frustum(scene, "/next view", camera, proposal.pose, _NEXT_COLOUR, picture)]
 
 
-def _legend(surface: MeanSurface | None, proposal: Proposal | None, sought: Quantity, frame: Frame) -> str:
+def _legend(surface: MeanSurface | None, proposal: Proposal | None, quantity: Quantity, frame: Frame) -> str:
     """Return the legend of the colours as HTML."""
     marks = [("points before", BEFORE), ("new points, last camera", NEW), ("earlier cameras", GREY)]
-    marks += [] if proposal is None else [("next view", _NEXT)]
+    marks += [] if proposal is None else [("next view", _NEXT_COLOUR)]
     if isinstance(surface, PlacedShape):
         kind = "part" if surface.is_part else "known shape"
         shapes = [(f"likeliest {kind}: {html.escape(surface.caption)}", PART), ("its imagined parts", IMAGINED)]
-        marks[:0] = [*shapes, ("where other shapes disagree", GHOST)]
+        marks[:0] = [*shapes, ("where other shapes disagree", DISPUTED)]
     rows = [f'<div><b style="color:{colour}">&#9679;</b> {name}</div>' for name, colour in marks]
     if surface is not None and not isinstance(surface, PlacedShape):
         low, high = middle_range(frame.length_to_world(surface.deviation))
         rows.append(_bar(f"the surface is known to, in {frame.unit}", DEVIATION, f"{low:g}", f"{high:g}"))
     if proposal is not None and np.isfinite(proposal.values).any():
-        ends = (shown_value(sought, value, frame) for value in colour_range(open_values(proposal)))
-        rows.append(_bar(f"candidates: {sought.name}", VALUE, *ends))
+        ends = (value_text(quantity, value, frame) for value in colour_range(open_values(proposal)))
+        rows.append(_bar(f"candidates: {quantity.name}", VALUE, *ends))
     return f'<div style="padding:0 1em 1em;font-size:.85em">{"".join(rows)}</div>'
 
 
@@ -292,7 +298,7 @@ def _frustum(
         name,
         fov=camera.fov,
         aspect=(right - left) / (below - above),
-        scale=_FRUSTUM,
+        scale=_FRUSTUM_SIZE,
         color=to_rgb(colour),
         image=picture,
         wxyz=Rotation.from_matrix(np.asarray(pose.rotation, np.float64)).as_quat(scalar_first=True),

@@ -23,9 +23,9 @@ _SLOPE_STEP = 0.005
 # Deviation as a fraction of the distance to the nearest point. On a cow after one to five views, between 0.1 and 0.4
 # from the points, the error of the surface is 0.2 to 0.3 of this distance (root mean square), which is two to three of
 # the posterior's standard deviations. Measured from the truth to the surface, which may lack a part, it is 0.4 to 0.7.
-_UNSEEN = 0.25
+_DEVIATION_PER_DISTANCE = 0.25
 # A piece of the surface is kept if a point of the cloud is nearer than this, in scene units.
-_HELD = 0.1
+_MAX_DISTANCE = 0.1
 
 
 class MeanSurface(eqx.Module):
@@ -66,15 +66,15 @@ def mean_surface(sampler: SurfaceSampler, inputs: StepInputs) -> MeanSurface | N
     vertices, faces, normals = triangles
     # Normals are features too, so that the two sides of a thin sheet are far apart.
     features = np.concatenate([vertices, 0.1 * normals], axis=1)
-    anchors = _spread(features, _SLOPE_ANCHORS)
-    few = anchors[:_DEVIATION_ANCHORS]
+    anchors = _farthest_rows(features, _SLOPE_ANCHORS)
+    deviation_rows = anchors[:_DEVIATION_ANCHORS]
     dtype = observations.cloud.points.dtype
-    variance = np.asarray(posterior.variance(vertices[few].astype(dtype)))
+    variance = np.asarray(posterior.variance(vertices[deviation_rows].astype(dtype)))
     step = _SLOPE_STEP * normals[anchors]
     ahead, behind = (np.asarray(posterior.mean((vertices[anchors] + s).astype(dtype))) for s in (step, -step))
     slope = np.abs(ahead - behind) / (2.0 * _SLOPE_STEP)
-    spread = _interpolate(features, few, np.sqrt(np.maximum(variance, 1e-30)))
-    deviation = spread / _interpolate(features, anchors, np.maximum(slope, 1e-6))
+    value_deviation = _interpolate(features, deviation_rows, np.sqrt(np.maximum(variance, 1e-30)))
+    deviation = value_deviation / _interpolate(features, anchors, np.maximum(slope, 1e-6))
     return MeanSurface(vertices, faces, normals, deviation)
 
 
@@ -84,13 +84,15 @@ def _mean_of_samples(values: Float[np.ndarray, "s g g g"], grid: Grid) -> MeanSu
     if triangles is None:
         return None
     vertices, faces, normals = triangles
-    place = (vertices + grid.half_extent).T / grid.spacing
-    slope = np.linalg.norm([map_coordinates(part, place, order=1) for part in np.gradient(mean, grid.spacing)], axis=0)
-    spread = map_coordinates(values.std(axis=0, ddof=min(1, len(values) - 1)), place, order=1)
-    return MeanSurface(vertices, faces, normals, spread / np.maximum(slope, 1e-6))
+    grid_points = (vertices + grid.half_extent).T / grid.spacing
+    slope = np.linalg.norm(
+        [map_coordinates(part, grid_points, order=1) for part in np.gradient(mean, grid.spacing)], axis=0
+    )
+    value_deviation = map_coordinates(values.std(axis=0, ddof=min(1, len(values) - 1)), grid_points, order=1)
+    return MeanSurface(vertices, faces, normals, value_deviation / np.maximum(slope, 1e-6))
 
 
-def as_shown(surface: MeanSurface | None, cloud: PointCloud) -> MeanSurface | None:
+def near_points(surface: MeanSurface | None, cloud: PointCloud) -> MeanSurface | None:
     """Return the connected pieces of a surface that are near points of the cloud; None if there are none.
 
     Other pieces are guesses. The deviation becomes sqrt(sd^2 + (r / 4)^2), where sd is the surface's deviation and r
@@ -99,18 +101,18 @@ def as_shown(surface: MeanSurface | None, cloud: PointCloud) -> MeanSurface | No
     """
     if surface is None:
         return None
-    away, _ = cKDTree(cloud.to_numpy()[0]).query(surface.vertices)
+    distances, _ = cKDTree(cloud.to_numpy()[0]).query(surface.vertices)
     edges = np.concatenate([surface.faces[:, :2], surface.faces[:, 1:]])
     piece = trimesh.graph.connected_component_labels(edges, len(surface.vertices))
-    is_kept = np.isin(piece, piece[away < _HELD])
+    is_kept = np.isin(piece, piece[distances < _MAX_DISTANCE])
     faces = surface.faces[is_kept[surface.faces[:, 0]]]
     if len(faces) == 0:
         return None
-    number, deviation = np.cumsum(is_kept) - 1, np.hypot(surface.deviation, _UNSEEN * away)
-    return MeanSurface(surface.vertices[is_kept], number[faces], surface.normals[is_kept], deviation[is_kept])
+    new_index, deviation = np.cumsum(is_kept) - 1, np.hypot(surface.deviation, _DEVIATION_PER_DISTANCE * distances)
+    return MeanSurface(surface.vertices[is_kept], new_index[faces], surface.normals[is_kept], deviation[is_kept])
 
 
-def _spread(features: np.ndarray, count: int) -> np.ndarray:
+def _farthest_rows(features: np.ndarray, count: int) -> np.ndarray:
     """Return the indices of `count` rows far from each other, in order of choice.
 
     If there are fewer rows, the first index is repeated.
@@ -123,7 +125,7 @@ def _spread(features: np.ndarray, count: int) -> np.ndarray:
 
 def _interpolate(features: np.ndarray, anchors: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Interpolate positive values from anchor rows to all rows, as a weighted mean of their logarithms."""
-    distance, near = cKDTree(features[anchors]).query(features, k=min(8, len(anchors)))
+    distance, neighbours = cKDTree(features[anchors]).query(features, k=min(8, len(anchors)))
     width = 0.5 * distance[:, -1:] + 1e-12
     weight = np.exp(-0.5 * (distance / width) ** 2) + 1e-12
-    return np.exp(np.sum(weight * np.log(values)[near], axis=1) / np.sum(weight, axis=1))
+    return np.exp(np.sum(weight * np.log(values)[neighbours], axis=1) / np.sum(weight, axis=1))

@@ -33,15 +33,15 @@ from jaxnbv.viz.choice import draw_acquisition
 from jaxnbv.viz.data import report_data
 from jaxnbv.viz.figures import STYLE, overview_figure
 from jaxnbv.viz.placed_shape import PlacedShape, likeliest_part
-from jaxnbv.viz.render import Still, beside, draw_items, frame
-from jaxnbv.viz.scene import seen_items
+from jaxnbv.viz.render import Still, crop, draw_items, eye_beside
+from jaxnbv.viz.scene import scene_items
 from jaxnbv.viz.style import BEFORE, VALUE
 
-_INCHES, _LARGE, _LETTERS, _DPI = 2.4, 4.8, 62, 110
+_INCHES, _LARGE, _MAX_LETTERS, _DPI = 2.4, 4.8, 62, 110
 # Viewpoint for clouds whose normals point in all directions.
-_USUAL_EYE = np.array([0.8, 0.9, 2.2])
+_DEFAULT_EYE = np.array([0.8, 0.9, 2.2])
 # Half the side of the slice of a posterior, in scene units, and its pixels along a side.
-_REACH, _PIXELS = 1.5, 48
+_HALF_SIDE, _PIXELS = 1.5, 48
 
 
 class Drawing(NamedTuple):
@@ -66,9 +66,9 @@ class Picture:
         return self.png
 
 
-def html_of(shown: Any) -> str:
+def html_of(value: Any) -> str:
     """Return HTML with a small picture of an object and its caption."""
-    drawing = drawing_of(shown)
+    drawing = drawing_of(value)
     caption = html.escape(drawing.facts)
     if drawing.draw is None:
         return f"<div>{caption}</div>"
@@ -83,9 +83,9 @@ def html_of(shown: Any) -> str:
 
 
 @functools.singledispatch
-def drawing_of(shown: Any) -> Drawing:
+def drawing_of(value: Any) -> Drawing:
     """Return the drawing of an object, according to its type."""
-    return Drawing(None, repr(shown))
+    return Drawing(None, repr(value))
 
 
 @drawing_of.register
@@ -107,7 +107,7 @@ def _(cloud: PointCloud) -> Drawing:
 def _draw_shaded(points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], axes: Axes) -> None:
     """Draw a cloud (in any unit) from the mean direction of its normals, bright where it faces the viewer."""
     eye = normals.mean(axis=0)
-    eye = eye if np.linalg.norm(eye) > 0.2 else _USUAL_EYE
+    eye = eye if np.linalg.norm(eye) > 0.2 else _DEFAULT_EYE
     rotation = np.asarray(look_at(eye).rotation)
     x, y, depth = ((points - points.mean(axis=0)) @ rotation).T
     facing = np.clip(-normals @ rotation[:, 2], 0.0, 1.0)
@@ -127,11 +127,11 @@ def _(posterior: SurfacePosterior) -> Drawing:
 
 def _draw_slice(posterior: SurfacePosterior, axes: Axes) -> None:
     """Draw P(f < level), the probability of being inside, on the plane z = 0. x is to the right, y is up."""
-    axis = jnp.linspace(-_REACH, _REACH, _PIXELS)
+    axis = jnp.linspace(-_HALF_SIDE, _HALF_SIDE, _PIXELS)
     x, y = jnp.meshgrid(axis, axis)
     places = jnp.stack([x.ravel(), y.ravel(), jnp.zeros(_PIXELS**2)], axis=-1)
     inside = np.asarray(posterior.probability_inside(places))
-    extent = (-_REACH, _REACH, -_REACH, _REACH)
+    extent = (-_HALF_SIDE, _HALF_SIDE, -_HALF_SIDE, _HALF_SIDE)
     axes.imshow(inside.reshape(_PIXELS, _PIXELS), VALUE, vmin=0, vmax=1, origin="lower", extent=extent)
     axes.axis("off")
 
@@ -154,18 +154,18 @@ def _(episode: Episode) -> Drawing:
     hypotheses = episode.views[-1].hypotheses if count else None
     part = likeliest_part(hypotheses, episode.cloud) if isinstance(hypotheses, PartHypotheses) else None
     facts += "" if part is None else f"; {part.caption}"
-    drawn = functools.partial(_draw_views, episode, part)
-    return Drawing(drawn, facts + (f"; {episode.stop_reason}" if episode.stop_reason else ""))
+    draw = functools.partial(_draw_views, episode, part)
+    return Drawing(draw, facts + (f"; {episode.stop_reason}" if episode.stop_reason else ""))
 
 
 def _draw_views(episode: Episode, part: PlacedShape | None, axes: Axes) -> None:
     """Draw the points (those of the last view in a different colour), the likeliest part, and the cameras."""
     poses = [view.pose for view in episode.views]
     extent = max(1.8, *(float(np.linalg.norm(pose.position)) for pose in poses))
-    still = Still(beside(poses[-1]), part, 400, extent)
+    still = Still(eye_beside(poses[-1]), part, 400, extent)
     points, new = episode.cloud.to_numpy()[0], episode.views[-1].scan.to_numpy()[0]
-    shown = draw_items(axes, still, seen_items(points, new, poses, episode.planner.camera), 0.8)
-    frame(axes, still, shown)
+    content = draw_items(axes, still, scene_items(points, new, poses, episode.planner.camera), 0.8)
+    crop(axes, still, content)
 
 
 @drawing_of.register
@@ -183,9 +183,9 @@ def _(observations: Observations) -> Drawing:
 def _(session: Session) -> Drawing:
     if not session.views:
         return Drawing(None, "no image yet")
-    shown, next_view = drawing_of(session.episode), session.next_view
+    drawing, next_view = drawing_of(session.episode), session.next_view
     value = "" if next_view is None else f"; the next view is worth {next_view.value:.4g}"
-    return Drawing(shown.draw, shown.facts + value)
+    return Drawing(drawing.draw, drawing.facts + value)
 
 
 @drawing_of.register
@@ -213,16 +213,16 @@ def show(
     return picture
 
 
-def _large(shown: Any, progress: bool) -> Picture:
-    episode = shown.episode if isinstance(shown, Session) and shown.views else shown
+def _large(value: Any, progress: bool) -> Picture:
+    episode = value.episode if isinstance(value, Session) and value.views else value
     with mpl.rc_context(STYLE):
         if isinstance(episode, Episode):
             data = report_data(episode, progress=progress, imagine=False)
             return Picture(overview_figure(data), 80)
-        drawing = drawing_of(shown)
+        drawing = drawing_of(value)
         if drawing.draw is None:
             raise InputError(f"this has no picture: {drawing.facts}. Give one thing that holds points")
         figure = Figure(figsize=(_LARGE, _LARGE))
-        figure.text(0.5, 0.02, "\n".join(textwrap.wrap(drawing.facts, _LETTERS)), ha="center", fontsize=8)
+        figure.text(0.5, 0.02, "\n".join(textwrap.wrap(drawing.facts, _MAX_LETTERS)), ha="center", fontsize=8)
         drawing.draw(figure.add_axes((0.02, 0.1, 0.96, 0.88)))
         return Picture(figure, _DPI)

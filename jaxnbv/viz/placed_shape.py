@@ -27,21 +27,21 @@ from jaxnbv.viz.sphere import unit
 
 _Values: TypeAlias = Float[np.ndarray, "_ _ _"]
 
-# Nodes along each axis of the grids for the surface of a shape, for its ghost, and for the distances to the hypotheses.
-# Half extent of the grids relative to the half extent of the shapes.
-_NODES, _FINE, _COARSE, _ROOM = 128, 96, 48, 1.05
+# Nodes along each axis of the grids for the surface of a shape, for its disputed space, and for the distances to the
+# hypotheses. Half extent of the grids relative to the half extent of the shapes.
+_NODES, _FINE_NODES, _COARSE_NODES, _MARGIN = 128, 96, 48, 1.05
 # No shape is drawn if the probability of "none of these" is higher. Few objects fit an example of a bank exactly.
-_SURELY_NONE = 0.9
-# Number of hypotheses to compare, and the least fraction of their probability that makes space part of the ghost.
-_RIVALS, _OPEN = 12, 0.1
+_MAX_NONE_PROBABILITY = 0.9
+# Number of hypotheses to compare, and the least fraction of their probability that makes space disputed.
+_MAX_HYPOTHESES, _MIN_DISPUTED = 12, 0.1
 # Distance between two registrations that still agree, and softness of a surface's step, in scene units.
 _TOLERANCE, _SOFTNESS = 0.05, 0.012
-# Pieces of the ghost smaller than this fraction of the shape's area are left out.
-_SMALLEST = 0.01
+# Pieces of disputed space smaller than this fraction of the shape's area are left out.
+_MIN_PIECE = 0.01
 # Surface this near to a scanned point counts as measured, and beyond twice this distance as imagined, in scene units.
-_NEAR = 0.06
+_MEASURED_DISTANCE = 0.06
 # Weight of normals in that distance: it separates the two sides of a sheet.
-_FACING = 0.1
+_NORMAL_WEIGHT = 0.1
 
 
 class PlacedShape(MeanSurface):
@@ -50,7 +50,7 @@ class PlacedShape(MeanSurface):
     - `name`, `probability`: name and probability of the part, or of the kind of shape.
     - `measured`: for each vertex 1 where points were scanned, 0 where the shape is imagined.
     - `agreed`: for each vertex 1 where most hypotheses have the same surface, 0 where few do.
-    - `ghost`: surface of the space that other hypotheses fill; None if there is no such space.
+    - `disputed_space`: surface of the space that other hypotheses fill; None if there is no such space.
     - `is_part`: whether it is a part at true size.
     """
 
@@ -58,7 +58,7 @@ class PlacedShape(MeanSurface):
     probability: float
     measured: Float[np.ndarray, " v"]
     agreed: Float[np.ndarray, " v"]
-    ghost: MeanSurface | None = None
+    disputed_space: MeanSurface | None = None
     is_part: bool = True
 
     @property
@@ -71,21 +71,21 @@ class _Fits(NamedTuple):
     """Some registered shapes with their probabilities. The first one is the shape to draw."""
 
     bank: ShapeBank
-    placed: Hypotheses
+    hypotheses: Hypotheses
     weights: Float[np.ndarray, " h"]
 
     @classmethod
-    def of(cls, bank: ShapeBank, placed: Hypotheses, weights: Float[np.ndarray, " h"], rows: list[int]) -> "_Fits":
+    def of(cls, bank: ShapeBank, hypotheses: Hypotheses, weights: Float[np.ndarray, " h"], rows: list[int]) -> "_Fits":
         """Select the shapes in these rows, and normalise their weights, which are in the order of the rows."""
-        chosen = np.asarray(rows)
-        return cls(bank, jax.tree.map(lambda leaf: leaf[chosen], placed), weights / max(weights.sum(), 1e-30))
+        indices = np.asarray(rows)
+        return cls(bank, jax.tree.map(lambda leaf: leaf[indices], hypotheses), weights / max(weights.sum(), 1e-30))
 
 
 def placed_parts(hypotheses: PartHypotheses, count: int) -> list[PlacedShape]:
     """Return the likeliest parts, `count` at most, each at its likeliest placement."""
     shapes, weights = np.asarray(hypotheses.placed.shape), np.asarray(hypotheses.shape_weights)
     return [
-        _placed(hypotheses.bank, hypotheses.placed, int(np.argmax(shapes == part)), float(weights[part]))
+        _place_shape(hypotheses.bank, hypotheses.placed, int(np.argmax(shapes == part)), float(weights[part]))
         for part in np.argsort(-weights)[:count]
         if weights[part] > 0
     ]
@@ -105,77 +105,83 @@ def likeliest_part(hypotheses: PartHypotheses, cloud: PointCloud | None = None) 
     first = int(np.argmax(shapes == hypotheses.most_likely[0]))
     rows = [
         first,
-        *(row for row in np.argsort(-weights, kind="stable")[:_RIVALS].tolist() if row != first and weights[row] > 0),
+        *(
+            row
+            for row in np.argsort(-weights, kind="stable")[:_MAX_HYPOTHESES].tolist()
+            if row != first and weights[row] > 0
+        ),
     ]
-    return _compared(part, _Fits.of(hypotheses.bank, hypotheses.placed, weights[rows], rows), cloud)
+    return _with_hypotheses(part, _Fits.of(hypotheses.bank, hypotheses.placed, weights[rows], rows), cloud)
 
 
 def likeliest_shape(
-    bank: ShapeBank, placed: Hypotheses, weights: Float[AnyArray, " h_and_none"], cloud: PointCloud
+    bank: ShapeBank, hypotheses: Hypotheses, weights: Float[AnyArray, " h_and_none"], cloud: PointCloud
 ) -> PlacedShape | None:
     """Return the likeliest shape of the likeliest kind; None if "none of these" is nearly certain.
 
     - `bank`: examples of categories.
-    - `placed`, `weights`: the registered shapes and their weights. The last weight is that of "none of these".
+    - `hypotheses`, `weights`: the registered shapes and their weights. The last weight is that of "none of these".
     - `cloud`: scanned points.
     """
     weights = np.asarray(weights, np.float64)
-    if weights[-1] > _SURELY_NONE:
+    if weights[-1] > _MAX_NONE_PROBABILITY:
         return None
-    names = [kind_of(bank.names[shape]) for shape in np.asarray(placed.shape)]
+    names = [kind_of(bank.names[shape]) for shape in np.asarray(hypotheses.shape)]
     rows, kinds = dict[str, int](), dict[str, float]()
     for row in np.argsort(-weights[:-1], kind="stable").tolist():
         rows.setdefault(names[row], row)
         kinds[names[row]] = kinds.get(names[row], 0.0) + weights[row]
-    likely = sorted(kinds, key=lambda kind: -kinds[kind])[:_RIVALS]
-    first = _placed(bank, placed, rows[likely[0]], kinds[likely[0]])
+    likely = sorted(kinds, key=lambda kind: -kinds[kind])[:_MAX_HYPOTHESES]
+    first = _place_shape(bank, hypotheses, rows[likely[0]], kinds[likely[0]])
     shape = dataclasses.replace(first, name=likely[0], is_part=False)
-    by_kind = np.array([kinds[kind] for kind in likely])
-    return _compared(shape, _Fits.of(bank, placed, by_kind, [rows[kind] for kind in likely]), cloud)
+    kind_weights = np.array([kinds[kind] for kind in likely])
+    return _with_hypotheses(shape, _Fits.of(bank, hypotheses, kind_weights, [rows[kind] for kind in likely]), cloud)
 
 
-def _placed(bank: ShapeBank, placed: Hypotheses, row: int, probability: float) -> PlacedShape:
-    shape = bank.shape(placed.shape[row])
-    grid = Grid(_NODES, _ROOM * float(jnp.max(jnp.abs(shape.extremes))))
+def _place_shape(bank: ShapeBank, hypotheses: Hypotheses, row: int, probability: float) -> PlacedShape:
+    shape = bank.shape(hypotheses.shape[row])
+    grid = Grid(_NODES, _MARGIN * float(jnp.max(jnp.abs(shape.extremes))))
     triangles = level_triangles(np.array(_own_distances(shape.solid, jnp.asarray(grid.axis, jnp.float32))), grid)
     assert triangles is not None
     vertices, faces, normals = triangles
-    place = jax.tree.map(lambda rows: np.asarray(rows[row], np.float64), placed.placement)
+    placement = jax.tree.map(lambda rows: np.asarray(rows[row], np.float64), hypotheses.placement)
     return PlacedShape(
-        (place.scale * vertices) @ place.rotation.T + place.shift,
+        (placement.scale * vertices) @ placement.rotation.T + placement.shift,
         faces,
-        unit(normals / place.scale) @ place.rotation.T,
+        unit(normals / placement.scale) @ placement.rotation.T,
         np.zeros(len(vertices)),
-        bank.names[int(placed.shape[row])],
+        bank.names[int(hypotheses.shape[row])],
         probability,
         np.ones(len(vertices)),
         np.ones(len(vertices)),
     )
 
 
-def _compared(shape: PlacedShape, fits: _Fits, cloud: PointCloud) -> PlacedShape:
-    """Return a copy of the shape with `measured`, `agreed` and `ghost`, from the scan and the other fits."""
-    half = min(_ROOM * float(_extent(fits.bank, fits.placed)) + _TOLERANCE, np.pi)
-    grid, coarse = Grid(_FINE, half), Grid(_COARSE, half)
+def _with_hypotheses(shape: PlacedShape, fits: _Fits, cloud: PointCloud) -> PlacedShape:
+    """Return a copy of the shape with `measured`, `agreed` and `disputed_space`, from the scan and the other fits."""
+    half_extent = min(_MARGIN * float(_extent(fits.bank, fits.hypotheses)) + _TOLERANCE, np.pi)
+    grid, coarse = Grid(_FINE_NODES, half_extent), Grid(_COARSE_NODES, half_extent)
     # Compute distances on a coarse grid: they are smooth, and each hypothesis costs as much as the whole shape.
-    others = np.array(_distances(fits.bank, fits.placed, jnp.asarray(coarse.axis, jnp.float32)))
-    filled, own = np.zeros((_FINE,) * 3, others.dtype), _resampled(others[0], coarse, grid)
-    at, agreed = (shape.vertices + half).T / coarse.spacing, np.zeros(len(shape.vertices))
+    others = np.array(_distances(fits.bank, fits.hypotheses, jnp.asarray(coarse.axis, jnp.float32)))
+    occupancy, own_distances = np.zeros((_FINE_NODES,) * 3, others.dtype), _resample(others[0], coarse, grid)
+    grid_points, agreed = (shape.vertices + half_extent).T / coarse.spacing, np.zeros(len(shape.vertices))
     for weight, distance in zip(fits.weights.tolist(), others, strict=True):
-        filled += weight * _step(-_resampled(distance, coarse, grid))
-        agreed += weight * _step(2.0 * _TOLERANCE - np.abs(map_coordinates(distance, at, order=1)))
-    # Positive outside the ghost, and near the shape itself.
-    outside = np.maximum(4.0 * _SOFTNESS * (_OPEN - filled), _TOLERANCE - own)
-    ghost = _pieces(outside, grid, _SMALLEST * shape.mesh.area)
+        occupancy += weight * _step(-_resample(distance, coarse, grid))
+        agreed += weight * _step(2.0 * _TOLERANCE - np.abs(map_coordinates(distance, grid_points, order=1)))
+    # Positive outside the disputed space, and near the shape itself.
+    outside = np.maximum(4.0 * _SOFTNESS * (_MIN_DISPUTED - occupancy), _TOLERANCE - own_distances)
+    disputed_space = _pieces(outside, grid, _MIN_PIECE * shape.mesh.area)
     agreed = np.clip(4.0 * agreed - 1.5, 0.0, 1.0)
-    return dataclasses.replace(shape, measured=_measured(shape, cloud), agreed=agreed, ghost=ghost)
+    return dataclasses.replace(
+        shape, measured=_measured_weight(shape, cloud), agreed=agreed, disputed_space=disputed_space
+    )
 
 
 def _step(x: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
     return np.clip(0.5 + x / (4.0 * _SOFTNESS), 0.0, 1.0)
 
 
-def _resampled(values: _Values, coarse: Grid, fine: Grid) -> _Values:
+def _resample(values: _Values, coarse: Grid, fine: Grid) -> _Values:
     """Interpolate values linearly from a coarse grid to a finer grid of the same extent."""
     hats = np.stack([np.interp(fine.axis, coarse.axis, row) for row in np.eye(coarse.resolution)], axis=1)
     hats = hats.astype(values.dtype)
@@ -186,11 +192,11 @@ def _resampled(values: _Values, coarse: Grid, fine: Grid) -> _Values:
 
 
 @program
-def _extent(bank: ShapeBank, placed: Hypotheses) -> Float[Array, ""]:
+def _extent(bank: ShapeBank, hypotheses: Hypotheses) -> Float[Array, ""]:
     """Return the largest absolute coordinate of the placed shapes."""
-    corners = bank.shape(placed.shape).extremes * placed.placement.scale[:, None]
-    turned = jnp.einsum("hpj,hij->hpi", corners, placed.placement.rotation) + placed.placement.shift[:, None]
-    return jnp.max(jnp.abs(turned))
+    corners = bank.shape(hypotheses.shape).extremes * hypotheses.placement.scale[:, None]
+    rotated = jnp.einsum("hpj,hij->hpi", corners, hypotheses.placement.rotation) + hypotheses.placement.shift[:, None]
+    return jnp.max(jnp.abs(rotated))
 
 
 @program
@@ -199,26 +205,26 @@ def _own_distances(solid: SignedDistance, axis: Float[AnyArray, " g"]) -> Float[
 
 
 @program
-def _distances(bank: ShapeBank, placed: Hypotheses, axis: Float[AnyArray, " g"]) -> Float[Array, "h g g g"]:
-    solids = bank.shape(placed.shape).solid
+def _distances(bank: ShapeBank, hypotheses: Hypotheses, axis: Float[AnyArray, " g"]) -> Float[Array, "h g g g"]:
+    solids = bank.shape(hypotheses.shape).solid
 
-    def of_shape(one):
-        solid, placement = one
+    def of_shape(solid_and_placement):
+        solid, placement = solid_and_placement
         return on_tensor_grid(lambda x: placement.distance(solid, x), axis)
 
-    return jax.lax.map(of_shape, (solids, placed.placement))
+    return jax.lax.map(of_shape, (solids, hypotheses.placement))
 
 
-def _measured(surface: MeanSurface, cloud: PointCloud) -> Float[np.ndarray, " v"]:
+def _measured_weight(surface: MeanSurface, cloud: PointCloud) -> Float[np.ndarray, " v"]:
     points, normals = cloud.to_numpy()
     if len(points) == 0:
         return np.zeros(len(surface.vertices))
-    tree = cKDTree(np.concatenate([points, _FACING * normals], axis=1))
-    away, _ = tree.query(np.concatenate([surface.vertices, _FACING * surface.normals], axis=1))
-    return np.clip(2.0 - away / _NEAR, 0.0, 1.0)
+    tree = cKDTree(np.concatenate([points, _NORMAL_WEIGHT * normals], axis=1))
+    distances, _ = tree.query(np.concatenate([surface.vertices, _NORMAL_WEIGHT * surface.normals], axis=1))
+    return np.clip(2.0 - distances / _MEASURED_DISTANCE, 0.0, 1.0)
 
 
-def _pieces(values: Float[np.ndarray, "g g g"], grid: Grid, smallest: float) -> MeanSurface | None:
+def _pieces(values: Float[np.ndarray, "g g g"], grid: Grid, min_area: float) -> MeanSurface | None:
     """Return the pieces of the zero set of grid values with at least this area; None if there are none."""
     triangles = level_triangles(values, grid)
     if triangles is None:
@@ -227,7 +233,7 @@ def _pieces(values: Float[np.ndarray, "g g g"], grid: Grid, smallest: float) -> 
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     label = trimesh.graph.connected_component_labels(mesh.edges_unique, len(vertices))
     area = np.bincount(label[faces[:, 0]], mesh.area_faces, label.max() + 1)
-    used, rows = np.unique(faces[area[label[faces[:, 0]]] >= smallest], return_inverse=True)
-    if len(used) == 0:
+    vertex_rows, rows = np.unique(faces[area[label[faces[:, 0]]] >= min_area], return_inverse=True)
+    if len(vertex_rows) == 0:
         return None
-    return MeanSurface(vertices[used], rows.reshape(-1, 3), normals[used], np.zeros(len(used)))
+    return MeanSurface(vertices[vertex_rows], rows.reshape(-1, 3), normals[vertex_rows], np.zeros(len(vertex_rows)))

@@ -17,32 +17,32 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose, look_at
 from jaxnbv.scanning.triangle_rays import first_faces
 from jaxnbv.viz.data import ReportData
-from jaxnbv.viz.imagined import lamp, look_picture
+from jaxnbv.viz.imagined import colour_image, lamp
 from jaxnbv.viz.mean_surface import MeanSurface
 from jaxnbv.viz.placed_shape import PlacedShape
-from jaxnbv.viz.scene import Cameras, Points, frustum, seen_items
+from jaxnbv.viz.scene import Cameras, Points, frustum, scene_items
 from jaxnbv.viz.sphere import unit
-from jaxnbv.viz.style import DEVIATION, GHOST, IMAGINED, LINE, NEW, OPEN, PART, framed
+from jaxnbv.viz.style import DEVIATION, DISPUTED, IMAGINED, LINE, NEW, OPEN, PART, draw_border
 
 _DISTANCE = 11.0
-_SLACK = 0.04  # Noise and the mean's own error must not hide a point behind the surface that it lies on.
-_HIDDEN = 0.18
+_DEPTH_TOLERANCE = 0.04  # Noise and the mean's own error must not hide a point behind the surface that it lies on.
+_HIDDEN_OPACITY = 0.18
 # Width of the region for the mean depth (fraction of the picture), largest darkening, and depth at which it is reached.
-_HOLLOW, _DARKEST, _DEEP = 0.05, 0.4, 0.25
-_INSET = 0.24
+_OCCLUSION_WIDTH, _MAX_DARKENING, _FULL_DEPTH = 0.05, 0.4, 0.25
+_INSET_SIZE = 0.24
 # Opacity of the space that other hypotheses fill.
-_GHOST = 0.3
-_STILL, _SMALL = 640, 280
+_DISPUTED_OPACITY = 0.3
+_STILL_SIZE, _TRUTH_SIZE = 640, 280
 # Longest edge of the triangles of a true surface, in scene units.
-_EDGE = 0.05
+_MAX_EDGE = 0.05
 
 
-def beside(pose: Pose) -> Float[np.ndarray, "3"]:
+def eye_beside(pose: Pose) -> Float[np.ndarray, "3"]:
     """Return a direction 40 degrees beside a camera, from which its scan and the camera are visible."""
-    away = unit(np.asarray(pose.position, dtype=np.float64))
-    across = np.cross([0.0, 1.0, 0.0], away)
+    outward = unit(np.asarray(pose.position, dtype=np.float64))
+    across = np.cross([0.0, 1.0, 0.0], outward)
     across = unit(across) if np.linalg.norm(across) >= 1e-3 else np.array([1.0, 0.0, 0.0])
-    return math.cos(math.radians(40)) * away + math.sin(math.radians(40)) * across
+    return math.cos(math.radians(40)) * outward + math.sin(math.radians(40)) * across
 
 
 class Still:
@@ -74,12 +74,12 @@ class Still:
             self._paint(surface, deviation)
 
     def _paint(self, surface: MeanSurface, deviation: LogNorm | None) -> None:
-        mask, colours, depth = self._traced(surface, deviation)
-        if isinstance(surface, PlacedShape) and surface.ghost is not None:
-            mask, colours, depth = self._with_ghost(surface.ghost, mask, colours, depth)
+        mask, colours, depth = self._trace(surface, deviation)
+        if isinstance(surface, PlacedShape) and surface.disputed_space is not None:
+            mask, colours, depth = self._blend_disputed(surface.disputed_space, mask, colours, depth)
         self.show(mask, colours, depth)
 
-    def _traced(
+    def _trace(
         self, surface: MeanSurface, deviation: LogNorm | None
     ) -> tuple[Bool[np.ndarray, " rays"], Float[np.ndarray, "hits 4"], Float[np.ndarray, " hits"]]:
         """Return which rays of `fine_camera` hit the surface, and the colour and depth of each hit."""
@@ -91,39 +91,41 @@ class Still:
         )
         mask = rows >= 0
         points = origin + distances[mask, None] * directions[mask]
-        near = surface.faces[rows[mask]]
-        weight = _barycentric(points, vertices[near])
-        normals = unit(np.sum(weight[..., None] * surface.normals[near], axis=1))
-        lit = 0.72 + 0.34 * np.clip(normals @ lamp(self.pose), -0.4, 1.0)
+        corners = surface.faces[rows[mask]]
+        weight = _barycentric(points, vertices[corners])
+        normals = unit(np.sum(weight[..., None] * surface.normals[corners], axis=1))
+        brightness = 0.72 + 0.34 * np.clip(normals @ lamp(self.pose), -0.4, 1.0)
         colours = np.tile(mpl.colors.to_rgba(LINE), (len(points), 1))
         if isinstance(surface, PlacedShape):
-            scanned, imagined, open_ = (np.array(mpl.colors.to_rgb(colour)) for colour in (PART, IMAGINED, OPEN))
+            scanned, imagined, disputed = (np.array(mpl.colors.to_rgb(colour)) for colour in (PART, IMAGINED, OPEN))
             measured, agreed = (
-                np.sum(weight * one[near], axis=1)[:, None] for one in (surface.measured, surface.agreed)
+                np.sum(weight * values[corners], axis=1)[:, None] for values in (surface.measured, surface.agreed)
             )
-            colours[:, :3] = measured * scanned + (1.0 - measured) * (agreed * imagined + (1.0 - agreed) * open_)
+            colours[:, :3] = measured * scanned + (1.0 - measured) * (agreed * imagined + (1.0 - agreed) * disputed)
         elif deviation is not None:
-            colours = DEVIATION(deviation(np.exp(np.sum(weight * np.log(surface.deviation)[near], axis=1))))
+            colours = DEVIATION(deviation(np.exp(np.sum(weight * np.log(surface.deviation)[corners], axis=1))))
         depth = (points - np.asarray(self.pose.position)) @ np.asarray(self.pose.forward)
-        shaded = lit * (1.0 - _occlusion(mask.reshape(2 * self.size, -1), depth))
+        shaded = brightness * (1.0 - _occlusion(mask.reshape(2 * self.size, -1), depth))
         colours[:, :3] = np.clip(colours[:, :3] * shaded[:, None], 0.0, 1.0)
         return mask, colours, depth
 
-    def _with_ghost(
+    def _blend_disputed(
         self,
-        ghost: MeanSurface,
+        disputed_space: MeanSurface,
         mask: Bool[np.ndarray, " rays"],
         colours: Float[np.ndarray, "hits 4"],
         depth: Float[np.ndarray, " hits"],
     ) -> tuple[Bool[np.ndarray, " rays"], Float[np.ndarray, "all 4"], Float[np.ndarray, " all"]]:
-        """Blend a translucent surface into results of `_traced`, and return the new ones. It hides no points."""
-        is_ghost, over, ghost_depth = self._traced(ghost, None)
+        """Blend a translucent surface into results of `_trace`, and return the new ones. It hides no points."""
+        is_disputed, over, disputed_depth = self._trace(disputed_space, None)
         under, front = np.zeros((len(mask), 4)), np.zeros((len(mask), 4))
         deep, near = np.full(len(mask), np.inf), np.full(len(mask), np.inf)
-        under[mask], deep[mask], near[is_ghost] = colours, depth, ghost_depth
-        # Brightness of the ghost's own shading, relative to a lit face.
-        front[is_ghost, :3] = np.array(mpl.colors.to_rgb(GHOST)) * (over[:, :3] / np.array(mpl.colors.to_rgb(LINE)))
-        front[is_ghost, 3] = _GHOST
+        under[mask], deep[mask], near[is_disputed] = colours, depth, disputed_depth
+        # Brightness of its own shading, relative to a lit face.
+        front[is_disputed, :3] = np.array(mpl.colors.to_rgb(DISPUTED)) * (
+            over[:, :3] / np.array(mpl.colors.to_rgb(LINE))
+        )
+        front[is_disputed, 3] = _DISPUTED_OPACITY
         front[near > deep] = 0.0
         alpha = front[:, 3:] + under[:, 3:] * (1.0 - front[:, 3:])
         mixed = front[:, :3] * front[:, 3:] + under[:, :3] * under[:, 3:] * (1.0 - front[:, 3:])
@@ -155,7 +157,7 @@ class Still:
         local = (points - np.asarray(self.pose.position)) @ np.asarray(self.pose.rotation)
         pixels = self.camera.to_pixels(local[:, :2] / local[:, 2:])
         column, row = np.clip(pixels.astype(int), 0, self.size - 1).T
-        return pixels - 0.5, local[:, 2] < self.depth[row, column] + _SLACK
+        return pixels - 0.5, local[:, 2] < self.depth[row, column] + _DEPTH_TOLERANCE
 
 
 def _barycentric(points: Float[np.ndarray, "n 3"], corners: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3"]:
@@ -173,12 +175,14 @@ def _occlusion(mask: Bool[np.ndarray, "h w"], depth: Float[np.ndarray, " hits"])
 
     It grows with the depth of the hit relative to the mean depth around it.
     """
-    width, deep = round(_HOLLOW * len(mask)), np.zeros(mask.shape)
-    deep[mask] = depth
+    width, depths = round(_OCCLUSION_WIDTH * len(mask)), np.zeros(mask.shape)
+    depths[mask] = depth
     # Two filters in a row, so that a pixel's weight falls off with distance.
-    sums, shares = (uniform_filter(uniform_filter(image, width), width)[mask] for image in (deep, mask.astype(float)))
-    mean = sums / np.maximum(shares, 1e-9)
-    return _DARKEST * np.clip((depth - mean) / _DEEP, 0.0, 1.0)
+    sums, fractions = (
+        uniform_filter(uniform_filter(image, width), width)[mask] for image in (depths, mask.astype(float))
+    )
+    mean = sums / np.maximum(fractions, 1e-9)
+    return _MAX_DARKENING * np.clip((depth - mean) / _FULL_DEPTH, 0.0, 1.0)
 
 
 def draw_truth(axes: Axes, data: ReportData) -> bool:
@@ -187,19 +191,21 @@ def draw_truth(axes: Axes, data: ReportData) -> bool:
     if mesh is None:
         return False
     # Shading is interpolated between vertices, so they must be near each other.
-    vertices, faces = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, _EDGE, max_iter=12)
+    vertices, faces = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, _MAX_EDGE, max_iter=12)
     fine = trimesh.Trimesh(vertices, faces)
     normals, flat = np.asarray(fine.vertex_normals), np.ones(len(fine.vertices))
-    still = Still(data.stage.eye, MeanSurface(fine.vertices, fine.faces, normals, flat), _SMALL, data.stage.extent)
+    still = Still(
+        data.viewpoint.eye, MeanSurface(fine.vertices, fine.faces, normals, flat), _TRUTH_SIZE, data.viewpoint.extent
+    )
     axes.imshow(still.image, interpolation="bilinear")
-    frame(axes, still, [still.project(np.asarray(fine.vertices))[0]])
+    crop(axes, still, [still.project(np.asarray(fine.vertices))[0]])
     return True
 
 
-def painted(data: ReportData, index: int) -> Still:
+def render_view(data: ReportData, index: int) -> Still:
     """Return a picture of the surface after view `index` (from 0), from the viewpoint of all views."""
-    stage, norm = data.stage, LogNorm(*data.deviations)
-    return Still(stage.eye, data.views[index].surface, _STILL, stage.extent, norm)
+    viewpoint, norm = data.viewpoint, LogNorm(*data.deviations)
+    return Still(viewpoint.eye, data.views[index].surface, _STILL_SIZE, viewpoint.extent, norm)
 
 
 def draw_scene(
@@ -209,77 +215,77 @@ def draw_scene(
 
     The likeliest part is named at the bottom.
 
-    - `still`: picture of the surface, see `painted`.
+    - `still`: picture of the surface, see `render_view`.
     - `weight`: factor for the sizes of lines, dots and letters.
     - `inset`: whether the emptiest corner shows what the last view saw.
     - `aspect`: width divided by height.
     """
-    view, stage = data.views[index], data.stage
+    view, viewpoint = data.views[index], data.viewpoint
     axes.imshow(still.image, interpolation="bilinear", zorder=1)
-    poses = [stage.pulled(other.pose) for other in data.views[: index + 1]]
-    items = seen_items(view.before, view.new, poses, data.camera, stage.depth)
+    poses = [viewpoint.drawn_pose(other.pose) for other in data.views[: index + 1]]
+    items = scene_items(view.before, view.new, poses, data.camera, viewpoint.depth)
     if isinstance(view.surface, PlacedShape):
         # Scanned points must stand out on the imagined surface.
         items = tuple(item._replace(weight=2.0 * item.weight) if isinstance(item, Points) else item for item in items)
     draw_items(axes, still, items, weight)
-    extent = _extent(data, still)
-    frame(axes, still, extent, aspect)
+    content = _content_pixels(data, still)
+    crop(axes, still, content, aspect)
     if isinstance(view.surface, PlacedShape) and view.surface.is_part:
         style: dict[str, Any] = {"ha": "center", "va": "bottom", "fontsize": 10 * weight, "fontweight": "bold"}
         style["bbox"] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 2}
         axes.text(0.5, 0.01, view.surface.caption, transform=axes.transAxes, zorder=5, **style)
-    if inset and view.look is not None:
-        across, up = _free_corner(axes, extent)
-        wide, tall = _INSET / aspect, _INSET
-        place = axes.inset_axes((across * (1 - wide), up * (1 - tall), wide, tall))
-        place.imshow(look_picture(view.look, plain=True), interpolation="nearest")
-        framed(place, NEW, 1.2 * weight)
+    if inset and view.image is not None:
+        across, up = _free_corner(axes, content)
+        wide, tall = _INSET_SIZE / aspect, _INSET_SIZE
+        corner_axes = axes.inset_axes((across * (1 - wide), up * (1 - tall), wide, tall))
+        corner_axes.imshow(colour_image(view.image, is_plain=True), interpolation="nearest")
+        draw_border(corner_axes, NEW, 1.2 * weight)
 
 
-def _free_corner(axes: Axes, extent: list[Float[np.ndarray, "_ 2"]]) -> tuple[int, int]:
+def _free_corner(axes: Axes, content: list[Float[np.ndarray, "_ 2"]]) -> tuple[int, int]:
     """Return the corner with the fewest of these pixels: (0, 0) is bottom left, (1, 1) is top right."""
     (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
-    places = [(pixels - [left, bottom]) / [right - left, top - bottom] for pixels in extent]
+    places = [(pixels - [left, bottom]) / [right - left, top - bottom] for pixels in content]
 
-    def share_in(corner: tuple[int, int]) -> float:
-        return sum(float(np.mean((np.abs(at - corner) < 1.25 * _INSET).all(axis=1))) for at in places)
+    def fraction_near(corner: tuple[int, int]) -> float:
+        return sum(float(np.mean((np.abs(points - corner) < 1.25 * _INSET_SIZE).all(axis=1))) for points in places)
 
-    return min(((0, 0), (0, 1), (1, 0), (1, 1)), key=share_in)
+    return min(((0, 0), (0, 1), (1, 0), (1, 1)), key=fraction_near)
 
 
-def _extent(data: ReportData, still: Still) -> list[Float[np.ndarray, "_ 2"]]:
+def _content_pixels(data: ReportData, still: Still) -> list[Float[np.ndarray, "_ 2"]]:
     """Return the pixels of the content of all views, so that their pictures can be cropped alike."""
     surfaces = [view.surface.vertices for view in data.views if view.surface is not None]
-    shown = [still.project(rows)[0] for rows in (*surfaces, *(view.new for view in data.views)) if len(rows)]
+    content = [still.project(rows)[0] for rows in (*surfaces, *(view.new for view in data.views)) if len(rows)]
     for view in data.views:
-        pose = data.stage.pulled(view.pose)
-        shown.append(still.project(frustum(pose, data.camera, data.stage.depth).reshape(-1, 3))[0])
-        shown.append(still.project(1.1 * np.asarray(pose.position, np.float64)[None])[0])
-    return [np.clip(pixels, 0, still.size) for pixels in shown]
+        pose = data.viewpoint.drawn_pose(view.pose)
+        content.append(still.project(frustum(pose, data.camera, data.viewpoint.depth).reshape(-1, 3))[0])
+        content.append(still.project(1.1 * np.asarray(pose.position, np.float64)[None])[0])
+    return [np.clip(pixels, 0, still.size) for pixels in content]
 
 
 def draw_items(
     axes: Axes, still: Still, items: Iterable[Points | Cameras], weight: float = 1.0
 ) -> list[Float[np.ndarray, "_ 2"]]:
     """Draw points that the surface does not hide, and numbered cameras. Return the pixels of all items."""
-    drawn = []
+    content = []
     for item in items:
         if isinstance(item, Points):
             pixels, in_front = still.project(item.places)
             x, y = pixels[in_front].T
             axes.scatter(x, y, s=item.weight * weight, c=item.colour, linewidths=0, zorder=2)
-            drawn.append(pixels)
+            content.append(pixels)
             continue
         for number, pose in enumerate(item.poses, start=item.first):
             ends = frustum(pose, item.camera, item.depth)
-            drawn.append(_draw_segments(axes, still, ends, item.colour, item.weight * weight))
-            beyond = 1.09 * np.asarray(pose.position, np.float64)[None]
-            (apex,), (apex_in_front,) = still.project(beyond)
-            drawn.append(apex[None])
+            content.append(_draw_segments(axes, still, ends, item.colour, item.weight * weight))
+            label_point = 1.09 * np.asarray(pose.position, np.float64)[None]
+            (apex,), (apex_in_front,) = still.project(label_point)
+            content.append(apex[None])
             style: dict[str, Any] = {"fontweight": "bold" if item.weight > 1.0 else "normal", "color": item.colour}
             style |= {"alpha": 1.0 if apex_in_front else 0.4, "fontsize": 9 * weight, "zorder": 4}
             axes.text(apex[0], apex[1], str(number), ha="center", va="center", **style)
-    return drawn
+    return content
 
 
 def _draw_segments(
@@ -292,15 +298,15 @@ def _draw_segments(
     pixels, in_front = still.project(fine.reshape(-1, 3))
     pixels, in_front = pixels.reshape(25, -1, 2), in_front.reshape(25, -1)
     segments = np.stack([pixels[:-1], pixels[1:]], axis=2).reshape(-1, 2, 2)
-    shown = (in_front[:-1] & in_front[1:]).reshape(-1)
-    colours = [mpl.colors.to_rgba(colour, alpha) for alpha in np.where(shown, 1.0, _HIDDEN)]
+    is_visible = (in_front[:-1] & in_front[1:]).reshape(-1)
+    colours = [mpl.colors.to_rgba(colour, alpha) for alpha in np.where(is_visible, 1.0, _HIDDEN_OPACITY)]
     axes.add_collection(LineCollection(list(segments), colors=colours, linewidths=width, capstyle="round", zorder=3))
     return pixels.reshape(-1, 2)
 
 
-def frame(axes: Axes, still: Still, shown: list[Float[np.ndarray, "_ 2"]], aspect: float = 1.0) -> None:
+def crop(axes: Axes, still: Still, content: list[Float[np.ndarray, "_ 2"]], aspect: float = 1.0) -> None:
     """Crop the picture to the region of these pixels, with a width of `aspect` times the height."""
-    pixels = np.concatenate(shown)
+    pixels = np.concatenate(content)
     (left, top), (right, bottom) = pixels.min(axis=0), pixels.max(axis=0)
     half = 0.53 * max((right - left) / aspect, bottom - top) + 0.03 * still.size
     x, y = 0.5 * (left + right), 0.5 * (top + bottom)

@@ -23,22 +23,22 @@ from jaxnbv.planning.episode import Episode
 from jaxnbv.storage import describe
 from jaxnbv.storage.files import make_folder, write_text
 from jaxnbv.storage.folders import versions, writing_in
-from jaxnbv.viz.answers import capital, label_of, may_be_words, number
+from jaxnbv.viz.answers import capital, kinds_text, label_of, number_text
 from jaxnbv.viz.charts import other_charts, task_charts
 from jaxnbv.viz.choice import draw_choice, marks
 from jaxnbv.viz.data import ReportData, report_data
 from jaxnbv.viz.figures import STYLE
 from jaxnbv.viz.html import render
-from jaxnbv.viz.imagined import looks
-from jaxnbv.viz.render import draw_scene, draw_truth, painted
+from jaxnbv.viz.imagined import image_tiles
+from jaxnbv.viz.render import draw_scene, draw_truth, render_view
 from jaxnbv.viz.sketches import Sketches
 from jaxnbv.viz.space import figures_in_space
-from jaxnbv.viz.style import DEVIATION, GHOST, IMAGINED, OPEN, PART, bar_ticks, gradient
+from jaxnbv.viz.style import DEVIATION, DISPUTED, IMAGINED, OPEN, PART, bar_ticks, gradient
 
 # Sizes in inches: small, so that letters are legible on a phone.
 _SCENE, _SCENE_DPI = (5.2, 4.5), 131
 _TRUTH, _TRUTH_DPI = (1.8, 1.8), 150
-_WHY, _WHY_DPI = (4.2, 3.5), 185
+_CHOICE, _CHOICE_DPI = (4.2, 3.5), 185
 _QUALITY = 82
 
 
@@ -74,8 +74,8 @@ def write_report(
 def report_html(data: ReportData, title: str, question: str | None = None) -> str:
     """Return the report as HTML text: the template filled with data, pictures and plotly's code."""
     with mpl.rc_context(STYLE):
-        pictures = [(_scene(data, index), _why(data, index)) for index in range(len(data.views))]
-        charts = [[_chart(*chart) for chart in drawn(data)] for drawn in (task_charts, other_charts)]
+        pictures = [(_scene_picture(data, index), _choice_picture(data, index)) for index in range(len(data.views))]
+        charts = [[_chart(*chart) for chart in make_charts(data)] for make_charts in (task_charts, other_charts)]
     return render(
         Path(__file__).with_name("report.html"),
         title=title,
@@ -88,20 +88,20 @@ def report_html(data: ReportData, title: str, question: str | None = None) -> st
         units=_world_of(data.episode)[1],
         length=data.episode.frame.unit,
         gradient=gradient(DEVIATION),
-        shapes={"scanned": PART, "imagined": IMAGINED, "imagined, but others disagree": OPEN, "other shapes": GHOST},
-        truth=_truth(data),
+        shapes={"scanned": PART, "imagined": IMAGINED, "imagined, but others disagree": OPEN, "other shapes": DISPUTED},
+        truth=_truth_picture(data),
         question=data.task.question if question is None else question,
         ticks=_deviation_ticks(data),
         # Plotly's own JSON holds the numbers in packed form.
-        space=_zipped(f"[{','.join(str(figure.to_json()) for figure in figures_in_space(data))}]"),
-        plotly=_zipped(get_plotlyjs()),
-        address=picture_address,
+        space=_zip(f"[{','.join(str(figure.to_json()) for figure in figures_in_space(data))}]"),
+        plotly=_zip(get_plotlyjs()),
+        data_url=data_url,
         poses=[_matrix(data, index) for index in range(len(data.views))],
-        **{said.__name__: said for said in (capital, number, may_be_words, looks, marks)},
+        **{function.__name__: function for function in (capital, number_text, kinds_text, image_tiles, marks)},
     )
 
 
-def picture_address(picture: UInt8[np.ndarray, "h w _"]) -> str:
+def data_url(picture: UInt8[np.ndarray, "h w _"]) -> str:
     """Encode an image as a data URL, lossless if its shorter side has fewer than 64 pixels."""
     file = io.BytesIO()
     Image.fromarray(picture).save(file, format="WEBP", quality=_QUALITY, lossless=min(picture.shape[:2]) < 64)
@@ -110,8 +110,8 @@ def picture_address(picture: UInt8[np.ndarray, "h w _"]) -> str:
 
 def _matrix(data: ReportData, index: int) -> str:
     """Return the pose of a view as JSON text: a matrix from camera (OpenCV's axes) to world."""
-    placed = _world_of(data.episode)[0].to_world(data.views[index].pose)
-    return json.dumps(np.asarray(placed.to_matrix(), np.float64).round(6).tolist())
+    pose = _world_of(data.episode)[0].to_world(data.views[index].pose)
+    return json.dumps(np.asarray(pose.to_matrix(), np.float64).round(6).tolist())
 
 
 def _world_of(episode: Episode) -> tuple[Frame, str]:
@@ -119,8 +119,8 @@ def _world_of(episode: Episode) -> tuple[Frame, str]:
 
     It is the world of the object's file if there is one, otherwise that of the session or the scene.
     """
-    if episode.scene is not None and (own := episode.scene.world_frame) is not None:
-        return own, "the units of the object's file"
+    if episode.scene is not None and (world_frame := episode.scene.world_frame) is not None:
+        return world_frame, "the units of the object's file"
     return episode.frame, episode.frame.unit
 
 
@@ -130,31 +130,31 @@ def _deviation_ticks(data: ReportData) -> list[tuple[float, str]]:
     return [(round(100.0 * math.log(tick / low, high / low), 2), f"{tick:g}") for tick in bar_ticks(low, high)]
 
 
-def _zipped(text: str) -> bytes:
+def _zip(text: str) -> bytes:
     return gzip.compress(text.encode(), mtime=0)
 
 
-def _scene(data: ReportData, index: int) -> str:
+def _scene_picture(data: ReportData, index: int) -> str:
     """Draw the scene after a view, and return the picture as a data URL."""
     figure = Figure(figsize=_SCENE, facecolor="none")
     # Leave a margin, so that the frame of the inset is not cut.
     axes = figure.add_axes((0.002, 0.002, 0.996, 0.996))
-    draw_scene(axes, data, index, painted(data, index), weight=1.1, aspect=_SCENE[0] / _SCENE[1])
-    return picture_address(_pixels(figure, _SCENE_DPI))
+    draw_scene(axes, data, index, render_view(data, index), weight=1.1, aspect=_SCENE[0] / _SCENE[1])
+    return data_url(_pixels(figure, _SCENE_DPI))
 
 
-def _truth(data: ReportData) -> str | None:
+def _truth_picture(data: ReportData) -> str | None:
     """Draw the true surface, and return the picture as a data URL; None if the surface is not known."""
     figure = Figure(figsize=_TRUTH, facecolor="none")
     is_known = draw_truth(figure.add_axes((0.0, 0.0, 1.0, 1.0)), data)
-    return picture_address(_pixels(figure, _TRUTH_DPI)) if is_known else None
+    return data_url(_pixels(figure, _TRUTH_DPI)) if is_known else None
 
 
-def _why(data: ReportData, index: int) -> str:
+def _choice_picture(data: ReportData, index: int) -> str:
     """Draw why a view was chosen (see `draw_choice`), and return the picture as a data URL."""
-    figure = Figure(figsize=_WHY, facecolor="none")
+    figure = Figure(figsize=_CHOICE, facecolor="none")
     draw_choice(figure, data.views[index].proposal, data.quantity, data.episode.frame)
-    return picture_address(_pixels(figure, _WHY_DPI))
+    return data_url(_pixels(figure, _CHOICE_DPI))
 
 
 def _pixels(figure: Figure, dpi: int) -> UInt8[np.ndarray, "h w 4"]:
@@ -169,9 +169,14 @@ def _chart(title: str, figure: Figure) -> tuple[str, bytes, str]:
     file = io.BytesIO()
     with mpl.rc_context({"svg.hashsalt": "jaxnbv"}):
         figure.savefig(file, format="svg", metadata={"Date": None}, transparent=True)
-    place, (left, right) = figure.axes[0].get_position(), figure.axes[0].get_xlim()
-    box = {"left": place.x0, "wide": place.width / (right - left), "top": 1.0 - place.y1, "tall": place.height}
-    return capital(title), file.getvalue(), "; ".join(f"--{name}: {share:.2%}" for name, share in box.items())
+    position, (left, right) = figure.axes[0].get_position(), figure.axes[0].get_xlim()
+    box = {
+        "left": position.x0,
+        "wide": position.width / (right - left),
+        "top": 1.0 - position.y1,
+        "tall": position.height,
+    }
+    return capital(title), file.getvalue(), "; ".join(f"--{name}: {fraction:.2%}" for name, fraction in box.items())
 
 
 def _settings(episode: Episode, title: str) -> dict[str, str]:

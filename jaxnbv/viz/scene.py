@@ -34,7 +34,7 @@ class Cameras(NamedTuple):
     depth: float = FRUSTUM_DEPTH
 
 
-def seen_items(
+def scene_items(
     before: Float[np.ndarray, "n 3"],
     new: Float[np.ndarray, "m 3"],
     poses: Sequence[Pose],

@@ -6,11 +6,11 @@ from jaxnbv.observations import Observations
 from jaxnbv.sampler import StepInputs, SurfaceSampler
 from jaxnbv.surfaces.known_shapes import KnownShapes, KnownShapesPosterior
 from jaxnbv.surfaces.part_hypotheses import PartHypotheses
-from jaxnbv.viz.mean_surface import MeanSurface, as_shown, mean_surface
+from jaxnbv.viz.mean_surface import MeanSurface, mean_surface, near_points
 from jaxnbv.viz.placed_shape import likeliest_part, likeliest_shape
 
 
-def has_bank(sampler: SurfaceSampler) -> bool:
+def needs_no_posterior(sampler: SurfaceSampler) -> bool:
     """Return whether the model has a bank of known shapes, so that `shown_surface` needs no posterior."""
     return isinstance(sampler.model, KnownShapes) and sampler.model.bank.solids is not None
 
@@ -21,12 +21,12 @@ def shown_surface(sampler: SurfaceSampler, inputs: StepInputs) -> MeanSurface | 
     Return None if there is no such surface. The mean over several known shapes is the shape of none of them, so it is
     not shown. If the object fits no known shape, the mean is that of the model without the bank.
 
-    - `inputs`: inputs of a step, with a posterior unless `has_bank`.
+    - `inputs`: inputs of a step, with a posterior unless `needs_no_posterior`.
     """
     observations, posterior, model = inputs.observations, inputs.posterior, sampler.model
     if isinstance(observations.hypotheses, PartHypotheses):
         return likeliest_part(observations.hypotheses, observations.cloud)
-    if isinstance(model, KnownShapes) and has_bank(sampler):
+    if isinstance(model, KnownShapes) and needs_no_posterior(sampler):
         if isinstance(posterior, KnownShapesPosterior):
             fits, weights = posterior.fits, posterior.weights
         else:
@@ -34,9 +34,11 @@ def shown_surface(sampler: SurfaceSampler, inputs: StepInputs) -> MeanSurface | 
         if (shape := likeliest_shape(model.bank, fits, weights, observations.cloud)) is not None:
             return shape
         sampler = sampler.without_bank
-        of_none = posterior.of_none if isinstance(posterior, KnownShapesPosterior) else sampler.posterior(observations)
-        inputs = StepInputs(observations, of_none)
-    return as_shown(mean_surface(sampler, inputs), observations.cloud)
+        posterior_of_none = (
+            posterior.of_none if isinstance(posterior, KnownShapesPosterior) else sampler.posterior(observations)
+        )
+        inputs = StepInputs(observations, posterior_of_none)
+    return near_points(mean_surface(sampler, inputs), observations.cloud)
 
 
 def _within_volume(sampler: SurfaceSampler, observations: Observations) -> Observations:

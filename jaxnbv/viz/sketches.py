@@ -8,9 +8,9 @@ from jaxnbv.observations import Observations
 from jaxnbv.planning.episode import Episode
 from jaxnbv.planning.loop import Step, view_keys
 from jaxnbv.sampler import StepInputs
-from jaxnbv.viz.imagined import Imagined, imagined
+from jaxnbv.viz.imagined import Imagined, render_imagined
 from jaxnbv.viz.mean_surface import MeanSurface
-from jaxnbv.viz.shown_surface import has_bank, shown_surface
+from jaxnbv.viz.shown_surface import needs_no_posterior, shown_surface
 from jaxnbv.viz.unmeasured import Patch, unmeasured
 
 
@@ -46,23 +46,23 @@ class Sketches:
 
 
 def sketches_of(
-    episode: Episode, replayed: Iterable[Observations], held: Mapping[int, Sketch], imagine: bool
+    episode: Episode, all_observations: Iterable[Observations], by_view: Mapping[int, Sketch], imagine: bool
 ) -> Iterator[Sketch]:
     """Yield the sketch of the step after each view, including the step after the last view.
 
-    - `replayed`: observations after each view.
-    - `held`: sketches that exist already, keyed by the index of the step's view.
+    - `all_observations`: observations after each view.
+    - `by_view`: sketches that exist already, keyed by the index of the step's view.
     - `imagine`: whether new sketches show what was imagined.
     """
-    for index, observations in enumerate(replayed, start=1):
-        if index in held:
-            yield held[index]
+    for index, observations in enumerate(all_observations, start=1):
+        if index in by_view:
+            yield by_view[index]
             continue
         if episode.planner.acquisition.needs_hypotheses:
             yield _sketch(episode, index, StepInputs(observations), imagine)
             continue
         sampler, is_imagined = episode.planner.sampler, imagine and index < len(episode.views)
-        if has_bank(sampler) and not is_imagined:
+        if needs_no_posterior(sampler) and not is_imagined:
             yield _sketch(episode, index, StepInputs(observations), imagine)
             continue
         posterior = sampler.posterior(observations)
@@ -79,5 +79,5 @@ def _sketch(episode: Episode, index: int, inputs: StepInputs, imagine: bool = Tr
     sampler, observations = episode.planner.sampler, inputs.observations
     surface = shown_surface(sampler, inputs)
     patches = [] if surface is None else unmeasured(surface.mesh, observations, sampler.carving)
-    samples = imagined(episode, index, inputs) if imagine and index < len(episode.views) else None
+    samples = render_imagined(episode, index, inputs) if imagine and index < len(episode.views) else None
     return Sketch(surface, samples, patches)

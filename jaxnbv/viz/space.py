@@ -9,30 +9,32 @@ from jaxtyping import Float, Int
 from jaxnbv.viz.data import ReportData
 from jaxnbv.viz.mean_surface import MeanSurface
 from jaxnbv.viz.placed_shape import PlacedShape
-from jaxnbv.viz.scene import Cameras, Points, frustum, seen_items
-from jaxnbv.viz.style import DEVIATION, GHOST, IMAGINED, INK, OPEN, PART, colour_scale
+from jaxnbv.viz.scene import Cameras, Points, frustum, scene_items
+from jaxnbv.viz.style import DEVIATION, DISPUTED, IMAGINED, INK, OPEN, PART, colour_scale
 
 # Largest numbers of points and vertices of all views together, for a small page, and least vertices of one view.
-_POINTS, _VERTICES, _FEWEST_VERTICES = 18_000, 24_000, 1500
+_MAX_POINTS, _MAX_VERTICES, _MIN_VERTICES = 18_000, 24_000, 1500
 # Coordinates are rounded to this, in scene units: a power of two, whose multiples pack well.
-_GRAIN = 1 / 256
-_GLASS = {"color": GHOST, "opacity": 0.25}
+_ROUNDING = 1 / 256
+_GLASS = {"color": DISPUTED, "opacity": 0.25}
 _LIGHT = {"ambient": 0.72, "diffuse": 0.45, "specular": 0.04, "roughness": 0.9}
 
 
 def figures_in_space(data: ReportData) -> list[go.Figure]:
     """Return one plotly figure per view. Items that a reader hides stay hidden in the next figure."""
-    stage, count, figures = data.stage, max(len(data.views), 6), []
-    points, vertices = _POINTS // count, max(_VERTICES // count, _FEWEST_VERTICES)
+    viewpoint, count, figures = data.viewpoint, max(len(data.views), 6), []
+    points, vertices = _MAX_POINTS // count, max(_MAX_VERTICES // count, _MIN_VERTICES)
     grades = np.log10(data.deviations)
     for index, view in enumerate(data.views):
-        poses = [stage.pulled(other.pose) for other in data.views[: index + 1]]
-        drawn = [] if view.surface is None else [_mesh(view.surface, vertices, grades)]
-        if isinstance(view.surface, PlacedShape) and view.surface.ghost is not None:
-            drawn.append(_triangles(view.surface.ghost, vertices // 2, _named("other shapes") | _GLASS))
-        for item in seen_items(view.before, view.new, poses, data.camera, stage.depth):
-            drawn += _points(item, points) if isinstance(item, Points) else _cameras(item)
-        figures.append(go.Figure(drawn, _layout(stage.eye, stage.extent)))
+        poses = [viewpoint.drawn_pose(other.pose) for other in data.views[: index + 1]]
+        traces = [] if view.surface is None else [_mesh(view.surface, vertices, grades)]
+        if isinstance(view.surface, PlacedShape) and view.surface.disputed_space is not None:
+            traces.append(
+                _triangles(view.surface.disputed_space, vertices // 2, _legend_entry("other shapes") | _GLASS)
+            )
+        for item in scene_items(view.before, view.new, poses, data.camera, viewpoint.depth):
+            traces += _points(item, points) if isinstance(item, Points) else _cameras(item)
+        figures.append(go.Figure(traces, _layout(viewpoint.eye, viewpoint.extent)))
     return figures
 
 
@@ -52,21 +54,21 @@ def _layout(eye: Float[np.ndarray, "3"], extent: float) -> dict[str, Any]:
     }
 
 
-def _placed(places: Float[np.ndarray, "n 3"]) -> dict[str, Any]:
+def _plotly_points(places: Float[np.ndarray, "n 3"]) -> dict[str, Any]:
     """Return coordinates keyed by plotly's axes. Plotly's vertical axis z is our y."""
-    x, y, z = (_GRAIN * np.round(np.asarray(places, np.float64).T / _GRAIN)).astype(np.float32)
+    x, y, z = (_ROUNDING * np.round(np.asarray(places, np.float64).T / _ROUNDING)).astype(np.float32)
     return {"x": z, "y": x, "z": y}
 
 
-def _named(name: str) -> dict[str, Any]:
+def _legend_entry(name: str) -> dict[str, Any]:
     return {"name": name, "legendgroup": name, "hoverinfo": "skip", "showlegend": True}
 
 
-def _points(item: Points, most: int) -> list[dict[str, Any]]:
-    rows = np.linspace(0, len(item.places) - 1, min(most, len(item.places))).astype(int)
+def _points(item: Points, limit: int) -> list[dict[str, Any]]:
+    rows = np.linspace(0, len(item.places) - 1, min(limit, len(item.places))).astype(int)
     marker = {"color": item.colour, "size": 1.0 + item.weight}
-    places = _placed(item.places[rows])
-    return [{"type": "scatter3d", "mode": "markers", "marker": marker, **places, **_named(item.name)}]
+    places = _plotly_points(item.places[rows])
+    return [{"type": "scatter3d", "mode": "markers", "marker": marker, **places, **_legend_entry(item.name)}]
 
 
 def _cameras(item: Cameras) -> list[dict[str, Any]]:
@@ -77,12 +79,12 @@ def _cameras(item: Cameras) -> list[dict[str, Any]]:
     gapped = np.pad(edges, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan).reshape(-1, 3)
     line = {"color": item.colour, "width": 3.0 * item.weight}
     numbers = {
-        **_placed(1.09 * np.stack([np.asarray(pose.position, np.float64) for pose in item.poses])),
+        **_plotly_points(1.09 * np.stack([np.asarray(pose.position, np.float64) for pose in item.poses])),
         "text": [f"<b>{item.first + i}</b>" for i in range(len(item.poses))],
         "textfont": {"color": item.colour, "size": 14},
     }
-    wires = {"type": "scatter3d", "mode": "lines", "line": line, **_placed(gapped), **_named(item.name)}
-    return [wires, {"type": "scatter3d", "mode": "text", **numbers, **_named(item.name), "showlegend": False}]
+    lines = {"type": "scatter3d", "mode": "lines", "line": line, **_plotly_points(gapped), **_legend_entry(item.name)}
+    return [lines, {"type": "scatter3d", "mode": "text", **numbers, **_legend_entry(item.name), "showlegend": False}]
 
 
 def _mesh(surface: MeanSurface, limit: int, grades: Float[np.ndarray, "2"]) -> dict[str, Any]:
@@ -96,27 +98,27 @@ def _mesh(surface: MeanSurface, limit: int, grades: Float[np.ndarray, "2"]) -> d
         # Open, imagined, scanned.
         scale = [[0.0, OPEN], [0.5, IMAGINED], [1.0, PART]]
         grade = np.maximum(surface.measured, 0.5 * surface.agreed)
-        looks = _named("likeliest shape") | {"cmin": 0.0, "cmax": 1.0, "colorscale": scale}
+        style = _legend_entry("likeliest shape") | {"cmin": 0.0, "cmax": 1.0, "colorscale": scale}
     else:
         grade = np.log10(surface.deviation)
-        looks = _named("surface of the mean")
-        looks |= {"cmin": grades[0], "cmax": grades[1], "colorscale": colour_scale(DEVIATION)}
-    return _triangles(surface, limit, looks | {"showscale": False}, grade)
+        style = _legend_entry("surface of the mean")
+        style |= {"cmin": grades[0], "cmax": grades[1], "colorscale": colour_scale(DEVIATION)}
+    return _triangles(surface, limit, style | {"showscale": False}, grade)
 
 
 def _triangles(
-    surface: MeanSurface, limit: int, looks: dict[str, Any], grade: Float[np.ndarray, " v"] | None = None
+    surface: MeanSurface, limit: int, style: dict[str, Any], grade: Float[np.ndarray, " v"] | None = None
 ) -> dict[str, Any]:
     """Return a plotly trace of a coarser mesh with at most `limit` vertices, coloured by `grade` if given."""
-    own, faces = clustered(surface.vertices, surface.faces, limit)
-    count = np.bincount(own)
-    vertices = np.stack([np.bincount(own, column) / count for column in surface.vertices.T], axis=1)
+    new_index, faces = clustered(surface.vertices, surface.faces, limit)
+    count = np.bincount(new_index)
+    vertices = np.stack([np.bincount(new_index, column) / count for column in surface.vertices.T], axis=1)
     if grade is not None:
-        looks = looks | {"intensity": np.round(np.bincount(own, grade) / count, 2).astype(np.float32)}
+        style = style | {"intensity": np.round(np.bincount(new_index, grade) / count, 2).astype(np.float32)}
     return {
         "type": "mesh3d",
-        **looks,
-        **_placed(vertices),
+        **style,
+        **_plotly_points(vertices),
         **dict(zip("ijk", faces.T.astype(np.uint16), strict=True)),
         "lighting": _LIGHT,
         "lightposition": {"x": 4000, "y": 3000, "z": 8000},
@@ -130,13 +132,13 @@ def clustered(
 
     Returns the new index of each vertex, and the faces (Rossignac and Borrel 1993).
     """
-    own = np.arange(len(vertices))
+    new_index = np.arange(len(vertices))
     cell = 0.01
-    while own.max(initial=-1) + 1 > limit:
+    while new_index.max(initial=-1) + 1 > limit:
         steps = np.floor(vertices / cell).astype(np.int64)
         steps -= steps.min(axis=0)
-        _, own = np.unique(np.ravel_multi_index(steps.T, steps.max(axis=0) + 1), return_inverse=True)
+        _, new_index = np.unique(np.ravel_multi_index(steps.T, steps.max(axis=0) + 1), return_inverse=True)
         cell *= 1.2
-    joined = own[faces]
-    a, b, c = joined.T
-    return own, np.unique(joined[(a != b) & (b != c) & (c != a)], axis=0)
+    new_faces = new_index[faces]
+    a, b, c = new_faces.T
+    return new_index, np.unique(new_faces[(a != b) & (b != c) & (c != a)], axis=0)

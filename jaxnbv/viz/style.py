@@ -14,7 +14,7 @@ from jaxnbv.storage.files import write_whole
 INK, GREY, LINE = "#1f2733", "#7a8494", "#d9dee6"
 BEFORE, NEW = "#26344d", "#d55e00"
 # Colours of a known shape: scanned, imagined, different in other hypotheses. Colour of the space that those fill.
-PART, IMAGINED, OPEN, GHOST = "#6cc5a6", "#d7efe6", "#d5d0ec", "#8c7fc0"
+PART, IMAGINED, OPEN, DISPUTED = "#6cc5a6", "#d7efe6", "#d5d0ec", "#8c7fc0"
 # Colours of several lines in one chart (Okabe and Ito). NEW is not among them, because it marks the true one.
 SERIES = ["#0072b2", "#56b4e9", "#009e73", "#e69f00", "#cc79a7", "#7a8494", "#26344d", "#b8b04a"]
 # Pale where the surface is known, dark where it is not: the scanned points stand out on what is known.
@@ -30,7 +30,7 @@ def colour_scale(colours: Colormap) -> list[list]:
 
 def gradient(colours: Colormap) -> str:
     """Convert a colour map to a CSS gradient from left to right."""
-    steps = ", ".join(f"{colour} {100 * at:.0f}%" for at, colour in colour_scale(colours))
+    steps = ", ".join(f"{colour} {100 * position:.0f}%" for position, colour in colour_scale(colours))
     return f"linear-gradient(90deg, {steps})"
 
 
@@ -54,7 +54,7 @@ def bar_ticks(low: float, high: float) -> list[float]:
     return decades[:: -(-len(decades) // 5)] if len(decades) > 1 else [low, high]
 
 
-def framed(axes: Axes, colour: str, width: float) -> None:
+def draw_border(axes: Axes, colour: str, width: float) -> None:
     """Remove the ticks of axes, and draw a frame around them."""
     axes.set(xticks=[], yticks=[])
     axes.spines[:].set(visible=True, color=colour, linewidth=width)

@@ -26,35 +26,35 @@ from jaxnbv.utility import Answer
 from jaxnbv.viz.answers import Chart, CoverageAnswer, capital, words_of
 
 
-class Rival(NamedTuple):
-    """Result of a different search from the same first view: name, a sentence, and charts as in `Task`."""
+class Comparison(NamedTuple):
+    """Result of a different search from the same first view: name, a sentence, and charts as in `TaskReport`."""
 
     name: str
-    words: str
+    sentence: str
     charts: tuple[Chart, ...]
-    seen: Chart
+    coverage_chart: Chart
 
 
-class Task(NamedTuple):
+class TaskReport(NamedTuple):
     """The task of an episode, with its answers after each view.
 
-    - `amounts`, `seen`: amount of surface seen after each view, and its chart.
+    - `amounts`, `coverage_chart`: amount of surface seen after each view, and its chart.
     - `answers`, `charts`: answers after each view, and their charts. If the acquisition has no answers, these are the
       amounts.
-    - `question`, `asked`, `found`, `sure`: texts for the head of the report: the question, how views were chosen, the
-      answer, and from which view on the answer is reliable.
+    - `question`, `choice_text`, `answer_text`, `reliability_text`: texts for the head of the report: the question, how
+      views were chosen, the answer, and from which view on the answer is reliable.
     - `rival`: result of a different search, or None.
     """
 
     amounts: Sequence[CoverageAnswer]
-    seen: Chart
+    coverage_chart: Chart
     answers: Sequence[Answer]
     charts: tuple[Chart, ...]
     question: str
-    asked: str
-    found: str
-    sure: str
-    rival: Rival | None
+    choice_text: str
+    answer_text: str
+    reliability_text: str
+    rival: Comparison | None
 
     @property
     def is_coverage(self) -> bool:
@@ -66,35 +66,36 @@ def task_of(
     episode: Episode,
     truth: Float[AnyArray, "n 3"] | None = None,
     rival: Episode | None = None,
-    replayed: Sequence[Observations] | None = None,
-) -> Task:
+    all_observations: Sequence[Observations] | None = None,
+) -> TaskReport:
     """Return the task of an episode: that of its acquisition, or to see all surface if it has no answers.
 
     - `truth`: points of the true surface, in scene coordinates.
     - `rival`: an episode of a different search from the same first view.
-    - `replayed`: observations after each view, if they are already computed.
+    - `all_observations`: observations after each view, if they are already computed.
     """
     planner = episode.planner
-    seen, true = seen_after(episode, truth, replayed), None
-    answers = _answers(episode, episode.views) or seen
-    if episode.scene is not None and answers is not seen:
+    amounts, true_answer = coverage_answers(episode, truth, all_observations), None
+    answers = _answers(episode, episode.views) or amounts
+    if episode.scene is not None and answers is not amounts:
         cloud = true_cloud(episode.scene, planner.capacity)
-        true = None if cloud is None else planner.acquisition.true_answer(episode.scene, cloud)
-    beside = None
+        true_answer = None if cloud is None else planner.acquisition.true_answer(episode.scene, cloud)
+    comparison = None
     if rival is not None:
-        rival_seen = seen_after(rival, truth)
-        charts = _charts(_answers(episode, rival.views) or rival_seen, true)
-        beside = Rival(search_name(rival), race_words(rival, episode), charts, _charts(rival_seen, None)[0])
-    return Task(
-        amounts=seen,
-        seen=_charts(seen, None)[0],
+        rival_amounts = coverage_answers(rival, truth)
+        charts = _charts(_answers(episode, rival.views) or rival_amounts, true_answer)
+        comparison = Comparison(search_name(rival), rival_text(rival, episode), charts, _charts(rival_amounts, None)[0])
+    return TaskReport(
+        amounts=amounts,
+        coverage_chart=_charts(amounts, None)[0],
         answers=answers,
-        charts=_charts(answers, true),
+        charts=_charts(answers, true_answer),
         question=words_of(answers[-1]).question,
-        asked=_asked(planner),
-        found=capital(words_of(answers[-1]).found) + ("" if true is None else f". In truth: {words_of(true).found}"),
-        sure=_sure(episode, answers),
-        rival=beside,
+        choice_text=_choice_text(planner),
+        answer_text=capital(words_of(answers[-1]).found)
+        + ("" if true_answer is None else f". In truth: {words_of(true_answer).found}"),
+        reliability_text=_reliability_text(episode, answers),
+        rival=comparison,
     )
 
 
@@ -105,12 +106,12 @@ def _charts(answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...
 def _answers(episode: Episode, views: Sequence[View]) -> Sequence[Answer]:
     """Return the acquisition's answers after these views, in world coordinates; empty if it has none."""
     answers = [view.answer(episode.planner.acquisition) for view in views]
-    said = [answer.in_world(episode.frame) for answer in answers if answer is not None]
-    return said if len(said) == len(answers) else []
+    world_answers = [answer.in_world(episode.frame) for answer in answers if answer is not None]
+    return world_answers if len(world_answers) == len(answers) else []
 
 
-def seen_after(
-    episode: Episode, truth: Float[AnyArray, "n 3"] | None, replayed: Sequence[Observations] | None = None
+def coverage_answers(
+    episode: Episode, truth: Float[AnyArray, "n 3"] | None, all_observations: Sequence[Observations] | None = None
 ) -> list[CoverageAnswer]:
     """Return how much of the surface was seen after each view.
 
@@ -119,26 +120,26 @@ def seen_after(
     `NewSurface`. An area measured at a slant counts in full here, but for less in the acquisition.
 
     - `truth`: points of the true surface, in scene coordinates.
-    - `replayed`: observations after each view, if they are already computed.
+    - `all_observations`: observations after each view, if they are already computed.
     """
     views, acquisition = episode.views, episode.planner.acquisition
     if truth is not None:
-        shares = [100.0 * float(share) for share in coverage(views, truth)]
-        return [CoverageAnswer(("of the surface seen",), np.array([share])) for share in shares]
-    of = new_surface_of(acquisition)
-    before = itertools.chain([None], episode.observations() if replayed is None else replayed)
+        percentages = [100.0 * float(percentage) for percentage in coverage(views, truth)]
+        return [CoverageAnswer(("of the surface seen",), np.array([percentage])) for percentage in percentages]
+    new_surface = new_surface_of(acquisition)
+    before = itertools.chain([None], episode.observations() if all_observations is None else all_observations)
     new = [
-        float(_new_area(of, seen, ImaginedView(view.scan, view.camera, view.pose)))
-        for seen, view in zip(before, views, strict=False)
+        float(_new_area(new_surface, observations, ImaginedView(view.scan, view.camera, view.pose)))
+        for observations, view in zip(before, views, strict=False)
     ]
     areas, unit = episode.frame.length_to_world(np.cumsum(new), 2), f"{episode.frame.unit}²"
     return [CoverageAnswer(("of surface seen",), np.array([area]), unit=unit) for area in areas]
 
 
 @program
-def _new_area(of: NewSurface, before: Observations | None, view: ImaginedView) -> Float[Array, ""]:
+def _new_area(new_surface: NewSurface, before: Observations | None, view: ImaginedView) -> Float[Array, ""]:
     area = pixel_area(view.scan, view.camera, view.pose, GRAZING)
-    return jnp.sum(area if before is None else area * of.context(inputs_of(before))(view.scan.points))
+    return jnp.sum(area if before is None else area * new_surface.context(inputs_of(before))(view.scan.points))
 
 
 def true_cloud(scene: Surface, count: int) -> PointCloud | None:
@@ -146,12 +147,12 @@ def true_cloud(scene: Surface, count: int) -> PointCloud | None:
     mesh = true_mesh(scene)
     if mesh is None:
         return None
-    own = mesh.to_trimesh()
-    points, faces = trimesh.sample.sample_surface(own, count, seed=0)
-    return PointCloud.from_arrays(np.asarray(points, np.float32), np.asarray(own.face_normals[faces], np.float32))
+    triangles = mesh.to_trimesh()
+    points, faces = trimesh.sample.sample_surface(triangles, count, seed=0)
+    return PointCloud.from_arrays(np.asarray(points, np.float32), np.asarray(triangles.face_normals[faces], np.float32))
 
 
-def settled_after(episode: Episode, answers: Sequence[Answer]) -> list[bool]:
+def is_reliable_after(episode: Episode, answers: Sequence[Answer]) -> list[bool]:
     """Return, for each view, whether its answer is reliable. Stop rules get the episode's random keys."""
 
     def holds(rule: Sure, index: int) -> bool:
@@ -161,15 +162,15 @@ def settled_after(episode: Episode, answers: Sequence[Answer]) -> list[bool]:
     return words_of(answers[-1]).settled(answers, holds)
 
 
-def since(settled: Sequence[bool]) -> int | None:
+def first_reliable(is_reliable: Sequence[bool]) -> int | None:
     """Return the first view (from 1) from which on all answers are reliable; None if the last one is not."""
-    return len(settled) - int(np.argmin([*settled[::-1], False]) - 1) if settled[-1] else None
+    return len(is_reliable) - int(np.argmin([*is_reliable[::-1], False]) - 1) if is_reliable[-1] else None
 
 
-def lost_again(settled: Sequence[bool]) -> int | None:
+def first_lost(is_reliable: Sequence[bool]) -> int | None:
     """Return the first view (from 1) with a reliable answer if a later one is unreliable; None otherwise."""
-    first = int(np.argmax(settled))
-    return first + 1 if settled[first] and not all(settled[first:]) else None
+    index = int(np.argmax(is_reliable))
+    return index + 1 if is_reliable[index] and not all(is_reliable[index:]) else None
 
 
 def search_name(episode: Episode) -> str:
@@ -177,7 +178,7 @@ def search_name(episode: Episode) -> str:
     return re.sub("(?<!^)(?=[A-Z])", " ", type(episode.planner.search).__name__).lower()
 
 
-def race_words(rival: Episode, episode: Episode) -> str:
+def rival_text(rival: Episode, episode: Episode) -> str:
     """Return a sentence about a different search from the same first view: number of views, and answer.
 
     It says if these views did not fulfil the stop rule that ended `episode`.
@@ -191,7 +192,7 @@ def race_words(rival: Episode, episode: Episode) -> str:
     return f"{text} ({words_of(answers[-1]).found})." if answers else f"{text}."
 
 
-def _asked(planner: Planner) -> str:
+def _choice_text(planner: Planner) -> str:
     name = planner.quantity.name
     if not planner.search.uses_samples:
         return f"Each view is where the {name} is highest."
@@ -200,10 +201,10 @@ def _asked(planner: Planner) -> str:
     return f"Each view is where the {name} is highest, over {planner.sampler.num_samples} imagined surfaces."
 
 
-def _sure(episode: Episode, answers: Sequence[Answer]) -> str:
-    settled, count = settled_after(episode, answers), len(answers)
-    first, lost = since(settled), lost_again(settled)
+def _reliability_text(episode: Episode, answers: Sequence[Answer]) -> str:
+    is_reliable, count = is_reliable_after(episode, answers), len(answers)
+    first, lost = first_reliable(is_reliable), first_lost(is_reliable)
     text = f"From view {first} on" if first else f"Not yet after {count} view{'s' * (count > 1)}"
-    again = f" At view {lost} it was sure already, but then not." if lost else ""
-    ended = "" if episode.stop_reason is None else f" It ended by its rule: {episode.stop_reason}."
-    return f"{text}.{again} Sure means {words_of(answers[-1]).settled_means}.{ended}"
+    lost_text = f" At view {lost} it was sure already, but then not." if lost else ""
+    stop_text = "" if episode.stop_reason is None else f" It ended by its rule: {episode.stop_reason}."
+    return f"{text}.{lost_text} Sure means {words_of(answers[-1]).settled_means}.{stop_text}"

@@ -12,11 +12,11 @@ from scipy.ndimage import binary_dilation
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.observations import Observations
 from jaxnbv.scanning import Carving, TriangleMesh
-from jaxnbv.viz.answers import coordinates, number
+from jaxnbv.viz.answers import number_text, point_text
 
 # Least number of views that looked at a patch, since one may be chance. Least fraction of the surface in a patch.
 # Maximum number of patches.
-_LOOKS, _SHARE, _PATCHES = 2, 0.005, 3
+_MIN_LOOKS, _MIN_AREA, _MAX_PATCHES = 2, 0.005, 3
 
 
 class Patch(NamedTuple):
@@ -39,30 +39,30 @@ def unmeasured(surface: trimesh.Trimesh, observations: Observations, carving: Ca
         return []
     mesh, count = TriangleMesh(surface.vertices, surface.faces, Frame()), int(observations.num_views)
     cells = np.asarray(looks.grid.cell_of(jnp.asarray(surface.triangles_center)))
-    times = np.zeros((looks.grid.resolution + 1,) * 3, int)
+    num_looks = np.zeros((looks.grid.resolution + 1,) * 3, int)
     for index in range(count):
-        in_vain = np.zeros(times.shape, bool)
+        is_missed = np.zeros(num_looks.shape, bool)
         cells_of_view = np.asarray(looks.unmeasured_cells(mesh, index, observations.poses.rows[index]))
-        in_vain[tuple(cells_of_view[(cells_of_view < looks.grid.resolution).all(axis=1)].T)] = True
+        is_missed[tuple(cells_of_view[(cells_of_view < looks.grid.resolution).all(axis=1)].T)] = True
         # Include the neighbouring cells, because rays are farther apart than cells.
-        times += binary_dilation(in_vain, np.ones((3, 3, 3)))
-    of_face = times[tuple(np.minimum(cells, looks.grid.resolution).T)]
-    chosen = of_face >= _LOOKS
+        num_looks += binary_dilation(is_missed, np.ones((3, 3, 3)))
+    looks_of_face = num_looks[tuple(np.minimum(cells, looks.grid.resolution).T)]
+    is_unmeasured = looks_of_face >= _MIN_LOOKS
     if carving is not None:
-        chosen &= np.asarray(carving.volume(jnp.asarray(surface.triangles_center))) < -looks.grid.spacing
+        is_unmeasured &= np.asarray(carving.volume(jnp.asarray(surface.triangles_center))) < -looks.grid.spacing
     pieces = trimesh.graph.connected_components(
-        surface.face_adjacency[chosen[surface.face_adjacency].all(axis=1)], nodes=np.nonzero(chosen)[0]
+        surface.face_adjacency[is_unmeasured[surface.face_adjacency].all(axis=1)], nodes=np.nonzero(is_unmeasured)[0]
     )
-    patches = [_patch(surface, faces, of_face) for faces in pieces]
-    patches = [patch for patch in patches if patch.area > _SHARE * surface.area]
-    return sorted(patches, key=lambda patch: -patch.area)[:_PATCHES]
+    patches = [_patch(surface, faces, looks_of_face) for faces in pieces]
+    patches = [patch for patch in patches if patch.area > _MIN_AREA * surface.area]
+    return sorted(patches, key=lambda patch: -patch.area)[:_MAX_PATCHES]
 
 
-def unmeasured_words(patches: Sequence[Patch], frame: Frame) -> str:
+def unmeasured_text(patches: Sequence[Patch], frame: Frame) -> str:
     """Return a sentence about the patches, with areas and positions in the world of a frame."""
     parts = [
-        f"{number(float(frame.length_to_world(patch.area, 2)))} {frame.unit}² about {coordinates(patch.middle, frame)} "
-        f"({patch.looks} looks)"
+        f"{number_text(float(frame.length_to_world(patch.area, 2)))} {frame.unit}² about "
+        f"{point_text(patch.middle, frame)} ({patch.looks} looks)"
         for patch in patches
     ]
     return (
@@ -71,7 +71,7 @@ def unmeasured_words(patches: Sequence[Patch], frame: Frame) -> str:
     )
 
 
-def _patch(surface: trimesh.Trimesh, faces: np.ndarray, times: np.ndarray) -> Patch:
+def _patch(surface: trimesh.Trimesh, faces: np.ndarray, looks_of_face: np.ndarray) -> Patch:
     areas = surface.area_faces[faces]
     middle = np.average(surface.triangles_center[faces], axis=0, weights=areas)
-    return Patch(float(areas.sum()), middle, int(np.median(times[faces])))
+    return Patch(float(areas.sum()), middle, int(np.median(looks_of_face[faces])))

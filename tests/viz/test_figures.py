@@ -24,9 +24,9 @@ from jaxnbv.viz.data import ReportData
 from jaxnbv.viz.figures import STYLE, overview_figure
 from jaxnbv.viz.mean_surface import MeanSurface
 from jaxnbv.viz.space import clustered, figures_in_space
-from jaxnbv.viz.stage import stage_of
 from jaxnbv.viz.style import bar_ticks
-from jaxnbv.viz.task import Rival
+from jaxnbv.viz.task import Comparison
+from jaxnbv.viz.viewpoint import viewpoint_of
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def of_views(data, count):
     """The data of an episode with `count` views, the same ones repeated."""
     views = tuple(itertools.islice(itertools.cycle(data.views), count))
     charts = tuple(chart._replace(values=np.resize(chart.values, (count, 1))) for chart in data.task.charts)
-    return dataclasses.replace(data, views=views, task=data.task._replace(charts=charts, seen=charts[0]))
+    return dataclasses.replace(data, views=views, task=data.task._replace(charts=charts, coverage_chart=charts[0]))
 
 
 def texts(figure):
@@ -122,11 +122,11 @@ def test_the_ticks_of_any_range_have_room(data, low, monkeypatch):
 
 
 @pytest.mark.parametrize("names", [("one",), tuple("abcde"), tuple(f"a part of a name of {k}" for k in range(12))])
-@pytest.mark.parametrize("one_true", [True, False])
-def test_legends_of_the_task_have_room(data, names, one_true):
+@pytest.mark.parametrize("marks_true_name", [True, False])
+def test_legends_of_the_task_have_room(data, names, marks_true_name):
     values = np.linspace(0.0, 1.0, len(names))
-    chart = Chart("a quantity (units)", names, np.tile(values, (3, 1)), values[::-1], one_true, 0.9)
-    rival = Rival("farthest view", "", (chart._replace(values=np.tile(values, (7, 1))),), data.task.seen)
+    chart = Chart("a quantity (units)", names, np.tile(values, (3, 1)), values[::-1], marks_true_name, 0.9)
+    rival = Comparison("farthest view", "", (chart._replace(values=np.tile(values, (7, 1))),), data.task.coverage_chart)
     with mpl.rc_context(STYLE):
         ((_, figure),) = task_charts(dataclasses.replace(data, task=data.task._replace(charts=(chart,), rival=rival)))
         check_letters(figure)
@@ -183,13 +183,13 @@ def test_ten_views_of_fine_surfaces_make_a_small_page(data):
 
 
 def test_all_cameras_stand_beside_the_object_in_one_picture(episode):
-    stage = stage_of(episode, [ball().mesh])
-    assert np.linalg.norm(stage.eye) == pytest.approx(1.0)
+    viewpoint = viewpoint_of(episode, [ball().mesh])
+    assert np.linalg.norm(viewpoint.eye) == pytest.approx(1.0)
     for view in episode.views:
-        position = np.asarray(stage.pulled(view.pose).position, np.float64)
+        position = np.asarray(viewpoint.drawn_pose(view.pose).position, np.float64)
         distance = np.linalg.norm(position)
-        assert stage.radius < distance < np.linalg.norm(view.pose.position)
-        assert 1.09 * distance <= stage.extent
+        assert viewpoint.radius < distance < np.linalg.norm(view.pose.position)
+        assert 1.09 * distance <= viewpoint.extent
         np.testing.assert_allclose(position / distance, np.asarray(view.pose.position) / 2.5, atol=0.05)
 
 
@@ -201,7 +201,7 @@ def test_the_picture_is_drawn_from_where_what_the_chosen_views_saw_is_not_hidden
     sides = trimesh.creation.box((1.0, 1.0, 1.0))
     sides.apply_translation((0.5, 0.0, 0.0))
     sides.update_faces(sides.face_normals[:, 0] < 0.5)
-    assert stage_of(scanned, [sides]).eye[0] > 0.8 > stage_of(scanned, []).eye[0] > 0.2
+    assert viewpoint_of(scanned, [sides]).eye[0] > 0.8 > viewpoint_of(scanned, []).eye[0] > 0.2
 
 
 def test_a_record_without_standard_errors_is_drawn_too(data):

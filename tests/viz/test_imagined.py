@@ -8,7 +8,7 @@ import pytest
 import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.viz.data import report_data
-from jaxnbv.viz.imagined import look, looks
+from jaxnbv.viz.imagined import image_tiles, shaded_image
 
 CAMERA = nbv.Camera(1.0, 32, 32)
 TRUE_RADIUS = 1.0
@@ -63,10 +63,10 @@ def test_the_samples_are_those_of_the_step(episode):
     assert first.imagined is None
     num_pixels = [np.sum(sample.mask) for sample in second.imagined.samples]
     np.testing.assert_allclose(num_pixels, rim(radii[:4]), rtol=0.02)
-    tiles = [tile.name for tile in looks(second.imagined, second.look)]
+    tiles = [tile.name for tile in image_tiles(second.imagined, second.image)]
     assert tiles == [*(f"imagined {k}" for k in range(1, 5)), "then seen"]
-    assert second.look.mask.shape == (32, 32)
-    np.testing.assert_allclose(9 * second.look.mask.sum(), rim(TRUE_RADIUS), rtol=0.05)
+    assert second.image.mask.shape == (32, 32)
+    np.testing.assert_allclose(9 * second.image.mask.sum(), rim(TRUE_RADIUS), rtol=0.05)
 
 
 def test_what_was_seen_before_is_told_from_what_was_not(episode):
@@ -74,9 +74,9 @@ def test_what_was_seen_before_is_told_from_what_was_not(episode):
     cloud = 1.0 * np.asarray(nbv.geometry.fibonacci_sphere(4000), np.float64)
     pose = nbv.look_at((2.5, 0.0, 0.0))
     scan = nbv.scan(nbv.SDFSurface(Sphere(1.0)), CAMERA, pose)
-    image = look(scan, CAMERA, pose, cloud[cloud[:, 2] > 0])
+    image = shaded_image(scan, CAMERA, pose, cloud[cloud[:, 2] > 0])
     z = np.asarray(scan.points)[:, 2].reshape(32, 32)
-    assert image.known[image.mask & (z > 0.0)].all()
-    assert not image.known[~image.mask | (z < -0.25)].any()
-    assert not look(scan, CAMERA, pose, cloud[:0]).known.any()
-    assert 0.0 <= image.lit.min() <= image.lit.max() <= 1.0
+    assert image.is_seen[image.mask & (z > 0.0)].all()
+    assert not image.is_seen[~image.mask | (z < -0.25)].any()
+    assert not shaded_image(scan, CAMERA, pose, cloud[:0]).is_seen.any()
+    assert 0.0 <= image.brightness.min() <= image.brightness.max() <= 1.0

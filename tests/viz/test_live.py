@@ -33,7 +33,7 @@ def watched(tmp_path_factory):
 
 
 def handles(page):
-    return {handle.name: handle for handle in page._drawn}
+    return {handle.name: handle for handle in page._handles}
 
 
 def test_all_that_is_known_is_in_the_scene(watched):

@@ -67,8 +67,8 @@ def test_nothing_is_drawn_of_what_is_none_of_these():
     assert likeliest_part(hypotheses(0.3, 0.2, 0.1, 0.4)).name == "slab"
 
 
-def test_a_shape_of_a_bank_is_drawn_as_registered_and_the_others_as_a_ghost():
-    """The slab is the likelier kind; the cube is taller, and so is the ghost. Points lie on the slab's top."""
+def test_a_shape_of_a_bank_is_drawn_as_registered_and_the_others_as_disputed_space():
+    """The slab is the likelier kind; the cube is taller, and so is the disputed space. Points lie on the slab's top."""
     bank = nbv.ShapeBank.of([Cuboid([0.7, 0.7, 0.7]), Cuboid([0.9, 0.3, 0.5])], ("cube 1", "slab 1"))
     scale, still = jnp.array([[1.0, 1.0, 1.0], [1.0, 2.0, 1.0]]), jnp.tile(jnp.eye(3), (2, 1, 1))
     placed = Hypotheses(jnp.array([0, 1]), Placement(still, jnp.zeros((2, 3)), scale), jnp.zeros(2), jnp.ones(2, bool))
@@ -81,7 +81,7 @@ def test_a_shape_of_a_bank_is_drawn_as_registered_and_the_others_as_a_ghost():
     near = np.linalg.norm(shape.vertices - corner[0], axis=1)
     assert shape.measured[near < 0.05].min() == 1.0
     assert shape.measured[near > 0.3].max() == 0.0
-    np.testing.assert_allclose(np.abs(shape.ghost.vertices).max(axis=0), 0.7, atol=0.05)
+    np.testing.assert_allclose(np.abs(shape.disputed_space.vertices).max(axis=0), 0.7, atol=0.05)
     assert likeliest_shape(bank, placed, np.array([0.02, 0.03, 0.95]), cloud) is None
 
 
@@ -116,7 +116,7 @@ def test_a_report_shows_the_part_over_the_scan(episode):
     data = report_data(episode, progress=False)
     assert [view.surface.caption for view in data.views] == ["slab  75 %", "slab  75 %"]
     assert data.views[1].imagined.names == ("slab", "cube left")
-    assert task_of(episode).asked.endswith("over the likeliest parts and how they may lie.")
+    assert task_of(episode).choice_text.endswith("over the likeliest parts and how they may lie.")
     page = report_html(data, "thing")
     assert Page(page).tables["Probability"][1][0] == "view 1"
     for words in ("Which part is it?", "Slab, probability 0.75", "The likeliest known shape where it fits"):

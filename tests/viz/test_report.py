@@ -17,14 +17,14 @@ import jaxnbv as nbv
 from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.viz import report_data, write_report
-from jaxnbv.viz.answers import number
-from jaxnbv.viz.choice import best_first, marks, open_values
+from jaxnbv.viz.answers import number_text
+from jaxnbv.viz.choice import descending_values, marks, open_values
 from jaxnbv.viz.mean_surface import mean_surface
 from jaxnbv.viz.report import report_html
 from jaxnbv.viz.space import figures_in_space
 from jaxnbv.viz.sphere import on_map, smooth_map
 from jaxnbv.viz.style import log_ticks, middle_range
-from jaxnbv.viz.task import seen_after
+from jaxnbv.viz.task import coverage_answers
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +79,7 @@ def test_the_page_holds_every_view_and_escapes_its_title(report, episode, data):
     for matrix, figure_in_space, view, view_data in zip(
         poses_of(text), spatial, episode.views, data.views, strict=True
     ):
-        assert all(part in html.unescape(text) for part in view_data.told.values())
+        assert all(part in html.unescape(text) for part in view_data.sentences.values())
         np.testing.assert_allclose(matrix, view.pose.to_matrix(), atol=1e-5)
         (points,) = (trace for trace in figure_in_space["data"] if trace["name"] == "new points")
         assert points["x"]["dtype"] == "f4"
@@ -96,7 +96,9 @@ def test_what_is_drawn_in_space_stands_where_it_is(episode, data):
     places = {name: np.stack([trace.y, trace.z, trace.x], axis=1) for name, trace in traces.items()}
     np.testing.assert_allclose(places["new points"], episode.views[2].scan.to_numpy()[0], atol=1 / 500)
     np.testing.assert_allclose(places["points before"], episode.views[1].cloud.to_numpy()[0], atol=1 / 500)
-    np.testing.assert_allclose(places["new camera"][0], data.stage.pulled(episode.views[2].pose).position, atol=1 / 500)
+    np.testing.assert_allclose(
+        places["new camera"][0], data.viewpoint.drawn_pose(episode.views[2].pose).position, atol=1 / 500
+    )
 
 
 def test_poses_are_in_the_units_of_the_objects_file(episode, data):
@@ -110,14 +112,14 @@ def test_poses_are_in_the_units_of_the_objects_file(episode, data):
 
 
 def test_the_sentence_tells_the_numbers_of_the_step(episode, data):
-    view, said = episode.views[1], data.views[1].told
+    view, said = episode.views[1], data.views[1].sentences
     values = np.sort(np.asarray(view.proposal.values, np.float64))[::-1]
     values = values[np.isfinite(values)]
     assert f"the highest of {len(values)} open candidates" in said["What it promised"]
-    assert f"Best other {number(values[1])}, median {number(np.median(values))}" in said["Beside the others"]
+    assert f"Best other {number_text(values[1])}, median {number_text(np.median(values))}" in said["Beside the others"]
     assert "two standard errors" in said["Beside the others"]
     assert f"added {int(view.scan.count):,} points" in said["What came"]
-    before, after = (data.views[i].seen.values[0] for i in (0, 1))
+    before, after = (data.views[i].coverage.values[0] for i in (0, 1))
     assert f"coverage went from {before:.0f} % to {after:.0f} %" in said["What came"]
 
 
@@ -132,18 +134,18 @@ def test_of_a_scene_without_truth_the_area_that_was_seen_is_told(tmp_path, episo
     path = write_report(lone, tmp_path, progress=False)
     page = path.read_text(encoding="utf-8")
     assert "<h2>Surface seen (scene units²)</h2>" in page
-    area = report_data(lone, progress=False, imagine=False).views[0].seen.values[0]
+    area = report_data(lone, progress=False, imagine=False).views[0].coverage.values[0]
     assert area == pytest.approx(2.0 * np.pi * (1.0 - 1.0 / 2.5), rel=0.15)
-    assert f"<td>{number(area)}</td>" in page
+    assert f"<td>{number_text(area)}</td>" in page
     # The same view again adds nothing. A view from the other side adds as much again.
     behind = nbv.look_at((0.0, 0.0, -2.5))
     other = nbv.scan(nbv.SDFSurface(nbv.sdf.Sphere(1.0)), camera, behind)
     views = *lone.views, *lone.views, nbv.View(behind, other, other, None, camera)
-    once, again, both = (seen.values[0] for seen in seen_after(dataclasses.replace(lone, views=views), None))
+    once, again, both = (seen.values[0] for seen in coverage_answers(dataclasses.replace(lone, views=views), None))
     assert once == pytest.approx(again) == pytest.approx(area)
     assert both == pytest.approx(2.0 * area, rel=0.02)
     truth = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
-    assert report_data(lone, truth, progress=False).views[0].seen.values[0] in (0.0, 50.0, 100.0)
+    assert report_data(lone, truth, progress=False).views[0].coverage.values[0] in (0.0, 50.0, 100.0)
 
 
 class NoisySphere(nbv.surfaces.Fields):
@@ -214,7 +216,7 @@ def test_excluded_candidates_have_no_value():
     values = jnp.array([3.0, -jnp.inf, 5.0, 1.0, 4.0])
     proposal = nbv.search.Proposal(poses[0], values[0], poses, values)
     np.testing.assert_array_equal(open_values(proposal), [3.0, np.nan, 5.0, 1.0, 4.0])
-    np.testing.assert_array_equal(best_first(proposal), [5.0, 4.0, 3.0, 1.0])
+    np.testing.assert_array_equal(descending_values(proposal), [5.0, 4.0, 3.0, 1.0])
     assert marks(proposal) == ["× visited"]
 
 
@@ -239,4 +241,4 @@ def test_the_map_keeps_values():
 def test_ranges_and_ticks_are_round():
     assert middle_range(np.linspace(0.0, 0.09, 1001)[14:]) == pytest.approx((0.002, 0.1))
     np.testing.assert_allclose(log_ticks(0.001, 0.1), [0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1])
-    assert [number(value) for value in (0.001234, 186.59, 1234.5, -2.0)] == ["0.00123", "187", "1,234", "−2"]
+    assert [number_text(value) for value in (0.001234, 186.59, 1234.5, -2.0)] == ["0.00123", "187", "1,234", "−2"]

@@ -18,11 +18,11 @@ from jaxnbv.tasks.classification import ClassAnswer, Classifier
 from jaxnbv.tasks.heat import Coldest
 from jaxnbv.tasks.segmentation import PartAnswer
 from jaxnbv.utility import Answer
-from jaxnbv.viz.answers import number, words_of
+from jaxnbv.viz.answers import number_text, words_of
 from jaxnbv.viz.charts import task_charts
 from jaxnbv.viz.data import report_data
 from jaxnbv.viz.report import report_html
-from jaxnbv.viz.task import lost_again, race_words, since, task_of, true_cloud
+from jaxnbv.viz.task import first_lost, first_reliable, rival_text, task_of, true_cloud
 
 KEY = jax.random.key(0)
 
@@ -102,7 +102,7 @@ def test_a_utility_of_ones_own_has_its_chart_and_its_truth(plain):
     header, *rows, true = Page(text).tables["Greatest height"]
     assert header == ["greatest height"]
     heights = [float(view.cloud.to_numpy()[0][:, 1].max()) for view in episode.views]
-    assert [row[1] for row in rows] == [number(height) for height in heights]
+    assert [row[1] for row in rows] == [number_text(height) for height in heights]
     assert float(true[1]) == pytest.approx(0.9, abs=0.01)
     assert "<h1>Greatest height?" in text
     settled = abs(heights[-1] / heights[-2] - 1.0) < 0.05
@@ -115,7 +115,7 @@ def test_coverage_by_view_is_the_share_of_the_truth_that_was_seen(plain):
     data = report_data(episode, truth, progress=False, imagine=False)
     _, *rows = Page(report_html(data, "ball")).tables["Surface seen (%)"]
     assert [row[1] for row in rows] == [
-        number(100.0 * share) for share in nbv.scanning.metrics.coverage(episode.views, truth)
+        number_text(100.0 * share) for share in nbv.scanning.metrics.coverage(episode.views, truth)
     ]
 
 
@@ -197,14 +197,14 @@ def settled(answers):
     ],
 )
 def test_since_when_an_answer_can_be_relied_on(answers, view):
-    assert since(settled(answers)) == view
+    assert first_reliable(settled(answers)) == view
 
 
 @pytest.mark.parametrize(
     ("answers", "view"), [(classes(0.5, 0.96, 0.97), None), (classes(0.96, 0.9, 0.97), 1), (classes(0.5, 0.6), None)]
 )
 def test_an_answer_that_was_lost_again_is_told(answers, view):
-    assert lost_again(settled(answers)) == view
+    assert first_lost(settled(answers)) == view
 
 
 def test_a_class_that_halves_of_the_points_do_not_tell_is_sure_nowhere():
@@ -219,7 +219,7 @@ def test_a_class_that_halves_of_the_points_do_not_tell_is_sure_nowhere():
     assert episode.stop_reason is None
     task = task_of(episode)
     assert task.answers[-1].values.max() > 0.95
-    assert task.sure.startswith("Not yet after 2 views")
+    assert task.reliability_text.startswith("Not yet after 2 views")
     # Without halves to classify, the first view is enough.
     assert nbv.Sure(0.95, 0).reason(planner.acquisition, episode.cloud, KEY) is not None
 
@@ -232,19 +232,21 @@ def test_a_rival_is_told_of_and_drawn(plain):
     rival = data.task.rival
     p = np.exp(np.asarray(Leaning()(other.cloud), np.float64))
     text = f"{NAMES[int(np.argmax(p))]}, probability {p.max():.2f}"
-    assert rival.words == f"Farthest view took 3 views from the same start ({text})."
+    assert rival.sentence == f"Farthest view took 3 views from the same start ({text})."
     ended = dataclasses.replace(episode, stop_reason="sure of it")
-    assert race_words(other, ended) == f"Farthest view was not done after 3 views from the same start ({text})."
-    assert race_words(dataclasses.replace(other, stop_reason="sure of it"), ended).startswith(
+    assert rival_text(other, ended) == f"Farthest view was not done after 3 views from the same start ({text})."
+    assert rival_text(dataclasses.replace(other, stop_reason="sure of it"), ended).startswith(
         "Farthest view needed 3 views"
     )
-    assert report_data(ended, progress=False, imagine=False).task.sure.endswith("It ended by its rule: sure of it.")
+    assert report_data(ended, progress=False, imagine=False).task.reliability_text.endswith(
+        "It ended by its rule: sure of it."
+    )
     np.testing.assert_allclose(rival.charts[0].values[2], p, atol=1e-6)
     truth = nbv.scanning.metrics.truth_points(scene, jax.random.key(0))
     np.testing.assert_allclose(
-        rival.seen.values[:, 0], 100.0 * np.array(nbv.scanning.metrics.coverage(other.views, truth))
+        rival.coverage_chart.values[:, 0], 100.0 * np.array(nbv.scanning.metrics.coverage(other.views, truth))
     )
-    assert rival.words in report_html(data, "thing")
+    assert rival.sentence in report_html(data, "thing")
     ((_, figure),) = task_charts(data)
     (axes,) = figure.axes
     drawn = [line.get_ydata() for line in axes.lines]
@@ -259,7 +261,7 @@ def test_a_rival_is_asked_what_the_episode_is_asked(plain):
     (chart,) = report_data(run(score, scene, 2), progress=False, imagine=False, rival=other).task.rival.charts
     assert chart.names == NAMES
     rival = report_data(other, progress=False, imagine=False, rival=run(score, scene, 1)).task.rival
-    assert rival.words == "Random view took 1 view from the same start."
+    assert rival.sentence == "Random view took 1 view from the same start."
     assert rival.charts[0].label == "surface seen (%)"
 
 

@@ -11,16 +11,16 @@ from matplotlib.figure import Figure
 from small_run import CAMERA, small_run
 
 import jaxnbv as nbv
-from jaxnbv.cli.lines import Lines
+from jaxnbv.cli.lines import ViewPrinter
 from jaxnbv.geometry.pose import look_at
 from jaxnbv.search import Search, Trajectories
 from jaxnbv.search.base import best_unvisited
 from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.viz import report_data, sphere
-from jaxnbv.viz.answers import CoverageAnswer, number
+from jaxnbv.viz.answers import CoverageAnswer, number_text
 from jaxnbv.viz.choice import draw_acquisition
 from jaxnbv.viz.report import report_html
-from jaxnbv.viz.words import told
+from jaxnbv.viz.words import sentences_about
 
 COVERAGE, LOTS = (search.quantity(nbv.Coverage()) for search in (nbv.DiscreteSearch(), nbv.RandomView()))
 
@@ -51,7 +51,7 @@ class Walks(Search):
 def coarse():
     """Trace surfaces at a quarter of the pixels on each side, since tracing takes most of the time of a picture."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("jaxnbv.viz.render._STILL", 160)
+        patch.setattr("jaxnbv.viz.render._STILL_SIZE", 160)
         yield
 
 
@@ -95,7 +95,7 @@ def said_of(value, others, starts=0, pose=None, standard_error=None, quantity=CO
     scan = nbv.PointCloud.from_arrays(np.eye(3), np.eye(3))
     views = [nbv.View(first, scan, scan, None, CAMERA), nbv.View(pose, scan, scan, looked, CAMERA)]
     answers = [CoverageAnswer(("of surface seen",), np.array([area]), unit="scene units²") for area in (0.2, 0.3)]
-    return " ".join(told(quantity, views, answers, nbv.Frame()).values())
+    return " ".join(sentences_about(quantity, views, answers, nbv.Frame()).values())
 
 
 @pytest.mark.parametrize(
@@ -128,17 +128,17 @@ def test_words_say_where_a_camera_looks_past_the_centre():
 
 
 def test_the_sentence_and_the_summary_tell_the_numbers_of_the_step(few, few_data, capsys):
-    said = few_data.views[1].told
+    said = few_data.views[1].sentences
     proposal = few.views[1].proposal
     best = float(np.max(proposal.values))
     assert said["What it promised"].endswith("was found by gradient ascent from 4 starts.")
-    assert said["Beside the others"].startswith(f"Best candidate {number(best)}, median")
-    lines = Lines(few.planner)
+    assert said["Beside the others"].startswith(f"Best candidate {number_text(best)}, median")
+    lines = ViewPrinter(few.planner)
     for one in few.views:
         lines(one)
     first, _, second = capsys.readouterr().out.splitlines()[:3]
     assert first == "views are chosen by expected coverage gain (scene units²)"
-    assert second.endswith(f"points   {number(float(proposal.value))}, by ascent from {number(best)}")
+    assert second.endswith(f"points   {number_text(float(proposal.value))}, by ascent from {number_text(best)}")
 
 
 def test_a_page_of_a_search_by_gradient(few_data):

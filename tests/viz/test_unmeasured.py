@@ -10,7 +10,7 @@ import trimesh
 import jaxnbv as nbv
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.scanning import Carving
-from jaxnbv.viz.unmeasured import unmeasured, unmeasured_words
+from jaxnbv.viz.unmeasured import unmeasured, unmeasured_text
 
 RADIUS, DARK, GRID, CAMERA = 0.6, 0.4, nbv.Grid(61, 1.2), nbv.Camera(0.6, 60, 60)
 MESH = trimesh.creation.icosphere(5, RADIUS)
@@ -40,7 +40,7 @@ def test_a_cap_that_two_views_did_not_measure_is_one_patch():
     assert patch.area == pytest.approx(2.0 * np.pi * RADIUS * (RADIUS - DARK), abs=rim)
     np.testing.assert_allclose(patch.middle, [0.0, 0.0, 0.5 * (RADIUS + DARK)], atol=GRID.spacing)
     assert patch.looks == 2
-    words = unmeasured_words([patch], Frame())
+    words = unmeasured_text([patch], Frame())
     assert "(2 looks)" in words
     assert f"about ({patch.middle[0]:.2f}".replace("-", "−") in words
 

@@ -7,7 +7,7 @@ from scipy.spatial import ConvexHull
 import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Capsule
 from jaxnbv.viz import report_data
-from jaxnbv.viz.mean_surface import MeanSurface, as_shown
+from jaxnbv.viz.mean_surface import MeanSurface, near_points
 
 
 def test_the_deviation_allows_for_a_quarter_of_the_distance_to_the_nearest_point():
@@ -16,11 +16,11 @@ def test_the_deviation_allows_for_a_quarter_of_the_distance_to_the_nearest_point
     surface = MeanSurface(vertices, ConvexHull(vertices).simplices, vertices, np.full(200, 0.03))
     # Empty rows are at the origin, and must not count as points.
     cloud = nbv.PointCloud.from_arrays(vertices[:1], vertices[:1], capacity=4)
-    result = as_shown(surface, cloud)
+    result = near_points(surface, cloud)
     chord = 2 * np.sin(0.5 * np.arccos(np.clip(vertices @ vertices[0], -1, 1)))
     np.testing.assert_allclose(result.deviation, np.sqrt(0.03**2 + (chord / 4) ** 2), rtol=1e-5)
     np.testing.assert_array_equal(result.vertices, vertices)
-    assert as_shown(None, cloud) is None
+    assert near_points(None, cloud) is None
 
 
 def test_pieces_that_hold_no_points_are_not_shown():
@@ -31,10 +31,10 @@ def test_pieces_that_hold_no_points_are_not_shown():
     both = np.concatenate([ball, other])
     surface = MeanSurface(both, np.concatenate([faces, faces + 200]), np.concatenate([ball, ball]), np.full(400, 0.03))
     cloud = nbv.PointCloud.from_arrays(ball[:1], ball[:1])
-    result = as_shown(surface, cloud)
+    result = near_points(surface, cloud)
     np.testing.assert_array_equal(result.vertices, ball)
     np.testing.assert_array_equal(result.faces, faces)
-    assert as_shown(surface, nbv.PointCloud.from_arrays([[1.5, 9.0, 0.0]], [[0.0, 1.0, 0.0]])) is None
+    assert near_points(surface, nbv.PointCloud.from_arrays([[1.5, 9.0, 0.0]], [[0.0, 1.0, 0.0]])) is None
 
 
 def test_an_end_beyond_the_images_border_is_never_shown_as_certain():

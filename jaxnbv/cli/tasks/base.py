@@ -5,7 +5,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
-from jaxnbv.cli.options import asking
+from jaxnbv.cli.options import task_option
 
 if TYPE_CHECKING:
     from jaxnbv.acquisition import Acquisition
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from jaxnbv.scanning.sensors import Setting
     from jaxnbv.surfaces import ShapeBank
 
-network_option = asking(
+network_option = task_option(
     metavar="FILE", help="Network, .pth or .safetensors: a classifier for tasks about the class, a segmenter for parts."
 )
 
@@ -84,10 +84,10 @@ class Task(ABC):
         """
 
 
-def usual_first(radius: float | None = None) -> "Pose":
+def default_first_pose(radius: float | None = None) -> "Pose":
     """Return the default first pose: at (0.8, 0.9, 2.2), or in this direction at distance `radius`."""
     from jaxnbv.geometry.pose import look_at
 
-    usual = (0.8, 0.9, 2.2)
-    scale = 1.0 if radius is None else radius / math.hypot(*usual)
-    return look_at(tuple(scale * x for x in usual))
+    direction = (0.8, 0.9, 2.2)
+    scale = 1.0 if radius is None else radius / math.hypot(*direction)
+    return look_at(tuple(scale * x for x in direction))

@@ -28,14 +28,14 @@ class ClassTask(Task):
 
     @classmethod
     @abstractmethod
-    def compared(cls, classifier: "Classifier") -> "Acquisition":
+    def make_acquisition(cls, classifier: "Classifier") -> "Acquisition":
         """Make the acquisition from a classifier."""
 
     def acquisition(self, mesh: "TriangleMesh", camera: "Camera", first: "Pose") -> "Acquisition":
         from jaxnbv.networks import CloudClassifier, load_checkpoint, network_scale
 
         network = load_checkpoint(self.network)
-        return self.compared(CloudClassifier(network, scale=network_scale(network)))
+        return self.make_acquisition(CloudClassifier(network, scale=network_scale(network)))
 
     @classmethod
     def demo(cls, scene: int, seed: int) -> Subject:
@@ -52,10 +52,10 @@ class ClassTask(Task):
         from jaxnbv.studies.scenes import HOUSEHOLD, Framing, Split, hidden_view, truck_scene
 
         truck = truck_scene(Split.TEST, scene, is_rotated=False)
-        around = sphere_candidates(120)
-        first = hidden_view(truck, jax.random.key(seed), poses=around[np.asarray(around.position[:, 1]) > 0])
+        poses = sphere_candidates(120)
+        first = hidden_view(truck, jax.random.key(seed), poses=poses[np.asarray(poses.position[:, 1]) > 0])
         side = Framing.CLOSE_UP.longest_side
-        acquisition = cls.compared(pretrained_classifier("truck", side, num_points=_NUM_POINTS))
+        acquisition = cls.make_acquisition(pretrained_classifier("truck", side, num_points=_NUM_POINTS))
         note = f"the truck carries a {HOUSEHOLD[int(truck.label)]}, which the first view does not show"
         grid, question = Grid(64, 0.7 * side), "What does the truck carry?"
         return Subject("truck", SDFSurface(truck), acquisition, first, "truck", grid, note, question)
@@ -66,7 +66,7 @@ class CrossEntropyTask(ClassTask):
     about = "the object's class"
 
     @classmethod
-    def compared(cls, classifier: "Classifier") -> "Acquisition":
+    def make_acquisition(cls, classifier: "Classifier") -> "Acquisition":
         from jaxnbv.tasks import CrossEntropy
 
         return CrossEntropy(classifier)
@@ -77,7 +77,7 @@ class EntropyTask(ClassTask):
     about = "its class, by reduction of entropy"
 
     @classmethod
-    def compared(cls, classifier: "Classifier") -> "Acquisition":
+    def make_acquisition(cls, classifier: "Classifier") -> "Acquisition":
         from jaxnbv.tasks import EntropyReduction
 
         return EntropyReduction(classifier)
@@ -88,7 +88,7 @@ class MixedTask(ClassTask):
     about = "its class, first by cross-entropy, then by reduction of entropy"
 
     @classmethod
-    def compared(cls, classifier: "Classifier") -> "Acquisition":
+    def make_acquisition(cls, classifier: "Classifier") -> "Acquisition":
         from jaxnbv.tasks import MixedEntropy
 
         return MixedEntropy(classifier)

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from jaxnbv.cli.tasks.base import Subject, Task, usual_first
+from jaxnbv.cli.tasks.base import Subject, Task, default_first_pose
 
 if TYPE_CHECKING:
     from jaxnbv.acquisition import Acquisition
@@ -27,4 +27,4 @@ class CoverageTask(Task):
         from jaxnbv.studies.scenes import demo_object
         from jaxnbv.tasks import NewSurface
 
-        return Subject("mug", demo_object(), NewSurface(), usual_first())
+        return Subject("mug", demo_object(), NewSurface(), default_first_pose())

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
-from jaxnbv.cli.options import Position, asking
+from jaxnbv.cli.options import Position, task_option
 from jaxnbv.cli.tasks.base import Subject, Task
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ class HeatTask(Task):
     example = "a procedural body of one of four kinds, heated at one place"
     source: Annotated[
         Position | None,
-        asking(
+        task_option(
             metavar="X Y Z",
             help="For heat: position in scene units. The object is heated at its nearest point to this.",
             show_default="the middle of the first view",
@@ -40,7 +40,7 @@ class HeatTask(Task):
         return HEAT_SETTING
 
     def acquisition(self, mesh: "TriangleMesh", camera: "Camera", first: "Pose") -> "Acquisition":
-        return _heated_at(_source(self.source, mesh, camera, first))
+        return _coldest_acquisition(_source(self.source, mesh, camera, first))
 
     @classmethod
     def demo(cls, scene: int, seed: int) -> Subject:
@@ -49,31 +49,39 @@ class HeatTask(Task):
 
         from jaxnbv.studies.scenes import heat_scene, source_view
 
-        heated = heat_scene(scene)
-        first = source_view(heated, jax.random.key(seed))
-        return Subject(heated.name, heated.surface, _heated_at(np.asarray(heated.source)), first, bank="heat")
+        heat_object = heat_scene(scene)
+        first = source_view(heat_object, jax.random.key(seed))
+        return Subject(
+            heat_object.name,
+            heat_object.surface,
+            _coldest_acquisition(np.asarray(heat_object.source)),
+            first,
+            bank="heat",
+        )
 
 
-def _heated_at(source: "Float[np.ndarray, '3']") -> "Acquisition":
+def _coldest_acquisition(source: "Float[np.ndarray, '3']") -> "Acquisition":
     from jaxnbv.acquisition import ExpectedUtilityImprovement
     from jaxnbv.tasks import ColdestPoint
 
     return ExpectedUtilityImprovement(ColdestPoint(source), _NUM_POINTS)
 
 
-def _source(place: Position | None, mesh: "TriangleMesh", camera: "Camera", first: "Pose") -> "Float[np.ndarray, '3']":
-    """Return the object's point nearest to `place`, or else the point in the middle of the first view."""
+def _source(
+    position: Position | None, mesh: "TriangleMesh", camera: "Camera", first: "Pose"
+) -> "Float[np.ndarray, '3']":
+    """Return the object's point nearest to `position`, or else the point in the middle of the first view."""
     import jax
     import numpy as np
 
     from jaxnbv.checks import require
     from jaxnbv.scanning import scan
 
-    if place is not None:
+    if position is not None:
         points = mesh.sample_points(jax.random.key(0), 20_000)
-        return points[np.linalg.norm(points - place, axis=1).argmin()]
+        return points[np.linalg.norm(points - position, axis=1).argmin()]
     points, _ = scan(mesh, camera, first).to_numpy()
     require(len(points) > 0, "the first view does not see the object: give another --first, or a --source")
-    away, forward = points - np.asarray(first.position), np.asarray(first.forward)
-    beside = np.linalg.norm(away - (away @ forward)[:, None] * forward, axis=1)
-    return points[beside.argmin()]
+    offsets, forward = points - np.asarray(first.position), np.asarray(first.forward)
+    distances = np.linalg.norm(offsets - (offsets @ forward)[:, None] * forward, axis=1)
+    return points[distances.argmin()]

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from jaxnbv.cli.options import asking
+from jaxnbv.cli.options import task_option
 from jaxnbv.cli.tasks.base import Subject, Task
 
 if TYPE_CHECKING:
@@ -30,11 +30,11 @@ class IdentifyTask(Task):
     until = ("identified=0.95",)
     parts: Annotated[
         Path,
-        asking(metavar="FOLDER", help="For identify: folder with a mesh of each part that the object may be."),
+        task_option(metavar="FOLDER", help="For identify: folder with a mesh of each part that the object may be."),
     ]
     parts_scale: Annotated[
         str,
-        asking(
+        task_option(
             metavar="UNIT",
             help="For identify: unit of the parts, a number of MESH units, or mm, cm, m, in, ft for a MESH in metres.",
             show_default="1",
@@ -76,10 +76,10 @@ class IdentifyTask(Task):
         bank = ShapeBank.from_meshes(meshes, names=tuple(housings), scale=1.0, progress=False)
         index = scene % len(housings)
         name, solid = list(housings.items())[index]
-        turn = Rotation.random(random_state=scene)
-        frame = Frame(2.5 / float(np.ptp(turn.apply(bank.extremes[index]), axis=0).max()))
-        surface = SDFSurface(solid.rotate(turn.as_rotvec(), turn.magnitude()).scale(frame.scale))
-        first = look_at(_RADIUS * turn.apply(_FIRST) / np.linalg.norm(_FIRST))
+        rotation = Rotation.random(random_state=scene)
+        frame = Frame(2.5 / float(np.ptp(rotation.apply(bank.extremes[index]), axis=0).max()))
+        surface = SDFSurface(solid.rotate(rotation.as_rotvec(), rotation.magnitude()).scale(frame.scale))
+        first = look_at(_RADIUS * rotation.apply(_FIRST) / np.linalg.norm(_FIRST))
         note = f"the object is the housing with {name}; the first view does not look into its pocket"
         return Subject("housing", surface, Identify(), first, bank.in_scene(frame), note=note)
 

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from jaxnbv.cli.options import asking
-from jaxnbv.cli.tasks.base import Subject, Task, network_option, usual_first
+from jaxnbv.cli.options import task_option
+from jaxnbv.cli.tasks.base import Subject, Task, default_first_pose, network_option
 
 if TYPE_CHECKING:
     from jaxnbv.acquisition import Acquisition
@@ -27,7 +27,7 @@ class PartTask(Task):
     until = ("parts-found=60",)
     category: Annotated[
         str,
-        asking(
+        task_option(
             metavar="NAME",
             help="For parts: category of the object in ShapeNet-part. It must stand upright along y and face x.",
         ),
@@ -46,12 +46,12 @@ class PartTask(Task):
 
         if self.network is not None:
             network = load_checkpoint(self.network)
-            return _counting(CloudSegmenter(network, self.category, scale=network_scale(network)))
+            return _part_acquisition(CloudSegmenter(network, self.category, scale=network_scale(network)))
         require(
             self.category not in _UNKNOWN_TO_SEGMENTER,
             f"--category {self.category}: the shipped segmenter was not trained on it: give --network FILE",
         )
-        return _counting(part_segmenter(self.category))
+        return _part_acquisition(part_segmenter(self.category))
 
     @classmethod
     def demo(cls, scene: int, seed: int) -> Subject:
@@ -59,13 +59,13 @@ class PartTask(Task):
         from jaxnbv.scanning import SDFSurface
         from jaxnbv.studies.scenes import Split, part_scene
 
-        thing = part_scene(Split.TEST, scene)
-        category = CATEGORIES[int(thing.category)].name
-        acquisition = _counting(part_segmenter(category))
-        return Subject(category, SDFSurface(thing.solid), acquisition, usual_first(), bank="parts")
+        part_object = part_scene(Split.TEST, scene)
+        category = CATEGORIES[int(part_object.category)].name
+        acquisition = _part_acquisition(part_segmenter(category))
+        return Subject(category, SDFSurface(part_object.solid), acquisition, default_first_pose(), bank="parts")
 
 
-def _counting(segmenter: "CloudSegmenter") -> "Acquisition":
+def _part_acquisition(segmenter: "CloudSegmenter") -> "Acquisition":
     from jaxnbv.acquisition import ExpectedUtilityImprovement
     from jaxnbv.tasks import SoftPartCount
 

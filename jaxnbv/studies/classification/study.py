@@ -36,7 +36,7 @@ from jaxnbv.studies.scenes import ClassObject, ClassSet, FirstView, Framing, Spl
 from jaxnbv.studies.scenes.class_object import ClassMesh, scan_cue, surface_of
 from jaxnbv.tasks import Coverage, CrossEntropy, EntropyReduction, MixedEntropy
 from jaxnbv.tasks.classification import AnyClassifier, ClassAcquisition, Classifier, as_classifier
-from jaxnbv.viz.style import NEW, framed
+from jaxnbv.viz.style import NEW, draw_border
 
 # Number of runs of random search in each scene.
 _NUM_RANDOM_RUNS = 8
@@ -316,7 +316,7 @@ class ClassificationStudy(Study):
         def tile(axes: Axes, method: str, view: int) -> None:
             axes.imshow(_image(scene, camera, poses[method][view], bool(self.cue)), interpolation="antialiased")
             if self.cue and runs[method]["pixels"][0][view] >= CUE_PIXELS:
-                framed(axes, NEW, 1.6)
+                draw_border(axes, NEW, 1.6)
             log_p = runs[method]["log_p"][0][view]
             guess = int(np.argmax(log_p))
             caption_tile(axes, f"{names[guess]} {np.exp(log_p[guess]):.0%}", guess == record["label"])

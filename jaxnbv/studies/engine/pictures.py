@@ -14,7 +14,7 @@ from jaxnbv.studies.engine.measures import Record
 from jaxnbv.studies.engine.study import Study
 from jaxnbv.studies.engine.tiles import ScenePicture
 from jaxnbv.viz.figures import STYLE
-from jaxnbv.viz.style import LINE, framed, save_figure
+from jaxnbv.viz.style import LINE, draw_border, save_figure
 
 # Inches: size of a tile, and the margins beside and above the grid.
 _TILE_SIZE, _SIDE_MARGIN, _TOP_MARGIN = (1.75, 1.95), 0.35, 0.75
@@ -62,7 +62,7 @@ def _draw_picture(picture: ScenePicture, record: Record, methods: Sequence[str])
         axes.set_title(title, fontsize=9, loc="center", pad=4)
     for row, (method, run) in enumerate(zip(methods, runs, strict=True)):
         for axes in grid[row]:
-            framed(axes, LINE, 0.8)
+            draw_border(axes, LINE, 0.8)
         if picture.truth is not None:
             picture.truth(grid[row, 0]) if row == 0 else grid[row, 0].axis("off")
         for column, axes in enumerate(grid[row, start:]):
@@ -91,7 +91,7 @@ def _draw_one_tile_per_method(picture: ScenePicture, record: Record, methods: Se
     for axes in grid.ravel()[len(cells) :]:
         axes.axis("off")
     for axes, (name, method) in zip(grid.ravel(), cells, strict=False):
-        framed(axes, LINE, 0.8)
+        draw_border(axes, LINE, 0.8)
         axes.set_title(name, fontsize=9, loc="center", pad=4)
         if method is not None:
             picture.tile(axes, method, 0)
