@@ -27,7 +27,7 @@ _SIZE = 0.05
 _POINTS = 1024
 
 
-def _many() -> int:
+def _large_batch() -> int:
     """Return the batch size for scores that are cheap to compute."""
     return 128 if on_cpu() else 2048
 
@@ -54,7 +54,7 @@ class Coverage(Acquisition):
     @property
     def batch_size(self) -> int:
         """Number of scans to score together: large, because one loop over D computes the scores of all scans."""
-        return _many()
+        return _large_batch()
 
 
 class Newness(eqx.Module):
@@ -125,7 +125,7 @@ class NewSurface(Acquisition):
     @property
     def batch_size(self) -> int:
         """Number of scans to score together: large, because a score is cheap to compute."""
-        return _many()
+        return _large_batch()
 
 
 def new_surface_of(acquisition: Acquisition) -> NewSurface:
@@ -153,12 +153,12 @@ def seen_share(
     - `views`: poses of the views so far.
     - `barrier`: distances to obstacles from `poses`, see `scan`.
     """
-    areas = shared_map(_areas_shown, surfaces, newness, camera, poses, views, barrier)
+    areas = shared_map(_visible_areas, surfaces, newness, camera, poses, views, barrier)
     seen_area, visible_area = jnp.sum(areas, axis=0)
     return jnp.where(visible_area > 0, seen_area / jnp.where(visible_area > 0, visible_area, 1.0), 1.0)
 
 
-def _areas_shown(
+def _visible_areas(
     surface: GridSurface,
     newness: Newness,
     camera: Camera,
@@ -169,9 +169,9 @@ def _areas_shown(
     """Return two areas of one sample: the visible area that has been seen, and the whole visible area."""
     points = spread_points(surface, _POINTS)
     tolerance = surface.grid.spacing
-    is_shown = jnp.any(is_visible(surface, camera, poses, points, tolerance, barrier), axis=0)
+    is_in_view = jnp.any(is_visible(surface, camera, poses, points, tolerance, barrier), axis=0)
     is_seen = newness(points.points) <= 0
     if isinstance(newness.distances, Looks):
-        own = is_visible(surface, newness.distances.camera, views.rows, points, tolerance)
-        is_seen &= jnp.any(own & views.is_filled[:, None], axis=0)
-    return jnp.stack([jnp.sum(points.areas, where=is_seen & is_shown), jnp.sum(points.areas, where=is_shown)])
+        is_in_earlier_view = is_visible(surface, newness.distances.camera, views.rows, points, tolerance)
+        is_seen &= jnp.any(is_in_earlier_view & views.is_filled[:, None], axis=0)
+    return jnp.stack([jnp.sum(points.areas, where=is_seen & is_in_view), jnp.sum(points.areas, where=is_in_view)])

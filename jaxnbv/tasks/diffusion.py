@@ -124,8 +124,8 @@ def cloud_laplacian(points: Float[np.ndarray, "n 3"]) -> Laplacian:
     """
     if len(points) == 3:
         # The library reads uninitialised memory if there are only two neighbours.
-        one = np.linalg.matrix_rank(points[1:] - points[0]) == 2
-        return mesh_laplacian(points, np.array([[0, 1, 2]])) if one else _nothing(3)
+        is_triangle = np.linalg.matrix_rank(points[1:] - points[0]) == 2
+        return mesh_laplacian(points, np.array([[0, 1, 2]])) if is_triangle else _insulator(3)
     neighbours = min(_NEIGHBOURS, len(points) - 1)
     laplacian = optional("robust_laplacian").point_cloud_laplacian
     return _assemble(lambda: laplacian(points, n_neighbors=neighbours), len(points))
@@ -136,21 +136,21 @@ def mesh_laplacian(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f
     return _assemble(lambda: optional("robust_laplacian").mesh_laplacian(vertices, faces), len(vertices))
 
 
-def _nothing(count: int) -> Laplacian:
+def _insulator(count: int) -> Laplacian:
     """Return the Laplacian of points that conduct no heat."""
     return Laplacian(sparse.csc_matrix((count, count)), np.ones(count))
 
 
 def _assemble(build: Callable, count: int) -> Laplacian:
     if count < 3:
-        return _nothing(count)
+        return _insulator(count)
     try:
         weak, mass = build()
     except RuntimeError as error:
         # The library raises this error if there is no triangle at all.
         if "unreferenced vertex" not in str(error):
             raise
-        return _nothing(count)
+        return _insulator(count)
     # The library couples a point without triangles to zero degrees. With rows that sum to zero, the point is isolated.
     flow = weak - sparse.diags(weak.diagonal())
     flow.eliminate_zeros()
@@ -185,8 +185,8 @@ def cloud_temperature(points: Float[np.ndarray, "n 3"], heat: HeatProblem) -> Te
 
     **Raises:** `ValueError` for points that are not finite.
     """
-    points, place = _merge(points)
-    return _solve(cloud_laplacian(points), points, place, heat)
+    points, rows = _merge(points)
+    return _solve(cloud_laplacian(points), points, rows, heat)
 
 
 def mesh_temperature(
@@ -199,31 +199,33 @@ def mesh_temperature(
 
     **Raises:** `ValueError` for vertices that are not finite.
     """
-    vertices, place = _merge(vertices)
-    faces = place[faces]
-    solid = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
-    return _solve(mesh_laplacian(vertices, faces[solid]), vertices, place, heat)
+    vertices, rows = _merge(vertices)
+    faces = rows[faces]
+    is_proper = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    return _solve(mesh_laplacian(vertices, faces[is_proper]), vertices, rows, heat)
 
 
 def _merge(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the distinct points, sorted, and the row of each point among the distinct points."""
-    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
-    require(bad.size == 0, f"{bad.size} points are not finite, the first at row {bad[:1]}: drop these rows")
-    distinct, place = np.unique(np.asarray(points, np.float64), axis=0, return_inverse=True)
-    return distinct, place.reshape(-1)
+    bad_rows = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    require(
+        bad_rows.size == 0, f"{bad_rows.size} points are not finite, the first at row {bad_rows[:1]}: drop these rows"
+    )
+    distinct, rows = np.unique(np.asarray(points, np.float64), axis=0, return_inverse=True)
+    return distinct, rows.reshape(-1)
 
 
-def _solve(laplacian: Laplacian, points: np.ndarray, place: np.ndarray, heat: HeatProblem) -> Temperature:
+def _solve(laplacian: Laplacian, points: np.ndarray, rows: np.ndarray, heat: HeatProblem) -> Temperature:
     heating = heat.heating(points, laplacian.mass)
     # No heat flows between different connected components.
     _, pieces = connected_components(laplacian.weak, directed=False)
-    reached = np.isin(pieces, pieces[heating != 0.0])
+    is_reached = np.isin(pieces, pieces[heating != 0.0])
     values = np.full(len(points), float(heat.initial))
-    if reached.any():
+    if is_reached.any():
         values = diffuse(laplacian, values, heating, heat.duration, heat.steps)
         # The solver makes rounding errors, but the initial temperature must be exact.
-        values[~reached] = heat.initial
-    return Temperature(values[place], reached[place])
+        values[~is_reached] = heat.initial
+    return Temperature(values[rows], is_reached[rows])
 
 
 def refine(
@@ -257,8 +259,8 @@ def _split_faces(faces: np.ndarray, halves: np.ndarray) -> np.ndarray:
     count = (halves >= 0).sum(axis=1)
     # Rotate each triangle: one midpoint is then on the first edge, and two are on the first and second edges.
     first = np.where(count == 2, np.argmin(halves, axis=1) + 1, np.argmax(halves, axis=1))
-    turn = (first[:, None] + np.arange(3)) % 3
-    (a, b, c), (x, y, z) = (np.take_along_axis(rows, turn, axis=1).T for rows in (faces, halves))
+    order = (first[:, None] + np.arange(3)) % 3
+    (a, b, c), (x, y, z) = (np.take_along_axis(rows, order, axis=1).T for rows in (faces, halves))
     patterns = {
         0: [(a, b, c)],
         1: [(a, x, c), (x, b, c)],

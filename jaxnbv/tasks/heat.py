@@ -93,8 +93,8 @@ class ColdestPoint(Utility):
 def _values(
     points: np.ndarray, mask: np.ndarray, source: np.ndarray, heat: HeatProblem, reached_only: bool, workers: int
 ) -> list[float]:
-    clouds = [rows[filled] for rows, filled in zip(points, mask, strict=True)]
-    problems = [replace(heat, source=own) for own in source]
+    clouds = [rows[is_filled] for rows, is_filled in zip(points, mask, strict=True)]
+    problems = [replace(heat, source=center) for center in source]
     return _map(partial(_value, reached_only=reached_only), clouds, problems, workers)
 
 

@@ -97,10 +97,10 @@ def call_on_host(
 
 @eqx.filter_custom_jvp
 def _call(arrays: tuple[Any, ...], function: Callable, shape: tuple[int, ...], name: str) -> Float[Array, "..."]:
-    own_axes, dtype = arrays[0].ndim, arrays[0].dtype
+    num_axes, dtype = arrays[0].ndim, arrays[0].dtype
 
     def call(*inputs):
-        batch = inputs[0].shape[: inputs[0].ndim - own_axes]
+        batch = inputs[0].shape[: inputs[0].ndim - num_axes]
         flat = [np.asarray(array).reshape(-1, *array.shape[len(batch) :]) for array in inputs]
         result, expected = np.asarray(function(*flat), dtype), (len(flat[0]), *shape)
         require(result.shape == expected, f"the function of {name} returned shape {result.shape}, not {expected}")

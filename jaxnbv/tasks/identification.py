@@ -155,9 +155,9 @@ def _image(surface: GridSurface, camera: Camera, poses: Pose, barrier: Float[Arr
     """Render a part from each pose. The image has three values per ray, see `_Image`."""
     scans = scan(surface, camera, poses, barrier)
     offset = scans.points - poses.position[:, None]
-    away = jnp.linalg.norm(offset, axis=-1)
-    cosine = jnp.abs(jnp.sum(offset * scans.normals, axis=-1)) / jnp.where(scans.mask, away, 1.0)
-    return away, cosine, scans.mask
+    distances = jnp.linalg.norm(offset, axis=-1)
+    cosine = jnp.abs(jnp.sum(offset * scans.normals, axis=-1)) / jnp.where(scans.mask, distances, 1.0)
+    return distances, cosine, scans.mask
 
 
 def _information(images: _Image, context: ImaginedParts, camera: Camera) -> Float[Array, ""]:
@@ -165,18 +165,18 @@ def _information(images: _Image, context: ImaginedParts, camera: Camera) -> Floa
     (reach, _, hits), weights = images, context.weights
     weight = ray_weight(jnp.sum(jnp.where(hits, reach, 0.0)) / jnp.maximum(jnp.sum(hits), 1), camera)
 
-    def after(image):
+    def weights_after(image):
         misfit = weight * jnp.sum(_misfits(image, images, context.tau), axis=-1)
         return jax.nn.softmax(jnp.log(weights) - misfit)
 
-    after_each = jax.lax.map(after, images)
+    all_weights_after = jax.lax.map(weights_after, images)
 
     def information(classes):
-        entropies = entropy(jnp.matmul(after_each, classes, precision="highest"))
+        entropies = entropy(jnp.matmul(all_weights_after, classes, precision="highest"))
         return entropy(weights @ classes) - jnp.sum(weights * entropies)
 
-    about_class = information(context.classes)
-    return about_class + context.pose_weight * (information(jnp.eye(len(weights))) - about_class)
+    class_information = information(context.classes)
+    return class_information + context.pose_weight * (information(jnp.eye(len(weights))) - class_information)
 
 
 def _misfits(image: _Image, others: _Image, tau: Float[Array, ""]) -> Float[Array, "h rays"]:
@@ -187,8 +187,8 @@ def _misfits(image: _Image, others: _Image, tau: Float[Array, ""]) -> Float[Arra
     """
     (reach, _, hits), (expected, cosine, are_expected) = image, others
     both = hits & are_expected
-    apart = misfit_of(jnp.where(both, (reach - expected) * cosine, 0.0), tau)
-    return jnp.where(both, apart, jnp.where(hits ^ are_expected, MAX_MISFIT, 0.0))
+    misfits = misfit_of(jnp.where(both, (reach - expected) * cosine, 0.0), tau)
+    return jnp.where(both, misfits, jnp.where(hits ^ are_expected, MAX_MISFIT, 0.0))
 
 
 def entropy(weights: Float[Array, "*n c"]) -> Float[Array, "*n"]:

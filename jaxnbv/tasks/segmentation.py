@@ -102,9 +102,9 @@ class SoftPartCount(Utility):
             p = _probabilities(self.segmenter, cloud)
         total = jnp.sum(p, axis=1)
         # Rows without a point contain zeros.
-        proper = jnp.all(p >= -_SLACK) & jnp.all((jnp.abs(total - 1.0) < _SLACK) | (jnp.abs(total) < _SLACK))
+        is_proper = jnp.all(p >= -_SLACK) & jnp.all((jnp.abs(total - 1.0) < _SLACK) | (jnp.abs(total) < _SLACK))
         require(
-            bool(proper),
+            bool(is_proper),
             f"the segmenter gives values from {float(jnp.min(p)):.4g} whose sums over the parts run from "
             f"{float(jnp.min(total)):.4g} to {float(jnp.max(total)):.4g}: give probabilities, such as jax.nn.softmax "
             "of logits, and zeros for points that are not there",
