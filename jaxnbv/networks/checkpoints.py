@@ -44,7 +44,7 @@ def load_checkpoint(path: str | Path) -> Network:
     tensors, metadata = _read(path)
     try:
         if "network" in metadata:
-            return _filled(_blank(metadata["network"]), tensors)
+            return _fill(_blank_network(metadata["network"]), tensors)
         return published_network(tensors)
     except InputError as error:
         raise InputError(f"{path} does not hold a supported network: {error}") from error
@@ -58,7 +58,7 @@ def save_checkpoint(network: OwnNetwork, path: str | Path) -> None:
     """
     settings = network.settings if isinstance(network, InvariantClassifier) else {}
     metadata = {"network": json.dumps({"kind": type(network).__name__, **settings})}
-    arrays = {name: np.array(leaf, order="C") for name, leaf in _named(network)}
+    arrays = {name: np.array(leaf, order="C") for name, leaf in _named_leaves(network)}
     write_whole(Path(path), lambda file: file.write(safetensors.numpy.save(arrays, metadata)))
 
 
@@ -79,7 +79,7 @@ def _read(path: str | Path) -> tuple[_Tensors, Mapping[str, str]]:
         raise InputError(f"{path} is damaged or no safetensors file ({error}): fetch or write it again") from error
 
 
-def _blank(text: str) -> Any:
+def _blank_network(text: str) -> Any:
     """Make a network of jaxnbv with shapes in place of arrays, given the text in a file's metadata."""
     try:
         arguments = json.loads(text)
@@ -90,9 +90,9 @@ def _blank(text: str) -> Any:
         raise InputError(f"its metadata are {text[:200]!r}, which makes no network ({error})") from error
 
 
-def _filled(blank: Any, arrays: _Tensors) -> Any:
+def _fill(blank: Any, arrays: _Tensors) -> Any:
     """Return a copy of the network `blank` with these arrays in place of its shapes."""
-    expected = {name: leaf.shape for name, leaf in _named(blank)}
+    expected = {name: leaf.shape for name, leaf in _named_leaves(blank)}
     leaves: dict[str, np.ndarray] = {}
     for name in sorted(expected.keys() | arrays.keys()):
         require(name in arrays, f"the array {name} is missing")
@@ -108,6 +108,6 @@ def _filled(blank: Any, arrays: _Tensors) -> Any:
     return jax.tree.unflatten(jax.tree.structure(blank), [jnp.asarray(leaves[name]) for name in expected])
 
 
-def _named(network: Any) -> list[tuple[str, Any]]:
+def _named_leaves(network: Any) -> list[tuple[str, Any]]:
     leaves, _ = jax.tree_util.tree_flatten_with_path(network)
     return [(jax.tree_util.keystr(path, simple=True, separator="."), leaf) for path, leaf in leaves]

@@ -39,11 +39,11 @@ class CloudClassifier(Classifier):
 
     def __check_init__(self):
         check_fields(self)
-        parts = isinstance(self.network, PointNet2PartSegmenter | CompactPartSegmenter)
+        segments_parts = isinstance(self.network, PointNet2PartSegmenter | CompactPartSegmenter)
         names = () if self.classes is None else self.classes
-        proper = isinstance(names, tuple) and all(isinstance(name, str) for name in names)
-        require(proper, f"the classes are {short_text(self.classes)}; give a tuple of names")
-        require(not parts, "the network segments parts: give it to CloudSegmenter")
+        has_names = isinstance(names, tuple) and all(isinstance(name, str) for name in names)
+        require(has_names, f"the classes are {short_text(self.classes)}; give a tuple of names")
+        require(not segments_parts, "the network segments parts: give it to CloudSegmenter")
         require(self.num_points >= 1, f"num_points is {self.num_points}; the network needs at least one")
         require(self.scale > 0, f"the scale is {self.scale}; it must be positive")
 
@@ -90,8 +90,8 @@ class CloudSegmenter(Segmenter):
             check_type(index, int, "the category")
             is_valid = bool(0 <= index < len(CATEGORIES))
             require(is_valid, f"the category is {index}; choose 0 to {len(CATEGORIES) - 1}, or a name such as 'chair'")
-        whole = isinstance(network, PointNet2Classifier | InvariantClassifier)
-        require(not whole, "the network classifies whole clouds: give it to CloudClassifier")
+        classifies_clouds = isinstance(network, PointNet2Classifier | InvariantClassifier)
+        require(not classifies_clouds, "the network classifies whole clouds: give it to CloudClassifier")
         require(num_points >= 1, f"num_points is {num_points}; the network needs at least one")
         require(is_traced(scale) or float(scale) > 0, f"the scale is {scale}; it must be positive")
         self.network, self.num_points = network, num_points
@@ -124,6 +124,6 @@ class CloudSegmenter(Segmenter):
         log_p = self.network(self.scale * inputs.points, inputs.normals, self.category, inputs.mask)
         count = log_p.shape[-1]
         require(count == NUM_PARTS, f"the network has {count} parts; give one with the 50 parts of ShapeNet-part")
-        allowed = jnp.asarray(part_mask())[self.category]
-        p = jax.nn.softmax(jnp.where(allowed, log_p, -jnp.inf), axis=-1)
+        is_allowed = jnp.asarray(part_mask())[self.category]
+        p = jax.nn.softmax(jnp.where(is_allowed, log_p, -jnp.inf), axis=-1)
         return jnp.where(inputs.mask[:, None], p, 0.0)

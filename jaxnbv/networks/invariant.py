@@ -11,9 +11,9 @@ from jaxnbv.checks import require
 from jaxnbv.geometry.farthest_points import farthest_point_indices
 from jaxnbv.networks.layers import ball_query, interpolate, product
 
-_POOLED = 192
+_POOLED_WIDTH = 192
 # `Focus`: number of centres of its second level, and number of points that it chooses.
-_CENTERS, _CHOSEN = 384, 320
+_NUM_CENTERS, _NUM_SELECTED = 384, 320
 
 
 class PairLevel(eqx.Module):
@@ -90,7 +90,7 @@ class Focus(eqx.Module):
     def __init__(self, key: PRNGKeyArray):
         edge_key, around_key, first_key, last_key = jax.random.split(key, 4)
         self.edge = PairLevel(0, 16, 32, 0.25, 0, 24, edge_key)
-        self.around = PairLevel(32, 48, 48, 0.8, _CENTERS, 32, around_key)
+        self.around = PairLevel(32, 48, 48, 0.8, _NUM_CENTERS, 32, around_key)
         self.head = (eqx.nn.Linear(80, 48, key=first_key), eqx.nn.Linear(48, 1, key=last_key))
 
     def __call__(
@@ -112,9 +112,9 @@ class Focus(eqx.Module):
         Returns the points, their normals and their mask. If the points are in farthest point order, the selected points
         are farthest point samples of the cue.
         """
-        on_cue = mask & (self(points, normals, mask) > 0.0)
-        index = jnp.argsort(~on_cue, stable=True)[:_CHOSEN]
-        return points[index], normals[index], on_cue[index]
+        is_on_cue = mask & (self(points, normals, mask) > 0.0)
+        index = jnp.argsort(~is_on_cue, stable=True)[:_NUM_SELECTED]
+        return points[index], normals[index], is_on_cue[index]
 
 
 class InvariantClassifier(eqx.Module):
@@ -151,8 +151,8 @@ class InvariantClassifier(eqx.Module):
         groups: tuple[int, int] = (256, 64),
         focused: bool = False,
     ):
-        named = num_classes if classes is None else len(classes)
-        require(named == num_classes, f"{classes} names {named} classes; the network has {num_classes}")
+        num_names = num_classes if classes is None else len(classes)
+        require(num_names == num_classes, f"{classes} names {num_names} classes; the network has {num_classes}")
         require(
             min(radii) > 0 and 1 <= groups[1] <= groups[0],
             f"the levels have radii {radii} and {groups} groups: give positive radii, and the second level no more "
@@ -160,8 +160,11 @@ class InvariantClassifier(eqx.Module):
         )
         edge_key, pattern_key, first_key, last_key = jax.random.split(key, 4)
         self.edge = PairLevel(0, 32, 64, radii[0], groups[0], 24, edge_key)
-        self.pattern = PairLevel(64, 112, _POOLED, radii[1], groups[1], 48, pattern_key)
-        self.head = (eqx.nn.Linear(_POOLED, _POOLED, key=first_key), eqx.nn.Linear(_POOLED, num_classes, key=last_key))
+        self.pattern = PairLevel(64, 112, _POOLED_WIDTH, radii[1], groups[1], 48, pattern_key)
+        self.head = (
+            eqx.nn.Linear(_POOLED_WIDTH, _POOLED_WIDTH, key=first_key),
+            eqx.nn.Linear(_POOLED_WIDTH, num_classes, key=last_key),
+        )
         self.focus = Focus(jax.random.fold_in(key, 1)) if focused else None
         self.temperature, self.classes = jnp.asarray(1.0), classes
 

@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxnbv.checks import require
 from jaxnbv.geometry.farthest_points import farthest_point_indices
 
-_WORD = 32
+_WORD_BITS = 32
 _NEIGHBOURS = 3
 # Keeps the weight finite if a point and a coarse point coincide. In squared units of the points, as published.
 _SOFTENING = 1e-8
@@ -161,16 +161,16 @@ def _positions_of_true(flags: Bool[Array, "m n"], count: int) -> Int[Array, "m c
     counts of the words determine the word that holds the k-th true entry, and five bisections of this word determine
     the bit. This takes one pass over the flags. Sorting the columns would take many passes.
     """
-    flags = jnp.pad(flags, ((0, 0), (0, -flags.shape[1] % _WORD))).reshape(len(flags), -1, _WORD)
-    bit = jnp.left_shift(jnp.uint32(1), jnp.arange(_WORD, dtype=jnp.uint32))
+    flags = jnp.pad(flags, ((0, 0), (0, -flags.shape[1] % _WORD_BITS))).reshape(len(flags), -1, _WORD_BITS)
+    bit = jnp.left_shift(jnp.uint32(1), jnp.arange(_WORD_BITS, dtype=jnp.uint32))
     words = jnp.sum(jnp.where(flags, bit, jnp.uint32(0)), axis=-1, dtype=jnp.uint32)
-    through = jnp.cumsum(_bit_count(words), axis=1)
+    counts_through = jnp.cumsum(_bit_count(words), axis=1)
 
-    wanted = jnp.arange(count, dtype=jnp.int32)
-    word = jnp.sum(through[:, None, :] <= wanted[:, None], axis=-1, dtype=jnp.int32)
-    before = jnp.where(word > 0, jnp.take_along_axis(through, jnp.maximum(word - 1, 0), axis=1), 0)
+    ranks = jnp.arange(count, dtype=jnp.int32)
+    word = jnp.sum(counts_through[:, None, :] <= ranks[:, None], axis=-1, dtype=jnp.int32)
+    counts_before = jnp.where(word > 0, jnp.take_along_axis(counts_through, jnp.maximum(word - 1, 0), axis=1), 0)
     bits = jnp.take_along_axis(words, jnp.minimum(word, words.shape[1] - 1), axis=1)
-    rank, column = wanted - before, _WORD * word
+    rank, column = ranks - counts_before, _WORD_BITS * word
     for half in (16, 8, 4, 2, 1):
         lower = _bit_count(bits & jnp.uint32((1 << half) - 1))
         above = lower <= rank

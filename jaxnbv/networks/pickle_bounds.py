@@ -12,7 +12,7 @@ _PUTS, _GETS = ("PUT", "BINPUT", "LONG_BINPUT"), ("GET", "BINGET", "LONG_BINGET"
 # Operations that modify the first object that they take from the stack and put this object back.
 _CHANGES = ("APPEND", "APPENDS", "SETITEM", "SETITEMS", "ADDITEMS", "BUILD")
 # Python hashes nested tuples by recursion without a depth limit, which could overflow the C stack.
-_DEEPEST = 500
+_MAX_DEPTH = 500
 
 
 def skip_pickle(file: BytesIO | mmap.mmap, size: int) -> None:
@@ -29,16 +29,21 @@ def skip_pickle(file: BytesIO | mmap.mmap, size: int) -> None:
     marks: list[int] = []
     memo: dict[int, int] = {}
     operations: Iterator[tuple[Any, Any, Any]] = pickletools.genops(file)  # type: ignore[arg-type]
-    for code, argument, at in operations:
+    for code, argument, position in operations:
         if code.name in _PUTS:
-            require(argument <= at - start, f"asks for room for {argument} things in {at - start} bytes: it is damaged")
+            require(
+                argument <= position - start,
+                f"asks for room for {argument} things in {position - start} bytes: it is damaged",
+            )
             memo[argument] = stack[-1]
         elif code.name == "MEMOIZE":
             memo[len(memo)] = stack[-1]
         elif code.name in _GETS:
             stack.append(memo[argument])
         elif code.name == "FRAME":
-            require(argument <= size - at, f"declares a frame of {argument} bytes, more than it has: it is damaged")
+            require(
+                argument <= size - position, f"declares a frame of {argument} bytes, more than it has: it is damaged"
+            )
         elif code.name == "MARK":
             marks.append(len(stack))
         elif code.name == "DUP":
@@ -55,5 +60,5 @@ def skip_pickle(file: BytesIO | mmap.mmap, size: int) -> None:
             del stack[first:]
             depth = 1 + max(depths[code.name in _CHANGES :], default=-1)
             depth = max([depth, *depths[: code.name in _CHANGES]])
-            require(depth <= _DEEPEST, f"nests {depth} deep, more than any model: it is damaged")
+            require(depth <= _MAX_DEPTH, f"nests {depth} deep, more than any model: it is damaged")
             stack += [depth] * len(code.stack_after)

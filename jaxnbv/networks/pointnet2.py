@@ -32,7 +32,7 @@ SCALES = SINGLE_SCALE, MULTI_SCALE
 PARTS_SCALES = SINGLE_SCALE, (Level(512, (0.1, 0.2, 0.4), (32, 64, 128)), Level(128, (0.4, 0.8), (64, 128)))
 
 
-def _filled(
+def _fill_masked(
     points: Float[Array, "n 3"], normals: Float[Array, "n 3"], mask: Bool[Array, " n"] | None
 ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Bool[Array, " n"]]:
     """Return points and normals with zeros in rows whose mask is False, and the mask.
@@ -48,7 +48,7 @@ def _filled(
     return jnp.where(mask[:, None], points, 0.0), jnp.where(mask[:, None], normals, 0.0), mask
 
 
-def _down(network: Any, rows: Any, mask: Bool[Array, " n"]) -> tuple[list[Any], Float[Array, " outputs"]]:
+def _encode(network: Any, rows: Any, mask: Bool[Array, " n"]) -> tuple[list[Any], Float[Array, " outputs"]]:
     """Compute the centres and features of each level of a network, and the features of the whole cloud.
 
     - `rows`: points and their features, or None for no features.
@@ -96,8 +96,8 @@ class PointNet2Classifier(eqx.Module):
 
         **Raises:** `ValueError` if points and normals are not both (n, 3), or there are no rows.
         """
-        points, normals, mask = _filled(points, normals, mask)
-        _, x = _down(self, (points, normals if self.uses_normals else None), mask)
+        points, normals, mask = _fill_masked(points, normals, mask)
+        _, x = _encode(self, (points, normals if self.uses_normals else None), mask)
         for layer in self.hidden:
             x = jax.nn.relu(layer(x))
         return jax.nn.log_softmax(self.last(x))
@@ -127,9 +127,9 @@ class PointNet2PartSegmenter(eqx.Module):
     @property
     def num_categories(self) -> int:
         """The number of categories, from the shapes of the weights."""
-        carried = self.propagations[-2].layers[-1].bias.shape[0]
-        own = 3 + (6 if self.uses_normals else 3)
-        return self.propagations[-1].layers[0].weight.shape[0] - carried - own
+        carried_width = self.propagations[-2].layers[-1].bias.shape[0]
+        point_width = 3 + (6 if self.uses_normals else 3)
+        return self.propagations[-1].layers[0].weight.shape[0] - carried_width - point_width
 
     @property
     def uses_normals(self) -> bool:
@@ -154,7 +154,7 @@ class PointNet2PartSegmenter(eqx.Module):
         **Raises:** `ValueError` if points and normals are not both (n, 3), there are no rows, or there is no such
         category.
         """
-        points, normals, mask = _filled(points, normals, mask)
+        points, normals, mask = _fill_masked(points, normals, mask)
         count = self.num_categories
         require(
             is_traced(category) or 0 <= int(category) < count,
@@ -164,10 +164,10 @@ class PointNet2PartSegmenter(eqx.Module):
         # centre.
         features = jnp.concatenate([points, normals], axis=-1) if self.uses_normals else points
         one_hot = jnp.broadcast_to(jax.nn.one_hot(category, count, dtype=points.dtype), (len(points), count))
-        levels, x = _down(self, (points, features), mask)
-        own = [(points, jnp.concatenate([one_hot, points, features], axis=-1)), *levels]
+        levels, x = _encode(self, (points, features), mask)
+        inputs = [(points, jnp.concatenate([one_hot, points, features], axis=-1)), *levels]
         x, coarse = x[None], jnp.zeros((1, 3), points.dtype)
-        for (points, features), propagation in zip(reversed(own), self.propagations, strict=True):
+        for (points, features), propagation in zip(reversed(inputs), self.propagations, strict=True):
             x, coarse = propagation(points, coarse, features, x), points
         return jax.nn.log_softmax(self.last(jax.nn.relu(self.hidden(x))), axis=-1)
 
@@ -213,16 +213,16 @@ class CompactPartSegmenter(eqx.Module):
         - `mask`: False for rows to ignore. The values of these rows have no meaning.
         """
         mask = jnp.ones(len(points), bool) if mask is None else mask
-        own = jnp.where(mask[:, None], jnp.concatenate([points, normals], axis=-1), 0.0)
-        points = own[:, :3]
-        centers, fine = self.fine(points, own, mask)
-        everywhere = jnp.ones(len(centers), bool)
-        coarse_centers, coarse = self.coarse(centers, fine, everywhere)
+        inputs = jnp.where(mask[:, None], jnp.concatenate([points, normals], axis=-1), 0.0)
+        points = inputs[:, :3]
+        centers, fine = self.fine(points, inputs, mask)
+        is_center = jnp.ones(len(centers), bool)
+        coarse_centers, coarse = self.coarse(centers, fine, is_center)
         whole = self.whole.pool(self.whole.lift(coarse_centers, coarse))
         context = jnp.concatenate([whole, jax.nn.one_hot(category, len(CATEGORIES), dtype=whole.dtype)])
         coarse = self.to_coarse(coarse_centers, jnp.zeros((1, 3), points.dtype), coarse, context[None])
         fine = self.to_fine(centers, coarse_centers, fine, coarse)
-        return jax.nn.log_softmax(self.last(self.to_points(points, centers, own, fine)))
+        return jax.nn.log_softmax(self.last(self.to_points(points, centers, inputs, fine)))
 
 
 def _layers(keys: Any, *widths: int) -> tuple[Linear, ...]:

@@ -37,7 +37,8 @@ def published_network(tensors: Tensors) -> PointNet2Classifier | PointNet2PartSe
     segments = any(name.startswith("fp") for name in tensors)
     network = _part_segmenter(state) if segments else _classifier(state)
     require(
-        not state.left, f"{len(state.left)} tensors are not part of such a network, such as {sorted(state.left)[:1]}"
+        not state.unused,
+        f"{len(state.unused)} tensors are not part of such a network, such as {sorted(state.unused)[:1]}",
     )
     return network
 
@@ -77,26 +78,26 @@ def _encoder(
     - `scales`: sizes of the levels for networks with one radius per level, and with several.
     - `kinds`: allowed numbers of inputs, and the meaning of each.
     """
-    multi = "sa1.conv_blocks.0.0.weight" in state.tensors
-    first = "sa1.conv_blocks.0.0.weight" if multi else "sa1.mlp_convs.0.weight"
+    is_multi_scale = "sa1.conv_blocks.0.0.weight" in state.tensors
+    first = "sa1.conv_blocks.0.0.weight" if is_multi_scale else "sa1.mlp_convs.0.weight"
     inputs = state.take(first, None, None).shape[1]
     choices = " or ".join(f"{number} ({meaning})" for number, meaning in kinds.items())
     require(inputs in kinds, f"the tensor {first} takes {inputs} inputs; expected {choices}")
     levels, widths = [], [inputs - 3]
-    for number, level in enumerate(scales[multi], start=1):
-        blocks = [f"conv_blocks.{index}" for index in range(len(level.radii))] if multi else ["mlp_convs"]
-        branches = tuple(state.pooled(f"sa{number}.{block}", 3 + widths[-1], roll=multi) for block in blocks)
+    for number, level in enumerate(scales[is_multi_scale], start=1):
+        blocks = [f"conv_blocks.{index}" for index in range(len(level.radii))] if is_multi_scale else ["mlp_convs"]
+        branches = tuple(state.pooled(f"sa{number}.{block}", 3 + widths[-1], roll=is_multi_scale) for block in blocks)
         levels.append(SetAbstraction(branches, level.radii, level.members, level.centers))
         widths.append(sum(_width(branch.layers) for branch in branches))
     return tuple(levels), state.pooled("sa3.mlp_convs", 3 + widths[-1]), widths
 
 
 class _State:
-    """Tensors keyed by name, with checks of their shapes. `left` has the names of the tensors not used so far."""
+    """Tensors keyed by name, with checks of their shapes. `unused` has the names of the tensors not used so far."""
 
     def __init__(self, tensors: Tensors):
         self.tensors = {name: array for name, array in tensors.items() if not name.endswith("num_batches_tracked")}
-        self.left = set(self.tensors)
+        self.unused = set(self.tensors)
 
     def take(self, name: str, *shape: int | None) -> np.ndarray:
         """Check the shape of a tensor, and return the tensor as float64.
@@ -110,7 +111,7 @@ class _State:
             fits and all(length == 1 for length in actual[len(shape) :]),
             f"the tensor {name} has shape {actual}; expected ({', '.join(str(a or 'any') for a in shape)})",
         )
-        self.left.discard(name)
+        self.unused.discard(name)
         return np.asarray(self.tensors[name], dtype=np.float64).reshape(actual[: len(shape)])
 
     def linear(self, name: str, inputs: int | None, norm: str | None = None, roll: bool = False) -> Linear:
@@ -130,8 +131,8 @@ class _State:
         weight = np.roll(weight, 3, axis=0) if roll else weight
         with np.errstate(over="ignore"):
             arrays = [array.astype(jnp.result_type(float)) for array in (weight, bias)]
-        finite = all(np.isfinite(array).all() for array in arrays)
-        require(finite, f"the layer {name} has entries that are not finite as {arrays[0].dtype}: train it again")
+        is_finite = all(np.isfinite(array).all() for array in arrays)
+        require(is_finite, f"the layer {name} has entries that are not finite as {arrays[0].dtype}: train it again")
         return Linear(*map(jnp.asarray, arrays))
 
     def layers(self, name: str, inputs: int | None, roll: bool = False) -> tuple[Linear, ...]:

@@ -55,10 +55,10 @@ def read_torch_tensors(path: str | Path) -> dict[str, np.ndarray]:
     require(os.path.isfile(path), f"there is no file {path}: give the path of a PyTorch checkpoint")
     try:
         with path.open("rb") as file:
-            archive = file.read(2) == b"PK"
+            is_archive = file.read(2) == b"PK"
             file.seek(0)
             size = os.fstat(file.fileno()).st_size
-            return _state_dictionary((_read_archive if archive else _read_stream)(file, size))
+            return _state_dictionary((_read_archive if is_archive else _read_stream)(file, size))
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     except Exception as error:  # a damaged pickle can raise nearly anything
@@ -73,17 +73,23 @@ def _state_dictionary(content: Any) -> dict[str, np.ndarray]:
         isinstance(content, dict) and len(content) > 0 and all(isinstance(name, str) for name in content),
         "holds no state dictionary; save model.state_dict(), or a dictionary with it under 'model_state_dict'",
     )
-    odd = [name for name, tensor in content.items() if not isinstance(tensor, np.ndarray)]
-    require(not odd, f"entry {odd[:1]} is not a tensor; save model.state_dict() alone, or under 'model_state_dict'")
-    shared = "module." if all(name.startswith("module.") for name in content) else ""
-    return {name.removeprefix(shared): tensor for name, tensor in content.items()}
+    wrong_names = [name for name, tensor in content.items() if not isinstance(tensor, np.ndarray)]
+    require(
+        not wrong_names,
+        f"entry {wrong_names[:1]} is not a tensor; save model.state_dict() alone, or under 'model_state_dict'",
+    )
+    prefix = "module." if all(name.startswith("module.") for name in content) else ""
+    return {name.removeprefix(prefix): tensor for name, tensor in content.items()}
 
 
 def _read_archive(file: BufferedIOBase, size: int) -> Any:
     """Read a zip archive. It has one folder with data.pkl, the arrays as data/<key>, and the byte order."""
     with zipfile.ZipFile(file) as archive:
-        unpacked = sum(entry.file_size for entry in archive.infolist())
-        require(unpacked <= size, f"unpacks to {unpacked} bytes from {size}, which torch.save does not: save it again")
+        unpacked_size = sum(entry.file_size for entry in archive.infolist())
+        require(
+            unpacked_size <= size,
+            f"unpacks to {unpacked_size} bytes from {size}, which torch.save does not: save it again",
+        )
         roots = [name.removesuffix("data.pkl") for name in archive.namelist() if name.endswith("/data.pkl")]
         require(len(roots) == 1, "is a zip file, but not one made by torch.save: it has no data.pkl")
         order = f"{roots[0]}byteorder"
@@ -93,7 +99,7 @@ def _read_archive(file: BufferedIOBase, size: int) -> Any:
         )
         contents = functools.cache(lambda key: archive.read(f"{roots[0]}data/{key}"))
         pickled = archive.read(f"{roots[0]}data.pkl")
-        return _unpickled(BytesIO(pickled), len(pickled), lambda key, *form: np.frombuffer(contents(key), *form))
+        return _unpickle(BytesIO(pickled), len(pickled), lambda key, *form: np.frombuffer(contents(key), *form))
 
 
 def _read_stream(file: BufferedIOBase, size: int) -> Any:
@@ -112,31 +118,31 @@ def _read_stream(file: BufferedIOBase, size: int) -> Any:
         return storages[key]
 
     with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped:
-        magic, _, _, content, keys = (_unpickled(mapped, size, load) for _ in range(5))
+        magic, _, _, content, keys = (_unpickle(mapped, size, load) for _ in range(5))
         file.seek(mapped.tell())
     require(magic == _STREAM_MAGIC, "is neither a zip archive nor an older PyTorch file: torch.save the model anew")
     require(sorted(keys) == sorted(storages), "lists other storages than its tensors need: the file is damaged")
     for key in keys:
         (count,) = struct.unpack("<q", file.read(8))
-        read = file.readinto(storages[key].view("uint8").data)
+        num_read = file.readinto(storages[key].view("uint8").data)
         require(
-            count == len(storages[key]) and read == storages[key].nbytes,
+            count == len(storages[key]) and num_read == storages[key].nbytes,
             f"the storage {key} is cut short or of another size: fetch the file again",
         )
     return content
 
 
-def _unpickled(file: BytesIO | mmap.mmap, size: int, load: _Load) -> Any:
+def _unpickle(file: BytesIO | mmap.mmap, size: int, load: _Load) -> Any:
     """Load the object in the next pickle of a file. `load`: function that loads a storage."""
     start = file.tell()
     skip_pickle(file, size)
     end = file.tell()
     file.seek(start)
-    return _Tensors(BytesIO(file.read(end - start)), load).load()
+    return _TensorUnpickler(BytesIO(file.read(end - start)), load).load()
 
 
-class _Tensors(pickle.Unpickler):
-    """Unpickler that only creates tensors and dictionaries, and puts a `_Nothing` for everything else."""
+class _TensorUnpickler(pickle.Unpickler):
+    """Unpickler that only creates tensors and dictionaries, and puts a `_Placeholder` for everything else."""
 
     def __init__(self, file: BytesIO, load: _Load):
         super().__init__(file)
@@ -149,7 +155,7 @@ class _Tensors(pickle.Unpickler):
             return _TYPES[name]
         if (module, name) == ("collections", "OrderedDict"):
             return self._dictionary
-        return _KNOWN.get((module, name), _Nothing)
+        return _FUNCTIONS.get((module, name), _Placeholder)
 
     def persistent_load(self, identifier: Any) -> np.ndarray:
         """Return the storage with identifier ('storage', type, key, device, count). Older files append None."""
@@ -170,13 +176,13 @@ class _Dictionary(OrderedDict):
         pass
 
 
-class _Nothing:
+class _Placeholder:
     """The replacement for all unknown names in a file. It accepts any arguments and does nothing."""
 
-    def __new__(cls, *_: Any) -> "_Nothing":
+    def __new__(cls, *_: Any) -> "_Placeholder":
         return super().__new__(cls)
 
-    def __call__(self, *_: Any) -> "_Nothing":
+    def __call__(self, *_: Any) -> "_Placeholder":
         return self
 
     def __setstate__(self, _: Any) -> None:
@@ -191,7 +197,7 @@ def _tensor(storage: np.ndarray, offset: int, shape: tuple[int, ...], strides: t
     return tensor
 
 
-_KNOWN: dict[tuple[str, str], Any] = {
+_FUNCTIONS: dict[tuple[str, str], Any] = {
     ("torch._utils", "_rebuild_tensor_v2"): _tensor,
     ("torch._utils", "_rebuild_parameter"): lambda tensor, *_: tensor,
 }
