@@ -43,15 +43,15 @@ def clouds_of(file: MeshFile, number: int, points: int) -> PointCloud:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *clouds)
 
 
-def told(network, objects: list[tuple[MeshFile, PointCloud]], names: tuple[str, ...]) -> dict:
+def accuracy(network, objects: list[tuple[MeshFile, PointCloud]], names: tuple[str, ...]) -> dict:
     """Share of an object's clouds that the network classifies correctly: mean and standard error over objects."""
-    shares = {
+    fractions = {
         f"{names[file.label]} {file.name}": float(np.mean(log_probabilities(network, clouds).argmax(1) == file.label))
         for file, clouds in objects
     }
-    each = np.array(list(shares.values()))
-    error = float(each.std(ddof=1) / np.sqrt(len(each))) if len(each) > 1 else None
-    return {"objects": len(each), "right": float(each.mean()), "error": error, "by_object": shares}
+    values = np.array(list(fractions.values()))
+    error = float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else None
+    return {"objects": len(values), "right": float(values.mean()), "error": error, "by_object": fractions}
 
 
 def main() -> None:
@@ -74,17 +74,17 @@ def main() -> None:
 
     network = pretrained_classifier("household").network
     results = {"versions": versions(), "tuned_on": [f"{names[f.label]} {f.name}" for f, _ in few]}
-    results["as it is"] = told(network, rest, names)
+    results["as it is"] = accuracy(network, rest, names)
     if few:
         procedural = scanned_clouds(household_scene, Split.TRAIN, range(STAND_INS), points)
         clouds = jax.tree.map(
             lambda *leaves: np.concatenate(leaves),
             PointCloud(procedural.clouds.points, procedural.clouds.normals, procedural.clouds.mask),
-            *(PointCloud(of.points, of.normals, of.mask) for _, of in few),
+            *(PointCloud(cloud.points, cloud.normals, cloud.mask) for _, cloud in few),
         )
         labels = np.concatenate([procedural.labels, *(np.full(CLOUDS, file.label) for file, _ in few)])
         tuned = train(network, clouds, labels, jax.random.key(1), arguments.steps, learning_rate=3e-4)
-        results["tuned"] = told(tuned, rest, names)
+        results["tuned"] = accuracy(tuned, rest, names)
     print(f"tuned on: {', '.join(results['tuned_on']) or 'none'}")
     for observations in ("as it is", "tuned"):
         if observations in results:

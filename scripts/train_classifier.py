@@ -78,8 +78,8 @@ def source(name: str, framing: Framing, folder: Path) -> Source:
 
 def informative(data: LabelledClouds) -> LabelledClouds:
     """All clouds that show the cue of the class, and a quarter of the others, which teach little."""
-    turn = np.arange(len(data.labels)) // (data.labels.max() + 1)
-    rows = (data.cue_pixels > 0) | (turn % 4 == 0)
+    round_index = np.arange(len(data.labels)) // (data.labels.max() + 1)
+    rows = (data.cue_pixels > 0) | (round_index % 4 == 0)
     return jax.tree.map(lambda leaf: leaf[rows], data)
 
 
@@ -152,8 +152,8 @@ def main() -> None:
         data, keys = (both.clouds, both.point_labels), jax.random.split(jax.random.key(4))
         # Every point is an example, so a batch needs few clouds.
         focus = fit(Focus(keys[0]), focus_loss, data, keys[1], recipe.focus, 8, file=folder / "focus.eqx")
-        chosen = chosen_clouds(focus, both.clouds)
-        network = train(network, chosen, both.labels, jax.random.key(2), second, file=folder / "imagined.eqx")
+        focused = chosen_clouds(focus, both.clouds)
+        network = train(network, focused, both.labels, jax.random.key(2), second, file=folder / "imagined.eqx")
         network = eqx.tree_at(lambda net: net.focus, network, focus, is_leaf=lambda leaf: leaf is None)
     else:
         scans = thinned(informative(scans))

@@ -30,8 +30,8 @@ def log_probabilities(network: CompactPartSegmenter, example: LabelledClouds):
     """log p of the parts at each point, very low for parts of other categories than the cloud's."""
     cloud = example.clouds
     log_p = network(cloud.points, cloud.normals, example.labels, cloud.mask)
-    allowed = jnp.asarray(part_mask())[example.labels]
-    return jax.nn.log_softmax(jnp.where(allowed, log_p, -1e9))
+    is_allowed = jnp.asarray(part_mask())[example.labels]
+    return jax.nn.log_softmax(jnp.where(is_allowed, log_p, -1e9))
 
 
 def loss(network: CompactPartSegmenter, example: LabelledClouds):
@@ -55,17 +55,17 @@ def predicted(network: CompactPartSegmenter, data: LabelledClouds):
 def report(name: str, network: CompactPartSegmenter, data: LabelledClouds) -> None:
     """Print the accuracy over points, and the mean intersection over union of the parts of a category."""
     labels, confidence = (np.asarray(array) for array in predicted(network, jax.tree.map(jnp.asarray, data)))
-    mask, right = data.clouds.mask, labels == data.point_labels
-    print(f"{name}: {right[mask].mean():.1%} of points right, mean confidence {confidence[mask].mean():.1%}")
+    mask, is_right = data.clouds.mask, labels == data.point_labels
+    print(f"{name}: {is_right[mask].mean():.1%} of points right, mean confidence {confidence[mask].mean():.1%}")
     for index in np.unique(data.labels):
         rows = data.labels == index
-        is_filled, said, true = mask[rows], labels[rows], data.point_labels[rows]
+        is_filled, guess, true = mask[rows], labels[rows], data.point_labels[rows]
         ratios = []
         for part in CATEGORIES[index].labels:
-            either = is_filled & ((said == part) | (true == part))
+            either = is_filled & ((guess == part) | (true == part))
             if either.any():
-                ratios.append((either & (said == true)).sum() / either.sum())
-        accuracy = (said == true)[is_filled].mean()
+                ratios.append((either & (guess == true)).sum() / either.sum())
+        accuracy = (guess == true)[is_filled].mean()
         text = ", ".join(f"{ratio:.2f}" for ratio in ratios)
         print(f"  {CATEGORIES[index].name:12} {accuracy:6.1%} of points, intersection over union {text}")
 

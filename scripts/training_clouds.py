@@ -22,12 +22,12 @@ from jaxnbv.studies.scenes.splits import scene_key
 # Imagined clouds use scene numbers from here on, which no scanned cloud uses.
 FIRST_IMAGINED = 100_000
 # Maximum number of true views in a cloud, and before an imagined view.
-MOST_VIEWS = 5
-_AT_ONCE, _POSES = 100, 4
+MAX_VIEWS = 5
+_SCENES_PER_FILE, _POSES = 100, 4
 # Three standard deviations of the sensor's noise.
 _NOISE = 3 * SensorNoise().points
 
-Thing: TypeAlias = ClassObject | PartScene
+SceneObject: TypeAlias = ClassObject | PartScene
 
 
 class LabelledClouds(eqx.Module):
@@ -64,7 +64,7 @@ class Source(NamedTuple):
     """
 
     folder: Path
-    scene: Callable[[Split, int], Thing]
+    scene: Callable[[Split, int], SceneObject]
     planner: Planner
     num_points: int = 1024
     setting: Setting = USUAL_SETTING
@@ -74,9 +74,11 @@ class Source(NamedTuple):
         """Clouds of true scans, one for each of `count` scenes, in the network's units."""
 
         def make(first: int) -> LabelledClouds:
-            return scanned_clouds(self.scene, split, range(first, first + _AT_ONCE), self.num_points, self.setting)
+            return scanned_clouds(
+                self.scene, split, range(first, first + _SCENES_PER_FILE), self.num_points, self.setting
+            )
 
-        return self._kept(f"scanned-{split}", range(0, count, _AT_ONCE), make)
+        return self._load_or_make(f"scanned-{split}", range(0, count, _SCENES_PER_FILE), make)
 
     def imagined(self, split: Split, count: int) -> LabelledClouds:
         """Clouds that end in a scan of a posterior sample, four for each sample of `count` scenes."""
@@ -84,9 +86,9 @@ class Source(NamedTuple):
         def make(index: int) -> LabelledClouds:
             return imagined_clouds(self.scene, split, index, self.planner, self.num_points, self.setting)
 
-        return self._kept(f"imagined-{split}", range(FIRST_IMAGINED, FIRST_IMAGINED + count), make)
+        return self._load_or_make(f"imagined-{split}", range(FIRST_IMAGINED, FIRST_IMAGINED + count), make)
 
-    def _kept(self, name: str, steps: Iterable[int], make: Callable[[int], LabelledClouds]) -> LabelledClouds:
+    def _load_or_make(self, name: str, steps: Iterable[int], make: Callable[[int], LabelledClouds]) -> LabelledClouds:
         """Clouds of all steps. Each step has its own file, so that an interrupted run makes only the missing ones."""
         folder = make_folder(self.folder / name)
         parts = []
@@ -103,20 +105,20 @@ class Source(NamedTuple):
 
 
 def scanned_clouds(
-    scene: Callable[[Split, int], Thing],
+    scene: Callable[[Split, int], SceneObject],
     split: Split,
     indices: Sequence[int],
     num_points: int = 1024,
     setting: Setting = USUAL_SETTING,
 ) -> LabelledClouds:
     """A cloud of each scene from one to five random views with the sensor's noise, in scene units."""
-    things = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(scene(split, index) for index in indices))
+    targets = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(scene(split, index) for index in indices))
     keys = jax.vmap(lambda index: scene_key(1, split, index))(jnp.asarray(indices))
-    return _scanned(things, keys, num_points, setting)
+    return _scanned(targets, keys, num_points, setting)
 
 
 def imagined_clouds(
-    scene: Callable[[Split, int], Thing],
+    scene: Callable[[Split, int], SceneObject],
     split: Split,
     index: int,
     planner: Planner,
@@ -142,62 +144,64 @@ def joined_views(views: PointCloud) -> PointCloud:
 
 
 @eqx.filter_jit
-def _scanned(things: Thing, keys: Key[Array, " scenes"], num_points: int, setting: Setting) -> LabelledClouds:
-    def cloud_of(thing_and_key):
-        thing, key = thing_and_key
-        views, _, count, pixels = _partial_views(thing, key, MOST_VIEWS, setting)
+def _scanned(targets: SceneObject, keys: Key[Array, " scenes"], num_points: int, setting: Setting) -> LabelledClouds:
+    def cloud_of(target_and_key):
+        target, key = target_and_key
+        views, _, count, pixels = _partial_views(target, key, MAX_VIEWS, setting)
         cloud = farthest_point_subsample(joined_views(views), num_points)
-        return LabelledClouds(cloud, _label(thing), _point_labels(thing, cloud), count, pixels, jnp.asarray(False))
+        return LabelledClouds(cloud, _label(target), _point_labels(target, cloud), count, pixels, jnp.asarray(False))
 
-    return jax.lax.map(cloud_of, (things, keys))
+    return jax.lax.map(cloud_of, (targets, keys))
 
 
 @eqx.filter_jit
-def _imagined(thing: Thing, key: PRNGKeyArray, planner: Planner, num_points: int, setting: Setting) -> LabelledClouds:
+def _imagined(
+    target: SceneObject, key: PRNGKeyArray, planner: Planner, num_points: int, setting: Setting
+) -> LabelledClouds:
     key, sample_key, pose_key = jax.random.split(key, 3)
-    views, poses, count, pixels = _partial_views(thing, key, MOST_VIEWS - 1, setting)
-    *_, observations = planner.replay(((poses[i], views[i]) for i in range(MOST_VIEWS - 1)), setting.camera)
+    views, poses, count, pixels = _partial_views(target, key, MAX_VIEWS - 1, setting)
+    *_, observations = planner.replay(((poses[i], views[i]) for i in range(MAX_VIEWS - 1)), setting.camera)
     surfaces = planner.sampler.sample(observations, sample_key)
     cloud = limit_capacity(joined_views(views), num_points)
 
     def of_sample(surface_and_key):
         surface, pose_key = surface_and_key
         scans = scan(surface, setting.camera, random_poses(pose_key, _POSES, setting.radius))
-        return jax.lax.map(lambda one: farthest_point_subsample(concatenate(cloud, one), num_points), scans)
+        return jax.lax.map(lambda view_scan: farthest_point_subsample(concatenate(cloud, view_scan), num_points), scans)
 
     keys = jax.random.split(pose_key, planner.sampler.num_samples)
     clouds = jax.lax.map(of_sample, (surfaces, keys))
     clouds = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), clouds)
     label, count, pixels, imagined = (
-        jnp.full(len(clouds.mask), value) for value in (_label(thing), count, pixels, True)
+        jnp.full(len(clouds.mask), value) for value in (_label(target), count, pixels, True)
     )
-    return LabelledClouds(clouds, label, _point_labels(thing, clouds), count, pixels, imagined)
+    return LabelledClouds(clouds, label, _point_labels(target, clouds), count, pixels, imagined)
 
 
 def _partial_views(
-    thing: Thing, key: PRNGKeyArray, most: int, setting: Setting
+    target: SceneObject, key: PRNGKeyArray, max_views: int, setting: Setting
 ) -> tuple[PointCloud, Pose, Int[Array, ""], Int[Array, ""]]:
-    """Scans from one to `most` random views, with all further views masked; the poses, the number of views, and the
+    """Scans from one to `max_views` random views, further views masked; the poses, the number of views, and the
     largest number of pixels on the cue in a view."""
     pose_key, noise_key, count_key = jax.random.split(key, 3)
-    poses = random_poses(pose_key, most, setting.radius)
-    if isinstance(thing, PartScene):
-        scans = scan(SDFSurface(thing.solid), setting.camera, poses)
+    poses = random_poses(pose_key, max_views, setting.radius)
+    if isinstance(target, PartScene):
+        scans = scan(SDFSurface(target.solid), setting.camera, poses)
         pixels = scans.count
     else:
-        pixels, scans = scan_cue(thing, setting.camera, poses)
-    count = jax.random.randint(count_key, (), 1, most + 1)
-    used = jnp.arange(most) < count
+        pixels, scans = scan_cue(target, setting.camera, poses)
+    count = jax.random.randint(count_key, (), 1, max_views + 1)
+    is_used = jnp.arange(max_views) < count
     views = SensorNoise()(scans, noise_key)
-    views = PointCloud(views.points, views.normals, views.mask & used[:, None], views.missed & used[:, None])
-    return views, poses, count, jnp.max(jnp.where(used, pixels, 0))
+    views = PointCloud(views.points, views.normals, views.mask & is_used[:, None], views.missed & is_used[:, None])
+    return views, poses, count, jnp.max(jnp.where(is_used, pixels, 0))
 
 
-def _label(thing: Thing) -> Int[Array, ""]:
-    return thing.category if isinstance(thing, PartScene) else thing.label
+def _label(target: SceneObject) -> Int[Array, ""]:
+    return target.category if isinstance(target, PartScene) else target.label
 
 
-def _point_labels(thing: Thing, cloud: PointCloud) -> Any:
-    if isinstance(thing, PartScene):
-        return thing.solid.part_labels(cloud.points)
-    return thing.on_cue(cloud.points, _NOISE) & cloud.mask
+def _point_labels(target: SceneObject, cloud: PointCloud) -> Any:
+    if isinstance(target, PartScene):
+        return target.solid.part_labels(cloud.points)
+    return target.on_cue(cloud.points, _NOISE) & cloud.mask

@@ -5,7 +5,7 @@ import jax
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
-from training_clouds import MOST_VIEWS, Source, imagined_clouds, scanned_clouds
+from training_clouds import MAX_VIEWS, Source, imagined_clouds, scanned_clouds
 
 import jaxnbv as nbv
 from jaxnbv.studies.scenes import PATTERNS, Split, part_scene, pyramid_scene
@@ -43,7 +43,7 @@ def test_scanned_clouds_are_samples_of_their_scenes_with_noise(scanned):
     np.testing.assert_array_equal(scanned.labels, np.arange(5, 5 + COUNT) % len(PATTERNS))
     assert scanned.clouds.points.shape == (COUNT, POINTS, 3)
     assert not np.asarray(scanned.imagined).any()
-    assert {*np.asarray(scanned.views).tolist()} == {*range(1, MOST_VIEWS + 1)}
+    assert {*np.asarray(scanned.views).tolist()} == {*range(1, MAX_VIEWS + 1)}
     assert np.asarray(scanned.clouds.count > 50).all()
     for row in range(COUNT):
         _, normals = scanned.clouds[row].to_numpy()
@@ -108,7 +108,7 @@ def test_imagined_clouds_begin_with_what_was_truly_seen(imagined):
 
 @pytest.mark.slow
 def test_clouds_are_kept_in_the_units_of_the_network(tmp_path, monkeypatch):
-    monkeypatch.setattr("training_clouds._AT_ONCE", 3)
+    monkeypatch.setattr("training_clouds._SCENES_PER_FILE", 3)
     source = Source(tmp_path, pyramid_scene, PLANNER, POINTS, scale=2.0)
     batch = source.scanned(Split.TEST, 6)
     again = scanned_clouds(pyramid_scene, Split.TEST, range(6), POINTS)
