@@ -40,6 +40,8 @@ install_import_hook(["jaxnbv", "forecasts", "covering", "peers", "training", "tr
 settings.register_profile("repeatable", derandomize=True, deadline=None)
 settings.load_profile("repeatable")
 
+# .ci/run repeats the tests marked as_users with this, so that they are compiled as users compile.
+AS_USERS = os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] == "0"
 # Memory of a worker in bytes.
 MEMORY = 3 << 30
 SHARED = Path(__file__).resolve().parents[2] / "shared"
@@ -86,7 +88,7 @@ def compile_for_speed(wanted):
 @pytest.fixture(scope="module", autouse=True)
 def compiled_programs(request):
     """Compile as the module asks for. Drop all programs when they fill the memory, as they would in a whole run."""
-    computes = getattr(request.module, "COMPUTES", False)
+    computes = AS_USERS or getattr(request.module, "COMPUTES", False)
     if computes == jax.config.values["jax_disable_most_optimizations"] or psutil.Process().memory_info().rss > MEMORY:
         compile_for_speed(computes)
 
@@ -96,7 +98,7 @@ def computes():
     """Compile a single test for speed."""
     compile_for_speed(True)
     yield
-    compile_for_speed(False)
+    compile_for_speed(AS_USERS)
 
 
 @pytest.fixture(autouse=True)
