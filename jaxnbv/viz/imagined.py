@@ -124,7 +124,7 @@ def _fine_camera(camera: Camera) -> Camera:
 
 
 def colour_image(image: ShadedImage, new_colour: str = BEFORE, is_plain: bool = False) -> UInt8[np.ndarray, "h w 3"]:
-    """Colour a picture: grey where seen before, `new_colour` elsewhere on the surface, white without a hit.
+    """Colour a picture: grey where seen before, `new_colour` elsewhere on the surface, white beside it.
 
     - `is_plain`: whether to make the whole surface grey.
     """

@@ -27,7 +27,7 @@ from jaxnbv.viz.answers import Chart, CoverageAnswer, capital, words_of
 
 
 class Comparison(NamedTuple):
-    """Result of a different search from the same first view: name, a sentence, and charts as in `TaskReport`."""
+    """Result of a different search from the same first view: name, sentence, and charts of a `TaskReport`."""
 
     name: str
     sentence: str

@@ -132,7 +132,7 @@ def test_the_live_view_holds_the_part(episode):
     page = nbv.viz.LiveView(port=0)
     try:
         page.update(episode)
-        by_name = {handle.name: handle for handle in page._drawn}
+        by_name = {handle.name: handle for handle in page._handles}
         assert {"/likeliest part, slab  75 %", "/other shapes"} <= set(by_name)
         assert not by_name["/imagined/2 cube left"].visible
         assert "slab 75 %" in page._text.content.lower()
