@@ -18,26 +18,31 @@ from jaxnbv.surfaces.known_shapes import kind_of, systematic_resampling
 from jaxnbv.surfaces.registration import FitTargets, Prior, register
 
 CAMERA = nbv.Camera(height=40, width=40, fov=1.0)
-QUICK = nbv.ScreenedSPSR(nbv.GeometricSPSR((0.02, 0.06), (0.2, 0.25), truncation=8))
-RESIDUAL = nbv.ScreenedSPSR(nbv.GeometricSPSR(0.02, truncation=12), (nbv.surfaces.OnSurface(),))
+# The two models differ in numbers only, and share programs.
+QUICK, RESIDUAL = (
+    nbv.ScreenedSPSR(nbv.GeometricSPSR(lengthscales, (0.2, 0.25), truncation=8), (nbv.surfaces.OnSurface(),))
+    for lengthscales in ((0.02, 0.06), (0.02, 0.025))
+)
 GRID = nbv.Grid(40)
 
 
-class Corner(SignedDistance):
-    """Two boxes that meet: a solid without symmetry.
+class Boxes(SignedDistance):
+    """Two boxes that meet.
 
-    - `arm`: half the length of the second box.
+    - `sides`: half the lengths of their sides.
+    - `middle`: centre of the second. The first is centred.
     """
 
-    arm: Float[Array, ""]
+    sides: Float[Array, "2 3"]
+    middle: Float[Array, " 3"]
 
     def __call__(self, x):
-        first = Cuboid([0.9, 0.3, 0.4])(x)
-        return jnp.minimum(first, Cuboid(jnp.stack([0.2, self.arm, 0.25]))(x - jnp.array([0.6, 0.5, 0.1])))
+        return jnp.minimum(Cuboid(self.sides[0])(x), Cuboid(self.sides[1])(x - self.middle))
 
 
 def corner(arm):
-    return Corner(jnp.asarray(arm, jnp.float32))
+    """A solid without symmetry. The second box is `arm` long, on either side of its centre."""
+    return Boxes(jnp.array([[0.9, 0.3, 0.4], [0.2, arm, 0.25]]), jnp.array([0.6, 0.5, 0.1]))
 
 
 ARMS = (0.35, 0.5, 0.65, 0.8)
@@ -80,52 +85,40 @@ def observations_of(surface, positions, noise=0.005):
 AROUND = ((0.5, 1.0, 3.2), (2.8, 1.2, -1.2), (-2.5, -1.5, -1.5))
 
 
-@pytest.fixture(scope="module")
-def planted():
-    """Eight poses of one shape of the bank, seen from three sides, and the registered shapes."""
-    fits = []
-    for seed in range(8):
-        rotation, index = Rotation.random(random_state=seed), seed % len(ARMS)
-        surface, _, shift = filling(ARMS[index], rotation)
-        targets = FitTargets.of(observations_of(surface, AROUND))
-        fits.append(
-            (index, rotation, shift, register(BANK, Prior(nbv.surfaces.FreeRotation(), nbv.Box()), targets, 2048))
-        )
-    return fits
+def fits_of(bank, observations):
+    return register(bank, Prior(nbv.surfaces.FreeRotation(), nbv.Box()), FitTargets.of(observations), 2048)
 
 
-def test_planted_poses_are_recovered(planted):
-    turned, moved = [], []
-    for _, rotation, shift, fits in planted:
-        off = Rotation.from_matrix(np.asarray(fits.placement.rotation[0])) * rotation.inv()
-        turned.append(np.degrees(off.magnitude()))
-        moved.append(np.linalg.norm(np.asarray(fits.placement.shift[0]) - shift))
-    assert np.median(turned) < 3.0
+def test_planted_poses_are_recovered_and_modes_of_a_shape_are_far_apart():
+    """Each shape of the bank in a pose of its own, seen from three sides."""
+    turned, moved, shapes = [], [], []
+    for index, arm in enumerate(ARMS):
+        rotation = Rotation.random(random_state=index)
+        surface, _, shift = filling(arm, rotation)
+        fits = fits_of(BANK, observations_of(surface, AROUND))
+        turned.append((Rotation.from_matrix(fits.placement.rotation[0]) * rotation.inv()).magnitude())
+        moved.append(np.linalg.norm(fits.placement.shift[0] - shift))
+        shapes.append(int(fits.shape[0]))
+        is_distinct = np.asarray(fits.is_distinct)
+        rotations, names = np.asarray(fits.placement.rotation)[is_distinct], np.asarray(fits.shape)[is_distinct]
+        trace = np.einsum("aij,bij->ab", rotations, rotations)
+        near = (trace > 1.0 + 2.0 * np.cos(np.radians(15.0))) & (names[:, None] == names)
+        np.testing.assert_array_equal(near, np.eye(len(names), dtype=bool))
+        assert np.all(np.diff(fits.misfit) >= 0)
+    assert np.degrees(np.median(turned)) < 3.0
     assert np.median(moved) < 0.02
     # The true shape fits best.
-    assert sum(int(fits.shape[0]) == index for index, *_, fits in planted) >= 7
-
-
-def test_modes_of_one_shape_are_far_apart(planted):
-    for *_, fits in planted:
-        is_distinct = np.asarray(fits.is_distinct)
-        rotation, shape = np.asarray(fits.placement.rotation)[is_distinct], np.asarray(fits.shape)[is_distinct]
-        trace = np.einsum("aij,bij->ab", rotation, rotation)
-        near = (trace > 1.0 + 2.0 * np.cos(np.radians(15.0))) & (shape[:, None] == shape)
-        np.testing.assert_array_equal(near, np.eye(len(shape), dtype=bool))
-        assert np.all(np.diff(np.asarray(fits.misfit)) >= 0)
+    assert shapes == [0, 1, 2, 3]
 
 
 def test_a_symmetric_shape_stands_in_all_the_ways_that_look_alike():
-    """A bar seen from above may be rotated by half a turn."""
-    bank = nbv.ShapeBank.of([Cuboid([1.2, 0.3, 0.4])])
-    targets = FitTargets.of(observations_of(nbv.SDFSurface(Cuboid([1.25, 0.31, 0.42])), ((0.5, 3.0, 1.5),)))
-    fits = register(bank, Prior(nbv.surfaces.Upright(), nbv.Box()), targets, 512)
-    angles = np.degrees(
-        np.arctan2(np.asarray(fits.placement.rotation)[:, 0, 2], np.asarray(fits.placement.rotation)[:, 0, 0])
-    )
-    good = np.asarray(fits.is_distinct) & (np.asarray(fits.misfit) < 0.2)
-    assert sorted(np.round(np.abs(angles[good])).astype(int).tolist()) == pytest.approx([0, 180], abs=3)
+    """A bar may be rotated by half a turn about each of its axes."""
+    bars = [Boxes(jnp.array(2 * [[1.2, 0.3, height]]), jnp.zeros(3)) for height in (0.45, 0.55, 0.65, 0.75)]
+    fits = fits_of(nbv.ShapeBank.of(bars), observations_of(nbv.SDFSurface(Cuboid([1.25, 0.31, 0.47])), AROUND))
+    good = np.asarray(fits.is_distinct & (fits.misfit < 0.2) & (fits.shape == 0))
+    diagonals = np.einsum("aii->ai", fits.placement.rotation)[good]
+    expected = [[-1, -1, 1], [-1, 1, -1], [1, -1, -1], [1, 1, 1]]
+    np.testing.assert_allclose(diagonals[np.lexsort(np.rint(diagonals).T[::-1])], expected, atol=0.01)
 
 
 def test_shapes_are_fitted_to_empty_space_too():
@@ -160,9 +153,6 @@ def test_without_shapes_the_model_is_the_unknown_one_to_the_bit():
     observations = observations_of(nbv.SDFSurface(Sphere(1.2)), AROUND[:1])
     empty = model(nbv.ShapeBank.of([])).condition(observations)
     assert eqx.tree_equal(empty, QUICK.condition(observations))
-    assert eqx.tree_equal(
-        empty.sample(jax.random.key(3), 2), QUICK.condition(observations).sample(jax.random.key(3), 2)
-    )
 
 
 def test_samples_of_one_exact_shape_equal_it_to_the_noise():
