@@ -50,7 +50,7 @@ def views_of_a_box(errors, noise=0.0, eyes=EYES, roll=True):
         said = true @ np.linalg.inv(error)
         moved = said @ np.linalg.inv(true)
         points, normals = points @ moved[:3, :3].T + moved[:3, 3], normals @ moved[:3, :3].T
-        clouds.append(PointCloud.from_arrays(points, normals))
+        clouds.append(PointCloud.from_arrays(points, normals, 3000))
         poses.append(Pose.from_matrix(said))
     return clouds, poses
 
@@ -61,7 +61,7 @@ def apart(one, other):
     return np.degrees(Rotation.from_matrix(change[:3, :3]).magnitude()), np.linalg.norm(change[:3, 3])
 
 
-@settings(max_examples=5)
+@settings(max_examples=4)
 @given(st.integers(0, 1000), st.floats(1.0, 3.0), st.floats(0.001, 0.015))
 def test_the_error_of_the_mount_is_found(seed, degrees, length):
     error = random_motion(seed, degrees, length)
@@ -89,24 +89,19 @@ def test_exact_poses_stay_as_they_are():
 
 
 def test_the_error_of_a_single_pose_is_its_own():
+    """Its view moves as small_gicp moves the points onto all others by generalised ICP, without a model of the
+    mount."""
     errors = len(EYES) * [np.eye(4)]
     # It sees three faces that other views see too, which determines its error.
     errors[1] = random_motion(5, 1.5, 0.008)
-    alignment = align_views(*views_of_a_box(errors, noise=0.0005))
+    clouds, poses = views_of_a_box(errors, noise=0.0005)
+    alignment = align_views(clouds, poses)
     assert not alignment.is_mount
     assert np.argmax(alignment.disagreement) == 1
     angle, shift = apart(errors[1], alignment.corrections[1])
     assert angle < 0.2
     assert shift < 0.003
     assert np.argmax(alignment.errors[0]) == np.argmax(alignment.errors[1]) == 1
-
-
-def test_a_single_pose_is_corrected_as_small_gicp_does():
-    """small_gicp moves the view's points onto all others by generalised ICP, without a model of the mount."""
-    errors = len(EYES) * [np.eye(4)]
-    errors[1] = random_motion(5, 1.5, 0.008)
-    clouds, poses = views_of_a_box(errors, noise=0.0005)
-    alignment = align_views(clouds, poses)
     source = clouds[1].to_numpy()[0].astype(np.float64)
     others = [cloud.to_numpy()[0] for index, cloud in enumerate(clouds) if index != 1]
     result = small_gicp.align(
