@@ -1,8 +1,6 @@
 """Depth images of a sensor: units, strides, boxes, ranges, and input that cannot be right."""
 
-import functools
 import itertools
-import operator
 
 import numpy as np
 import pytest
@@ -10,22 +8,39 @@ from scipy.ndimage import gaussian_filter
 
 import jaxnbv as nbv
 from jaxnbv.geometry.gaps import find_block_side
-from jaxnbv.scanning.sdf import Cuboid, Sphere
 
-# In metres, z up: a ball on a table, 0.8 m from the camera, and a pillar between them at the left.
-BALL = Sphere(0.1).translate([0.0, 0.0, 0.1])
-TABLE = Cuboid([0.6, 0.6, 0.02]).translate([0.0, 0.0, -0.02])
-PILLAR = Cuboid([0.01, 0.01, 0.4]).translate([-0.05, -0.5, 0.4])
+# In metres, z up: a ball on a table, 0.8 m from the camera, and a pillar between them at the left. Each solid is its
+# centre and its radius or half sides.
+BALL = [0.0, 0.0, 0.1], 0.1
+TABLE = [0.0, 0.0, -0.02], [0.6, 0.6, 0.02]
+PILLAR = [-0.05, -0.5, 0.4], [0.01, 0.01, 0.4]
 POSE = nbv.look_at((0.0, -0.8, 0.3), (0.0, 0.0, 0.1), up=(0.0, 0.0, 1.0))
 CAMERA = nbv.Camera.from_intrinsics([[90.0, 0.0, 34.0], [0.0, 95.0, 21.5], [0.0, 0.0, 1.0]], width=64, height=48)
 BOX = nbv.Box((-0.15, -0.15, 0.002), (0.15, 0.15, 0.25))
 
 
-def depth_of(*solids, camera=CAMERA, pose=POSE):
-    """Depth along the camera's axis. Infinite where nothing is hit."""
-    cloud = nbv.scan(nbv.SDFSurface(functools.reduce(operator.or_, solids)), camera, pose)
-    depth = (np.asarray(cloud.points, np.float64) - np.asarray(pose.position)) @ np.asarray(pose.forward, np.float64)
-    return np.where(cloud.mask, depth, np.inf).reshape(camera.height, camera.width)
+def rays_of(camera):
+    """The camera's position and the rays of its pixels, whose lengths along the camera's axis are one, in float64."""
+    rays = np.asarray(camera.pixel_directions(), np.float64) @ np.asarray(POSE.rotation, np.float64).T
+    return np.asarray(POSE.position, np.float64), rays
+
+
+def depth_of(*solids, camera=CAMERA):
+    """Depth along the camera's axis in closed form. Infinite where nothing is hit."""
+    origin, rays = rays_of(camera)
+    depth = np.full(len(rays), np.inf)
+    for center, size in solids:
+        away = origin - center
+        if np.ndim(size):
+            with np.errstate(divide="ignore"):
+                ends = np.sort([(side * np.array(size) - away) / rays for side in (-1, 1)], axis=0)
+            enter, leave = ends[0].max(axis=1), ends[1].min(axis=1)
+            depth = np.minimum(depth, np.where(enter < leave, enter, np.inf))
+        else:
+            a, b, c = (rays**2).sum(axis=1), rays @ away, away @ away - size**2
+            root = np.sqrt(np.maximum(b**2 - a * c, 0.0))
+            depth = np.minimum(depth, np.where(root > 0, (-b - root) / a, np.inf))
+    return depth.reshape(camera.height, camera.width)
 
 
 def test_millimetres_of_a_sensor_give_the_points_in_metres():
@@ -41,7 +56,7 @@ def test_millimetres_of_a_sensor_give_the_points_in_metres():
     assert not np.asarray(cloud.missed).any()
 
 
-@pytest.mark.parametrize("stride", [2, 3, 5])
+@pytest.mark.parametrize("stride", [2, 5])
 def test_a_strided_image_has_rows_of_the_whole(stride):
     """Planes are fitted to all pixels, whatever the stride."""
     strided, rows = CAMERA.strided(stride), slice(stride // 2, None, stride)
@@ -66,9 +81,8 @@ def test_a_box_keeps_the_object_and_knows_what_was_crossed():
     np.testing.assert_array_equal(cropped.mask, inside)
     assert inside.sum() > 200
     # For each ray, in float64 by small steps: whether it leaves the box again before its hit, or never meets the box.
-    position = np.asarray(POSE.position, np.float64)
-    rays = np.asarray(CAMERA.pixel_directions(), np.float64) @ np.asarray(POSE.rotation, np.float64).T
-    steps = np.linspace(0.0, 3.0, 3001)[:, None, None]
+    position, rays = rays_of(CAMERA)
+    steps = np.linspace(0.4, 1.4, 1001)[:, None, None]
     places = position + steps * rays
     within = np.all((places >= low) & (places <= high), axis=2)
     last = np.where(within.any(axis=0), steps[len(steps) - 1 - np.argmax(within[::-1], axis=0), 0, 0], -np.inf)
@@ -94,23 +108,31 @@ def test_depths_beyond_the_range_are_misses_and_nearer_ones_unknown():
     assert int(cloud.count) > 200
 
 
-def image_with(mark, background, dtype, camera=CAMERA):
+def image_with(mark, background, dtype):
     """The ball before a background, in millimetres or metres. In the left half, `mark` replaces all unmeasured
     depths."""
-    depth = depth_of(BALL, camera=camera)
+    depth = depth_of(BALL)
     ball = np.isfinite(depth)
     image = np.where(ball, 1000.0 * depth, background)
-    image[:, : camera.width // 2][ball[:, : camera.width // 2]] = mark
+    image[:, :32][ball[:, :32]] = mark
     return np.round(image).astype(dtype) / (1.0 if dtype == np.uint16 else 1000.0), ball
 
 
 WALL = 2500.0 + 5.0 * np.random.default_rng(0).normal(size=(48, 64))
 
 
-@pytest.mark.parametrize("farthest", [None, 2.0])
-@pytest.mark.parametrize("dtype", [np.uint16, np.float32])
-@pytest.mark.parametrize("alone", [True, False])
-@pytest.mark.parametrize("mark", [65535, 32767, 10000, 8191, 4095, 2047])
+@pytest.mark.parametrize(
+    ("mark", "alone", "dtype", "farthest"),
+    [
+        (65535, True, np.uint16, 2.0),
+        (32767, False, np.uint16, None),
+        (10000, True, np.float32, None),
+        (8191, False, np.float32, 2.0),
+        (4095, True, np.uint16, None),
+        (2047, False, np.float32, None),
+        (2047, True, np.uint16, 2.0),
+    ],
+)
 @pytest.mark.filterwarnings("ignore:the depth image has the value")
 def test_a_mark_of_missing_depth_equals_zero(mark, alone, dtype, farthest):
     """The clouds are the same row by row, and no node within the ball is known to be empty."""
@@ -144,8 +166,9 @@ def test_a_mark_is_warned_of_and_a_wall_and_a_floor_are_not(recwarn):
 
 
 @pytest.mark.filterwarnings("ignore:the depth image has the value")
-@pytest.mark.parametrize("farthest", [None, 3.0])
-@pytest.mark.parametrize("rest", [1e10, 65504.0, 100.0, 20.0, 0.01, "a wall"])
+@pytest.mark.parametrize(
+    ("rest", "farthest"), [(1e10, None), (65504.0, 3.0), (100.0, None), (20.0, 3.0), (0.01, None), ("a wall", None)]
+)
 def test_a_far_background_and_glare_are_no_other_units(rest, farthest):
     depth = depth_of(BALL)
     camera = nbv.Camera.from_intrinsics(CAMERA.intrinsics, 48, 64, nearest=0.1, farthest=farthest)
@@ -158,32 +181,32 @@ def test_a_far_background_and_glare_are_no_other_units(rest, farthest):
 
 FINE = nbv.Camera.from_intrinsics([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]], width=640, height=480)
 SPARSE = {
-    "every 8th row": lambda v, u: v % 8 == 0,
-    "every 8th row, others": lambda v, u: v % 8 == 3,
-    "every 4th column": lambda v, u: u % 4 == 1,
+    "every 8th row": lambda v, u: v % 8 == 3,
     "every 2nd column": lambda v, u: u % 2 == 1,
     "every 4th pixel": lambda v, u: (v % 4 == 1) & (u % 4 == 3),
     "a lidar": lambda v, u: (v % 6 == 5) & (u % 2 == 0),
     "5 % at random": lambda v, u: np.random.default_rng(0).random(v.shape) < 0.05,
-    "20 % at random": lambda v, u: np.random.default_rng(0).random(v.shape) < 0.2,
 }
 
 
-@pytest.mark.parametrize("stride", [4, 8])
+# No side of the blocks is a multiple of the stride.
+STRIDE = 5
+
+
 @pytest.mark.parametrize("name", SPARSE)
-def test_an_image_with_gaps_shows_the_object(name, stride):
+def test_an_image_with_gaps_shows_the_object(name):
     """Almost as many rows as from the whole image, on their rays, near the ball and with its normals."""
     depth = depth_of(BALL, TABLE, camera=FINE)
     image = np.where(np.isfinite(depth) & SPARSE[name](*np.mgrid[:480, :640]), np.round(1e4 * depth), 0.0)
-    whole = nbv.PointCloud.from_depth(np.where(np.isfinite(depth), depth, 0.0), FINE, POSE, 1.0, stride, BOX)
-    cloud = nbv.PointCloud.from_depth(image.astype(np.uint16), FINE, POSE, 1e-4, stride, BOX)
+    whole = nbv.PointCloud.from_depth(np.where(np.isfinite(depth), depth, 0.0), FINE, POSE, 1.0, STRIDE, BOX)
+    cloud = nbv.PointCloud.from_depth(image.astype(np.uint16), FINE, POSE, 1e-4, STRIDE, BOX)
     points, normals = (np.asarray(rows, np.float64) for rows in cloud.to_numpy())
     assert 0.6 * int(whole.count) < len(points) < 1.4 * int(whole.count)
     outward = points - [0.0, 0.0, 0.1]
     distance = np.linalg.norm(outward, axis=1)
     assert np.median(np.abs(distance - 0.1)) < 4e-3
     assert np.median(np.sum(outward * normals, axis=1) / distance) > np.cos(np.radians(10.0))
-    rays = np.asarray(FINE.strided(stride).pixel_directions(), np.float64)[np.asarray(cloud.mask)]
+    rays = np.asarray(FINE.strided(STRIDE).pixel_directions(), np.float64)[np.asarray(cloud.mask)]
     local = (points - np.asarray(POSE.position, np.float64)) @ np.asarray(POSE.rotation, np.float64)
     np.testing.assert_allclose(local / local[:, 2:], rays, atol=1e-5)
     # Rays between the samples are not taken to have passed.
@@ -204,10 +227,10 @@ def test_holes_are_no_gaps():
 
 def test_planes_are_seen_exactly_between_samples():
     """Planes are linear in inverse depth, so that the pattern and the phase of the gaps do not matter."""
-    depth = depth_of(Cuboid([3.0, 3.0, 0.02]).translate([0.0, 0.0, -0.02]), camera=FINE)
+    depth, box = depth_of(([0.0, 0.0, -1.0], [3.0, 3.0, 1.0]), camera=FINE), nbv.Box((-1.0,) * 3, (1.0,) * 3)
     for keep in SPARSE.values():
         image = np.where(np.isfinite(depth) & keep(*np.mgrid[:480, :640]), depth, 0.0)
-        points, normals = nbv.PointCloud.from_depth(image, FINE, POSE, stride=5).to_numpy()
+        points, normals = nbv.PointCloud.from_depth(image, FINE, POSE, 1.0, STRIDE, box).to_numpy()
         # Farther away the plane is too oblique for a fit.
         points, normals = points[points[:, 1] < 0.0], normals[points[:, 1] < 0.0]
         assert len(points) > 2000
@@ -245,13 +268,12 @@ def test_only_infinity_is_a_miss():
         assert int(cloud.missed.sum()) == missed
 
 
-@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
-@pytest.mark.parametrize("noise", [0.0, 1e-3])
+@pytest.mark.parametrize(("share", "noise"), [(0.0, 1e-3), (0.5, 0.0), (1.0, 1e-3)])
 def test_pixels_that_mix_a_near_and_a_far_surface_are_left_out_and_thin_parts_stay(share, noise):
     """A ball and a leg three pixels wide stand 0.8 m away before a wall. Some of the pixels beside an edge have a depth
     anywhere between the two."""
     camera = CAMERA.resized(192, 256)
-    leg = Cuboid([0.0035, 0.0035, 0.1]).translate([0.14, 0.0, 0.1])
+    leg = [0.14, 0.0, 0.1], [0.0035, 0.0035, 0.1]
     near = np.minimum(depth_of(BALL, leg, camera=camera), 1.6)
     far = near
     for axis, shift in itertools.product((0, 1), (-1, 1)):
@@ -259,9 +281,11 @@ def test_pixels_that_mix_a_near_and_a_far_surface_are_left_out_and_thin_parts_st
     rng = np.random.default_rng(0)
     mixed = (far - near > 0.1) & (rng.uniform(size=near.shape) < share)
     depth = np.where(mixed, near + rng.uniform(size=near.shape) * (far - near), near)
-    points, _ = nbv.PointCloud.from_depth(depth + noise * rng.normal(size=near.shape), camera, POSE).to_numpy()
-    object_points = points[points[:, 1] < 0.3]
-    away = np.minimum(*(np.abs(np.asarray(solid(object_points))) for solid in (BALL, leg)))
-    assert away.max() < 0.012
-    assert len(object_points) > 0.95 * np.sum((near < 1.6) & ~mixed)
-    assert np.sum(np.abs(object_points[:, 0] - 0.14) < 0.01) > (280 if share == 0 else 80)
+    noisy = depth + noise * rng.normal(size=near.shape)
+    points = np.asarray(nbv.PointCloud.from_depth(noisy, camera, POSE, stride=2).to_numpy()[0], np.float64)
+    points = points[points[:, 1] < 0.3]
+    from_ball = np.abs(np.linalg.norm(points - BALL[0], axis=1) - BALL[1])
+    from_leg = np.linalg.norm(np.maximum(np.abs(points - leg[0]) - leg[1], 0.0), axis=1)
+    assert np.minimum(from_ball, from_leg).max() < 0.012
+    assert len(points) > 0.95 * np.sum(((near < 1.6) & ~mixed)[1::2, 1::2])
+    assert np.sum(np.abs(points[:, 0] - 0.14) < 0.01) > (70 if share == 0 else 20)

@@ -1,6 +1,7 @@
 """Normals of plain points against those of their surface; planes fitted to noisy depth images: the estimated noise, and
 the errors that remain in normals and depths."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 import jaxnbv as nbv
 from jaxnbv.geometry.depth_noise import depth_noise
 
+NOISE = jax.jit(depth_noise)
 CENTRES = np.asarray(nbv.geometry.fibonacci_sphere(3000), np.float64)
 
 
@@ -61,11 +63,11 @@ def image(noise, seed=0):
     return np.round(1000.0 * noisy).astype(np.uint16)
 
 
-@pytest.mark.parametrize("noise", [1e-3, 2e-3, 5e-3])
+@pytest.mark.parametrize("noise", [1e-3, 5e-3])
 def test_the_noise_of_an_image_is_found(noise):
     """The tolerance is that of the median of some hundred differences near a pixel, and of the surface's curvature."""
     depth = jnp.asarray(1e-3 * image(noise))
-    ratio = np.asarray(depth_noise(depth, depth > 0, 0.0)) / np.hypot(noise, 1e-3 / np.sqrt(12))
+    ratio = np.asarray(NOISE(depth, depth > 0, 0.0)) / np.hypot(noise, 1e-3 / np.sqrt(12))
     assert np.median(ratio) == pytest.approx(1.0, rel=0.1)
     assert np.quantile(np.abs(ratio - 1.0), 0.9) < 0.25
 
@@ -77,12 +79,12 @@ def test_noise_is_local_in_image_and_depth():
     Within a tile and a half of the middle the estimate may be either.
     """
     rng = np.random.default_rng(0)
-    near = np.arange(240) % 15 < 5
-    wall = np.where(near[:, None], 0.5, 2.0) * np.ones((240, 320))
-    truth = np.where(near[:, None], 1e-3, 8e-3) * np.where(np.arange(320) < 160, 1.0, 4.0)
+    near = np.arange(160) % 15 < 5
+    wall = np.where(near[:, None], 0.5, 2.0) * np.ones((160, 200))
+    truth = np.where(near[:, None], 1e-3, 8e-3) * np.where(np.arange(200) < 100, 1.0, 4.0)
     depth = jnp.asarray(wall + truth * rng.normal(size=wall.shape))
-    ratio = np.asarray(depth_noise(depth, depth > 0, 0.0)) / truth
-    away = np.abs(np.arange(320) - 160) > 16
+    ratio = np.asarray(NOISE(depth, depth > 0, 0.0)) / truth
+    away = np.abs(np.arange(200) - 100) > 16
     assert np.quantile(np.abs(np.log(ratio[:, away])), 0.95) < 0.3
 
 
@@ -90,28 +92,28 @@ def test_correlated_errors_do_not_hide_noise():
     """Each error is averaged with those of the next pixels, as by a sensor that smooths. The estimate is less than for
     independent errors, but more than half."""
     rng = np.random.default_rng(0)
-    independent = 1e-3 * rng.normal(size=(121, 161))
-    smoothed = 0.25 * sum(independent[down : 120 + down, right : 160 + right] for down in (0, 1) for right in (0, 1))
+    independent = 1e-3 * rng.normal(size=(161, 201))
+    smoothed = 0.25 * sum(independent[down : 160 + down, right : 200 + right] for down in (0, 1) for right in (0, 1))
     depth = jnp.asarray(1.0 + smoothed)
-    assert np.median(depth_noise(depth, depth > 0, 0.0)) == pytest.approx(smoothed.std(), rel=0.1)
+    assert np.median(NOISE(depth, depth > 0, 0.0)) == pytest.approx(smoothed.std(), rel=0.1)
 
 
 def test_steps_of_depth_are_noise():
     """The depth of a slope changes in steps of 1 cm, each over a dozen pixels, so most differences are zero."""
-    slope = 2.0 + 0.01 * np.floor(np.arange(320) / 12.0) * np.ones((240, 1))
-    noise = depth_noise(jnp.asarray(slope), jnp.ones(slope.shape, bool), 0.0)
+    slope = 2.0 + 0.01 * np.floor(np.arange(200) / 12.0) * np.ones((160, 1))
+    noise = NOISE(jnp.asarray(slope), jnp.ones(slope.shape, bool), 0.0)
     assert np.median(noise) == pytest.approx(0.01 / np.sqrt(12), rel=0.5)
 
 
-@pytest.mark.parametrize("shape", [(5, 3), (6, 6), (240, 320)])
+@pytest.mark.parametrize("shape", [(5, 3), (160, 200)])
 def test_an_image_without_four_pixels_in_a_row_has_no_noise_but_that_of_rounding(shape):
     apart = np.zeros(shape, bool)
     apart[::3, ::4] = True
     for valid in (apart, np.zeros(shape, bool)):
-        np.testing.assert_array_equal(depth_noise(jnp.ones(shape), jnp.asarray(valid), 0.25), 0.25)
+        np.testing.assert_array_equal(NOISE(jnp.ones(shape), jnp.asarray(valid), 0.25), 0.25)
 
 
-@pytest.mark.parametrize("wall", [0.75, 1.5, 4.0])
+@pytest.mark.parametrize("wall", [0.75, 4.0])
 def test_a_noisy_background_does_not_blur_what_is_before_it(wall):
     """A ball of 8 cm at 0.57 m before a wall over most of the image, with noise that grows as the square of the depth.
     Compares with the ball's equation, and with the image without a wall."""
@@ -124,12 +126,12 @@ def test_a_noisy_background_does_not_blur_what_is_before_it(wall):
     noisy = truth + 2.5e-3 * truth**2 * np.random.default_rng(0).normal(size=truth.shape)
     clouds = {}
     for name, depth in (("alone", np.where(on_ball, noisy, 0.0)), ("before", noisy)):
-        cloud = nbv.PointCloud.from_depth(np.round(1e3 * depth).astype(np.uint16), camera, pose, 1e-3, stride=4)
-        mask = np.asarray(cloud.mask) & on_ball[2::4, 2::4].reshape(-1)
+        cloud = nbv.PointCloud.from_depth(np.round(1e3 * depth).astype(np.uint16), camera, pose, 1e-3, stride=8)
+        mask = np.asarray(cloud.mask) & on_ball[4::8, 4::8].reshape(-1)
         points, normals = np.asarray(cloud.points)[mask], np.asarray(cloud.normals)[mask]
         away = np.linalg.norm(points, axis=1)
         clouds[name] = np.median(np.abs(away - RADIUS)), np.quantile(angles(normals, points / away[:, None]), 0.9)
-        assert mask.sum() > 0.99 * on_ball[2::4, 2::4].sum()
+        assert mask.sum() > 0.99 * on_ball[4::8, 4::8].sum()
     np.testing.assert_allclose(clouds["before"], clouds["alone"], rtol=0.1)
     assert clouds["before"][0] < 2.3e-4
     assert clouds["before"][1] < 4.0
@@ -140,13 +142,12 @@ def test_a_noisy_background_does_not_blur_what_is_before_it(wall):
     [(0.0, 2.5, 9.0), (1e-3, 4.5, 14.0), (2e-3, 8.0, 20.0)],
     ids=["rounded", "1 mm", "2 mm"],
 )
-@pytest.mark.parametrize("stride", [1, 4])
-def test_normals_are_accurate_despite_noise(noise, median, most, stride):
+def test_normals_are_accurate_despite_noise(noise, median, most):
     """Errors in degrees at half and nine tenths of the pixels, including the edge of the ball. Fitted depths are better
     than measured ones."""
     depth, normals = ball_and_plane()
-    rows = slice(stride // 2, None, stride)
-    cloud = nbv.PointCloud.from_depth(image(noise), CAMERA, POSE, depth_scale=1e-3, stride=stride)
+    rows = slice(1, None, 3)
+    cloud = nbv.PointCloud.from_depth(image(noise), CAMERA, POSE, depth_scale=1e-3, stride=3)
     mask, truth = np.asarray(cloud.mask), normals[rows, rows].reshape(-1, 3)
     assert mask.mean() > 0.99
     cosine = np.sum(np.asarray(cloud.normals, np.float64) * truth, axis=1)[mask]
