@@ -39,7 +39,10 @@ from jaxnbv.utility import Answer, AnyUtility, Quantity, Utility, as_utility, de
 
 
 class ImaginedView(eqx.Module):
-    """One imagined scan, its camera and its pose, in scene coordinates. `scan.mask` marks the rows with a point."""
+    """One imagined scan, its camera and its pose, in scene coordinates.
+
+    `scan.mask` marks the rows with a point.
+    """
 
     scan: PointCloud
     camera: Camera

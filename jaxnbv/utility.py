@@ -97,7 +97,10 @@ class Utility(eqx.Module):
         return None
 
     def answer_values(self, cloud: PointCloud) -> Float[Array, " n"] | None:
-        """Return the values of `answer` by JAX operations. None if there is no answer, or if it needs other code."""
+        """Return the values of `answer` by JAX operations.
+
+        None if there is no answer, or if it needs other code.
+        """
         return None
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> Answer | None:

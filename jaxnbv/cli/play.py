@@ -142,7 +142,7 @@ def first_pose(place: Position, surface: Surface) -> Pose:
 
 
 def check_options(options: EpisodeOptions) -> None:
-    """Check options that could only fail after the object and the known shapes were made, which takes seconds.
+    """Check options that would otherwise fail only after the object and the known shapes were made.
 
     **Raises:** `ValueError` for fewer than one view, an invalid stop rule, or known shapes for the paper's model.
     """

@@ -9,7 +9,10 @@ from jaxnbv.checks import AnyArray
 
 @jax.custom_jvp
 def safe_norm(*components: Float[AnyArray, "*#n"]) -> Float[Array, "*n"]:
-    """Return the Euclidean length of the vectors with these components. Its derivative at the zero vector is zero."""
+    """Return the Euclidean length of the vectors with these components.
+
+    Its derivative at the zero vector is zero.
+    """
     return jnp.sqrt(sum(c * c for c in components))
 
 
@@ -32,7 +35,9 @@ def rotation_about(axis: Float[Array, "3"], angle: Float[Array, ""]) -> Float[Ar
 
 
 def rotation_from_vector(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """Convert a rotation vector to a matrix. The vector's direction is the axis, its length the angle in radians.
+    """Convert a rotation vector to a matrix.
+
+    The vector's direction is the axis, and its length the angle in radians.
 
     For the vector w and its length a, Rodrigues' formula is I + sin(a) / a [w]_x + (1 - cos(a)) / a^2 [w]_x^2. Near
     zero, both fractions are replaced by their Taylor series, so the result is differentiable at w = 0 too.

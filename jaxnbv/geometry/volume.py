@@ -68,7 +68,7 @@ class Box(eqx.Module):
         return Box(self.low - np.array([margin, 0.0, margin]), self.high + margin)
 
     def shares_beyond(self, points: Float[np.ndarray, "n 3"], margin: float) -> dict[str, float]:
-        """Return, for each face, the fraction of points that lie more than the length `margin` beyond the face.
+        """Return, for each face, the fraction of points that are farther than `margin` beyond the face.
 
         The keys are the names of the faces, such as "+x". The dictionary is empty if there are no points.
         """

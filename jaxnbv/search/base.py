@@ -134,7 +134,10 @@ class Baseline(CandidateSearch):
 
     @abstractmethod
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
-        """Return the value of each candidate. The search proposes the best one that `problem` does not exclude."""
+        """Return the value of each candidate.
+
+        The search proposes the best candidate that `problem` does not exclude.
+        """
 
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
         """Propose the candidate with the highest value of `values`. The scores are not used."""

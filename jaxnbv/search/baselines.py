@@ -53,7 +53,10 @@ class UncertaintyView(Baseline):
         return Quantity("uncertain length of the principal ray", "", meaning, length_power=1)
 
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
-        """Return `uncertain_length` of each candidate, after the cost of the move is applied. The key is not used."""
+        """Return `uncertain_length` of each candidate, after the cost of the move is applied.
+
+        The key is not used.
+        """
         return problem.apply_cost(uncertain_length(problem, candidates), candidates)
 
 

@@ -44,7 +44,10 @@ class PoseSpace(eqx.Module):
         """
 
     def check_camera(self, camera: Camera) -> None:
-        """Raise `ValueError` if the camera's image is too narrow for the poses. By default, every camera is valid."""
+        """Raise `ValueError` if the camera's image is too narrow for the poses.
+
+        By default, every camera is valid.
+        """
         return
 
 

@@ -67,7 +67,10 @@ class RunFolder(ResultFolder):
 
     @classmethod
     def config_of(cls, path: str | Path, kind: str, **replacements: Any) -> dict[str, Any]:
-        """Rebuild the configuration of an existing folder, with `replacements` for some parts, see `read_config`."""
+        """Rebuild the configuration of an existing folder, with `replacements` for some parts.
+
+        See `read_config`.
+        """
         return read_config(path, kind, cls.format, replacements)
 
     def count(self, name: str) -> int:

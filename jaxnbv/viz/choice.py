@@ -19,7 +19,7 @@ from jaxnbv.viz import sphere
 from jaxnbv.viz.answers import number_text
 from jaxnbv.viz.style import GREY, INK, LINE, NEW, VALUE
 
-# With fewer candidates than this, the map is not coloured between them.
+# The map is coloured between candidates if there are at least this many.
 _MIN_CANDIDATES = 12
 # Letters in a line of the caption.
 _MAX_LETTERS = 56

@@ -67,7 +67,7 @@ def sketches_of(
             continue
         posterior = sampler.posterior(observations)
         inputs = StepInputs(observations, posterior)
-        # With the step's own key, the samples are those that it imagined. Moments without closed form need samples.
+        # The step's own key gives the samples that it imagined. Moments without closed form need samples.
         if is_imagined or not posterior.has_closed_forms:
             sample_key, *_ = view_keys(episode.key, index)
             surfaces = sampler.sample(observations, sample_key, posterior)
