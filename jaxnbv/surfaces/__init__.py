@@ -8,6 +8,7 @@ from jaxnbv.surfaces.known_shapes import KnownShapes as KnownShapes
 from jaxnbv.surfaces.known_shapes import KnownShapesPosterior as KnownShapesPosterior
 from jaxnbv.surfaces.part_hypotheses import PartHypotheses as PartHypotheses
 from jaxnbv.surfaces.part_pose import ObjectPose as ObjectPose
+from jaxnbv.surfaces.part_pose import object_pose as object_pose
 from jaxnbv.surfaces.pathwise import FieldsAbout as FieldsAbout
 from jaxnbv.surfaces.pathwise import TrigonometricPosterior as TrigonometricPosterior
 from jaxnbv.surfaces.placement import AsGiven as AsGiven
