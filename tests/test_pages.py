@@ -48,7 +48,17 @@ def smaller(planner_of=nbv.Planner):
         camera = nbv.Camera(height=12, width=12)
         return dataclasses.replace(planner, sampler=sampler, capacity=512, camera=camera)
 
+    make.for_parts = planner_of.for_parts
     return make
+
+
+def before_arm(monkeypatch):
+    """A session's default planner with smaller settings."""
+    sampler = nbv.SurfaceSampler(SMALL, grid=nbv.Grid(24), num_samples=2)
+    planner = nbv.Planner(
+        nbv.NewSurface(), nbv.DiscreteSearch(24), nbv.Camera(height=12, width=16), sampler, capacity=512
+    )
+    monkeypatch.setattr("jaxnbv.planning.session.usual_planner", lambda: planner)
 
 
 class Tensor(np.ndarray):
@@ -104,6 +114,7 @@ def before_cluster(monkeypatch):
 
 # Preparations that a page leaves to its reader.
 BEFORE = {
+    "how_to/arm.md": before_arm,
     "how_to/cluster.md": before_cluster,
     "how_to/mesh.md": before_mesh,
     "how_to/pytorch_classifier.md": before_pytorch,
@@ -136,11 +147,11 @@ def test_the_program_of_a_page_runs(page, tmp_path, monkeypatch):
         assert np.isfinite(float(names[name].value))
 
 
-# Smaller numbers of frequencies, views, samples, nodes, points, rays and candidates.
+# A model that is quick to compile. Smaller numbers of views, samples, nodes, points, rays and candidates.
 LESS = {
-    "nbv.ScreenedSPSR(),": "nbv.ScreenedSPSR(nbv.GeometricSPSR(0.05, truncation=8)),",
+    "nbv.ScreenedSPSR(),": "nbv.GeometricSPSR(0.05, 0.2, 8),",
     "views=5": "views=2",
-    "num_samples=16": "num_samples=4, grid=nbv.Grid(24)",
+    "num_samples=16": "num_samples=2, grid=nbv.Grid(24)",
     "nbv.NewSurface(),": "nbv.NewSurface(), capacity=512, camera=nbv.Camera(height=12, width=12),",
     "nbv.DiscreteSearch(),": "nbv.DiscreteSearch(12),",
 }
