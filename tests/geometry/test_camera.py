@@ -80,15 +80,7 @@ def test_a_resized_camera_sees_the_same_and_the_frustum_is_its_border(values, he
 
 FULL = np.array([[600.0, 0.0, 318.6], [0.0, 605.0, 242.3], [0.0, 0.0, 1.0]])
 # Principal points of depth cameras on the market, as shares of width and height.
-CENTERS = [
-    (0.4978, 0.5318),
-    (0.4980, 0.4835),
-    (0.5004, 0.5063),
-    (0.5, 0.5),
-    (0.4863, 0.4961),
-    (0.516, 0.49),
-    (0.505, 0.52),
-]
+CENTERS = [(0.4978, 0.5318), (0.5, 0.5), (0.4863, 0.4961), (0.516, 0.49)]
 
 
 @pytest.mark.parametrize(("left", "top"), [(320, 240), (600, 0), (-300, 100), (0, 400), (100, -200)])
@@ -105,10 +97,8 @@ def test_the_rays_of_a_window_are_those_of_the_whole_image(left, top):
 @pytest.mark.parametrize("binning", [2, 3, 4])
 @pytest.mark.parametrize("center", CENTERS)
 def test_a_matrix_of_another_image_size_is_named(center, binning, recwarn):
-    height, width = 480, 640
-    matrix = FULL + np.array(
-        [[0, 0, center[0] * width - 0.5 - 318.6], [0, 0, center[1] * height - 0.5 - 242.3], [0] * 3]
-    )
+    height, width, matrix = 480, 640, np.array(FULL)
+    matrix[:2, 2] = center[0] * width - 0.5, center[1] * height - 0.5
     nbv.Camera.from_intrinsics(matrix, height, width)
     assert len(recwarn) == 0
     named = r"centre of an image of 6\d\d x [45]\d\d, but this one is .* binned.* divide its first two rows by"
@@ -123,7 +113,6 @@ def test_a_matrix_of_another_image_size_is_named(center, binning, recwarn):
 
 
 LENSES = [
-    (-0.3, 0.1, 0.001, -0.002),
     (0.1, -0.2, 0.0005, 0.0005, 0.1),
     (8.1, 4.5, 1e-4, -2e-5, 0.2, 8.4, 6.5, 1.2),
 ]
@@ -156,9 +145,10 @@ def test_distortion_is_undone_once_an_image(lens):
     depth = np.where(x > 0.3, np.inf, np.minimum(ball, 0.8 / (1.0 - 0.1 * x)))
     camera = nbv.Camera.from_intrinsics(matrix, 240, 320, distortion=lens)
     pose = nbv.Pose(np.eye(3), np.zeros(3))
-    off = []
+    clouds, off = [], []
     for one in (camera, nbv.Camera.from_intrinsics(matrix, 240, 320)):
-        cloud = nbv.PointCloud.from_depth(depth, one, pose)
+        cloud = nbv.PointCloud.from_depth(depth, one, pose, stride=2)
+        clouds.append(cloud)
         points = np.asarray(cloud.to_numpy()[0], np.float64)
         from_ball = np.linalg.norm(points - center, axis=1) - radius
         from_wall = (points[:, 2] - 0.1 * points[:, 0] - 0.8) / math.hypot(1.0, 0.1)
@@ -166,9 +156,9 @@ def test_distortion_is_undone_once_an_image(lens):
     assert np.median(off[0]) < 5e-5
     assert np.percentile(off[0], 99) < 1e-3
     assert np.median(off[1]) > 4 * np.percentile(off[0], 90)
-    cloud = nbv.PointCloud.from_depth(depth, camera, pose)
+    cloud = clouds[0]
     missed, met = np.asarray(cloud.missed), np.asarray(cloud.mask)
-    across = np.asarray(camera.pixel_directions())[:, 0]
+    across = np.asarray(camera.strided(2).pixel_directions())[:, 0]
     assert not missed[across < 0.295].any()
     assert not met[across > 0.305].any()
     assert missed[across > 0.305].mean() > 0.6
@@ -228,8 +218,11 @@ def test_poses_to_matrices_and_back_in_both_conventions(given):
     np.testing.assert_allclose(turned.forward, -rotation[:, 2], atol=1e-6)
     np.testing.assert_allclose(turned.rotation[:, 1], -rotation[:, 1], atol=1e-6)
     np.testing.assert_allclose(turned.rotation[:, 0], rotation[:, 0], atol=1e-6)
-    batch = nbv.Pose.from_matrix(np.stack([matrix, np.eye(4)]))
-    assert batch.matrix.shape == (2, 4, 4)
+    pose = nbv.Pose.from_matrix(np.stack([matrix, np.eye(4)]))[0]
+    points = np.random.default_rng(0).normal(size=(5, 3))
+    np.testing.assert_allclose(
+        pose.to_scene(jnp.asarray(points, jnp.float32)), points @ rotation.T + position, atol=1e-5
+    )
 
 
 def test_a_matrix_to_three_digits_is_made_a_rotation():
@@ -243,13 +236,6 @@ def test_a_matrix_to_three_digits_is_made_a_rotation():
     was_off = np.abs(given @ given.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2)) > 1e-3
     assert 5 < was_off.sum() < 50
     assert off[was_off].max() < 1e-6
-
-
-def test_a_pose_s_matrix_moves_points_as_the_pose_does():
-    pose = nbv.look_at((0.8, 0.9, 2.2), (0.1, 0.2, 0.3))
-    points = np.random.default_rng(0).normal(size=(5, 3))
-    moved = np.concatenate([points, np.ones((5, 1))], axis=1) @ np.asarray(pose.matrix, np.float64).T
-    np.testing.assert_allclose(pose.to_scene(jnp.asarray(points, jnp.float32)), moved[:, :3], atol=1e-5)
 
 
 @settings(max_examples=100)

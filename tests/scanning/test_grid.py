@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.ndimage
-from bumps import GRID, box_hit, random_rays, rough_values
+from bumps import GRID, random_rays, rough_values
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from on_grid import nodes
@@ -61,28 +61,6 @@ def test_sphere_closed_form():
     assert np.abs(np.asarray(hits.normals)[mask] - points[mask]).max() < 2 * GRID.spacing**2
 
 
-def test_box_closed_form():
-    half = np.array([0.7, 0.83, 0.9])
-    q = np.abs(nodes(GRID.axis)) - half
-    outside = np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(axis=-1), 0)
-    origins, directions = random_rays(1, 4000, spread=0.6)
-    hits = nbv.scanning.GridSurface.from_values(outside, 0.0, GRID).trace(origins, directions)
-    t, normal = box_hit(origins, directions, half)
-    expected = origins + t[:, None] * directions.astype(np.float64)
-    assert np.asarray(hits.mask).all()
-    error = np.linalg.norm(np.asarray(hits.points) - expected, axis=1)
-    # The distance is linear near a face, so interpolation is exact two voxels away from the edges.
-    margin = np.sort(half - np.abs(expected), axis=1)[:, 1]
-    face = margin > 2 * GRID.spacing
-    assert face.sum() > 1000
-    assert error[face].max() < 1e-5 / 0.2
-    # Central differences reach a voxel further out, and as far inwards, where another face may be nearer.
-    face = margin > 4 * GRID.spacing
-    np.testing.assert_allclose(np.asarray(hits.normals)[face], normal[face], atol=1e-4)
-    # Nearer to an edge the hits are still zeros of the interpolant up to rounding.
-    assert np.abs(interpolate(outside, hits.points, GRID)).max() < 1e-5
-
-
 def brute_force(values, origins, directions, grid, step):
     """t at the first change of sign of the interpolant in the box, by dense sampling in float64. Infinite if there is
     none."""
@@ -124,7 +102,7 @@ def test_brute_force_march(amplitude):
 unit = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 0.1)
 
 
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(unit, unit, st.floats(-0.3, 0.3), st.floats(-0.3, 0.3))
 def test_no_tunnelling_through_a_two_voxel_sheet(normal, direction, shift, slide):
     grid = nbv.Grid(40, 1.75)
@@ -173,12 +151,12 @@ def test_far_origins_and_rays_on_the_border_of_the_box():
 
 
 def test_samples_in_a_batch_equal_single_ones():
-    values = np.stack([rough_values(GRID, seed, 0.1) for seed in range(3)]).astype(np.float32)
+    values = np.stack([rough_values(GRID, seed, 0.1) for seed in range(2)]).astype(np.float32)
     surfaces = nbv.scanning.GridSurface.from_values(values, 0.05, GRID)
-    poses = nbv.look_at(nbv.geometry.fibonacci_sphere(6, 2.5))
+    poses = nbv.look_at(nbv.geometry.fibonacci_sphere(3, 2.5))
     clouds = nbv.scanning.scan_samples(surfaces, CAMERA, poses)
-    assert clouds.points.shape == (3, 6, 1600, 3)
-    assert clouds.mask.shape == (3, 6, 1600)
+    assert clouds.points.shape == (2, 3, 1600, 3)
+    assert clouds.mask.shape == (2, 3, 1600)
     origins, directions = camera_rays(poses)
     vmapped = jax.vmap(lambda surface: surface.trace(origins, directions))(surfaces)
 
@@ -186,10 +164,10 @@ def test_samples_in_a_batch_equal_single_ones():
     def differs(a, b):
         return np.abs(np.asarray(a) - np.asarray(b)).max(axis=-1) > 1e-5
 
-    for i in range(3):
+    for i in range(2):
         single = nbv.scanning.GridSurface.from_values(values[i], 0.05, GRID)
         np.testing.assert_array_equal(single.distance, surfaces.distance[i])
-        for j in range(6):
+        for j in range(3):
             expected = nbv.scan(single, CAMERA, poses[j])
             assert (clouds.mask[i, j] != expected.mask).mean() <= 0.002
             assert differs(clouds.points[i, j], expected.points).mean() <= 0.002

@@ -81,11 +81,7 @@ def test_truth_of_a_solid_lies_on_its_surface():
     assert abs(points[:, 1].mean()) < 4 * 0.021
 
 
-def points_of(mesh, seed, count=SURFACE_POINTS):
-    return nbv.TriangleMesh(mesh.vertices, mesh.faces, nbv.Frame()).sample_points(jax.random.key(seed), count)
-
-
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 2**31), n=st.integers(1, 40), m=st.integers(1, 40))
 def test_distances_are_those_found_by_brute_force(seed, n, m):
     rng = np.random.default_rng(seed)
@@ -98,28 +94,9 @@ def test_distances_are_those_found_by_brute_force(seed, n, m):
     assert distance.hausdorff == pytest.approx(max(both))
 
 
-def test_concentric_spheres_are_their_radii_apart():
-    inner, outer = (trimesh.creation.icosphere(5, radius) for radius in (0.6, 0.9))
-    distance = surface_distance(points_of(inner, 0), points_of(outer, 1))
-    for value in (distance.accuracy, distance.completeness):
-        # The nearest samples lie beside the foot of the perpendicular, a little farther away.
-        assert 0.299 < value < 0.302
-    assert 0.3 < distance.hausdorff < 0.32
-
-
-def test_a_square_shifted_in_its_plane_lacks_a_strip():
-    """A strip of width s of the unit square sticks out on one side, with a mean distance of s / 2."""
-    square = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]], process=False)
-    shifted = square.copy().apply_translation([0.4, 0.0, 0.0])
-    distance = surface_distance(points_of(square, 0), points_of(shifted, 1))
-    floor = 0.5 / np.sqrt(SURFACE_POINTS)
-    assert distance.accuracy == pytest.approx(0.4 * 0.2 + 0.6 * floor, abs=0.004)
-    assert distance.completeness == pytest.approx(distance.accuracy, abs=0.004)
-    assert distance.hausdorff == pytest.approx(0.4, abs=0.01)
-
-
 def test_two_samples_of_one_surface_are_as_far_apart_as_documented():
     sphere = trimesh.creation.icosphere(4, 0.8)
-    distance = surface_distance(points_of(sphere, 0), points_of(sphere, 1))
+    mesh = nbv.TriangleMesh(sphere.vertices, sphere.faces, nbv.Frame())
+    distance = surface_distance(*(mesh.sample_points(jax.random.key(seed), SURFACE_POINTS) for seed in (0, 1)))
     assert distance.chamfer == pytest.approx(np.sqrt(sphere.area / SURFACE_POINTS), rel=0.03)
     assert distance.hausdorff < 0.06

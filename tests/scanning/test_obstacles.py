@@ -55,8 +55,7 @@ def test_a_table_is_met_where_its_plane_is(index):
         assert np.isinf(ranges[along < 0]).all()
 
 
-@pytest.mark.parametrize("as_mesh", [False, True])
-@pytest.mark.parametrize("index", range(3))
+@pytest.mark.parametrize(("index", "as_mesh"), [(0, False), (1, False), (2, False), (1, True)])
 def test_what_a_wall_hides_is_what_embree_says(as_mesh, index):
     """The wall is a box, or a mesh of twelve triangles."""
     low, high = [1.5, -1.0, -1.0], [1.7, 1.0, 1.0]
@@ -116,25 +115,20 @@ def test_space_is_seen_empty_up_to_an_obstacle():
     np.testing.assert_array_equal(limited[x < 0.4 - 2.5 * grid.spacing], free[x < 0.4 - 2.5 * grid.spacing])
 
 
-def planner_of(search, obstacles=None, capacity=256):
-    sampler, camera = (
-        nbv.SurfaceSampler(nbv.GeometricSPSR(0.1, truncation=8), nbv.Grid(28), 3),
-        nbv.Camera(height=12, width=12),
-    )
-    return nbv.Planner(nbv.Coverage(), search, camera, sampler, obstacles=obstacles, capacity=capacity, max_views=6)
-
-
-TABLED = planner_of(nbv.DiscreteSearch(40), nbv.Obstacles((TABLE,), clearance=0.3))
+def planner_of(search, obstacles):
+    sampler = nbv.SurfaceSampler(nbv.GeometricSPSR(0.1, truncation=8), nbv.Grid(28), 3)
+    camera = nbv.Camera(height=12, width=12)
+    return nbv.Planner(nbv.Coverage(), search, camera, sampler, obstacles=obstacles, capacity=256, max_views=6)
 
 
 def test_an_episode_stands_and_sees_above_the_table():
-    episode = nbv.simulate(
-        TABLED, BALL, nbv.look_at((0.5, 0.8, 2.2)), 4, KEY, nbv.SensorNoise(0.0, 0.0), progress=False
-    )
+    planner = planner_of(nbv.FarthestView(40), nbv.Obstacles((TABLE,), clearance=0.3))
+    first, exact = nbv.look_at((0.5, 0.8, 2.2)), nbv.SensorNoise(0.0, 0.0)
+    episode = nbv.simulate(planner, BALL, first, 4, KEY, exact, progress=False)
     for view in episode.views:
         assert float(view.pose.position[1]) > -0.2
         assert np.asarray(view.scan.points)[np.asarray(view.scan.mask), 1].min(initial=0.0) > -0.501
-    below = np.asarray(TABLED.search.candidates.poses().position)[:, 1] < -0.2
+    below = np.asarray(planner.search.candidates.poses().position)[:, 1] < -0.2
     for view in episode.views[1:]:
         assert np.isneginf(np.asarray(view.proposal.values)[below]).all()
 
@@ -196,13 +190,12 @@ def test_what_an_object_stands_on_is_found(seed):
 @pytest.mark.parametrize(
     "parts",
     [
-        lambda rng: [level_board(rng, (0.45, 1.2), 0.4)],
         lambda rng: [level_board(rng, (0.45, 1.2), 1.0), level_board(rng, (2.0, 2.0), -1.5)],
         lambda rng: [level_board(rng, (2.0, 2.0), 0.3), rng.uniform(-0.4, 0.0, (200, 3))],
         lambda rng: [level_board(rng, (2.0, 2.0), 0.0)[:, [1, 0, 2]], rng.uniform(0.1, 0.4, (200, 3))],
         lambda rng: [rng.uniform(-0.4, 0.4, (30, 3))],
     ],
-    ids=["a table that is the object", "the top of a box", "things below", "a wall", "few points"],
+    ids=["the top of a box", "things below", "a wall", "few points"],
 )
 def test_points_of_no_support_are_kept(parts):
     assert under(*parts(np.random.default_rng(0))) is None
@@ -238,7 +231,7 @@ def carton_before_a_wall(rng, size, tilt, gap, table=True):
     return image, pose, corners @ turn.T, turn[:, 2]
 
 
-SIZES = {"carton": (0.3, 0.22, 0.2), "book on edge": (0.17, 0.03, 0.24), "cereal box": (0.19, 0.06, 0.29)}
+SIZES = {"carton": (0.3, 0.22, 0.2), "book on edge": (0.17, 0.03, 0.24)}
 
 
 @pytest.mark.parametrize("tilt", [0.0, 20.0])
@@ -246,12 +239,12 @@ SIZES = {"carton": (0.3, 0.22, 0.2), "book on edge": (0.17, 0.03, 0.24), "cereal
 def test_a_table_before_a_wall_is_found_from_any_side(size, tilt):
     """In all views, whatever margin the box has. The plane is within 0.5 degrees and 1.5 mm of the true one."""
     rng = np.random.default_rng(5)
-    for room in (0.003, 0.01, 0.03, 0.06):
+    for room in (0.003, 0.06):
         for gap in (0.02, 0.1):
             image, pose, corners, normal = carton_before_a_wall(rng, size, tilt, gap)
             low, high = corners.min(axis=0) - room, corners.max(axis=0) + room
             frame = nbv.Frame.fit(np.array([low, high]), up="z")
-            cloud = nbv.PointCloud.from_depth(image, SEEN_BY, pose)
+            cloud = nbv.PointCloud.from_depth(image, SEEN_BY, pose, stride=2)
             table = table_under(frame.to_scene(cloud), frame.to_scene(nbv.Box(tuple(low), tuple(high))))
             (plane,) = table.solids
             assert frame.rotation.T @ np.asarray(plane.normal) @ normal > np.cos(np.radians(0.5))
@@ -262,19 +255,19 @@ def test_a_table_before_a_wall_is_found_from_any_side(size, tilt):
 def test_a_wall_is_no_table_and_a_wrong_axis_is_named():
     """A block in the air before a wall, and a block on a table with a wrong upward axis."""
     rng = np.random.default_rng(6)
-    for _ in range(3):
+    for _ in range(2):
         for table in (False, True):
             image, pose, corners, _ = carton_before_a_wall(rng, SIZES["carton"], 0.0, 0.4, table)
             low, high = corners.min(axis=0) - 0.01, corners.max(axis=0) + 0.01
             box = nbv.Box(tuple(low), tuple(high))
             frame = nbv.Frame.fit(np.array([low, high]), up="z")
-            cloud = nbv.PointCloud.from_depth(image, SEEN_BY, pose)
+            cloud = nbv.PointCloud.from_depth(image, SEEN_BY, pose, stride=2)
             assert (table_under(frame.to_scene(cloud), frame.to_scene(box)) is not None) == table
             assert other_ups(cloud, box, "y") == (("z",) if table else ())
 
 
 def test_no_proposal_is_inside_or_under_what_is_known():
-    """1,000 random scenes of a slanted table, a block, a capsule for an arm, and a few scanned points. Distances come
+    """200 random scenes of a slanted table, a block, a capsule for an arm, and a few scanned points. Distances come
     from the definitions, in float64."""
     camera, clearance = nbv.Camera(height=4, width=4), 0.15
     poses = jax.tree.map(
@@ -292,7 +285,7 @@ def test_no_proposal_is_inside_or_under_what_is_known():
         return proposal.pose.position, proposal.value
 
     rng, looked, x = np.random.default_rng(0), 0, np.asarray(poses.position, np.float64)
-    for _ in range(1000):
+    for _ in range(200):
         point, normal = rng.uniform(-0.6, 0.2, 3) * [0, 1, 0], rng.normal([0.0, 1.0, 0.0], [0.2, 0.0, 0.2])
         half, block = rng.uniform(0.1, 0.5, 3), rng.uniform(-1.5, 1.5, 3)
         start, end = rng.uniform(-2.0, 2.0, (2, 3))
@@ -309,4 +302,4 @@ def test_no_proposal_is_inside_or_under_what_is_known():
         to_seen = np.linalg.norm(points - place, axis=1).min()
         assert min(table, to_block, to_arm, to_seen) >= clearance - 1e-4
         looked += ((x - point) @ normal < 0).mean()
-    assert 200 < looked < 800
+    assert 40 < looked < 160

@@ -62,12 +62,9 @@ def looks(surface, pose, moved):
     return jax.jvp(look, (pose,), (moved,), has_aux=True)
 
 
-@pytest.mark.parametrize("name", ["field", "distances on a grid", "solid"])
+@pytest.mark.parametrize("name", ["field", "solid"])
 def test_scans_as_functions_of_a_pose_against_central_differences(name, x64):
-    if name == "solid":
-        surface = nbv.SDFSurface(solid())
-    else:
-        surface = grid_surface(some_bumps(RNG) if name == "field" else solid(), GRID)
+    surface = nbv.SDFSurface(solid()) if name == "solid" else grid_surface(some_bumps(RNG), GRID)
     starts, count, h = nbv.look_at(nbv.geometry.fibonacci_sphere(6, 2.5)), SPACE.num_parameters, 1e-6
     at, step = 0.1 * RNG.normal(size=(6, count)), RNG.normal(size=(6, count))
     values, slopes, (masks, rays) = looks(surface, *moves(starts, at, step, jnp.asarray([0.0, h, -h])))
@@ -134,19 +131,19 @@ def traced(weights, surface, origins, directions):
     return jax.value_and_grad(total, argnums=(0, 1, 2), has_aux=True)(surface.values, origins, directions)
 
 
-@pytest.mark.parametrize("axes", [(0, 0, 0), (0, None, None), (None, 0, None)])
+@pytest.mark.parametrize("axes", [(0, 0, None), (None, 0, None)])
 def test_every_way_to_batch_fields_and_rays_equals_a_loop(axes, x64):
     origins, directions = (
-        rays + 0.05 * RNG.normal(size=(4, 30, 3)) for rays in random_rays(RNG, 30, spread=0.7, dtype=float)
+        rays + 0.05 * RNG.normal(size=(3, 30, 3)) for rays in random_rays(RNG, 30, spread=0.7, dtype=float)
     )
     weights = jnp.asarray(RNG.normal(size=(2, 30, 3)))
     # Arguments without a batch axis are the first of the batch.
     arguments = [
         batch if axis == 0 else jax.tree.map(lambda leaf: leaf[0], batch)
-        for batch, axis in zip((small_surfaces(RNG, 4), origins, directions), axes, strict=True)
+        for batch, axis in zip((small_surfaces(RNG, 3), origins, directions), axes, strict=True)
     ]
     together = jax.jit(jax.vmap(traced, (None, *axes)))(weights, *arguments)
-    for i in range(4):
+    for i in range(3):
         turn = [
             jax.tree.map(lambda leaf, i=i: leaf[i], each) if axis == 0 else each
             for each, axis in zip(arguments, axes, strict=True)

@@ -49,8 +49,9 @@ def turned(points, axis, angle):
 
 
 CAPSULE_PROFILE = np.concatenate([arc(0, -0.5, 0.3, -np.pi / 2, 0), arc(0, 0.5, 0.3, 0, np.pi / 2)])
+BALL = 0.8 * np.asarray(nbv.geometry.fibonacci_sphere(200_000))
 EXACT = {
-    "sphere": (Sphere(0.8), 0.8 * np.asarray(nbv.geometry.fibonacci_sphere(200_000))),
+    "sphere": (Sphere(0.8), BALL),
     "box": (Cuboid([0.7, 0.5, 0.9]), box_surface([0.7, 0.5, 0.9])),
     "cylinder": (Cylinder(0.6, 0.8), revolve(np.array([[0, -0.8], [0.6, -0.8], [0.6, 0.8], [0, 0.8]]))),
     "cone": (Cone(0.9, 0.3, 0.6), revolve(np.array([[0, -0.6], [0.9, -0.6], [0.3, 0.6], [0, 0.6]]))),
@@ -58,10 +59,7 @@ EXACT = {
     "pointed cone": (Cone(0.8, 0.0, 0.5), revolve(np.array([[0, -0.5], [0.8, -0.5], [0, 0.5]]))),
     "torus": (Torus(0.7, 0.25), revolve(arc(0.7, 0, 0.25, 0, 2 * np.pi))),
     "capsule": (Capsule([0, -0.5, 0], [0, 0.5, 0], 0.3), revolve(CAPSULE_PROFILE)),
-    "capsule without a length": (
-        Capsule([0, 0, 0], [0, 0, 0], 0.8),
-        0.8 * np.asarray(nbv.geometry.fibonacci_sphere(200_000)),
-    ),
+    "capsule without a length": (Capsule([0, 0, 0], [0, 0, 0], 0.8), BALL),
     "moved": (
         Capsule([0, -0.5, 0], [0, 0.5, 0], 0.3).rotate([1, 2, 3], 0.7).scale(0.5).translate([0.2, -0.1, 0.3]),
         0.5 * turned(revolve(CAPSULE_PROFILE), [1, 2, 3], 0.7) + [0.2, -0.1, 0.3],
@@ -80,7 +78,7 @@ BOUNDS = {
 
 
 @pytest.mark.parametrize("name", EXACT)
-def test_exact_distance_equals_that_to_a_dense_sampling(name):
+def test_exact_distance_equals_that_to_a_dense_sampling_and_is_negative_inside_only(name):
     sdf, surface = EXACT[name]
     x = RNG.uniform(-1.6, 1.6, (3000, 3))
     nearest, _ = cKDTree(surface).query(x)
@@ -89,11 +87,7 @@ def test_exact_distance_equals_that_to_a_dense_sampling(name):
     # A sampling of spacing s overestimates a distance d by at most s^2 / (2 d). Here s < 0.012.
     np.testing.assert_allclose(np.abs(value[far]), nearest[far], atol=2e-3)
     assert (np.abs(value) <= nearest + 2e-5).all()
-
-
-@pytest.mark.parametrize("name", EXACT)
-def test_exact_distance_is_negative_inside_only(name):
-    sdf, surface = EXACT[name]
+    # The distance is negative inside only.
     assert np.abs(np.asarray(values(sdf, surface))).max() < 2e-3
     outside = surface.mean(axis=0) + 4.0 * np.asarray(nbv.geometry.fibonacci_sphere(200))
     assert (np.asarray(values(sdf, outside)) > 0).all()

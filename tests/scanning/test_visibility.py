@@ -26,10 +26,9 @@ def ball(middle, radius):
     return lambda x: np.linalg.norm(x - np.asarray(middle), axis=-1) - radius
 
 
-@pytest.mark.parametrize("count", [1024, 4000])
-def test_points_stand_for_equal_areas_of_a_ball(count):
+def test_points_stand_for_equal_areas_of_a_ball():
     middle = np.array([0.1, -0.05, 0.2])
-    points, normals, areas = map(np.asarray, spread_points(surface_of(ball(middle, 0.9)), count))
+    points, normals, areas = map(np.asarray, spread_points(surface_of(ball(middle, 0.9)), 1024))
     outward = (points - middle) / 0.9
     # Linear interpolation is too low by at most h^2 / (8 R), relative to R.
     np.testing.assert_allclose(np.linalg.norm(outward, axis=1), 1.0, atol=GRID.spacing**2 / (7.0 * 0.9**2))
@@ -63,7 +62,7 @@ def test_a_pose_sees_what_faces_it_and_nothing_hides():
     middles, radii = np.array([[0.0, 0.0, 0.7], [0.0, 0.1, -0.6]]), (0.4, 0.6)
     both = surface_of(lambda x: np.minimum(*(ball(m, r)(x) for m, r in zip(middles, radii, strict=True))))
     poses = look_at([(0.0, 0.0, 4.0), (4.0, 0.0, 0.0), (0.0, -2.0, 3.0)])
-    points = spread_points(both, 1500)
+    points = spread_points(both, 1000)
     x, normals = np.asarray(points.points, np.float64), np.asarray(points.normals, np.float64)
     masks = seen_of(both, poses, points)
     own = np.argmin([np.abs(ball(m, r)(x)) for m, r in zip(middles, radii, strict=True)], axis=0)
@@ -113,9 +112,8 @@ def test_what_is_behind_an_obstacle_is_not_seen():
     points = spread_points(surface, 1000)
     wall = jnp.where(jnp.arange(CAMERA.num_rays) < CAMERA.num_rays // 2, 1.0, jnp.inf)
     free = np.asarray(is_visible(surface, CAMERA, poses, points, GRID.spacing))
-    behind = np.asarray(
-        is_visible(surface, CAMERA, poses, points, GRID.spacing, jnp.stack([wall, jnp.full_like(wall, 9.0)]))
-    )
+    barrier = jnp.stack([wall, jnp.full_like(wall, 9.0)])
+    behind = np.asarray(is_visible(surface, CAMERA, poses, points, GRID.spacing, barrier))
     height = np.asarray(points.points)[:, 1]
     np.testing.assert_array_equal(behind[0], free[0] & (height < 0))
     np.testing.assert_array_equal(behind[1], free[1])
@@ -136,5 +134,6 @@ def test_rays_of_a_batch_are_those_of_each():
     surface = surface_of(ball((0.1, 0.0, 0.0), 0.7))
     points = SurfacePoints(*(rows[:50] for rows in spread_points(surface, 400)))
     poses = look_at(jax.random.normal(jax.random.key(0), (40, 3)) + jnp.array([0.0, 0.0, 4.0]))
-    each = [seen_of(surface, jax.tree.map(lambda rows, i=i: rows[i : i + 1], poses), points)[0] for i in range(40)]
-    np.testing.assert_array_equal(seen_of(surface, poses, points), np.stack(each))
+    together = seen_of(surface, poses, points)
+    for i in (0, 17, 31, 32, 39):
+        np.testing.assert_array_equal(together[i], seen_of(surface, poses[i][None], points)[0])

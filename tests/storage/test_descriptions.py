@@ -18,26 +18,19 @@ from small_planner import planner_of
 
 import jaxnbv as nbv
 from jaxnbv.checks import InputError
-from jaxnbv.geometry.pose import look_at
-from jaxnbv.scanning import Grid, SDFSurface, SensorNoise
+from jaxnbv.scanning import Grid, SDFSurface
 from jaxnbv.scanning.sdf import Capsule, Sphere
-from jaxnbv.search import DiscreteSearch, FarthestView, SphereCandidates
+from jaxnbv.search import DiscreteSearch, SphereCandidates
 from jaxnbv.storage import describe
 from jaxnbv.surfaces import GeometricSPSR
 
+# Other changes are in `test_a_folder_of_another_configuration_is_refused`.
 CHANGES = {
     "model": {"planner": planner_of(model=GeometricSPSR(truncation=8, lengthscale=0.051))},
-    "search": {"planner": planner_of(FarthestView(12))},
-    "candidates": {"planner": planner_of(DiscreteSearch(13))},
     "radius": {"planner": planner_of(DiscreteSearch(SphereCandidates(12, 2.6)))},
-    "samples": {"planner": planner_of(num_samples=4)},
     "grid": {"planner": planner_of(grid=Grid(25))},
     "capacity": {"planner": planner_of(capacity=129)},
-    "scene": {"scene": SDFSurface(Sphere(0.7))},
     "one number of the scene": {"scene": SDFSurface(Sphere(0.7) | Capsule([0.2, 0.3, -0.4], [0.5, 0.6, 0.9], 0.31))},
-    "noise": {"noise": SensorNoise(points=0.02)},
-    "first": {"first": look_at((0.8, 0.9, 2.3))},
-    "key": {"key": jax.random.key(1)},
     "kind of key": {"key": jax.random.key(0, impl="rbg")},
 }
 

@@ -177,7 +177,7 @@ PLAIN = st.recursive(
 )
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(PLAIN)
 def test_any_plain_value_comes_back(value):
     arrays = {}
@@ -258,15 +258,6 @@ def test_a_folder_gives_its_configuration_back(tmp_path):
     assert RunFolder.config_of(tmp_path, "episode", planner=planner)["planner"] is planner
     with pytest.raises(InputError, match="another episode"):
         RunFolder(tmp_path, "episode", again | {"planner": planner})
-
-
-def test_a_part_that_cannot_be_rebuilt_is_passed(tmp_path):
-    planner = planned(nbv.CrossEntropy(nbv.HostClassifier(len, 2, version="a"), 16))
-    stored(tmp_path, planner=planner)
-    with pytest.raises(InputError, match=r"planner\.acquisition\.classifier .*planner=\.\.\."):
-        RunFolder.config_of(tmp_path, "episode")
-    again = RunFolder.config_of(tmp_path, "episode", planner=planner)
-    assert RunFolder(tmp_path, "episode", again).count("view") == 1
 
 
 def test_damaged_arrays_are_refused_by_name(tmp_path):
