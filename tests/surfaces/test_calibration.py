@@ -28,7 +28,7 @@ def padded(points, normals, rows, capacity):
 
 @pytest.mark.parametrize("noise", [0.3, 0.05])
 def test_sample_mean_and_joint_covariance_equal_weight_space(noise):
-    """24,000 samples at four data points and six others. After whitening by the exact moments, the 10 means and the 45
+    """12,000 samples at four data points and six others. After whitening by the exact moments, the 10 means and the 45
     correlations have standard error N^-1/2, and the 10 variances (2 / N)^1/2. The sums of squares are chi-square with
     10 and 55 degrees of freedom."""
     settings = SETTINGS | {"noise": noise}
@@ -37,7 +37,7 @@ def test_sample_mean_and_joint_covariance_equal_weight_space(noise):
     x = np.concatenate([points[:4], rng.uniform(-1.5, 1.5, (6, 3))])
     mean, covariance = WeightSpace(**settings).posterior(points, normals, x)
     posterior = nbv.GeometricSPSR(**settings).condition(padded(points, normals, np.arange(2, 14), 16))
-    draws = [np.asarray(posterior.sample(jax.random.key(seed), 8000)(x), np.float64) for seed in range(3)]
+    draws = [np.asarray(posterior.sample(jax.random.key(seed), 4000)(x), np.float64) for seed in range(3)]
     white = np.linalg.solve(np.linalg.cholesky(covariance), (np.concatenate(draws) - mean).T)
     count = white.shape[1]
     means = white.mean(axis=1) * np.sqrt(count)

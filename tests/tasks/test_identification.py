@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 import jaxnbv as nbv
-from jaxnbv.checks import InputError
 from jaxnbv.observations import Observations
+from jaxnbv.planning.stopping import StopContext
 from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning.sdf import Cuboid, Translated, Union
 from jaxnbv.surfaces.part_hypotheses import PartHypotheses
+from jaxnbv.surfaces.part_pose import surface_error
 from jaxnbv.surfaces.placement import Placement
 from jaxnbv.surfaces.registration import Hypotheses
 from jaxnbv.tasks.identification import entropy
@@ -63,11 +64,6 @@ def test_a_view_is_worth_what_it_tells():
     assert below == pytest.approx(0.0, abs=1e-3)
 
 
-def test_a_text_is_no_group():
-    with pytest.raises(InputError, match="the group is the text 'abc': give a list"):
-        nbv.Identify(group="abc")
-
-
 def test_names_poses_and_groups():
     """A block that may be turned end for end is the other block for its name, but not for its pose."""
     half_turn = np.array([np.eye(3), np.diag([-1.0, 1.0, -1.0]), np.eye(3)])
@@ -88,19 +84,22 @@ def test_names_poses_and_groups():
 
 
 def test_derivative_in_the_pose():
-    """Information changes smoothly where a boss comes into sight, in agreement with finite differences."""
+    """Information changes smoothly where a boss comes into sight."""
     inputs = step((0.5, 0.5, 0.0))
     context = nbv.Identify().context(inputs)
 
-    def value(angle):
+    @jax.jit
+    @jax.grad
+    def slope(angle):
         pose = nbv.look_at(3.2 * jnp.stack([jnp.sin(angle), jnp.cos(angle), 0.1]))
         return nbv.Identify().sample_scores(context, inputs.surfaces, CAMERA, pose[None])[0, 0]
 
-    slope = jax.grad(value)(jnp.asarray(1.2))
-    assert np.isfinite(float(slope))
+    assert np.isfinite(float(slope(1.2)))
 
 
 def test_its_requirements():
+    with pytest.raises(nbv.InputError, match="the group is the text 'abc': give a list"):
+        nbv.Identify(group="abc")
     with pytest.raises(nbv.InputError, match="needs known parts"):
         nbv.Planner(nbv.Identify())
     with pytest.raises(nbv.InputError, match="2 names for 3 parts"):
@@ -109,6 +108,21 @@ def test_its_requirements():
         nbv.Identify().context(StepInputs(Observations.start(step((1.0, 0.0, 0.0)).observations.cloud)))
 
 
+def test_rules_stop_once_the_part_or_its_surface_is_known():
+    """Both rules read the observations and the frame only. The errors of the surface are those of points and pose."""
+    for weights, name in (((0.93, 0.07, 0.0), "low"), ((0.07, 0.93, 0.0), "high")):
+        observations = step(weights).observations
+        context = StopContext(
+            nbv.Planner.for_parts(BANK), observations, (), 0.0, jax.random.key(0), dict, nbv.Frame(scale=10.0)
+        )
+        assert nbv.Identified(0.9).after(context) == f"it is {name} (93 %)"
+        assert nbv.Identified(0.95).after(context) is None
+        error = surface_error(observations.hypotheses, observations)
+        assert nbv.Placed(0.099 * error).after(context) is None
+        assert nbv.Placed(0.101 * error).after(context) == f"its surface is known to {0.1 * error:.2g}"
+
+
+@pytest.mark.slow
 def test_an_episode_ends_once_the_part_is_known():
     """The planner, its proposal and the stop rules in a simulation."""
     planner = nbv.Planner.for_parts(BANK)
