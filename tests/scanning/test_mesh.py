@@ -3,7 +3,6 @@
 import copy
 import pickle
 import sys
-from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -11,14 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
-from bumps import box_hit, random_rays
+from bumps import random_rays
+from on_grid import nodes
 
 import jaxnbv as nbv
 from jaxnbv.scanning.mesh_files import load_parts
 from jaxnbv.scanning.sdf import Cuboid, Sphere, Torus
 from jaxnbv.storage.folders import software
 
-SHARED = Path(__file__).parents[3] / "shared" / "meshes"
 RNG = np.random.default_rng(1)
 
 
@@ -67,21 +66,9 @@ def test_hits_equal_moller_trumbore(name):
     np.testing.assert_allclose(np.asarray(hits.points)[use], (o + t[:, None] * d)[use], atol=2e-5)
     assert (np.sum(np.asarray(hits.normals)[use] * d[use], axis=1) < 0).all()
     assert not np.asarray(hits.points)[~mask].any()
-
-
-@pytest.mark.usefixtures("tracer")
-def test_hits_of_a_box_equal_the_closed_form():
-    mesh = nbv.TriangleMesh.from_arrays(SHAPES["box"].vertices, SHAPES["box"].faces)
-    half = np.array([0.5, 1.25, 0.75])
-    np.testing.assert_allclose(np.abs(mesh.vertices), np.broadcast_to(half, (8, 3)))
-    o, d = random_rays(RNG, 2000, spread=0.8, dtype=float)
-    hits = mesh.trace(o, d)
-    t, normal = box_hit(o, d, half)
-    mask = np.asarray(hits.mask)
-    assert (mask != np.isfinite(t)).mean() < 0.002
-    use = mask & np.isfinite(t)
-    np.testing.assert_allclose(np.asarray(hits.points)[use], (o + t[:, None] * d)[use], atol=1e-6)
-    assert (np.linalg.norm(np.asarray(hits.normals) - normal, axis=1)[use] < 1e-6).mean() > 0.998
+    # Rays that start beyond the mesh or look away meet nothing.
+    assert not np.asarray(mesh.trace(o, -d).mask).any()
+    assert not np.asarray(mesh.trace(o + 100 * d, d).mask).any()
 
 
 @pytest.mark.usefixtures("tracer")
@@ -95,14 +82,6 @@ def test_few_rays_slip_through_edges_of_small_triangles():
     mask = np.asarray(hits.mask)
     assert mask.mean() > 0.997
     np.testing.assert_allclose(np.asarray(hits.points)[mask], targets[mask], atol=1e-5)
-
-
-@pytest.mark.usefixtures("tracer")
-def test_rays_that_start_beyond_a_mesh_or_look_away_meet_nothing():
-    mesh = nbv.TriangleMesh.from_arrays(SHAPES["box"].vertices, SHAPES["box"].faces)
-    o, d = random_rays(RNG, 300, spread=0.3, dtype=float)
-    assert not np.asarray(mesh.trace(o, -d).mask).any()
-    assert not np.asarray(mesh.trace(o + 100 * d, d).mask).any()
 
 
 def test_a_mesh_that_was_scanned_is_copied():
@@ -256,7 +235,7 @@ def box_distance(x, center, extents):
     return np.where((beyond <= 0).all(axis=-1), -beyond.max(axis=-1), outside)
 
 
-def test_parts_are_the_nodes_where_the_whole_has_them(tmp_path):
+def test_parts_are_the_nodes_where_the_whole_has_them_with_their_distances(tmp_path):
     parts = load_parts(saved(tmp_path / "table.glb"))
     whole = nbv.load_mesh(tmp_path / "table.glb")
     assert parts.names == ("post", "slab")
@@ -264,17 +243,13 @@ def test_parts_are_the_nodes_where_the_whole_has_them(tmp_path):
     np.testing.assert_allclose(np.sort(joined, axis=0), np.sort(parts.mesh.vertices, axis=0), atol=1e-6)
     np.testing.assert_array_equal(parts.mesh.vertices, whole.vertices)
     # The longest side is 4, and now 2.5. The box around both is centred at (0.5, 1.5, 0).
-    expected = (np.array([0.0, 1.0, 0.0]) - [0.5, 1.5, 0.0]) * 2.5 / 4
-    np.testing.assert_allclose(parts.parts[0].vertices.mean(axis=0), expected, atol=1e-6)
-
-
-def test_distances_are_those_from_each_box(tmp_path):
     grid = nbv.Grid(9, 1.4)
-    distances = np.asarray(load_parts(saved(tmp_path / "table.glb")).distances(grid))
-    nodes = np.stack(np.meshgrid(grid.axis, grid.axis, grid.axis, indexing="ij"), axis=-1)
-    for distance, (center, extents) in zip(distances, BOXES.values(), strict=True):
-        expected = box_distance(nodes, (np.array(center) - [0.5, 1.5, 0.0]) * 0.625, np.array(extents) * 0.625)
-        np.testing.assert_allclose(distance, expected, atol=1e-5)
+    for part, distance, (center, extents) in zip(parts.parts, parts.distances(grid), BOXES.values(), strict=True):
+        center = (np.array(center) - [0.5, 1.5, 0.0]) * 0.625
+        np.testing.assert_allclose(part.vertices.mean(axis=0), center, atol=1e-6)
+        np.testing.assert_allclose(
+            distance, box_distance(nodes(grid.axis), center, np.array(extents) * 0.625), atol=1e-5
+        )
 
 
 def test_a_file_of_one_node_has_no_parts(tmp_path):
