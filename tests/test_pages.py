@@ -172,6 +172,7 @@ def test_the_script_of_the_readme_runs(tmp_path, monkeypatch):
         "key": jax.random.key(2),
         "pose": pose,
         "scan": scan,
+        "next_scan": scan,
         "x": np.random.default_rng(0).normal(size=(5, 3)),
     }
     exec(compile(script, "README.md", "exec"), variables)
