@@ -92,9 +92,10 @@ class Acquisition(eqx.Module):
     ) -> Float[Array, "samples poses *scores"]:
         """Return the scores of the imagined scans of each sampled surface from each pose of a batch.
 
-        An acquisition that is not a mean over samples may return a single row. Scans of `samples_at_once` samples from
-        all poses are computed together, and must fit into memory. `batch_size` scans are scored together. The samples
-        are divided among devices, or the poses if there are fewer samples than devices.
+        An acquisition that is not a mean over samples may return a single row. The scans of several samples (their
+        number is `scanning.grid.samples_at_once`) from all poses are computed together, and must fit into memory. Then
+        `self.batch_size` scans at a time are scored. Devices share the samples. If there are fewer samples than
+        devices, they share the poses.
 
         - `barrier`: distance along each ray to an obstacle, see `scan`.
         """

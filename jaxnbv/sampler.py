@@ -248,8 +248,8 @@ class SurfaceSampler(eqx.Module):
     def probability_inside(self, observations: Observations | PointCloud) -> Float[Array, "g g g"]:
         """Return P(f < level | observations) at the grid's nodes.
 
-        The estimate is the fraction of `num_samples` carved samples that are below the level, drawn with a fixed key.
-        This works for any model.
+        At each node, the estimate is the fraction of the samples that are below the level there. `num_samples` samples
+        are drawn with a fixed key and carved. This works for any model.
 
         **Raises:** `ValueError` if `sample` does.
         """

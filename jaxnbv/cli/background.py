@@ -31,7 +31,7 @@ def is_working() -> bool:
 
 
 def end_process(code: int) -> NoReturn:
-    """End the process at once. A normal exit would abort while threads run compiled code."""
+    """End the process at once. A normal exit crashes if a thread still runs compiled code."""
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(code)

@@ -96,10 +96,12 @@ def _points_and_normals(
     Bool[Array, " n"],
     Float[Array, " n"],
 ]:
-    """Return points and normals, and four arrays with one entry per ray.
+    """Return points, normals, and four arrays with one entry for each ray.
 
-    These arrays are: whether the point is valid, whether the ray is missed (it met nothing, or it crossed the box),
-    whether the point lies in the box, and the distance from the camera to the hit (infinite without a hit).
+    1. valid: whether the ray measured a point with a normal.
+    2. empty: whether the ray met nothing, or first met something beyond the box.
+    3. inside: whether the point lies in the box.
+    4. sight: the distance from the camera to the hit; infinite without a hit.
 
     - `missed`: whether the ray of each pixel met nothing.
     - `rounding`: standard deviation of the rounding of depths. `block_side`: see `find_block_side`.

@@ -364,9 +364,12 @@ def _disagreement(
 ) -> tuple[Float[np.ndarray, " views"], Float[np.ndarray, " views"]]:
     """Return, for each view, how much it disagrees with the views that `pairs` compares it with.
 
-    Points of two views are matched. The results are two medians over a view's matches: of the point-to-plane distance
-    between the two points, and of the angle between their normals (radians). NaN for a view without matches.
-    `median_distance` is the median distance of points from the cameras.
+    Points of two views are matched after the poses are corrected. The results are two medians over a view's matches: of
+    the point-to-plane distance between the two points, and of the angle between their normals (radians). NaN for a view
+    without matches.
+
+    - `corrections`: the correction X of each view's pose.
+    - `median_distance`: median distance of points from the cameras. Matched points are at most 8 % of it apart.
     """
     matches = _match_points(views, pairs, corrections, _MATCH_DISTANCES[0] * median_distance)
     residuals, _ = _linearise(views, matches, corrections, is_mount=True)

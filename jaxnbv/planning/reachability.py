@@ -199,7 +199,9 @@ def _reason_if_refused(pose: Pose, refused: Sequence[RefusedPose]) -> str | None
 
 
 def _answers(reachable: Reachable, matrices: Float[np.ndarray, "n 4 4"]) -> list[float | str]:
-    """Return, for each matrix, the user's score or the reason why the arm cannot reach the pose.
+    """Return, for each matrix, a score above 0, or the reason why the arm cannot reach the pose.
+
+    True and None become the score 1. False and the score 0 become the reason "not reachable".
 
     **Raises:** `ValueError` unless the function returns a list of bools, reasons or scores.
     """

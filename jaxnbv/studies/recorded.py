@@ -90,7 +90,7 @@ class FixedOrder(Baseline):
 
 
 class MostNewVoxels(Baseline):
-    """Greedy oracle that chooses the frame with the most voxels that no chosen frame shows yet.
+    """Greedy oracle that chooses the frame with the most new voxels: no frame chosen before shows them.
 
     - `is_shown`: True where a candidate shows a voxel.
     """
@@ -101,7 +101,10 @@ class MostNewVoxels(Baseline):
         return Quantity("new voxels", "", "voxels that a frame shows and no earlier frame does.", smooth=False)
 
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
-        """Return how many voxels each candidate shows that no visited one does. The key is not used."""
+        """Return, for each candidate, the number of voxels that it shows and no visited candidate shows.
+
+        The key is not used.
+        """
         is_shown = jnp.any(self.is_shown & problem.observations.poses.contains(candidates)[:, None], axis=0)
         gain = jnp.sum(self.is_shown & ~is_shown, axis=1)
         return gain.astype(candidates.position.dtype)

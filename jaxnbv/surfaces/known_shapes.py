@@ -2,7 +2,7 @@
 
     prior      f = m_k(T^-1 x) + g,   k ~ pi over shapes 1..K and 0 for none of these,   T the placement of the shape,
                g a Gaussian process, the residual
-    mean       m_k = h tanh(d_k / h), d_k the signed distance of shape k, h half the rise of f across the surface
+    mean       m_k = h tanh(d_k / h), d_k the signed distance of shape k, h the unit of `ScreenedSPSR.offset`
     weights    w_k proportional to exp(-beta E_k) over distinct fits (`Hypotheses.is_distinct`),  w_0 to exp(-beta E_0)
     sample     shapes by systematic resampling of w; then f about the mean m_k, or for k = 0 a sample of the model
                without known shapes

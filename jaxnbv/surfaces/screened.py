@@ -9,9 +9,9 @@ covariance k:
     mean     E g(x) = m(x) + (k(x, Y) + tau^2 1^T) w,   w = S^-1 (h value - m(Y))
     sample   f a sample given the normals, c and e from the prior;   w = S^-1 (h value - f(Y) + c - e)
 
-Here h is half the rise of the mean of f across the scanned surface, Y are the points y_k, 1 is a vector of ones, and
-Sigma is the covariance of e. K_ff is the prior covariance of f(Y), K_df the covariance of component d of the normals
-with f(Y), and A the covariance of the normals.
+Here h is half the rise of E f across the scanned surface (see `ScreenedSPSR.offset`), Y are the points y_k, 1 is a
+vector of ones, and Sigma is the covariance of e. K_ff is the prior covariance of f(Y), K_df the covariance of component
+d of the normals with f(Y), and A the covariance of the normals.
 
 The values change f by k(., Y) w. This consists of a change u_d = -A^-1 K_df w of the weights of the normals, and of a
 direct change s(n) / |n|^2 sum_k w_k e^{-i n.y_k} of the coefficients of f. The level c changes by -tau^2 1^T w. The
@@ -53,9 +53,10 @@ class ScreenedSPSR(SurfaceModel):
       lengthscale for the overall shape, which lets values affect f far from their points.
     - `values`: sources of values, see `jaxnbv.surfaces.values`.
     - `level_deviation`: prior standard deviation of the level, which is broad compared with the values of f.
-    - `offset`: distance from the points x_j, to both sides, over which the rise of f across the surface is measured, in
-      scene units. The unit h of values is half the median of E f(x_j + offset n_j) - E f(x_j - offset n_j), given the
-      normals alone, but at least half the prior standard deviation of f, because the two sides of a thin sheet cancel.
+    - `offset`: distance in scene units. The rise of E f across the surface at a point x_j is the value outside minus
+      the value inside, E f(x_j + offset n_j) - E f(x_j - offset n_j), given the normals alone. The unit h of values is
+      half the median rise, but at least half the prior standard deviation of f, because the two sides of a thin sheet
+      cancel.
 
     N normals and M values take 3 N^2 M + M^3 operations in addition to the cost of `base`.
 
@@ -142,8 +143,7 @@ def _condition(
 def _value_unit(base: GeometricSPSRPosterior, offset: float) -> Float[Array, ""]:
     """Return h, half the median rise of E f across the surface, given the normals alone.
 
-    The rise is from `offset` behind each point to `offset` in front of it, along its normal. h is at least half the
-    prior standard deviation of f.
+    h is at least half the prior standard deviation of f. See `ScreenedSPSR.offset`.
     """
     rows = some_rows(base.cloud, _NUM_UNIT_POINTS)
     points, step = base.cloud.points[rows], offset * base.cloud.normals[rows]
@@ -153,7 +153,7 @@ def _value_unit(base: GeometricSPSRPosterior, offset: float) -> Float[Array, ""]
 
 
 class ScreenedDraws(NamedTuple):
-    """Draws from the prior: the normal field and its noise, the level c, and the noise e of the values."""
+    """Prior draws: the normal field and its noise, the level c, and the noise e of the observed values."""
 
     normals: NormalDraws
     level: Float[Array, " s"]
@@ -167,7 +167,7 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
     - `mean_coefficients`: coefficients of E g, see `surfaces/trigonometric.py`.
     - `base`: the posterior p(f | normals).
     - `rows`: the observed values.
-    - `value_unit`: h, the unit of the values: half the rise of the mean of f across the surface.
+    - `value_unit`: h, the unit of the values, see `ScreenedSPSR.offset`.
     - `whitened`: C^-1 K_df, where A = C C^T is the covariance of the normals, and K_df their covariance with f at the
       points of `rows`.
     - `factor`: the Cholesky factor of S, the covariance of the values given the normals.
@@ -210,7 +210,7 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
         return jnp.zeros(len(means.values), self.weights.dtype)
 
     def prior_draws(self, key: PRNGKeyArray, num_samples: int) -> ScreenedDraws:
-        """Draw the normal field and its noise, the level c, and the noise e of the values from the prior."""
+        """Draw the parts of `ScreenedDraws` from the prior."""
         base_key, level_key, noise_key = jax.random.split(key, 3)
         normals = self.base.prior_draws(base_key, num_samples)
         dtype, shape = normals.noisy_normals.dtype, self.rows.noise.shape

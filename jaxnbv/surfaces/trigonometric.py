@@ -149,7 +149,7 @@ class NonuniformTransform(eqx.Module):
         self.truncation = truncation
 
     def evaluate(self, coefficients: Float[Array, "k a a a"]) -> Float[Array, "n k"]:
-        """Return the values at the points of k functions with these coefficients."""
+        """Evaluate k functions, given by their coefficients, at the n points of the transform."""
         values = evaluate_on_grid(coefficients, self._node_basis(coefficients.dtype))
         return self._interpolate(jnp.moveaxis(values, 0, -1))
 

@@ -1,7 +1,8 @@
 """Observed values of f relative to its level, beside the normals, which observe the gradient of f.
 
-Values are in units of h. Given the normals alone, the mean of f rises across the scanned surface, and h is half this
-rise (see `ScreenedSPSR.offset`). These units are used because the scale of f depends on the prior.
+Values are in units of h, because the scale of f depends on the prior. Given the normals alone, E f is larger a small
+distance outside the scanned surface than the same distance inside, and h is half the difference (see
+`ScreenedSPSR.offset`).
 """
 
 import math
@@ -24,7 +25,7 @@ from jaxnbv.surfaces.base import HALF_WIDTH
 class ValueRows(eqx.Module):
     """Observed values of f - c at points, with independent normal noise. The surface is where f = c.
 
-    The unit of values and noise is h, half the rise of the mean of f across the scanned surface.
+    The unit of values and noise is h, see `ScreenedSPSR.offset`.
 
     - `points`: where f is observed, in scene coordinates, within [-pi/2, pi/2]^3.
     - `values`, `noise`: observed values of f - c, positive outside the object, and their standard deviations.
@@ -90,7 +91,7 @@ class OutsideBoundary(ValueSource):
 
     - `volume`: see `jaxnbv.geometry.volume`; by default the box to which scenes are scaled.
     - `num_points`: number of points, spread evenly as seen from the origin.
-    - `value`, `noise`: observed value and its standard deviation, in units of h, half the rise of f across the surface.
+    - `value`, `noise`: observed value and its standard deviation, in units of h, see `ScreenedSPSR.offset`.
     - `margin`: distance by which the points lie outside the boundary, in scene units. Points are clipped to the scene.
       If the volume cuts the object, give a positive distance. Otherwise sampled objects would close at the cut.
 
@@ -139,7 +140,7 @@ class OnSurface(ValueSource):
     """Values of zero for f minus its level at points of the cloud: "screening" (Kazhdan and Hoppe 2013).
 
     - `num_points`: number of points, chosen by farthest point sampling. If the cloud has fewer points, all are used.
-    - `noise`: standard deviation of the values, in units of h, half the rise of f across the surface.
+    - `noise`: standard deviation of the values, in units of h, see `ScreenedSPSR.offset`.
 
     **Raises:** `ValueError` for a count below one or noise that is not positive.
     """
@@ -163,7 +164,7 @@ class EmptySpace(ValueSource):
     objects such as furniture, but not for a body whose hidden side is as large as its visible side.
 
     - `num_points`: number of points, chosen by farthest point sampling. If there are fewer empty points, all are used.
-    - `value`, `noise`: observed value and its standard deviation, in units of h, half the rise of f across the surface.
+    - `value`, `noise`: observed value and its standard deviation, in units of h, see `ScreenedSPSR.offset`.
 
     **Raises:** `ValueError` for a count below one or noise that is not positive.
     """

@@ -46,10 +46,10 @@ class Mark(NamedTuple):
 def deviation_figure(
     cad: TriangleMesh, values_at: Values, marks: Sequence[Mark], limit: float, unit_name: str, caption: str, up: str
 ) -> Figure:
-    """Draw the CAD from two sides, coloured by deviation, with numbered places (7.2 by 3.7 inches).
+    """Draw the CAD from two sides, coloured by deviation, with numbered places. Size: 7.2 by 3.7 inches.
 
     - `values_at`: see `Values`. `marks`: places to number, at least one, in the coordinates of `cad`.
-    - `limit`: deviation at the ends of the colours. `up`: upward axis of `cad`, see `Frame`.
+    - `limit`: the colour scale goes from -`limit` to `limit`. `up`: upward axis of `cad`, see `Frame`.
     """
     scene = TriangleMesh.from_arrays(cad.vertices, cad.faces, up)
     positions = np.asarray(scene.frame.to_scene(np.stack([mark.position for mark in marks])))

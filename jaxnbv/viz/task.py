@@ -1,4 +1,4 @@
-"""The task of an episode for its report: question, answers by view, their reliability, and charts."""
+"""Task section of an episode's report: question, answers by view, their reliability, and charts."""
 
 import itertools
 import re

@@ -59,7 +59,7 @@ def unmeasured(surface: trimesh.Trimesh, observations: Observations, carving: Ca
 
 
 def unmeasured_text(patches: Sequence[Patch], frame: Frame) -> str:
-    """Return a sentence about the patches, with areas and positions in the world of a frame."""
+    """Return a sentence about the patches, with areas and positions in the world units of `frame`."""
     parts = [
         f"{number_text(float(frame.length_to_world(patch.area, 2)))} {frame.unit}² about "
         f"{point_text(patch.middle, frame)} ({patch.looks} looks)"

@@ -158,6 +158,8 @@ class ClassificationStudy(Study):
     def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
         """Return one study for the option `framing`; without this option, one study for each of `framings`.
 
+        The keys of the result are the values of the framings, or "" if the class has only one framing.
+
         - `classifier`: option with the file of a network, see `load_checkpoint`; default: the shipped network.
 
         **Raises:** `ValueError` as `load_checkpoint` does, or if the network has a different number of classes than the

@@ -29,7 +29,7 @@ class ScenePicture(NamedTuple):
     - `tile`: function that draws the tile of a method (name) and a column (index) on the given axes.
     - `truth`: function that draws the tile of the true object, left of the first row; None for no such tile.
     - `columns`: titles of the columns; empty for one column per view.
-    - `marks`: entries of the legend, as settings of `Line2D` by name.
+    - `marks`: entries of the legend: for each label, the keyword arguments of its `Line2D`.
     - `scale`: colour scale of the colour bar, and its label; None for no colour bar.
     """
 
