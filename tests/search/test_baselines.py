@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 from on_grid import balls
 from scipy.stats import chi2
+from small_problem import propose
 
 import jaxnbv as nbv
 from jaxnbv.geometry.pose_list import PoseList
 from jaxnbv.sampler import StepInputs
 from jaxnbv.search.baselines import uncertain_length
 
-GRID = nbv.Grid(24)
+GRID, LENGTH = nbv.Grid(24), eqx.filter_jit(uncertain_length)
 CANDIDATES = np.asarray(nbv.geometry.fibonacci_sphere(12, 2.5), dtype=np.float64)
 
 
@@ -33,7 +34,7 @@ def index_of(proposal):
 def test_farthest_view_against_its_definition():
     search, visited = nbv.FarthestView(12), [np.array([0.8, 0.9, 2.2])]
     for _ in range(4):
-        proposal = search.propose(problem(np.array(visited)), jax.random.key(0))
+        proposal = propose(search, problem(np.array(visited)))
         nearest = np.array([min(np.linalg.norm(c - v) for v in visited) for c in CANDIDATES])
         new = np.array([min(np.linalg.norm(c - v) for v in visited) > 1e-3 for c in CANDIDATES])
         np.testing.assert_allclose(np.asarray(proposal.values)[new], nearest[new], rtol=1e-5)
@@ -88,8 +89,8 @@ def test_uncertainty_against_its_definition():
     question = problem(CANDIDATES[:1], surfaces)
     step = 0.5 * GRID.spacing
     expected = np.array([slow_uncertain_length(values, c, step / 8) for c in CANDIDATES])
-    proposal = search.propose(question, jax.random.key(0))
-    short = expected - np.asarray(uncertain_length(question, proposal.candidates))
+    proposal = propose(search, question)
+    short = expected - np.asarray(LENGTH(question, proposal.candidates))
     assert short.min() > -step / 4
     assert short.max() < 2 * step
     assert expected.std() > 3 * step
@@ -102,10 +103,10 @@ def test_uncertainty_against_its_definition():
 def test_the_threshold_of_the_transmittance_by_thin_rings_of_samples():
     """One of forty samples lies far behind the rest. The ray stops counting when two are left, not none."""
     radii = np.array([1.0] * 38 + [0.3] * 2)
-    value = uncertain_length(problem(np.zeros((0, 3)), balls(GRID, radii)), nbv.look_at(CANDIDATES))
+    value = LENGTH(problem(np.zeros((0, 3)), balls(GRID, radii)), nbv.look_at(CANDIDATES))
     np.testing.assert_allclose(value, 0.0, atol=1.1 * GRID.spacing)
     radii = np.array([1.0] * 37 + [0.3] * 3)
-    value = uncertain_length(problem(np.zeros((0, 3)), balls(GRID, radii)), nbv.look_at(CANDIDATES))
+    value = LENGTH(problem(np.zeros((0, 3)), balls(GRID, radii)), nbv.look_at(CANDIDATES))
     np.testing.assert_allclose(value, 0.7, atol=1.1 * GRID.spacing)
 
 
@@ -116,5 +117,5 @@ def test_a_ray_that_meets_a_look_on_the_boxes_face_is_still_open():
     values = np.stack([values[0], values[1] - 0.75])
     surfaces = nbv.scanning.GridSurface.from_values(values, 0.0, grid)
     # Surfaces are at z = -0.5 and z = 0.25, seen from z = 1.5, with looks every quarter: 1.5, 1.25, 1.0, ...
-    value = uncertain_length(problem(np.zeros((0, 3)), surfaces), nbv.look_at(jnp.array([[0.0, 0.0, 1.5]])))
+    value = LENGTH(problem(np.zeros((0, 3)), surfaces), nbv.look_at(jnp.array([[0.0, 0.0, 1.5]])))
     np.testing.assert_allclose(value, 0.75, atol=0.26)

@@ -45,7 +45,6 @@ ACQUISITIONS = (
     nbv.Coverage(),
     nbv.tasks.MixedEntropy(classifier, threshold=0.0),
     nbv.tasks.MixedEntropy(classifier, threshold=9.0),
-    nbv.tasks.EntropyReduction(classifier),
 )
 
 

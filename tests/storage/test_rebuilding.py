@@ -18,7 +18,7 @@ import optimistix as optx
 import pytest
 from hypothesis import given, settings
 from small_episode import BASE
-from small_planner import MODEL, SOLID, planner_of
+from small_planner import MODEL, SOLID
 
 import jaxnbv as nbv
 from jaxnbv import readers
@@ -141,13 +141,6 @@ def test_every_public_class_is_rebuilt():
 def as_arrays(thing):
     """The mesh without its tree, which differs between objects."""
     return (thing.vertices, thing.faces, thing.frame) if isinstance(thing, nbv.TriangleMesh) else thing
-
-
-def test_a_planner_that_was_made_again_plans_the_same():
-    planner = planner_of(nbv.DiscreteSearch(6), improvement(utility), num_samples=2)
-    cloud = nbv.PointCloud.from_arrays(SPHERE.vertices[:64], SPHERE.vertices[:64])
-    proposals = [each.propose(each.init(nbv.look_at((0.0, 0.0, 2.5)), cloud), KEY) for each in (planner, trip(planner))]
-    assert_same(*proposals)
 
 
 def test_a_mesh_that_was_made_again_is_scanned_the_same():
