@@ -198,8 +198,8 @@ BOMBS = {
     "tuples in tuples, remembered": b"\x80\x02}N" + b"\x85q\x00h\x00\x86" * 200_000 + b"Ns.",
     "one array of 8 TB": dumps({"a": view(storage("0", "DoubleStorage", 2**40), 0, (1,), (1,))}),
     "many arrays": dumps({str(i): view(storage(str(i), "DoubleStorage", 400), 0, (1,), (1,)) for i in range(40)}),
-    "copies": copies(2000, b"h\x01h\x02\x85R"),
-    "copies beside": copies(2000, b"h\x01)Rh\x03b"),
+    "copies": copies(700, b"h\x01h\x02\x85R"),
+    "copies beside": copies(700, b"h\x01)Rh\x03b"),
     "nothing taken": b"\x80\x02\x85.",
     "a mark that is none": b"\x80\x02t.",
 }

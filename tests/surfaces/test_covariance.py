@@ -14,8 +14,9 @@ from jaxnbv.surfaces.covariance import (
 )
 
 RNG = np.random.default_rng(0)
-X, Y = RNG.uniform(-1.5, 1.5, (7, 3)), RNG.uniform(-1.5, 1.5, (5, 3))
+X, Y = RNG.uniform(-1.5, 1.5, (2, 2, 3))
 Y[0] = X[0]
+FUNCTIONS = (normal_covariance, function_normal_covariance, function_covariance)
 
 
 def brute_force(x, y, spectrum):
@@ -29,33 +30,26 @@ def brute_force(x, y, spectrum):
     return np.cos(angle) @ s, cross, np.cos(angle) @ (s * inverse)
 
 
-@pytest.mark.parametrize(
-    ("nu", "lengthscale", "truncation"), [(0.5, 0.05, 12), (1.5, 0.2, 6), (2.5, 0.005, 12), (1.5, 0.1, 1)]
-)
-def test_covariances_equal_lattice_sums(x64, nu, lengthscale, truncation):
-    spectrum = lattice_spectrum(nu, lengthscale, 0.4, truncation)
+def test_covariances_equal_lattice_sums(x64):
+    """At a short lengthscale, for which high frequencies count."""
+    spectrum = lattice_spectrum(0.5, 0.005, 0.4, 12)
+    x, y, s = jnp.asarray(X), jnp.asarray(Y), circle_spectrum(0.5, 0.005, 0.4, 12)
     expected = brute_force(X, Y, spectrum)
-    x, y, s = jnp.asarray(X), jnp.asarray(Y), jnp.asarray(spectrum)
-    functions = (normal_covariance, function_normal_covariance, function_covariance)
-    for function, value in zip(functions, expected, strict=True):
-        np.testing.assert_allclose(function(x, y, s), value, atol=1e-12 * np.abs(value).max(), rtol=1e-12)
-    np.testing.assert_allclose(function_variance(s), expected[2][0, 0], rtol=1e-12)
+    for function, value in zip(FUNCTIONS, expected, strict=True):
+        np.testing.assert_allclose(function(x, y, s), value, atol=1e-9 * np.abs(value).max())
+    np.testing.assert_allclose(function_variance(s), expected[2][0, 0], rtol=1e-9)
 
 
 def test_covariances_equal_lattice_sums_in_float32_at_the_default_settings():
     """L = 50 and ell = 0.005, a million frequencies. Errors are relative to the largest value of each kernel."""
     spectrum = lattice_spectrum(1.5, 0.005, 0.2, 50)
-    x, y = X[:2], Y[:2]
-    expected = brute_force(x, y, spectrum)
-    x, y, s = (jnp.asarray(a, jnp.float32) for a in (x, y, circle_spectrum(1.5, 0.005, 0.2, 50)))
+    expected = brute_force(X, Y, spectrum)
+    x, y, s = (jnp.asarray(a, jnp.float32) for a in (X, Y, circle_spectrum(1.5, 0.005, 0.2, 50)))
     scales = (0.2**3, np.sqrt(expected[2][0, 0] * 0.2**3), expected[2][0, 0])
-    functions = (normal_covariance, function_normal_covariance, function_covariance)
-    for function, value, scale in zip(functions, expected, scales, strict=True):
+    for function, value, scale in zip(FUNCTIONS, expected, scales, strict=True):
         np.testing.assert_allclose(function(x, y, s), value, atol=2e-5 * scale)
     np.testing.assert_allclose(function_variance(s), expected[2][0, 0], rtol=2e-5)
 
-
-SMOOTHNESS = (0.5, 1.5, 2.5)
 
 MATERN = {
     0.5: lambda r: np.exp(-r),
@@ -64,14 +58,7 @@ MATERN = {
 }
 
 
-@pytest.mark.parametrize("nu", SMOOTHNESS)
-@pytest.mark.parametrize("lengthscale", [0.005, 0.1, 1.0])
-def test_spectrum_is_normalised_by_the_sum_over_all_integers(x64, nu, lengthscale):
-    spectrum = circle_spectrum(nu, lengthscale, 0.7, 20)
-    np.testing.assert_allclose(spectrum, lattice_spectrum(nu, lengthscale, 0.7, 20), rtol=1e-9)
-
-
-@pytest.mark.parametrize("nu", SMOOTHNESS)
+@pytest.mark.parametrize("nu", MATERN)
 @pytest.mark.parametrize("lengthscale", [0.02, 0.3])
 def test_kernel_is_the_matern_kernel_of_the_line_wrapped_around_the_circle(x64, nu, lengthscale):
     """sum_n s1(n) cos(n t) = variance sum_k m(t / 2 pi + k) / sum_k m(k), by Poisson summation. At the small length

@@ -81,8 +81,7 @@ def test_a_bank_keeps_true_sizes(meshes):
             0.0, abs=2e-3 * factor
         )
     assert bank.select([1]).is_true_size
-    without = nbv.ShapeBank.from_meshes(meshes, resolution=24, progress=False)
-    assert not without.is_true_size
+    without = nbv.ShapeBank.of([Sphere(0.5)])
     assert without.in_scene(nbv.Frame(scale=8.0)) is without
 
 
@@ -133,7 +132,7 @@ def test_misfit_of_rays_to_a_ball():
     assert float(none) == pytest.approx(0.25 * met, rel=0.01)
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.01, 0.05])
+@pytest.mark.parametrize("noise", [0.0, 0.05])
 def test_errors_of_points_are_those_of_the_sensor(noise):
     """tau is two standard deviations of the points along the rays, to an eighth (the quartile of 1,500 has an accuracy
     of 4 %). Noise alone makes a ball no other object."""

@@ -55,7 +55,7 @@ def off(mesh, change):
     return float(trimesh.proximity.closest_point_naive(mesh, points)[1].mean())
 
 
-@pytest.mark.parametrize("ahead", [(1, 1, 1), (1, -2, 1), (-1, 0.5, -0.7)])
+@pytest.mark.parametrize("ahead", [(1, 1, 1), (-1, 0.5, -0.7)])
 def test_a_partial_noisy_scan_is_laid_on_its_part_from_anywhere(ahead):
     mesh, is_solid = orient_outward(bracket())
     truth = motion(RNG)

@@ -39,9 +39,8 @@ def ball_area(sharpest: float) -> float:
     return quad(strip, 0.0, math.acos(RADIUS / AWAY), limit=200)[0]
 
 
-@pytest.mark.parametrize(("height", "width"), [(240, 240), (120, 240)])
-def test_the_area_of_a_ball_is_its_integral(height, width):
-    cloud, camera = looked_at(height, width)
+def test_the_area_of_a_ball_is_its_integral():
+    cloud, camera = looked_at(120, 240)
     for steepest in (0.2, 0.5):
         area = float(jnp.sum(pixel_area(cloud, camera, POSE, steepest)))
         # A pixel at the limb is a hit or a miss, which is about one in a hundred of the area.
@@ -50,7 +49,7 @@ def test_the_area_of_a_ball_is_its_integral(height, width):
 
 def test_the_area_of_a_slanted_face_does_not_depend_on_the_rays_or_the_distance():
     face = nbv.SDFSurface(Cuboid((0.5, 0.4, 1e-3)))
-    for pixels, away in ((120, 1.0), (200, 1.0), (200, 1.6)):
+    for pixels, away in ((120, 1.0), (200, 1.6)):
         camera, pose = nbv.Camera(height=pixels, width=pixels, fov=1.0), nbv.look_at((away, 0.3 * away, 1.5 * away))
         area = float(jnp.sum(pixel_area(nbv.scan(face, camera, pose), camera, pose, 0.2)))
         # The border is accurate to a pixel: a share of 2 / 120 * (1 / 1.0 + 1 / 0.8) of the face, most of it by chance.
@@ -174,10 +173,10 @@ def test_a_scan_that_sees_nothing_or_nothing_new_is_worth_nothing(score):
 
 def test_the_acquisition_against_brute_force_over_all_scans():
     rng = np.random.default_rng(2)
-    surfaces = balls(nbv.Grid(20), (0.8, 0.6, 0.9), rng.uniform(-0.3, 0.3, (3, 3)))
-    data, poses = drawn_cloud(rng, 60, 64), nbv.look_at(nbv.geometry.fibonacci_sphere(5, 2.5))
-    expected = np.zeros((3, 5))
-    for s, p in np.ndindex(3, 5):
+    surfaces = balls(nbv.Grid(20), (0.8, 0.6), rng.uniform(-0.3, 0.3, (2, 3)))
+    data, poses = drawn_cloud(rng, 60, 64), nbv.look_at(nbv.geometry.fibonacci_sphere(3, 2.5))
+    expected = np.zeros((2, 3))
+    for s, p in np.ndindex(2, 3):
         surface = jax.tree.map(lambda leaf, s=s: leaf[s], surfaces)
         expected[s, p] = chamfer(nbv.scan(surface, SMALL, poses[p]).to_numpy()[0], data.to_numpy()[0])
     assert expected.min() > 0
