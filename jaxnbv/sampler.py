@@ -133,7 +133,8 @@ class SurfaceSampler(eqx.Module):
     def with_bank(self, bank: ShapeBank, poses: ShapePoses) -> "SurfaceSampler":
         """Return a copy whose prior is `KnownShapes`, a mixture over a bank.
 
-        Shapes are registered within the volume. The current model becomes the mixture's "none of these".
+        Shapes are registered within the carving's volume, or within `Box()` if there is no carving. The current model
+        becomes the mixture's "none of these".
 
         - `poses`: the possible placements of the shapes in the scene.
         """
@@ -153,7 +154,7 @@ class SurfaceSampler(eqx.Module):
 
     @own_settings()
     def within(self, volume: Box) -> "SurfaceSampler":
-        """Return a copy with this box in place of every default `Box()`. The box may cut the object."""
+        """Return a copy in which this box replaces every default volume. The box may cut the object."""
 
         def replace(leaf):
             if isinstance(leaf, OutsideBoundary):

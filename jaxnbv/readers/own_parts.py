@@ -120,9 +120,9 @@ def _is_mount(
 
 
 def _components(candidate_depth: Float[np.ndarray, "k l"]) -> tuple[Int[np.ndarray, " blocks"], int]:
-    """Return the index of the connected component of each block with positive depth, and their number.
+    """Return the component index of each block with positive depth, and the number of components.
 
-    Neighbouring blocks at about the same depth belong to the same component.
+    Neighbouring blocks at about the same depth belong to the same connected component.
     """
     padded = np.pad(candidate_depth, 1)
     number = np.zeros(padded.shape, int)

@@ -39,7 +39,7 @@ def first_bracket(c: list) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
 
     If a cubic is positive at 0 but not at its local minimum, there is exactly one root before the minimum, and s is the
     position of the minimum. Otherwise s is 1: a cubic that is positive at 0 then has one root in [0, 1] if it is not
-    positive at 1, and none if it is. A cubic that is not positive at 0 counts as having its first root there.
+    positive at 1, else none. A cubic that is not positive at 0 counts as having its first root there.
 
     - `c`: the coefficients, constant first.
     """

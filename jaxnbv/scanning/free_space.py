@@ -201,9 +201,9 @@ def _is_crossed(
 
 
 def _least_within(image: Float[Array, "h w"], pixels: int) -> Float[Array, "h w"]:
-    """Return the minimum of each pixel and its eight neighbours at a distance of `pixels` rows or columns.
+    """Return, for each pixel, the minimum of nine pixels: a 3 x 3 pattern with a spacing of `pixels`.
 
-    Pixels beyond the border count as infinite.
+    The pattern is centred on the pixel. Pixels beyond the border count as infinite.
     """
     for axis in (0, 1):
         pad = [(0, 0), (0, 0)]

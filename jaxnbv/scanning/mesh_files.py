@@ -143,9 +143,9 @@ def _read(path: Path) -> list[tuple[str, trimesh.Trimesh]]:
 
 
 def _named_meshes(geometry: trimesh.Geometry) -> list[tuple[str, trimesh.Trimesh]]:
-    """Return the node's name and the transformed mesh for each mesh of a scene, or for a single mesh.
+    """Return a node name and a mesh in scene coordinates for each mesh of a trimesh scene.
 
-    A mesh without a node is named by its index.
+    A single mesh gives one entry. A mesh without a node has its index as the name.
     """
     parts = geometry.dump() if isinstance(geometry, trimesh.Scene) else [geometry]
     meshes = [part for part in parts if isinstance(part, trimesh.Trimesh)]

@@ -42,7 +42,7 @@ def read_ply(content: bytes) -> Triangles:
 
 
 def _header(text: str) -> tuple[str, dict[str, tuple[int, list[_Property]]]]:
-    """Return the encoding of a PLY file, and by name of each element, its row count and its properties."""
+    """Return the encoding of a PLY file, and a dict from element name to row count and properties."""
     encoding, elements = "", dict[str, tuple[int, list[_Property]]]()
 
     def kind_of(word: str) -> np.dtype:

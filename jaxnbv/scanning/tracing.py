@@ -151,7 +151,7 @@ _traced_zero = jax.custom_batching.custom_vmap(_first_zero)
 
 @_traced_zero.def_vmap
 def _traced_zero_batched(size: int, batched, field: GridField, u: list[Array], du: list[Array]):
-    """Join a `vmap`'s batches of rays through one field into one batch, which takes less time."""
+    """Trace the rays of all entries of a `vmap` as one batch if they share a field, which is faster."""
     u, du = jax.tree.map(
         lambda x, is_batched: x if is_batched else jnp.broadcast_to(x, (size, *x.shape)), (u, du), tuple(batched[1:])
     )
@@ -192,9 +192,9 @@ def smooth_gradient(field: GridField, x: Triple) -> Triple:
 
 
 def enter(u: Triple, du: Triple, field: GridField) -> tuple[March, Float[Array, " n"]]:
-    """Start a march where the rays u + t du enter the grid's box. Return it and the t of this point.
+    """Return a march from where the rays u + t du enter the grid's box, and the t of these points.
 
-    The `t` of the march counts from this point.
+    The march's own `t` is zero at these points.
     """
     # The box is smaller than the grid by a sliver, so that no position lies outside the grid after it is rounded and
     # moved forward.
@@ -226,7 +226,7 @@ def march(rays: March, field: GridField) -> March:
 
 
 def _stride(rays: March, field: GridField) -> March:
-    """Move rays through cells without a change of sign until most reach one or leave the grid's box."""
+    """Move rays until most have reached a cell in which the sign changes, or have left the grid's box."""
 
     def step(state):
         rays, _ = state

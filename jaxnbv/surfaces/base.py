@@ -181,7 +181,7 @@ class SurfaceModel(eqx.Module):
         return observations
 
     def in_scene(self, frame: Frame) -> "SurfaceModel":
-        """Return a copy with the true sizes of known parts converted from a frame's world to scene units.
+        """Return a copy in which the sizes of parts are converted from a frame's world units to scene units.
 
         A model without known parts at true size is returned unchanged.
         """

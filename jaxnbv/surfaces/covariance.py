@@ -136,9 +136,9 @@ def _sine_sum(x: Float[Array, " n"], y: Float[Array, " m"], spectrum: Spectrum) 
 
 
 def _inverse_square_sum(products, spectrum: Spectrum):
-    """Return a sum over frequency vectors n in which each term is divided by |n|^2.
+    """Return the sum that `products` computes over frequency vectors n, but with term n divided by |n|^2.
 
-    - `products`: returns the undivided sum for a spectrum s1. Its term n is proportional to s1(n_1) s1(n_2) s1(n_3).
+    - `products`: maps a spectrum s1 to the undivided sum. Its term n is proportional to s1(n_1) s1(n_2) s1(n_3).
     """
     frequency = jnp.arange(spectrum.shape[0], dtype=spectrum.dtype)
 

@@ -90,15 +90,15 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
         return -0.5 * (fit + 3.0 * self.solver.factor.log_determinant + 3.0 * count * jnp.log(2.0 * jnp.pi))
 
     def data_points(self) -> DataPoints:
-        """Return the points of the cloud, both for gradients and for values of mean functions."""
+        """Return the cloud's points, where both gradients and values of mean functions are needed."""
         points = fill_rows(self.cloud.points, self.cloud.mask)
         return DataPoints(points, points)
 
     def level_shift(self, means: MeansAtData) -> Float[Array, " s"]:
         """Return the change of the level that each mean function m_s causes.
 
-        The change is the mean of m_s(x_j) over the data, minus the level if grad m_s(x_j) were the normals. The level
-        is linear in the normals, so its slope is computed once for all mean functions.
+        The change is the mean of m_s(x_j) over the data, minus the level of a posterior with the normals grad m_s(x_j).
+        The level is linear in the normals, so its slope is computed once for all mean functions.
         """
         explained = jnp.einsum("snd,nd->s", means.gradients, _level_slope(self), precision="highest")
         return jnp.mean(means.values, axis=1, where=self.cloud.mask) - explained
@@ -183,7 +183,7 @@ def reconstruct(
 def mean_at_data(
     transform: NonuniformTransform, coefficients: Float[Array, "a a a"], cloud: PointCloud
 ) -> Float[Array, ""]:
-    """Return the mean over a cloud's points of the function that has these coefficients.
+    """Average the function with these coefficients over the points of a cloud.
 
     - `transform`: transform at the points of the cloud.
     """

@@ -2,13 +2,13 @@
 
     prior      f = m_k(T^-1 x) + g,   k ~ pi over shapes 1..K and 0 for none of these,   T the placement of the shape,
                g a Gaussian process, the residual
-    mean       m_k = h tanh(d_k / h), d_k the signed distance of shape k, h the unit of `ScreenedSPSR.offset`
+    mean       m_k = h tanh(d_k / h), d_k the signed distance of shape k, h as in `ScreenedSPSR.offset`
     weights    w_k proportional to exp(-beta E_k) over distinct fits (`Hypotheses.is_distinct`),  w_0 to exp(-beta E_0)
     sample     shapes by systematic resampling of w; then f about the mean m_k, or for k = 0 a sample of the model
                without known shapes
 
-E is the misfit of a shape to the scan, see `surfaces/registration.py`. The factor beta keeps several shapes possible. A
-likelihood that treats thousands of normals as independent would always select a single shape.
+E_k is the misfit of shape k to the scan (`surfaces/registration.py`), E_0 is `misfit_of_none`. The factor beta keeps
+several shapes possible. A likelihood that treats thousands of normals as independent would always select one shape.
 """
 
 import dataclasses
@@ -65,7 +65,7 @@ class KnownShapes(SurfaceModel):
     - `model_of_none`: the model for an object that is none of the shapes. With an empty bank this is the whole model.
     - `num_starts`: number of placements tried, all shapes together.
     - `noise_scale`: factor on the residual's standard deviation. With 1, the large prior deviation in unseen space
-      breaks thin parts in samples and adds floating fragments near the parts.
+      breaks thin pieces of sampled surface and adds floating fragments near them.
     - `inverse_temperature`: beta. The weight of a shape with misfit E is proportional to exp(-beta E).
     - `misfit_of_none`: the misfit at which a shape is as likely as "none of these".
 
@@ -110,7 +110,7 @@ class KnownShapes(SurfaceModel):
         )
 
     def fit(self, observations: Observations) -> tuple[Hypotheses, Float[Array, " h_and_none"]]:
-        """Register the shapes to the scan. Return hypotheses and weights, the last for "none of these"."""
+        """Return the shapes registered to the scan, and their weights followed by that of "none of these"."""
         fits = register(self.bank, Prior(self.poses, self.box), FitTargets.of(observations), self.num_starts)
         return fits, _weights(fits, self.inverse_temperature, self.misfit_of_none)
 
@@ -252,7 +252,7 @@ def kind_of(name: str) -> str:
 def systematic_resampling(
     key: PRNGKeyArray, weights: Float[Array, " n"], num_samples: int
 ) -> Int[Array, " num_samples"]:
-    """Draw indices in proportion to weights, each within one of its expected count (Kitagawa 1996)."""
+    """Draw each index in proportion to its weight, within one of the expected count (Kitagawa 1996)."""
     positions = (jnp.arange(num_samples) + jax.random.uniform(key)) / num_samples
     total = jnp.cumsum(weights)
     return jnp.clip(jnp.searchsorted(total / total[-1], positions, side="right"), 0, len(weights) - 1)

@@ -32,7 +32,7 @@ _T = TypeVar("_T")
 def as_tuple(values: Sequence[_T], name: str) -> tuple[_T, ...]:
     """Return the values as a tuple.
 
-    **Raises:** `ValueError`, which calls the values `name`, if they are not iterable.
+    **Raises:** `ValueError` if the values are not iterable. The message calls them `name`.
     """
     try:
         return tuple(values)

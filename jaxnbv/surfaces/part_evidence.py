@@ -1,7 +1,7 @@
 """Evidence of the rays of all views for placed parts, and the weights that follow from this evidence.
 
-A ray passes through empty space and meets the object at x. For a placed part with signed distance d, it gives two
-tests: x should lie on the part's surface, and the ray should not pass through the part before x. They give the misfit
+A ray passes through empty space and meets the object at x. It tests a placed part with signed distance d in two ways:
+x should lie on the part's surface, and the ray should not pass through the part before x. The misfit is
 
     L = sum over rays of  l(d(x)) + l(min over the ray of min(d, 0)),   l(r) = log(1 + r^2 / 2 tau^2)
 
@@ -10,12 +10,12 @@ effect of outliers. tau is twice the noise of the measured ray lengths, but at l
 part's surface on its grid. The noise is estimated from third differences of the lengths between pixels. A sensor may
 miss a surface. So a ray without a return counts only if it passes through the part in space that was seen to be empty.
 Misfits are summed over rays, so the weights become more decisive with more views. Rays that meet the object less than
-0.12 apart have dependent errors, so each counts as less than one ray. Each hypothesis h is a placed part:
+0.12 apart have dependent errors, so each counts as less than one ray. A hypothesis h (a placed part) has the weight
 
     w_h proportional to exp(-L_h),   w_0 (none of these) to exp(-L_0),   L_0 = sum over rays of e_0 + o
 
 The sum for L_0 is over the rays that met the object. e_0 is a constant. o is the amount by which l(d(x)) exceeds e_0
-for the hypothesis that explains x best. It covers points that belong to a different object, which no hypothesis
+for the hypothesis that explains x best. So o covers points that belong to a different object, which no hypothesis
 explains. The sum of o is limited, on the assumption that at most a fifth of the points belong to a different object.
 """
 
@@ -78,7 +78,7 @@ class Rays(NamedTuple):
     @classmethod
     @program
     def of(cls, observations: Observations, box: Box) -> "Rays | None":
-        """Return the rays of all views that enter a box; None if the observations do not store the rays."""
+        """Return those rays of all views that enter a box; None if the observations do not store rays."""
         looks, poses = observations.looks, observations.poses
         if looks is None or observations.empty_nodes is None:
             return None
@@ -179,10 +179,10 @@ def misfit_of(distance: Float[Array, "*n"], tau: Float[Array, ""]) -> Float[Arra
 def _deepest_penetration(
     distance: Callable[[Float[Array, "n 3"]], Float[Array, " n"]], rays: Rays
 ) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
-    """Return the smallest signed distance along each ray before its end, and whether it is evidence.
+    """Return the smallest signed distance to a solid along each ray, and whether it is evidence.
 
-    The distance is zero if the ray misses the solid. It is evidence if the ray has a return. If the ray has no return,
-    it is evidence only if the position of the smallest distance was seen to be empty.
+    A ray is followed to its end. The distance is zero if the ray misses the solid. It is evidence if the ray has a
+    return. Without a return, it is evidence only if the position of the smallest distance was seen to be empty.
     """
 
     def stride(state, _):

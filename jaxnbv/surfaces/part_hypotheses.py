@@ -54,7 +54,7 @@ class PartHypotheses(eqx.Module):
         return jnp.append(self.shape_weights, self.weights[-1])
 
     def names(self) -> dict[str, float]:
-        """Return the probability of each part by name, most likely first, including "none of these".
+        """Return a dict from part name to probability, most likely first, including "none of these".
 
         Parts without a hypothesis are left out.
         """
@@ -65,7 +65,7 @@ class PartHypotheses(eqx.Module):
 
     @property
     def most_likely(self) -> tuple[int, Placement]:
-        """Index in the bank of the most likely part, and its most likely placement."""
+        """The most likely part, as an index in the bank, and the most likely placement of this part."""
         shapes, weights = np.asarray(self.placed.shape), np.asarray(self.weights)[:-1]
         part = int(np.argmax(np.bincount(shapes, weights, len(self.bank))))
         row = int(np.argmax(np.where(shapes == part, weights, -1.0)))

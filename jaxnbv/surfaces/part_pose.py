@@ -46,7 +46,7 @@ class ObjectPose(eqx.Module):
 
 
 def object_pose(hypotheses: PartHypotheses, observations: Observations, frame: Frame) -> ObjectPose:
-    """Return the pose of the most likely part in the world that `frame` maps to the scene."""
+    """Return the world pose of the most likely part. `frame` maps the world to the scene."""
     part, placement = hypotheses.most_likely
     bank = hypotheses.bank
     shape = bank.shape(jnp.asarray(part))

@@ -2,9 +2,9 @@
 
 Each part is tried in the same number of placements, and its best few placements are refined by Gauss-Newton steps on
 the misfit E of `registration`. The best distinct results of each part are refined again on more points, together with
-the hypotheses of the previous view. Finally all parts are tried in each of the best placements so far. The search keeps
-results for every part, so similar parts cannot displace a part. The last stage also tries a part in placements that
-were reached only by similar parts. The time grows linearly with the number of parts.
+the hypotheses of the previous view. Finally all parts are tried in each of the best placements so far, since the right
+placement of a part may have been found only for a similar part. The search keeps results for every part, so no part is
+lost because a similar part fits better. The time grows linearly with the number of parts.
 """
 
 import dataclasses

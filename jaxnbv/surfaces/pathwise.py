@@ -117,7 +117,7 @@ class TrigonometricPosterior(SurfacePosterior):
 
         g_s is a sample of the posterior given the observed normals minus grad m_s, and the observed values minus m_s.
         If all mean functions are zero, the result equals that of `sample` with the same key. For any mean function, the
-        surface of a sample is where `fields(x) == posterior.level`.
+        surface of a sample is where its returned field equals `posterior.level`.
 
         - `means`: the mean functions m_s, which must be differentiable once.
         - `noise_scale`: factor on the standard deviation of the samples about the posterior mean, a single number or

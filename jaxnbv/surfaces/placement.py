@@ -32,7 +32,7 @@ class Placement(eqx.Module):
 
     @property
     def factor(self) -> Float[Array, "*batch"]:
-        """Scene units per unit of the shape's distance: the geometric mean of `scale`, exact if all are equal."""
+        """Factor on a shape's distances: the geometric mean of `scale`, exact if its entries are equal."""
         return jnp.exp(jnp.mean(jnp.log(self.scale), axis=-1))
 
     def to_shape(self, x: Float[Array, "n 3"]) -> Float[Array, "n 3"]:

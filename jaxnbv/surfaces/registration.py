@@ -46,7 +46,7 @@ _MAX_STEP = 0.3
 class FitTargets(NamedTuple):
     """Data to which shapes are fitted: points with normals, and empty points, in scene coordinates.
 
-    The first rows of each array are spread as evenly as all its rows. `mask` and `is_empty` are False for padding.
+    The first rows of an array cover the region of all rows, more sparsely. `mask` and `is_empty` are False for padding.
     """
 
     points: Float[Array, "n 3"]
@@ -195,7 +195,7 @@ def _rotated_starts(bank: ShapeBank, prior: Prior, targets: FitTargets, num_star
 
 
 def _swap_shapes(bank: ShapeBank, prior: Prior, hypotheses: Hypotheses, targets: FitTargets) -> Hypotheses:
-    """Compute the misfit of each shape in the placements of some good hypotheses of different rotation.
+    """Compute the misfit of each shape in the placements of some good hypotheses with distinct rotations.
 
     Each shape takes the rotation of the hypothesis. Its shift and scale, relative to the placement that fills the box,
     are also those of the hypothesis.
@@ -232,7 +232,7 @@ def evaluate(bank: ShapeBank, prior: Prior, placements: Placement, targets: FitT
 def refine(bank: ShapeBank, prior: Prior, starts: Hypotheses, targets: FitTargets, num_steps: int) -> Hypotheses:
     """Refine each start by Gauss-Newton steps on the misfit E, while the scale tau of distances falls.
 
-    Returns for each start the iterate of smallest E. This comparison evaluates E at the last tau.
+    Returns for each start the iterate whose E is smallest when evaluated at the last tau.
     """
     taus = jnp.append(jnp.geomspace(_FIRST_TAU, _LAST_TAU, num_steps), _LAST_TAU)
     basis = jnp.asarray(prior.step_basis, targets.points.dtype)

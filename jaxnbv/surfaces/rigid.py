@@ -52,8 +52,8 @@ class Registration(NamedTuple):
 
     - `matrix`: the motion from the scan to the mesh.
     - `median_distance`: median distance of the scan's points from the mesh, after this motion.
-    - `ambiguity`: distance between the mesh placed by `matrix` and the mesh placed by a motion that fits nearly as
-      well: a mean over the mesh, the largest over such motions. It is 0 if none of them is clearly different.
+    - `ambiguity`: if other motions fit nearly as well, the largest distance between the mesh placed by one of them and
+      the mesh placed by `matrix`, a mean over the mesh. It is 0 if none of these motions is clearly different.
     """
 
     matrix: Float[np.ndarray, "4 4"]
@@ -136,7 +136,7 @@ class _Stage(NamedTuple):
         return motions.take(rows)
 
     def rotate_about_weakest_axis(self, motion: _Motions) -> _Motions:
-        """Return copies of a motion, each followed by a turn about the screw axis the scan constrains least."""
+        """Return copies of a motion, followed by turns about the screw axis that the scan constrains least."""
         weakest = np.linalg.eigh(self.equations(motion).matrix[0])[1][:, 0]
         twist = np.zeros((4, 4))
         twist[:3, :3], twist[:3, 3] = np.cross(np.eye(3), weakest[:3]), weakest[3:]

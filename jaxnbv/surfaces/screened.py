@@ -4,18 +4,18 @@ This is a second step of Bayes' rule after `GeometricSPSR`, whose posterior give
 covariance k:
 
     level    c ~ N(0, tau^2), broad and independent of f;   g = f - c, and the surface is where g = 0
-    data     g(y_k) = h value_k + e_k,   e_k ~ N(0, h^2 noise_k^2),   k = 1, ..., M
+    data     g(y_j) = h value_j + e_j,   e_j ~ N(0, h^2 noise_j^2),   j = 1, ..., M
     factor   S = k(Y, Y) + tau^2 11^T + Sigma,   k(Y, Y) = K_ff - sum_d K_fd A^-1 K_df
     mean     E g(x) = m(x) + (k(x, Y) + tau^2 1^T) w,   w = S^-1 (h value - m(Y))
     sample   f a sample given the normals, c and e from the prior;   w = S^-1 (h value - f(Y) + c - e)
 
-Here h is half the rise of E f across the scanned surface (see `ScreenedSPSR.offset`), Y are the points y_k, 1 is a
+Here h is half the rise of E f across the scanned surface (see `ScreenedSPSR.offset`), Y are the points y_j, 1 is a
 vector of ones, and Sigma is the covariance of e. K_ff is the prior covariance of f(Y), K_df the covariance of component
 d of the normals with f(Y), and A the covariance of the normals.
 
-The values change f by k(., Y) w. This consists of a change u_d = -A^-1 K_df w of the weights of the normals, and of a
-direct change s(n) / |n|^2 sum_k w_k e^{-i n.y_k} of the coefficients of f. The level c changes by -tau^2 1^T w. The
-three components of v still share A.
+The values change f by k(., Y) w. This is the sum of two changes: u_d = -A^-1 K_df w is added to the weights of the
+normals, and s(n) / |n|^2 sum_j w_j e^{-i n.y_j} to the coefficients of f. The level c changes by -tau^2 1^T w. The
+three components of the normal field still share A.
 """
 
 import math
@@ -202,7 +202,7 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
         return jax.lax.map(at_point, x, batch_size=points_per_batch(len(x), self.base.cloud.capacity))
 
     def data_points(self) -> DataPoints:
-        """Return the cloud's points for gradients of mean functions, and the values' points for values."""
+        """Return the points where mean functions need gradients (the cloud) and values (`rows`)."""
         return DataPoints(self.base.data_points().gradient_points, fill_rows(self.rows.points, self.rows.mask))
 
     def level_shift(self, means: MeansAtData) -> Float[Array, " s"]:
@@ -210,7 +210,7 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
         return jnp.zeros(len(means.values), self.weights.dtype)
 
     def prior_draws(self, key: PRNGKeyArray, num_samples: int) -> ScreenedDraws:
-        """Draw the parts of `ScreenedDraws` from the prior."""
+        """Draw the normal field, its noise, the level and the noise of the values from the prior."""
         base_key, level_key, noise_key = jax.random.split(key, 3)
         normals = self.base.prior_draws(base_key, num_samples)
         dtype, shape = normals.noisy_normals.dtype, self.rows.noise.shape

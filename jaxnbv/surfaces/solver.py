@@ -63,7 +63,7 @@ class Solver(eqx.Module):
 
     @abstractmethod
     def solve(self, matrices: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
-        """Apply the inverse covariance A^-1 to the columns of matrices, which must be zero in unfilled rows."""
+        """Apply the inverse covariance A^-1 to the columns of matrices that are zero in unfilled rows."""
 
     @abstractmethod
     def explained_variance(self, x: Float[Array, "n 3"]) -> Float[Array, " n"]:
@@ -191,10 +191,10 @@ def points_per_batch(count: int, capacity: int) -> int:
 
 
 def _call_on_leading_rows(cloud: PointCloud, compute: Callable[[int], Float[Array, "*of"]]) -> Float[Array, "*of"]:
-    """Call `compute(size)` with the smallest of a few sizes for which the first rows hold all points.
+    """Call `compute(size)` with a `size` for which the first `size` rows of the cloud hold all its points.
 
-    The time thus depends on the number of filled rows, although array shapes are fixed. A small cloud always uses its
-    capacity as the size, because each size is compiled separately.
+    The size is the smallest of a few fixed ones, so the time depends on the number of filled rows. A small cloud always
+    uses its capacity as the size, because each size is compiled separately.
     """
     capacity = cloud.capacity
     if capacity <= _SMALL_CAPACITY:
@@ -207,6 +207,6 @@ def _call_on_leading_rows(cloud: PointCloud, compute: Callable[[int], Float[Arra
 
 
 def _apply_to_columns(function: Callable[[Array], Array], matrices: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
-    """Apply a function that maps the columns of a matrix to the columns of all matrices, in a single call."""
+    """Apply a function of a matrix's columns to the columns of all matrices, in a single call."""
     columns = jnp.moveaxis(matrices, 0, 1)
     return jnp.moveaxis(function(columns.reshape(len(columns), -1)).reshape(columns.shape), 1, 0)

@@ -85,7 +85,7 @@ def evaluate_on_grid(
 class TrigonometricFields(Fields):
     """Band-limited functions, which are evaluated exactly anywhere on the torus.
 
-    - `coefficients`: coefficients of phi_a(x1) phi_b(x2) phi_c(x3), one block per function.
+    - `coefficients`: coefficients of phi_a(x1) phi_b(x2) phi_c(x3), with a leading axis of functions.
     """
 
     coefficients: Float[Array, "s a a a"]

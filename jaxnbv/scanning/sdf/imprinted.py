@@ -86,7 +86,7 @@ def _ring(x, y, middle=0.74, half_width=0.24):
 
 
 def _star(x, y, inner=0.48):
-    """Return the signed distance to a star with five tips at radius 1.
+    """Return the signed distance to a star with five tips at radius 1 and notches at radius `inner`.
 
     The star consists of ten congruent wedges between a tip and a notch. The point is mirrored into one of the wedges.
     """
