@@ -7,10 +7,11 @@ X_i are estimated by minimising the disagreement of overlapping views,
     the sum over points p of view i and the nearest point q of view j  of  rho(n_q . (T_i X_i p - T_j X_j q)),
 
 with the robust loss rho(r) = c^2 log(1 + r^2 / c^2), whose width c is twice the median disagreement. The points p and q
-are in the coordinates of cameras i and j, and the normal n_q at q is in world coordinates. A Gaussian prior keeps
-components that no view determines close to zero. The nearest points are searched again in each round, within a distance
-that decreases (point-to-plane iterative closest points, Chen and Medioni 1992). The views determine all of X if the
-smallest eigenvalue of J^T J is large enough, where J is the derivative of the arguments of rho with respect to X.
+are in the coordinates of cameras i and j, and the normal n_q at q is in world coordinates. A Gaussian prior keeps those
+components of X_i close to zero that no view determines. The nearest points are searched again in each round, within a
+distance that decreases (point-to-plane iterative closest points, Chen and Medioni 1992). The views determine all of X
+if the smallest eigenvalue of J^T J is large enough. J is the derivative with respect to X of all distances
+n_q . (T_i X_i p - T_j X_j q).
 """
 
 from collections.abc import Sequence
@@ -58,9 +59,9 @@ class Alignment(eqx.Module):
 
     Lengths are in the units of the poses.
 
-    - `disagreement`: median point-to-plane distance between the points of a view and the nearest points of the views
-      that overlap it, with uncorrected poses. NaN for a view that overlaps no other view.
-    - `angle`: median angle between the normals of these pairs of points, in radians.
+    - `disagreement`: (views,), for each view the median point-to-plane distance between its points and the nearest
+      points of overlapping views, with uncorrected poses. NaN for a view that overlaps no other view.
+    - `angle`: (views,), for each view the median angle between the normals of these pairs of points, in radians.
     - `noise`: median point-to-plane distance between neighbouring points of the same view.
     - `corrected`: `disagreement` with corrected poses.
     - `corrections`: (views, 4, 4), the correction X of each view. The true pose of the camera is `matrix @ X`, where
@@ -109,10 +110,10 @@ class Alignment(eqx.Module):
 
     @property
     def motion(self) -> str:
-        """Text that names the further view that would best determine the `weakest` error of the mount.
+        """Advice which view to add, so that the views determine the `weakest` error of the mount better.
 
-        A shift along an axis, or a rotation about it, looks the same in all views if all motions between the views keep
-        the direction of the axis. The named view changes this direction.
+        A shift of the mount along an axis, or a rotation about it, looks the same in all views if the axis has the same
+        world direction in all views. The advised view changes this direction.
         """
         axis = self.weakest[3:] if np.linalg.norm(self.weakest[3:]) > 0 else self.weakest[:3]
         is_ahead = abs(axis[2]) > 0.8 * np.linalg.norm(axis)
@@ -216,7 +217,7 @@ def _in_camera(cloud: PointCloud, pose: Pose) -> _View:
 
 
 def _pairs(views: Sequence[_View]) -> list[tuple[int, int]]:
-    """Return pairs of views that may show the same surface: each view with a few of similar direction."""
+    """Return pairs of views that may show the same surface: each view and a few of similar direction."""
     forward = np.stack([view.matrix[:3, 2] for view in views])
     angles = np.arccos(np.clip(forward @ forward.T, -1.0, 1.0))
     np.fill_diagonal(angles, np.inf)
@@ -303,7 +304,8 @@ def _robust_step(
 
     - `residuals`, `jacobian`: point-to-plane distances and their derivative, from `_linearise`.
     - `scale`: width c of rho.
-    - `errors`, `prior`: the corrections so far, and the weights that pull them towards zero.
+    - `errors`: the corrections so far, as rotation vectors and shifts.
+    - `prior`: weights that pull the corrections towards zero.
     """
     step = np.zeros(jacobian.shape[1])
     for _ in range(_NUM_STEPS):

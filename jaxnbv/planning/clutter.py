@@ -93,7 +93,7 @@ class Clutter(NamedTuple):
     def _is_seen_through(
         self, depth: Float[np.ndarray, "height width"], camera: Camera, pose: Pose, frame: Frame
     ) -> Bool[np.ndarray, "n n n"]:
-        """Return a mask of the cells that are more than a cell nearer than the depth measured at their pixel."""
+        """Return a mask of the cells that are nearer than the depth at their pixel by more than a cell's side."""
         cell = frame.length_to_world(self.spacing)
         centers = np.asarray(frame.to_world(self._centers().reshape(-1, 3)), np.float64)
         local = (centers - np.asarray(pose.position, np.float64)) @ np.asarray(pose.rotation, np.float64)

@@ -113,7 +113,8 @@ class Episode(eqx.Module):
     def save(self, path: str | Path) -> None:
         """Save the episode to a folder (see `jaxnbv.storage` for its files). `simulate` can continue from it.
 
-        **Raises:** `ValueError` if the folder holds other files, an episode of another configuration, or more views.
+        **Raises:** `ValueError` if the folder holds other files, an episode of another configuration, or more views
+        than this episode.
         """
         folder = self.open(path)
         with folder.writing():
@@ -134,7 +135,7 @@ class Episode(eqx.Module):
         folder.write_cloud(self.frame.to_world(self.cloud))
 
     def open(self, path: str | Path) -> RunFolder:
-        """Open or create a folder that stores the views of an episode with this episode's configuration.
+        """Open or create a folder for the views of this episode, and return it.
 
         **Raises:** `ValueError` as `RunFolder` does.
         """

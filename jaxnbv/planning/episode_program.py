@@ -35,7 +35,7 @@ class ViewRecord(NamedTuple):
 
 
 def answers_by_parts(planner: Planner) -> bool:
-    """Return whether `View.answer` names a known part, because the acquisition has no answer of its own."""
+    """Return whether `View.answer` is the probabilities of known parts, as the acquisition has no answer."""
     return type(planner.acquisition).answer is Acquisition.answer and planner.sampler.model.carries_hypotheses
 
 

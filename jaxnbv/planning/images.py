@@ -93,7 +93,7 @@ class Image(NamedTuple):
         return self._replace(robot=robot)
 
     def cloud(self, camera: Camera, pose: Pose, stride: int, box: Box | None = None) -> PointCloud:
-        """Convert the image without the robot's pixels by `PointCloud.from_depth`. The `mask` is not applied."""
+        """Return `PointCloud.from_depth` of the image, without points of the robot. The `mask` is not applied."""
         cloud = PointCloud.from_depth(self.depth, camera, pose, self.scale, stride, box)
         return cloud if self.robot is None else only_where(cloud, ~self.robot, camera, stride)
 
@@ -128,7 +128,7 @@ class Image(NamedTuple):
 
 
 def only_where(cloud: PointCloud, pixels: Bool[np.ndarray, "height width"], camera: Camera, stride: int) -> PointCloud:
-    """Return a cloud with only the points of some pixels. The rays of other pixels keep their lengths.
+    """Return a cloud with only the points of some pixels. Its rays (`sight`, `missed`) do not change.
 
     - `pixels`: mask of the pixels to keep, at the image's full resolution.
     - `stride`: stride of the rows and columns from which the cloud was made.

@@ -43,7 +43,7 @@ class Intake:
         self.clutter = self._no_clutter()
 
     def without_images(self) -> "Intake":
-        """Return a copy without images that keeps the pose corrections, to add the images again with these."""
+        """Return a copy without images that keeps the pose corrections, for adding the images again."""
         intake = copy.copy(self)
         intake.images, intake.clutter = (), self._no_clutter()
         return intake

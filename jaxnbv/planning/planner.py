@@ -226,9 +226,9 @@ class Planner(eqx.Module):
     def sample_inputs(self, observations: Observations, key: PRNGKeyArray) -> StepInputs:
         """Return the observations, the model's posterior given them, and surfaces drawn from the posterior.
 
-        For an acquisition with `measurable_only` (`NewSurface`), the surfaces omit what an earlier view should have
-        measured but did not. For an acquisition with `needs_hypotheses` (`Identify`), there is no posterior, and the
-        only surface is that of the most probable part.
+        For an acquisition with `measurable_only` (`NewSurface`), the drawn surfaces lack those regions that an earlier
+        view should have measured but did not. For an acquisition with `needs_hypotheses` (`Identify`), there is no
+        posterior, and the only surface is that of the most probable part.
         """
         if self.acquisition.needs_hypotheses:
             return StepInputs(observations, None, hypotheses_of(observations).surfaces(self.sampler.grid, 1))

@@ -63,7 +63,7 @@ class _Option(NamedTuple):
 
 @dataclasses.dataclass
 class _Checks:
-    """Checks poses one after the other, and yields what the arm can reach of each.
+    """Iterable that checks poses in order, and yields for each the options that the arm can reach.
 
     - `poses`, `values`: poses to check and their values, in order.
     - `answers`: function of a batch of poses. It returns the score of each pose, or the reason why the arm cannot reach
@@ -120,13 +120,13 @@ def best_reachable(
     values_at: Callable[[Pose], Float[Array, " n"]] | None = None,
     seconds: float = math.inf,
 ) -> Choice:
-    """Find the pose with the highest value, times the user's score, that the arm can reach.
+    """Among the poses that the arm can reach, find the pose with the highest product of value and score.
 
     All poses that the search evaluated are considered. They are checked in batches, highest value first, until no
     unchecked pose can be better. If a pose cannot be reached, the same pose with the camera rotated about its optical
     axis is tried.
 
-    - `reachable`: the user's function; None if all poses can be reached.
+    - `reachable`: the user's function, which returns the scores; None if all poses can be reached.
     - `to_matrices`: function that converts scene poses to the matrices for `reachable`.
     - `refused`: poses that are excluded, also with the camera rotated about its optical axis.
     - `values_at`: function that returns the values of rotated poses; None if such a rotation does not change the value,
@@ -194,7 +194,7 @@ def _rotations_about_axis(pose: Pose) -> Pose:
 
 
 def _reason_if_refused(pose: Pose, refused: Sequence[RefusedPose]) -> str | None:
-    """Return why the user refused a pose, or a rotation of it about the optical axis; None if not refused."""
+    """Return why the user refused a pose or a rotation of it about the optical axis; None if neither."""
     return next((refused_pose.reason for refused_pose in refused if is_same_view(pose, refused_pose.pose)), None)
 
 

@@ -335,8 +335,8 @@ class Session:
         """Propose the pose for the next image.
 
         The result is stored in the folder, and stays the same until an image is added. No pose is proposed twice, even
-        if its image was taken elsewhere. Warns if the value is not greater than three standard errors plus the mean
-        value expected at visited poses, where nothing new is left to see.
+        if its image was taken elsewhere. Warns if the value is at most three standard errors above the mean value that
+        is expected at visited poses, where nothing new is left to see.
 
         - `seconds`: time limit for calls of `reachable`, which may be slow. After this time, the best reachable pose so
           far is used.

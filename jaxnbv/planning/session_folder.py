@@ -66,10 +66,9 @@ class SessionFolder:
         return image._replace(robot=entry.get("robot"))
 
     def store_image(self, index: int, image: Image) -> None:
-        """Store an image.
+        """Store an image, and delete the stored proposal for the image after it.
 
-        A stored proposal for the view after this image is removed. It is outdated, because it was computed from images
-        that the user has deleted.
+        If there is such a proposal, it is outdated: it was computed from images that the user has deleted since.
         """
         self._folder.file("proposal", index + 1).unlink(missing_ok=True)
         pixels = {"mask": image.mask, "robot": image.robot}

@@ -1,4 +1,4 @@
-"""Warnings of a session, such as those about a box that cuts the object, or about a table."""
+"""Warnings of a session, for example that the box cuts the object or that a plane counts as a table."""
 
 import math
 import warnings

@@ -251,8 +251,8 @@ class Sessions:
     def _box_around(self, points: Float[np.ndarray, "n 3"]) -> Box:
         """Return a cube that contains an object, given some of the object's points.
 
-        The cube extends beyond the points by their own extent, but at most to the length of the longest part. The sides
-        are equal because all objects can then share the same compiled programs.
+        On each side, the cube extends beyond the points by their own extent, but only as far as the longest part could
+        reach. The sides are equal so that all objects can share the same compiled programs.
         """
         low, high = points.min(axis=0), points.max(axis=0)
         padding = float((high - low).max()) + self._gap

@@ -32,8 +32,8 @@ _COST, _ONE_NUMBER = "the cost of going from one pose to another", "make it one 
 class ArcLength(eqx.Module):
     """Length of the path between two camera positions around a centre.
 
-    The length is hypot(mean of the distances from the centre x angle at the centre, difference of the distances). For
-    two positions at equal distance it is the length of the arc on a great circle.
+    The length is hypot(0.5 (r + s) alpha, s - r), with the distances r and s of the positions from the centre and the
+    angle alpha between them, seen from the centre. For r = s it is the length of the arc on a great circle.
 
     - `center`: the centre. The default is the middle of the scene, or the middle of the box in a session.
     """
@@ -55,7 +55,7 @@ arc_length = ArcLength()
 
 
 class WorldCost(eqx.Module):
-    """Cost function of scene poses that evaluates a cost function of world poses.
+    """Cost function of scene poses, which converts them to world poses for another cost function.
 
     - `of`: cost function of poses in world coordinates. An `ArcLength` without a centre uses the middle of the scene.
     - `frame`: frame of the user's world.

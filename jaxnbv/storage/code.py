@@ -87,7 +87,7 @@ def is_plain(obj: Any) -> bool:
 
 
 def closure(function: FunctionType) -> dict[str, Any]:
-    """Return the variables of a function's enclosing functions that have a value, keyed by name."""
+    """Return the values of a function's closure variables, keyed by name. Unset variables are absent."""
     values = {}
     for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
         with contextlib.suppress(ValueError):

@@ -41,9 +41,9 @@ def describe(obj: Any, arrays: dict[str, np.ndarray] | None = None, path: str = 
 
     `rebuild` is the inverse. Equinox modules, dataclasses and named tuples are described by their classes and fields,
     small arrays by their values, and large arrays by a hash of their bytes. A function is described by its source,
-    defaults, closure and all globals that its code reads. The same holds for each method of a user's class. Definitions
-    of installed packages are described by their names, and objects with a `version` (a text or a number) by their class
-    and version.
+    defaults, closure and all globals that its code reads. Each method of a user's class is described like a function.
+    Definitions of installed packages are described by their names, and objects with a `version` (a text or a number) by
+    their class and version.
 
     - `arrays`: a dictionary to fill with the contents of the large arrays, keyed by hash.
     - `path`: path of `obj` in a larger configuration, such as "planner.search", for error messages.
@@ -65,7 +65,7 @@ def fields_of(kind: type) -> Sequence[str]:
 
 
 class _Describer:
-    """State of one call of `describe`, which describes an object inside itself by a reference."""
+    """State of one call of `describe`. If an object contains itself, the inner one becomes a reference."""
 
     def __init__(self, arrays: dict[str, np.ndarray]):
         self.arrays = arrays
@@ -181,7 +181,7 @@ class _Describer:
         return source | self._without_arrays(parts, path)
 
     def _without_arrays(self, parts: dict[str, Any], path: str) -> dict[str, Any]:
-        """Describe parts of code without storing their arrays, since `rebuild` looks up code by name."""
+        """Describe the parts of a function or class. Arrays are not stored: `rebuild` looks up code by name."""
         arrays, self.arrays = self.arrays, {}
         try:
             return self._describe_values(parts, path)

@@ -1,4 +1,4 @@
-"""Writes files completely or not at all, and creates folders. Errors of the disk name the path."""
+"""Writes files completely or not at all, and creates folders. Error messages contain the path."""
 
 import os
 import secrets

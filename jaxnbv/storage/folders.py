@@ -45,7 +45,10 @@ def versions() -> dict[str, Any]:
 
 
 def differences(stored: Any, current: Any, name: str = "") -> list[str]:
-    """Return a text for each difference between two descriptions. Each text starts with their path `name`."""
+    """Return a text for each entry that differs between two descriptions. It starts with the path.
+
+    - `name`: path of the two descriptions.
+    """
     if isinstance(stored, dict) and isinstance(current, dict):
         keys = list(dict.fromkeys([*stored, *current]))
         nested = (differences(stored.get(key), current.get(key), f"{name}.{key}".lstrip(".")) for key in keys)
@@ -190,7 +193,7 @@ class ResultFolder:
             yield
 
     def set_versions(self, versions: dict[str, Any]) -> None:
-        """Set the `versions` of the process that computes new results. Warns if the folder has different ones."""
+        """Set the versions of the process that computes new results. Warns if they differ from the record."""
         self.versions = versions
         if not self.is_bound:
             return

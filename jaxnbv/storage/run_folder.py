@@ -1,7 +1,7 @@
 """The folder of an episode or a session, written step by step.
 
 episode.json      the configuration (planner, scene, noise, first pose, seed) and the versions of the software
-arrays.npz        large arrays of the configuration (weights of networks, meshes) by the SHA-256 of their bytes, if any
+arrays.npz        large arrays of the configuration (weights of networks, meshes), by SHA-256 of their bytes, if any
 view_00.npz       pose and scan of the first view; view_01.npz and so on also hold the search's proposal: candidates,
                   their values, and the trajectories of a gradient search
 end_00.npz        the reason why a rule ended the episode, and the number of views
@@ -144,7 +144,7 @@ def _checksum(arrays: dict[str, np.ndarray]) -> str:
 
 
 def _parts(arrays: dict[str, Any]) -> dict[str, Any]:
-    """Return modules and arrays by name. In `arrays`, a module's arrays have keys such as "scan.points"."""
+    """Return the modules and arrays of a file by name, from arrays with keys such as "scan.points"."""
     parts: dict[str, Any] = {}
     for name, array in arrays.items():
         part, _, rest = name.partition(".")
