@@ -30,6 +30,7 @@ from jaxnbv.networks import (
     part_segmenter,
     pretrained_classifier,
 )
+from jaxnbv.storage import folders
 from jaxnbv.studies.engine.records import read_records
 
 # Kept until the program ends.
@@ -103,12 +104,6 @@ def session(**changes):
     return nbv.Session(**(settings | changes))
 
 
-def stale_frame():
-    started = session()
-    started.add(*SHOT)
-    started.add(SHOT[0], nbv.look_at((2.5, 0.0, 0.0)).matrix)
-
-
 def stored(name, changes):
     file = WEIGHTS / "pyramid.safetensors"
     with safe_open(file, "numpy") as opened:
@@ -118,10 +113,11 @@ def stored(name, changes):
 
 
 def large_view():
-    """A view of zero arrays, a megabyte on disk that expands to gigabytes."""
+    """A view of zero arrays, which expand to more than is allowed."""
     folder = FOLDER / "episode"
     nbv.simulate(P, BALL, POSE, 1, KEY, folder=folder, progress=False)
-    np.savez_compressed(folder / "view_00.npz", points=np.zeros(2**26 + 2**18))
+    np.savez_compressed(folder / "view_00.npz", points=np.zeros(2**19))
+    folders.MAX_ARRAY_BYTES = 2**20
     nbv.simulate(P, BALL, POSE, 1, KEY, folder=folder, progress=False)
 
 
@@ -139,11 +135,6 @@ def reopened(name, change):
     return session(folder=FOLDER / name)
 
 
-def dangling(folder):
-    (folder / "image_01.npz").unlink()
-    (folder / "image_01.npz").symlink_to("elsewhere.npz")
-
-
 def piped(folder):
     (folder / "image_01.npz").unlink()
     os.mkfifo(folder / "image_01.npz")
@@ -155,14 +146,8 @@ def older_session_asks():
     older.next()
 
 
-def cut(name, share, text=None):
-    """A mesh whose file is cut short."""
-    ball = nbv.mesh_from_sdf(nbv.sdf.Sphere(1.0), nbv.Grid(16)).to_trimesh()
-    encoding = {"encoding": "ascii"} if name.endswith(".ply") else {}
-    written = ball.export(file_type=name[-3:], **encoding) if text is None else text
-    content = written if isinstance(written, bytes) else written.encode()
-    lines = content.splitlines(keepends=True)
-    (FOLDER / name).write_bytes(b"".join(lines[: int(share * len(lines))]))
+def mesh_of_text(name, text):
+    (FOLDER / name).write_text(text)
     return nbv.load_mesh(FOLDER / name)
 
 
@@ -178,13 +163,9 @@ def costing(cost):
     return priced.propose(priced.init(POSE, SCAN), KEY)
 
 
-def nan_if(condition, bad=jnp.nan):
-    """A utility that is `bad` if the number of points meets the condition, and zero otherwise."""
-
-    def lacking(cloud):
-        return jnp.where(condition(jnp.sum(cloud.mask)), bad, 0.0)
-
-    return lacking
+def infinite_later(cloud):
+    """A utility that is infinite for large clouds."""
+    return jnp.where(jnp.sum(cloud.mask) > 36, jnp.inf, 0.0)
 
 
 class NaNView(nbv.search.Baseline):
@@ -220,7 +201,6 @@ def nested(depth):
     return value
 
 
-COMMAS = "v 0,5 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
 BOAST = "OFF\n3 10000000 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
 NEVER = nbv.SurfaceSampler(MODEL, nbv.Grid(12), 2, nbv.Carving(lambda x: jnp.full(x.shape[:1], jnp.nan)))
 
@@ -239,22 +219,14 @@ REFUSED = {
     "a number as a mesh of a bank": (lambda: nbv.ShapeBank.from_meshes(["a.ply", 5]), "a mesh is 5"),
     "points beyond the torus": (lambda: POSTERIOR.probability_inside(10.0 * D), "9.978"),
     "nodes that are not finite": (lambda: POSTERIOR.sample(KEY, 2).on_grid(np.array([np.nan, 1.0])), "nan"),
-    "an infinite score": (
-        lambda: proposed(nbv.ExpectedUtilityImprovement(lambda c: jnp.where(c.points.shape[0] > 64, jnp.inf, 1.0))),
-        "points is inf",
-    ),
-    "parts without points": (lambda: parts_of(jnp.ones(16)), "(16,)"),
     "logits of parts": (lambda: parts_of(jnp.full((16, 3), 4.0)), "softmax"),
     "a ragged image": (lambda: nbv.PointCloud.from_depth([[2.0] * 6] * 5 + [[1]], SMALL, POSE), "numbers"),
     "a batch of scans": (lambda: P.init(None, SCANS), "batch"),
     "a batch of poses": (lambda: P.init(POSES, SCAN), "batch"),
     "no pose": (lambda: P.observe(OBSERVATIONS, None, SCAN), "None"),
-    "no observations": (lambda: P.propose(None, KEY), "observations is None"),
     "a cloud in place of observations": (lambda: P.propose(SCAN, KEY), "give Observations"),
     "observations as the inputs of a step": (lambda: P.choose(OBSERVATIONS, KEY), "give StepInputs"),
-    "a class as an acquisition": (lambda: planner(nbv.Coverage), "Coverage"),
     "a number as a key": (lambda: P.propose(OBSERVATIONS, 0), "jax.random.key"),
-    "values of another grid": (lambda: P.sampler.carve(OBSERVATIONS, jnp.zeros((3, 3, 3))), "(3, 3, 3)"),
     "a batch of first poses": (lambda: nbv.simulate(P, BALL, POSES, 1, KEY), "batch"),
     "rows that differ in number": (
         lambda: nbv.PointCloud(jnp.zeros((3, 3)), jnp.zeros((2, 3)), jnp.ones(3, bool)),
@@ -277,7 +249,6 @@ REFUSED = {
     "text as a radius": (lambda: nbv.sdf.Sphere("x"), "'x'"),
     "a turn about the plane": (lambda: nbv.sdf.Sphere(1.0).rotate([0.0, 1.0], 1.0), "(2,)"),
     "united with a number": (lambda: nbv.sdf.Union(nbv.sdf.Sphere(1.0), 3), "is 3"),
-    "scaled to nothing": (lambda: nbv.sdf.Sphere(1.0).scale(0), "positive"),
     "half a point": (
         lambda: nbv.mesh_from_sdf(nbv.sdf.Sphere(1.0), nbv.Grid(12)).sample_points(KEY, 2.5),
         "2.5",
@@ -297,23 +268,15 @@ REFUSED = {
     "half a category": (lambda: CloudSegmenter(SEGMENTER, 2.5), "2.5"),
     "too few classes": (lambda: proposed(nbv.CrossEntropy(CloudClassifier(CLASSIFIER, classes=("a",)), 16)), "names 1"),
     "a utility of NumPy, alone": (lambda: expected(greatest_by_numpy), "HostClassifier"),
-    "a utility of NumPy in a session": (lambda: session(planner=planner(greatest_by_numpy)).add(*SHOT), "jax.numpy"),
     "a utility that decides": (lambda: proposed(first_if_positive), "jnp.where"),
     "an acquisition that decides, alone": (lambda: expected(Deciding()), "jnp.where"),
-    "a utility of several numbers": (lambda: expected(lambda cloud: cloud.points[:, 1]), "one number"),
     "probabilities of a class, alone": (
         lambda: expected(nbv.CrossEntropy(lambda _: jnp.array([0.3, 0.7]))),
         "log_softmax",
     ),
-    "logits of a class": (lambda: proposed(nbv.CrossEntropy(lambda _: jnp.array([1.0, 2.0]), 16)), "log_softmax"),
-    "a first image of elsewhere": (
-        lambda: session().add(np.full((6, 6), 9.0), SHOT[1]),
-        "the first image shows nothing of the box",
-    ),
     "one score as several": (lambda: nbv.AcquisitionList(nbv.Coverage()), "a tuple"),
     "intrinsics of four rows": (lambda: nbv.Camera.from_intrinsics(np.eye(4), 6, 6), "(4, 4)"),
     "a rotation as a pose": (lambda: nbv.Pose.from_matrix(np.eye(3)), "(3, 3)"),
-    "a target nowhere": (lambda: nbv.look_at((0, 0, 2), (np.nan, 0, 0)), "got target"),
     "poses of a session that are one": (lambda: session(poses=np.eye(4)), "give a batch"),
     "a session without up": (lambda: session(up=None), 'up="z"'),
     "a depth image of text": (lambda: session().add("image", np.eye(4)), "'image'"),
@@ -327,39 +290,21 @@ REFUSED = {
         "gives no signed distances of points",
     ),
     "a gap among images": (lambda: reopened("gap", lambda f: (f / "image_01.npz").unlink()), "not image_01.npz"),
-    "a link to no image": (lambda: reopened("link", dangling), "image_01.npz is damaged"),
     "a pipe as an image": (lambda: reopened("pipe", piped), "image_01.npz is damaged"),
     "an older session that asks": (older_session_asks, "another process has added some"),
     "a scene without a number": (lambda: records("unnumbered"), "scene_x.json is not a record"),
-    "a PLY that ends early": (lambda: cut("early.ply", 0.6), "its header declares"),
-    "decimal commas": (lambda: cut("commas.obj", 1.0, COMMAS), "decimal points in place of commas"),
     "a mesh that is no file": (lambda: nbv.load_mesh(D), "give str or Path or Trimesh or Scene"),
-    "a face of ten million": (lambda: cut("boast.off", 1.0, BOAST), "of the 10000000 faces"),
-    "a negative cost": (lambda: costing(lambda a, b: -jnp.sum(b.position**2)), "zero or more"),
+    "a face of ten million": (lambda: mesh_of_text("boast.off", BOAST), "of the 10000000 faces"),
     "a cost that is not a number": (lambda: costing(lambda a, b: jnp.nan * b.position[0]), "the cost of going"),
-    "a cost of -1": (lambda: costing(lambda a, b: -1.0), "from one pose to another is -1.0"),
-    "a cost without end": (lambda: costing(lambda a, b: jnp.inf), "the cost of going from one pose to another is inf"),
-    "a cost of text": (lambda: costing(lambda a, b: "far"), "'far'"),
-    "a utility that is NaN later": (lambda: proposed(nan_if(lambda c: c > 36)), "the lacking of a cloud of"),
-    "a utility that is infinite later": (lambda: proposed(nan_if(lambda c: c > 36, jnp.inf)), "must be finite"),
+    "a utility that is infinite later": (lambda: proposed(infinite_later), "must be finite"),
     "a utility of nothing": (lambda: planner(lambda cloud: None), "the utility of a cloud is None"),
-    "a utility of two": (lambda: planner(lambda cloud: (1.0, 2.0)), "a utility is one number"),
     "a utility of complex numbers": (
         lambda: planner(lambda cloud: jnp.sum(cloud.points) * 1j),
         "a utility is one number",
     ),
-    "a classifier that is NaN later": (
-        lambda: proposed(nbv.CrossEntropy(lambda c: nan_if(lambda n: n > 36)(c) + jnp.log(jnp.full(2, 0.5)), 64)),
-        "the classifier's answers are not log-probabilities",
-    ),
     "a classifier of one number": (lambda: planner(nbv.CrossEntropy(lambda c: jnp.zeros(()), 16)), "the classifier"),
-    "a segmenter that is NaN later": (
-        lambda: proposed(nbv.SoftPartCount(lambda c: nan_if(lambda n: n > 36)(c) + jnp.full((c.capacity, 2), 0.5))),
-        "the segmenter gives values",
-    ),
     "a segmenter of rows": (lambda: planner(nbv.SoftPartCount(lambda c: c.mask)), "the segmenter's answer"),
-    "a baseline of NaN": (lambda: nan_baseline(), "the value of NaNView is not a number"),
-    "a rule that says True": (lambda: stopping(True), "the stop rule Saying returned True"),
+    "a baseline of NaN": (nan_baseline, "the value of NaNView is not a number"),
     "a rule that says nothing": (lambda: stopping(""), "None to go on"),
     "a rule of a number in two": (lambda: stopping(0.5, nbv.Budget(seconds=1e9)), "Saying returned 0.5"),
     "a utility by a mask": (
@@ -367,11 +312,6 @@ REFUSED = {
         "jnp.where(cloud.mask",
     ),
     "a utility that counts": (lambda: planner(lambda cloud: float(len(range(cloud.mask.sum())))), "jax.numpy"),
-    "a utility that looks for rows": (lambda: planner(lambda cloud: jnp.nonzero(cloud.mask)[0][0]), "jnp.where"),
-    "a classifier of NumPy": (
-        lambda: planner(nbv.CrossEntropy(lambda c: np.log(np.array(c.points[:2, 0])), 16)),
-        "jax.numpy",
-    ),
     "an acquisition that decides, first": (lambda: planner(Deciding()).init(POSE, SCAN), "jnp.where"),
     "a mesh without a frame": (lambda: nbv.TriangleMesh(np.eye(3), np.array([[0, 1, 2]])), "from_arrays"),
     "a camera in millimetres": (
@@ -385,17 +325,6 @@ REFUSED = {
     "a cost of three numbers": (lambda: costing(lambda a, b: b.position), "one number a pose"),
     "a cost of NumPy": (lambda: costing(lambda a, b: np.linalg.norm(b.position)), "jax.numpy"),
     "a rule or text": (lambda: nbv.Sure(0.9) | "x", "'x'"),
-    "a matrix of the whole image for half of it": (
-        lambda: nbv.Camera.from_intrinsics([[600.0, 0, 318], [0, 600, 238], [0, 0, 1]], 240, 320),
-        "divide its first two rows by 2",
-    ),
-    "a fisheye's four numbers and more": (
-        lambda: nbv.Camera.from_intrinsics(
-            [[600.0, 0, 320], [0, 600, 240], [0, 0, 1]], 480, 640, distortion=(0.1,) * 6
-        ),
-        "k1, k2, p1, p2",
-    ),
-    "a frame of before the move": (stale_frame, "bit for bit equal to image 1"),
     "an inverse of intrinsics": (
         lambda: nbv.Camera.from_intrinsics(np.linalg.inv([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]]), 480, 640),
         "intrinsic matrix",
@@ -412,7 +341,6 @@ REFUSED = {
     ),
     "what is allowed three times": (lambda: nbv.SphereCandidates(6).where(lambda p: p.position > 0), "True or False"),
     "a list in lists": (lambda: nbv.PointCloud.from_arrays(nested(5000), D), "nested too deep"),
-    "up without measure": (lambda: nbv.look_at((0, 0, 2), (0, 0, 0), (0, 1e30, 0)), "up direction"),
     "noise below zero": (lambda: nbv.SensorNoise(points=-0.1), "must not be negative"),
     "a depth's noise below zero": (lambda: nbv.DepthNoise(-1.0), "deviation is -1.0"),
     "a depth's noise for another camera": (
@@ -460,7 +388,6 @@ REFUSED = {
         "choose from pyramid",
     ),
     "a category that does not ship": (lambda: part_segmenter("spoon"), "category 'spoon'"),
-    "no such category": (lambda: CloudSegmenter(SEGMENTER, "sofa"), "no category 'sofa'"),
     "a segmenter of seven parts": (
         lambda: CloudSegmenter(lambda *_: jnp.zeros((60, 7)), 3, num_points=60)(CLOUD),
         "has 7 parts",
@@ -477,15 +404,6 @@ REFUSED = {
         "asked for 7 views",
         "room for 4",
         "max_views",
-    ),
-    "a first view of nothing": (
-        lambda: P.init(POSE, NO_POINTS),
-        "the first scan is empty: no point to start from",
-        "oint the camera",
-    ),
-    "a score that is no number": (
-        lambda: proposed(nbv.ExpectedUtilityImprovement(lambda c: jnp.sum(c.points) * jnp.nan)),
-        "is nan: it must be finite",
     ),
     "normals without length": (
         lambda: P.init(None, nbv.PointCloud(CLOUD.points, CLOUD.normals.at[1].set(0.0), CLOUD.mask)),

@@ -14,7 +14,6 @@ from jaxnbv.scanning.sdf import solid_of_mesh
 EYE, NOWHERE, SPHERE = np.eye(4), np.zeros((0, 3)), np.asarray(nbv.geometry.fibonacci_sphere(30), np.float64)
 TRIANGLE, FACE, TABLE = np.eye(3), np.array([[0, 1, 2]]), nbv.sdf.HalfSpace([0.0, -0.5, 0.0], [0.0, 1.0, 0.0])
 BANK = nbv.ShapeBank.of([nbv.sdf.Sphere(0.5)] * 4)
-IN_VIEW = nbv.search.ConstrainedPoses(off_axis=math.radians(15.1))
 SKEWED = [[100.0, 3.0, 30.0], [0.0, 100.0, 20.0], [0.0, 0.0, 1.0]]
 MIRRORED = [[-100.0, 0.0, 30.0], [0.0, 100.0, 20.0], [0.0, 0.0, 1.0]]
 TRANSPOSED = [[100.0, 0.0, 0.0], [0.0, 100.0, 0.0], [30.0, 20.0, 1.0]]
@@ -56,12 +55,9 @@ GEOMETRY = [
     (lambda: nbv.Camera(height=0), "at least one"),
     (lambda: nbv.Camera(width=-1), "at least one"),
     (lambda: nbv.Pose.from_matrix(EYE + np.eye(4, k=-3)), r"last row .* not \(0, 0, 0, 1\)"),
-    (lambda: nbv.Pose.from_matrix(2.0 * EYE), "last row"),
-    (lambda: nbv.Pose.from_matrix(np.diag([2.0, 2.0, 2.0, 1.0])), "not a rotation"),
     (lambda: nbv.Pose.from_matrix(EYE, "ros"), "'ros'; give one of opencv, opengl"),
     (lambda: pose_of(np.diag([1.0, 1.0, -1.0])), "not a rotation"),
     (lambda: pose_of(np.diag([1.0, 1.0, 1.1])), "not a rotation"),
-    (lambda: pose_of(np.eye(3) + 0.01 * np.eye(3, k=1)), "not a rotation"),
     (lambda: pose_of(np.full((3, 3), np.nan)), "not finite"),
     (lambda: pose_of(np.stack([np.eye(3), np.eye(3), np.zeros((3, 3))])), "not a rotation"),
     (lambda: nbv.look_at((1.0, 2.0, 3.0), (1.0, 2.0, 3.0)), "apart from its target"),
@@ -79,7 +75,6 @@ GEOMETRY = [
     (lambda: nbv.geometry.estimate_normals(np.where(SPHERE > 0.9, np.nan, SPHERE), (0, 0, 5.0)), "not finite"),
     (lambda: nbv.geometry.estimate_normals(SPHERE, tuple(SPHERE[5])), "where the sensor stands"),
     (lambda: nbv.Box((0.0, 0.0, 0.0), (1.0, 0.0, 1.0)), "has no inside"),
-    (lambda: nbv.Box((0.0, 0.0, 0.5), (1.0, 1.0, 0.2)), "has no inside"),
     (lambda: nbv.Box((0.0, math.nan, 0.0), (1.0, 1.0, 1.0)), "each of three sides must be positive and finite"),
     (lambda: nbv.Box((0.0, 0.0, 0.0), (1.0, 1.0, math.inf)), "each of three sides must be positive and finite"),
     (lambda: farthest_point_indices(np.zeros((3, 3), np.float32), np.ones(3, bool), 0), "at least one"),
@@ -130,10 +125,8 @@ SEARCH = [
     (lambda: nbv.search.ConstrainedPoses(off_axis=0.5 * math.pi), "off_axis is 1.57"),
     # The default camera's image ends 15 degrees from its centre. With half the width it ends at about half of that.
     (lambda: nbv.search.ConstrainedPoses().check_camera(nbv.Camera(width=25)), "but the image ends 0.133 rad"),
-    (lambda: IN_VIEW.check_camera(nbv.Camera()), "centre would leave it"),
     (lambda: nbv.NewSurface(0.0), r"size is 0\.0"),
     (lambda: nbv.Planner(nbv.Coverage), "acquisition is .*Coverage.*: give one"),
-    (lambda: nbv.Planner("coverage"), "acquisition is .*'coverage'.*: give one"),
 ]
 SURFACES = [
     (lambda: nbv.GeometricSPSR(nu=1.0), "nu is 1.0"),

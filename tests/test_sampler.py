@@ -17,11 +17,8 @@ preset = nbv.SurfaceSampler.preset
 
 def test_the_papers_model_has_its_published_values_and_is_not_carved():
     paper = preset("paper")
-    assert isinstance(paper.model, nbv.GeometricSPSR)
+    assert eqx.tree_equal(paper.model, nbv.GeometricSPSR(0.005, 0.2, 50, 0.01, 1.5))
     assert paper.carving is None
-    published = {"lengthscale": 0.005, "variance": 0.2, "noise": 0.01, "nu": 1.5, "truncation": 50}
-    for name, value in published.items():
-        assert jnp.allclose(getattr(paper.model, name), value), name
 
 
 @pytest.mark.parametrize(("given", "side"), [({"longest_side": 1.25}, 1.25), ({"volume": nbv.Box.cube(1.0)}, 1.0)])
@@ -122,12 +119,12 @@ def test_the_probability_is_the_share_of_the_samples_that_hold_a_node():
 TABLE = nbv.Obstacles((nbv.sdf.HalfSpace([0.0, -0.3, 0.0], [0.0, 1.0, 0.0]),))
 
 
-@pytest.mark.parametrize(("obstacles", "carving"), [(None, nbv.Carving()), (TABLE, nbv.Carving()), (TABLE, None)])
-def test_nothing_is_imagined_where_the_object_cannot_be(obstacles, carving):
+@pytest.mark.parametrize("carving", [nbv.Carving(), None])
+def test_nothing_is_imagined_where_the_object_cannot_be(carving):
     """Within obstacles, with and without carving."""
     sampler = balls(carving)
-    observations = seen(sampler, obstacles)
-    nowhere = np.asarray(GRID.axis)[None, :, None] < (-np.inf if obstacles is None else -0.3)
+    observations = seen(sampler, TABLE)
+    nowhere = np.asarray(GRID.axis)[None, :, None] < -0.3
     if carving is not None:
         nowhere = nowhere | np.asarray(observations.empty_nodes) | np.asarray(carving.outside(GRID))
     nowhere = np.broadcast_to(nowhere, SHARE.shape)
@@ -150,7 +147,7 @@ def test_a_cut_by_the_volume_is_no_surface():
     assert int(above[largest]) < 0.1 * int(beside[largest])
     whole = balls().sample(SCANS[0], KEY)
     # The smallest ball reaches at most two spacings beyond the slab, so that nothing of it is cut.
-    small = [nbv.scanning.scan_samples(one, CAMERA, POSES[1:]).mask[0].sum() for one in (surfaces, whole)]
+    small = [nbv.scanning.scan_samples(one, CAMERA, POSES).mask[0, 1].sum() for one in (surfaces, whole)]
     assert int(small[0]) == int(small[1]) > 0
 
 
@@ -231,9 +228,10 @@ def test_observations_of_another_grid_are_refused(made_by):
 
 
 def test_without_carving_observations_of_any_grid_are_accepted():
-    adapted = balls(None).adapt(seen(balls()))
+    observations = seen(balls())
+    adapted = balls(None).adapt(observations)
     assert adapted.empty_nodes is None
-    np.testing.assert_array_equal(adapted.cloud.points, seen(balls()).cloud.points)
+    np.testing.assert_array_equal(adapted.cloud.points, observations.cloud.points)
 
 
 @pytest.mark.parametrize("carving", [None, nbv.Carving()])
