@@ -1,6 +1,7 @@
 """Networks from checkpoints are read or refused."""
 
 import json
+from importlib import resources
 
 import equinox as eqx
 import jax
@@ -12,7 +13,9 @@ from torch_files import checkpoint
 
 import jaxnbv as nbv
 from jaxnbv.networks import CloudClassifier, CompactPartSegmenter, InvariantClassifier, load_checkpoint, save_checkpoint
+from jaxnbv.networks.pretrained import pretrained_classifier
 from jaxnbv.networks.torch_format import read_torch_tensors
+from jaxnbv.studies.scenes import PATTERNS
 
 RNG = np.random.default_rng(0)
 
@@ -20,6 +23,12 @@ RNG = np.random.default_rng(0)
 @pytest.fixture
 def state():
     return classifier_state(RNG, "ssg", 6)
+
+
+def test_shipped_weights_are_small_and_name_their_classes():
+    for file in (resources.files("jaxnbv.networks") / "weights").iterdir():
+        assert len(file.read_bytes()) < 2**20, file
+    assert pretrained_classifier("pyramid").classes == PATTERNS
 
 
 def assert_same(network, expected, rtol=1e-6):

@@ -1,4 +1,4 @@
-"""Ball queries against a loop in NumPy, and the gradients of interpolation."""
+"""Ball queries and interpolation against loops in NumPy."""
 
 import jax
 import jax.numpy as jnp
@@ -46,6 +46,26 @@ def test_a_point_on_the_sphere_is_within():
     for radius in (1.0, 2.0, 3.0):
         indices = ball_query(jnp.asarray(points), jnp.asarray(points), jnp.asarray(mask), radius, 90)
         np.testing.assert_array_equal(indices, ball_by_loop(points, points, mask, radius, 90))
+
+
+def interpolated_by_loop(points, coarse, features):
+    result = np.zeros((len(points), features.shape[1]))
+    for i, x in enumerate(points):
+        squared = {j: ((x - y) ** 2).sum() for j, y in enumerate(coarse)}
+        nearest = sorted(squared, key=squared.get)[:3]
+        weights = [1 / (squared[j] + 1e-8) for j in nearest]
+        for j, w in zip(nearest, weights, strict=True):
+            result[i] += w / sum(weights) * features[j]
+    return result
+
+
+@pytest.mark.parametrize("m", [1, 2, 40])
+def test_interpolation_against_a_loop(x64, m):
+    points, coarse, features = RNG.normal(size=(30, 3)), RNG.normal(size=(m, 3)), RNG.normal(size=(m, 5))
+    points[0] = coarse[0]
+    np.testing.assert_allclose(
+        jax.jit(interpolate)(points, coarse, features), interpolated_by_loop(points, coarse, features), atol=1e-12
+    )
 
 
 def test_gradients_are_bounded_however_close_the_coarse_points_are():

@@ -48,10 +48,6 @@ def small_network():
     )
 
 
-def rows(n):
-    return near_sphere(RNG, n)
-
-
 def random_state(kind, inputs, categories=16, parts=50):
     """`inputs` counts coordinates twice, like the first level."""
 
@@ -106,7 +102,7 @@ def test_against_a_plain_network(x64, tmp_path, kind, inputs, n):
     network = load_checkpoint(tmp_path / "net.safetensors")
     assert isinstance(network, PointNet2PartSegmenter)
     assert network.uses_normals == (inputs == 9)
-    points, normals = rows(n)
+    points, normals = near_sphere(RNG, n)
     answers = []
     for category in (4, 15):
         plain = [np.asarray(a) for a in (points, normals)]
@@ -117,22 +113,21 @@ def test_against_a_plain_network(x64, tmp_path, kind, inputs, n):
 
 
 def test_masked_rows_and_capacity_do_not_matter():
-    network, (points, normals) = small_network(), rows(30)
+    network, (points, normals) = small_network(), near_sphere(RNG, 30)
     expected = segment(network, points, normals, jnp.asarray(3))
     assert np.ptp(expected, axis=0).max() > 0.01
     np.testing.assert_allclose(np.exp(expected).sum(axis=1), 1.0, atol=1e-5)
     place = np.sort(RNG.permutation(40)[:30])
     mask = np.zeros(40, bool)
     mask[place] = True
-    for filling in (0.3, np.nan):
-        wide = [np.full((40, 3), filling, np.float32) for _ in range(2)]
-        wide[0][place], wide[1][place] = points, normals
-        log_p = segment(network, *map(jnp.asarray, wide), jnp.asarray(3), jnp.asarray(mask))
-        np.testing.assert_allclose(log_p[place], expected, atol=1e-5)
+    wide = np.full((2, 40, 3), np.nan, np.float32)
+    wide[:, place] = points, normals
+    log_p = segment(network, *wide, jnp.asarray(3), mask)
+    np.testing.assert_allclose(log_p[place], expected, atol=1e-5)
 
 
 def test_calls_that_cannot_be_answered_are_refused():
-    network, (points, normals) = small_network(), rows(30)
+    network, (points, normals) = small_network(), near_sphere(RNG, 30)
     for category in (-1, 16, np.asarray(50)):
         with pytest.raises(nbv.InputError, match="the network has 0 to 15"):
             network(points, normals, category)
@@ -175,14 +170,10 @@ def test_the_parts_of_all_categories_make_up_the_fifty():
 answers_of = eqx.filter_jit(lambda segmenter, cloud: (segmenter(cloud), *segmenter.predict(cloud)))
 
 
-def cloud_of(points, normals, capacity):
-    return nbv.PointCloud.from_arrays(np.asarray(points), np.asarray(normals), capacity)
-
-
 def test_a_cloud_segmenter_gives_probabilities_of_the_categorys_parts():
-    network, (points, normals) = small_network(), rows(30)
+    network, (points, normals) = small_network(), near_sphere(RNG, 30)
     segmenter = CloudSegmenter(network, "Table", num_points=40, scale=0.5)
-    cloud = cloud_of(2 * points, normals, 50)
+    cloud = nbv.PointCloud.from_arrays(2 * points, normals, 50)
     p, fed, labels = answers_of(segmenter, cloud)
     p = np.asarray(p)
     assert p.shape == (40, 50)
@@ -202,7 +193,7 @@ def test_a_cloud_segmenter_gives_probabilities_of_the_categorys_parts():
 
 
 def test_scenes_of_all_categories_and_scales_share_one_program(compilations):
-    network, cloud = small_network(), cloud_of(*rows(30), 50)
+    network, cloud = small_network(), nbv.PointCloud.from_arrays(*near_sphere(RNG, 30), 50)
     segmenters = [CloudSegmenter(network, index, 40, 1.0 + 0.1 * index) for index in range(16)]
     answers_of(segmenters[0], cloud)
     compilations.clear()

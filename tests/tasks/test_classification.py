@@ -61,8 +61,6 @@ def test_probability_zero_has_a_finite_price(x64, dtype):
     ("p", "q"),
     [
         ([0.2, 0.3, 0.5], [0.7, 0.2, 0.1]),
-        ([0.3, 0.3, 0.4], [0.1, 0.1, 0.8]),
-        ([0.02, 0.03, 0.95], [0.01, 0.01, 0.98]),
         ([0.02, 0.03, 0.95], [0.4, 0.3, 0.3]),
         ([1.0, 0.0, 0.0], [0.5, 0.25, 0.25]),
         ([0.5, 0.5, 0.0], [0.75, 0.25, 0.0]),
@@ -97,24 +95,26 @@ def test_the_switch_is_at_the_threshold_and_not_above_it(x64):
         nbv.tasks.MixedEntropy(first_point, threshold=-0.1)
 
 
-def test_a_scan_that_sees_nothing(x64):
-    data = random_cloud(20, 25)
-    scores = [
-        nbv.CrossEntropy(linear),
-        nbv.tasks.MixedEntropy(linear, threshold=0.0),
-        nbv.tasks.MixedEntropy(linear, threshold=2.0),
-        nbv.tasks.EntropyReduction(linear),
-    ]
-    for score in scores:
-        assert float(score_of(score, context_of(score, data), nothing(6))) == 0.0
-        gradient = jax.grad(_of_points(score, data, nothing(6)))(nothing(6).points)
-        assert not np.asarray(gradient).any()
-
-
-def _of_points(score, data, scanned):
-    return lambda points: score_of(
-        score, context_of(score, data), nbv.PointCloud(points, scanned.normals, scanned.mask)
+def scores_of(**settings):
+    """Scores that are the cross entropy, twice, and the reduction of entropy, twice."""
+    return (
+        nbv.CrossEntropy(linear, **settings),
+        nbv.tasks.MixedEntropy(linear, threshold=0.0, **settings),
+        nbv.tasks.MixedEntropy(linear, threshold=2.0, **settings),
+        nbv.tasks.EntropyReduction(linear, **settings),
     )
+
+
+def test_a_scan_that_sees_nothing_is_worth_nothing_and_has_no_gradient(x64):
+    data, scan = random_cloud(20, 25), nothing(6)
+    for score in scores_of():
+
+        def value(points, score=score):
+            return score_of(score, context_of(score, data), nbv.PointCloud(points, scan.normals, scan.mask))
+
+        worth, gradient = jax.jit(jax.value_and_grad(value))(scan.points)
+        assert float(worth) == 0.0
+        assert not np.asarray(gradient).any()
 
 
 def test_thinning_is_that_by_hand_and_happens_once_before_scans_are_added(x64):
@@ -122,14 +122,8 @@ def test_thinning_is_that_by_hand_and_happens_once_before_scans_are_added(x64):
     by_hand = nbv.geometry.farthest_point_subsample(data, 16)
     p = linear_in_numpy(*by_hand.to_numpy())
     q = linear_in_numpy(*nbv.geometry.concatenate(by_hand, scanned).to_numpy())
-    reduction = max(0.0, entropy_in_numpy(p) - entropy_in_numpy(q))
-    scores = {
-        nbv.CrossEntropy(linear, num_points=16): entropy_in_numpy(p, q),
-        nbv.tasks.MixedEntropy(linear, threshold=0.0, num_points=16): entropy_in_numpy(p, q),
-        nbv.tasks.MixedEntropy(linear, threshold=2.0, num_points=16): reduction,
-        nbv.tasks.EntropyReduction(linear, num_points=16): reduction,
-    }
-    for score, expected in scores.items():
+    crossed, reduction = entropy_in_numpy(p, q), max(0.0, entropy_in_numpy(p) - entropy_in_numpy(q))
+    for score, expected in zip(scores_of(num_points=16), (crossed, crossed, reduction, reduction), strict=True):
         context = context_of(score, data)
         for leaf, wanted in zip(jax.tree.leaves(context[0]), jax.tree.leaves(by_hand), strict=True):
             np.testing.assert_array_equal(leaf, wanted)
@@ -150,31 +144,23 @@ def test_thinning_to_the_points_of_the_utility_keeps_its_value(x64):
     assert context_of(whole, data)[0] is data
 
 
-@pytest.mark.parametrize(
-    "score",
-    [
-        nbv.CrossEntropy(linear, num_points=20),
-        nbv.tasks.MixedEntropy(linear, threshold=0.0, num_points=20),
-        nbv.tasks.MixedEntropy(linear, threshold=2.0, num_points=20),
-        nbv.tasks.EntropyReduction(linear, num_points=20),
-    ],
-)
-def test_gradient_in_the_scan_against_central_differences(x64, score):
-    data = nbv.PointCloud.from_arrays(0.01 * RNG.normal(size=(8, 3)), np.tile([0.0, 0.0, 0.01], (8, 1)) / 0.01, 12)
+def test_gradients_in_the_scan_against_central_differences(x64):
+    data = nbv.PointCloud.from_arrays(0.01 * RNG.normal(size=(8, 3)), np.tile([0.0, 0.0, 1.0], (8, 1)), 12)
     scanned = random_cloud(9, 11, (0.8, 0.4, -0.5))
-    for name in ("points", "normals"):
+    for score in scores_of(num_points=20):
+        for name in ("points", "normals"):
 
-        def value(rows, name=name):
-            return score_of(score, context_of(score, data), eqx.tree_at(lambda c: getattr(c, name), scanned, rows))
+            @jax.jit
+            def value(rows, score=score, name=name):
+                scan = eqx.tree_at(lambda c: getattr(c, name), scanned, rows)
+                return score_of(score, context_of(score, data), scan)
 
-        rows = getattr(scanned, name)
-        gradient = np.asarray(jax.grad(value)(rows))
-        assert not gradient[9:].any()
-        assert np.abs(gradient[:9]).min(axis=0).max() > 1e-6
-        for _ in range(4):
+            rows = getattr(scanned, name)
+            gradient = np.asarray(jax.grad(value)(rows))
+            assert not gradient[9:].any()
+            assert np.abs(gradient[:9]).min(axis=0).max() > 1e-6
             along = RNG.normal(size=rows.shape)
-            step = 1e-6
-            difference = (value(rows + step * along) - value(rows - step * along)) / (2 * step)
+            difference = (value(rows + 1e-6 * along) - value(rows - 1e-6 * along)) / 2e-6
             assert float(np.sum(gradient * along)) == pytest.approx(float(difference), rel=1e-6)
 
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from opinions import Linear, context_of, drawn_cloud, nothing, score_of
+from opinions import Linear, drawn_cloud, nothing
 
 import jaxnbv as nbv
 from jaxnbv.tasks import part_counts
@@ -60,23 +60,6 @@ def test_its_gradient_against_central_differences(x64):
     # The last row is masked, and must have no gradient.
     assert not np.asarray(slopes[0])[9:].any()
     assert np.asarray(slopes[0])[:9].any()
-
-
-def certain(part):
-    """A segmenter that is certain of one part for all points."""
-    return lambda cloud: jnp.where(cloud.mask[:, None], jax.nn.one_hot(jnp.full(cloud.capacity, part), PARTS), 0.0)
-
-
-def test_it_saturates_for_a_part_that_is_found():
-    def gain(count):
-        score = nbv.ExpectedUtilityImprovement(nbv.SoftPartCount(certain(2), 60.0))
-        return float(score_of(score, context_of(score, make_cloud(count, 1000)), make_cloud(30, 30)))
-
-    gains = [gain(count) for count in (1, 60, 200, 600)]
-    assert gains[0] > gains[1] > gains[2] > gains[3]
-    # tanh(31 / 60) - tanh(1 / 60), and less than a millionth away from 1 - 1.
-    assert gains[0] == pytest.approx(np.tanh(31 / 60) - np.tanh(1 / 60), rel=1e-5)
-    assert gains[3] < 1e-6
 
 
 def test_it_is_at_most_the_number_of_parts_and_zero_of_nothing():
