@@ -94,8 +94,8 @@ class Acquisition(eqx.Module):
 
         An acquisition that is not a mean over samples may return a single row. The scans of several samples (their
         number is `scanning.grid.samples_at_once`) from all poses are computed together, and must fit into memory. Then
-        `self.batch_size` scans at a time are scored. Devices share the samples. If there are fewer samples than
-        devices, they share the poses.
+        `self.batch_size` scans at a time are scored. The samples are divided among the devices, or the poses if there
+        are fewer samples than devices.
 
         - `barrier`: distance along each ray to an obstacle, see `scan`.
         """

@@ -118,8 +118,8 @@ def checked(function: _F) -> _F:
 def check_type(value: Any, hint: Any, name: str) -> None:
     """Raise `ValueError` if the value called `name` contradicts a plain type hint.
 
-    Plain are int, float, bool, two or three floats, classes, `Callable`, and each of these or None. Other type hints
-    are ignored.
+    Plain hints are int, float, bool, a tuple of two or three floats, classes, `Callable`, and a union of any of these
+    with None. Other hints are ignored.
     """
     if hint is int:
         is_whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)

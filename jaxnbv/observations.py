@@ -79,7 +79,7 @@ class Observations(eqx.Module):
 
     @property
     def empty_points(self) -> EmptyPoints:
-        """Nodes of a coarser grid (at most 20 per axis), and which of them were seen to be empty, for models."""
+        """Nodes of a coarser grid (at most 20 per axis), with a mask of those seen to be empty; for models."""
         if self.empty_nodes is None or self.grid is None:
             return EmptyPoints(jnp.zeros((1, 3), self.cloud.points.dtype), jnp.zeros(1, bool))
         stride = -(-self.grid.resolution // _MAX_POINTS_PER_AXIS)
@@ -131,8 +131,8 @@ def _is_stray(cloud: PointCloud, empty: Bool[Array, "g g g"], grid: Grid) -> Boo
     """Return whether each point is stray: alone, and in a grid cell whose nodes were all seen to be empty.
 
     A point is alone if no other point is within twice the spacing, the median distance between neighbours. Points on a
-    connected surface are about one spacing apart in a thinned cloud, so they are not alone. This keeps points of a thin
-    part that a view missed, and points of images with slightly wrong poses.
+    connected surface are about one spacing apart in a thinned cloud, so they are not alone. Therefore no point is stray
+    just because it is on a thin part that a view missed, or because the pose of its image is slightly wrong.
 
     - `empty`: mask of the nodes that were seen to be empty.
     """

@@ -93,7 +93,8 @@ class _Program:
 
         Returns None if the arguments contain code of a module that is not permitted.
 
-        - `static`, `leaves`: the arguments without their arrays, and these arrays in the order of `tree`.
+        - `static`: the arguments without their arrays.
+        - `tree`, `leaves`: structure and leaves of a tree of these arrays.
         - `kinds`: shape and type of each array.
         """
         function = self._function.__module__, self._function.__qualname__
@@ -117,7 +118,8 @@ class _Program:
         If the same lowered code is already stored, for a different entry, the program is loaded. Otherwise it is
         compiled and stored.
 
-        - `entry`: file for these arguments, which names the file of their program. See also `_load_or_compile`.
+        - `entry`: path of the file for these arguments, in which the name of the program's file is stored.
+        - `static`, `tree`, `leaves`: see `_load_or_compile`.
         """
         result = None
 
@@ -197,7 +199,7 @@ def _source() -> str:
 
 @functools.cache
 def _machine() -> str:
-    """Return a text with the versions of the libraries and the processor for which programs are compiled."""
+    """Return a text that identifies the versions of the libraries, the first device and the processor."""
     versions = [importlib.metadata.version(name) for name in _LIBRARIES]
     device, cpu = jax.local_devices()[0], Path("/proc/cpuinfo")
     lines = cpu.read_text().splitlines() if cpu.exists() else []
@@ -241,7 +243,7 @@ def _pickle(x: Any) -> bytes:
 
 
 def _without_names(code: str) -> str:
-    """Return lowered code in which numbers in order of appearance replace the names of functions.
+    """Return lowered code with numbers in place of functions' names, in order of appearance.
 
     JAX's own names of the functions depend on what the process lowered before, so equal code would differ.
     """

@@ -19,7 +19,7 @@ from jax.sharding import AxisType, PartitionSpec, get_abstract_mesh
 
 
 def shared_map(function: Callable[..., Any], rows: Any, *shared_args: Any, at_once: int = 1) -> Any:
-    """Map `function(row, *common)` over the rows of a tree, with the rows divided among devices.
+    """Map `function(row, *shared_args)` over the rows of a tree, with the rows divided among devices.
 
     Each device maps its rows by `jax.lax.map`.
 
@@ -42,7 +42,7 @@ def batched_map(function: Callable[..., Any], rows: Any, at_once: int) -> Any:
 
 
 def run_sharded(function: Callable[..., Any], rows: Any, *shared_args: Any) -> Any:
-    """Return `function(rows, *common)`, with the rows along the leading axis divided among devices.
+    """Return `function(rows, *shared_args)`, with the rows of the leading axis divided among devices.
 
     All devices get the whole result. The function must treat the rows independently. If there are more devices than
     rows, each device computes all rows. All arrays must be arguments, because arrays in a closure do not reach the

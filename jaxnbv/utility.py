@@ -99,7 +99,7 @@ class Utility(eqx.Module):
     def answer_values(self, cloud: PointCloud) -> Float[Array, " n"] | None:
         """Return the values of `answer` by JAX operations.
 
-        None if there is no answer, or if it needs other code.
+        None if there is no answer, or if the answer needs code outside JAX.
         """
         return None
 

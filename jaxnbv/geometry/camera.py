@@ -151,7 +151,7 @@ class Camera(eqx.Module):
     def strided(self, stride: int) -> "Camera":
         """Return the camera whose image is every `stride`-th row and column, starting at `stride // 2`.
 
-        **Raises:** `ValueError` for a stride below one, or one that leaves no pixel.
+        **Raises:** `ValueError` for a stride that is below one or leaves no pixel.
         """
         require(stride >= 1, f"the stride is {stride}; it must be at least 1")
         start = stride // 2
@@ -219,8 +219,8 @@ def _check_image_size(matrix: np.ndarray, height: int, width: int, center: tuple
 
     - `matrix`: the intrinsic matrix. `center`: its principal point, as fractions of the width and the height.
 
-    **Raises:** `ValueError` if such a principal point is at the corner of this image or beyond it, or if it lies
-    outside this image and the image would extend more than 70 degrees off the axis.
+    **Raises:** `ValueError` instead of the warning if the principal point is at the corner of the given image or beyond
+    it. Also raises it if the point lies outside the image and the image would extend more than 70 degrees off the axis.
     """
     (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
     tangent_x, tangent_y = (

@@ -40,7 +40,7 @@ def points_of_depth(
 
     - `scale`: units of the pose per unit of depth.
 
-    **Raises:** `ValueError` for a scale that is not positive, a batch of poses, a stride below one or that leaves no
+    **Raises:** `ValueError` for a scale that is not positive, a batch of poses, a stride that is below one or leaves no
     pixel, or for the same reasons as `from_depth`.
     """
     shape = (camera.height, camera.width)
@@ -133,11 +133,15 @@ def _points_and_normals(
 def _strided_samples(
     depth: Float[Array, "h w"], valid: Bool[Array, "h w"], stride: int, block_side: int
 ) -> tuple[Float[Array, "k l"], Bool[Array, "k l"], Float[Array, "k l"]]:
-    """Return the depth, its validity and a lower bound on it at every `stride`-th row and column.
+    """Return three arrays with an entry for every `stride`-th row and column of a depth image.
 
-    The image is divided into square blocks with side `block_side`. The depth is that of the valid pixel nearest to the
-    middle of the pixel's own block. The bound is the least such depth of this block and, if `block_side` > 1, of the
-    eight around it.
+    The image is divided into square blocks with side `block_side`. The sample of a block is its valid pixel nearest to
+    the middle. An entry describes the block that contains the pixel:
+
+    1. depth of the block's sample.
+    2. whether the block has a sample.
+    3. lower bound on the depth: the least depth of the samples in this block and, if `block_side` > 1, in the eight
+       blocks around it.
     """
     samples, is_sample, _ = block_samples(depth, valid, block_side)
     nearest = jnp.where(is_sample, samples, jnp.inf)

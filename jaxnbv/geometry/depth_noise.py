@@ -27,10 +27,10 @@ def depth_noise(
     """Return the standard deviation of each pixel's noise and rounding, in units of the depth.
 
     The result is at least `min_noise`. It is computed from the median magnitude of the third differences of depth along
-    rows and columns, which are mostly noise on a smooth surface. The median is over the differences near the pixel and
-    at a similar depth. If these are fewer than 16, it is over the whole image at a similar depth, and if these are also
-    fewer than 16, over all differences. If at least half but at most three quarters of the differences are zero, depths
-    are rounded to steps, and the size of the steps is computed from the other differences.
+    rows and columns, which are mostly noise on a smooth surface. The median is over the first of three sets that has at
+    least 16 differences: those near the pixel at a similar depth, those in the whole image at a similar depth, or all.
+    If at least half but at most three quarters of the differences are zero, depths are rounded to steps, and the size
+    of the steps is computed from the other differences.
     """
     tile = max(-(-max(depth.shape) // _MAX_TILES), _MIN_TILE_SIZE)
     tiles = tuple(-(-size // tile) for size in depth.shape)
@@ -61,7 +61,7 @@ def depth_noise(
 
 
 def _group_member(image: Shaped[Array, "h w"], axis: int, index: int) -> Shaped[Array, "k l"]:
-    """Return pixel `index` (0 to 3) of each group of four pixels that are two apart along an axis."""
+    """Return member `index` (0 to 3) of each group of pixels i, i + 2, i + 4 and i + 6 along an axis."""
     members = slice(2 * index, 2 * index + max(image.shape[axis] - 6, 0))
     return image[members] if axis == 0 else image[:, members]
 

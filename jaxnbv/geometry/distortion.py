@@ -1,7 +1,7 @@
 """OpenCV's lens distortion with 4, 5 or 8 coefficients (Brown 1971), and its removal from images.
 
-With (x, y) = (X / Z, Y / Z) and r^2 = x^2 + y^2, a lens shows a point (X, Y, Z) of the camera's frame at (x', y') in
-the plane Z = 1, where g is the radial part of the distortion:
+A lens shows a point (X, Y, Z) of the camera's frame at (x', y') in the plane Z = 1. With (x, y) = (X / Z, Y / Z),
+r^2 = x^2 + y^2 and the radial part g of the distortion, this image point is
 
     x' = x g + 2 p1 x y + p2 (r^2 + 2 x^2),    y' = y g + p1 (r^2 + 2 y^2) + 2 p2 x y,
     g = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)

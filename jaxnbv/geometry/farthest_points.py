@@ -46,7 +46,7 @@ _NUM_PARTS = 8
 
 
 def _first_of_largest(distance: Float[Array, " n"], rows: Int[Array, " n"]) -> Int[Array, ""]:
-    """Return the argmax of `distance`, with the bits of the floats compared as integers.
+    """Return the argmax of `distance`, computed by comparing the bits of the floats as integers.
 
     For floats that are not negative, the order of the bits is the order of the floats. On a CPU, a maximum of integers
     followed by a minimum of row indices is several times as fast as `jnp.argmax`.

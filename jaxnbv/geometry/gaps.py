@@ -17,11 +17,11 @@ _MIN_PLANE_FRACTION, _MIN_PLANE_PIXELS = 0.8, 4
 
 
 def find_block_side(valid: Bool[np.ndarray, "h w"]) -> int:
-    """Return the smallest side of square blocks of a depth image that rarely lack a valid pixel.
+    """Return the smallest side for which square blocks of a depth image rarely lack a valid pixel.
 
     The side is 1 if most valid pixels have enough neighbours for a plane, even if the image has holes. Otherwise it is
-    the smallest side for which the fraction of blocks with a valid pixel is about that of blocks of four times the
-    side. For example, the side is 8 if every eighth row is valid.
+    the smallest side for which blocks contain a valid pixel about as often as blocks of four times the side. For
+    example, the side is 8 if every eighth row is valid.
     """
     num_valid = correlate(valid.astype(np.uint8), np.ones((3, 3), np.uint8), mode="constant")
     if not valid.any() or np.mean(num_valid[valid] >= _MIN_PLANE_PIXELS) >= _MIN_PLANE_FRACTION:
@@ -40,10 +40,10 @@ def find_block_side(valid: Bool[np.ndarray, "h w"]) -> int:
 def block_samples(
     depth: Float[Array, "h w"], valid: Bool[Array, "h w"], side: int
 ) -> tuple[Float[Array, "k l"], Bool[Array, "k l"], Int[Array, "k l 2"]]:
-    """Return, for each square block of an image, its sample's depth, whether it has a sample, and where.
+    """Return the sample of each square block of an image: the valid pixel nearest to its middle.
 
-    The sample of a block is the valid pixel nearest to the middle of the block. The last result is the sample's column
-    and row within the block.
+    For each block, the results are the depth of the sample, whether there is a sample, and the sample's column and row
+    within the block.
 
     - `side`: side of the blocks in pixels.
     """

@@ -73,9 +73,9 @@ class DistanceField(eqx.Module):
         return cls(jnp.sqrt(squared).reshape(nodes.shape[:-1]), low, spacing)
 
     def __call__(self, x: Float[Array, "n 3"]) -> Float[Array, " n"]:
-        """Return the distance from each point x to the cloud. Differentiable in x.
+        """Return the interpolated distance from each point x to the cloud. Differentiable in x.
 
-        For a point outside the cube, return the distance from the nearest point of the cube.
+        For a point outside the cube of the grid, return the value at the nearest point of the cube.
         """
         coordinates = jnp.moveaxis((x - self.low) / self.spacing, -1, 0)
         return jax.scipy.ndimage.map_coordinates(self.values, list(coordinates), order=1, mode="nearest")

@@ -43,10 +43,10 @@ def fit_planes(
     min_noise: float | Float[Array, ""],
     block_side: int = 1,
 ) -> tuple[Float[Array, "k l"], Float[Array, "k l 3"], Bool[Array, "k l"]]:
-    """Return a fitted plane's depth and normal at every `stride`-th row and column, and whether it exists.
+    """Fit a plane at every `stride`-th row and column. Return its depth, its normal and whether it exists.
 
-    Normals are in the camera's frame and point towards the camera. In an image without gaps, the plane's depth is
-    limited to three standard deviations of the noise from the measured depth.
+    Normals are in the camera's frame and point towards the camera. In an image without gaps, the returned depth differs
+    from the measured depth by at most three standard deviations of the noise.
 
     - `depth`: depths, positive and finite where `valid`.
     - `camera`: the camera of the whole image.

@@ -161,7 +161,7 @@ def _check_positions(count: int, nearest: float, farthest: float, up: tuple[floa
 
 
 def _look_at_origin(positions: Float[Array, "n 3"], up: tuple[float, float, float]) -> Pose:
-    """Rotate `positions` as the y axis is rotated to `up`, and return poses there that look at the origin."""
+    """Return poses that look at the origin, at `positions` after a rotation that maps the y axis to `up`."""
     axis = jnp.asarray(up, positions.dtype)
     if up[0] or up[2] or up[1] < 0:
         rotation = rotation_between(jnp.asarray([0.0, 1.0, 0.0], positions.dtype), axis / jnp.linalg.norm(axis))

@@ -27,7 +27,7 @@ _PENALTY = 10.0
 
 
 class GradientSearch(Search):
-    """Gradient ascent over 2-DOF or 6-DOF poses from several starts, which run in one batch by Optimistix.
+    """Gradient ascent by Optimistix over 2-DOF or 6-DOF poses, from several starts in one batch.
 
     - `dof`: 2 for `SpherePoses()`, 6 for `FreePoses()`.
     - `space`: pose space to use in place of `dof`, for example `ConstrainedPoses()`.

@@ -32,7 +32,7 @@ class Problem(eqx.Module):
     - `camera`: the camera whose scans are simulated.
     - `acquisition`: the expected value of a view.
     - `obstacles`: solids around the object, or None. Obstacles may hide the object, and cameras keep clear of them.
-    - `cost`: function that applies the cost of moving from the last view to the value of a pose; None to ignore it.
+    - `cost`: function that changes the values of poses by the cost of moving there; None to ignore the cost.
     - `pending`: poses of earlier proposals without a view; None if there are none.
     - `context`: context of the acquisition, computed once from the inputs by `prepared`.
     """
@@ -81,7 +81,7 @@ class Problem(eqx.Module):
         return self.apply_cost(jnp.moveaxis(values, (0, 1), (-2, -1)), poses)
 
     def apply_cost(self, values: Float[Array, "*samples poses"], poses: Pose) -> Float[Array, "*samples poses"]:
-        """Apply the cost of the move from the last view to the values of poses, if there is a cost."""
+        """Return values that include the cost of moving from the last view to each pose, if there is a cost."""
         return values if self.cost is None else self.cost(values, self.observations, poses)
 
     def value_at_visited(self) -> Float[Array, ""]:
