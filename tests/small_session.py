@@ -48,3 +48,10 @@ def session_of(folder=None, **changes):
     defaults = {"obstacles": Obstacles(), "poses": POSES, "folder": folder}
     settings = {"camera": CAMERA, "box": BOX, "up": "z", **defaults, **changes}
     return Session(**{"planner": planner_of(), **settings})
+
+
+def begun(folder=None, **changes):
+    """A session after its first image."""
+    session = session_of(folder, **changes)
+    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    return session

@@ -1,14 +1,12 @@
-"""The simulated episode equals ask and tell by hand, and one jitted function."""
+"""The simulated episode equals ask and tell by hand."""
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from small_planner import FIRST, SCENE, SOLID, planner_of
 
 import jaxnbv as nbv
-from jaxnbv.geometry.pose import look_at
 from jaxnbv.planning.episode import Episode
 from jaxnbv.planning.simulate import observe_scene, simulate
 from jaxnbv.scanning import Grid, SDFSurface, SensorNoise, mesh_from_sdf, scan
@@ -80,42 +78,6 @@ def test_a_view_depends_on_the_key_and_its_number_alone(episode):
     assert_same_bits(shorter.views, episode.views[:2])
     other = simulate(PLANNER, SCENE, FIRST, 2, jax.random.key(6), progress=False)
     assert (np.asarray(other.views[0].scan.points) != np.asarray(shorter.views[0].scan.points)).any()
-
-
-def test_a_whole_episode_as_one_jitted_function(episode):
-    """Fusion may round differently, so numbers agree up to rounding, and choices exactly."""
-
-    @jax.jit
-    def run(key, position):
-        noise, first = SensorNoise(), look_at(position)
-
-        def keys(index):
-            return jax.random.split(jax.random.fold_in(key, index))
-
-        cloud = noise(scan(SCENE, PLANNER.camera, first), keys(0)[1])
-        observations = PLANNER.init(first, cloud)
-
-        def step(observations, index):
-            choose_key, noise_key = keys(index)
-            proposal = PLANNER.propose(observations, choose_key)
-            cloud = noise(scan(SCENE, PLANNER.camera, proposal.pose), noise_key)
-            return PLANNER.observe(observations, proposal.pose, cloud), (proposal.pose, proposal.values)
-
-        return jax.lax.scan(step, observations, jnp.arange(1, 4))
-
-    observations, (poses, values) = run(KEY, FIRST.position)
-    assert int(observations.num_views) == 4
-    for index in range(3):
-        view = episode.views[index + 1]
-        np.testing.assert_allclose(poses.position[index], view.pose.position, atol=1e-5)
-        np.testing.assert_allclose(values[index], view.proposal.values, rtol=0.02, atol=0.02)
-    np.testing.assert_array_equal(observations.cloud.mask, episode.cloud.mask)
-    assert int(observations.cloud.count) == 128, "farthest points were taken"
-    # Farthest point sampling may swap two points that tie up to rounding, so compare sets.
-    distance = np.linalg.norm(
-        np.asarray(observations.cloud.points)[:, None] - np.asarray(episode.cloud.points), axis=-1
-    )
-    assert (distance.min(axis=1) < 1e-4).mean() > 0.95
 
 
 def test_an_episode_over_a_mesh_runs_outside_jit():

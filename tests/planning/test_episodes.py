@@ -21,9 +21,14 @@ from jaxnbv.surfaces import FreeRotation
 # Without optimisation and with one LLVM module, XLA's rounding of a part depends on the rest of the module.
 COMPUTES = True
 BALLS = [Sphere(radius) | Capsule([0.2, 0.3, -0.4], [0.5, 0.6, 0.9], 0.3) for radius in (0.7, 0.8, 0.6)]
+NODES = jnp.stack(jnp.meshgrid(*3 * [jnp.asarray(nbv.Grid(20).axis, jnp.float32)], indexing="ij"), axis=-1)
+# The same balls by their values on a grid, with a leading axis.
+VALUES = jnp.stack([ball(NODES) for ball in BALLS])
+BATCH = GridSurface.from_values(VALUES, 0.0, nbv.Grid(20))
 KEYS = jax.random.split(jax.random.key(7), 3)
 POSES = nbv.look_at([(0.8, 0.9, 2.2), (0.8, -0.9, 2.2), (-2.0, 0.9, 1.0)])
-COVERAGE, NOISE = planner_of(), nbv.SensorNoise()
+COVERAGE, FARTHEST = planner_of(), planner_of(nbv.FarthestView(3))
+NOISE = nbv.SensorNoise()
 
 
 def by_height(cloud):
@@ -58,61 +63,42 @@ def assert_equal(together, alone, acquisition):
     assert np.isnan(together.values[:, 0]).all()
     assert_same_bits(together.poses, stacked([stacked([view.pose for view in each.views]) for each in alone]))
     assert_same_bits(together.clouds, stacked([each.cloud for each in alone]))
-    answers = [[view.answer(acquisition) for view in each.views] for each in alone]
-    if answers[0][0] is None:
-        assert together.answers is None
-    else:
-        expected = [[answer.values for answer in each] for each in answers]
-        np.testing.assert_array_equal(together.answers, np.asarray(expected, np.float32))
+    answers = [[view.answer(acquisition).values for view in each.views] for each in alone]
+    np.testing.assert_array_equal(together.answers, np.asarray(answers, np.float32))
 
 
 def test_episodes_are_those_of_simulate(compilations):
-    """The first pose is for each episode, or one for all. One program runs any number of views."""
-    together = nbv.episodes(COVERAGE, BALLS, POSES, 3, KEYS)
-    assert_equal(together, one_by_one(COVERAGE, BALLS, POSES, 3, KEYS), COVERAGE.acquisition)
-    assert len(np.unique(np.asarray(together.poses.position).reshape(-1, 3), axis=0)) > 5
-    keys = jax.random.split(jax.random.key(8), 3)
-    del compilations[:]
-    more = nbv.episodes(COVERAGE, BALLS[::-1], FIRST, 4, keys)
-    # The pose along an axis, and slices of another length. None of these is the program of an episode.
-    assert len(compilations) < 10
-    assert_equal(more, one_by_one(COVERAGE, BALLS[::-1], 3 * [FIRST], 4, keys), COVERAGE.acquisition)
-
-
-@pytest.mark.parametrize(
-    ("score", "noise"),
-    [
-        (nbv.CrossEntropy(by_height, num_points=64), nbv.SensorNoise(0.03, 0.02)),
-        (nbv.SoftPartCount(by_octant), nbv.SensorNoise(0.0, 0.0)),
-        (lambda cloud: jnp.sum(cloud.points**2), nbv.SensorNoise()),
-    ],
-    ids=["classes", "parts", "utility"],
-)
-def test_answers_are_those_of_each_view(score, noise):
-    planner = planner_of(nbv.FarthestView(12), score)
+    """Poses, values, clouds and answers. The first pose is for each episode, or one for all. One program runs any
+    number of views."""
+    planner, noise = planner_of(score=nbv.CrossEntropy(by_height, num_points=64)), nbv.SensorNoise(0.03, 0.02)
     together = nbv.episodes(planner, BALLS, POSES, 3, KEYS, noise)
+    assert_equal(together, one_by_one(planner, BALLS, POSES, 3, KEYS, noise), planner.acquisition)
+    assert len(np.unique(np.asarray(together.poses.position).reshape(-1, 3), axis=0)) >= 5
     assert together.answers.shape[:2] == (3, 3)
     assert (together.answers[:, 0] != together.answers[:, 1]).any()
-    assert_equal(together, one_by_one(planner, BALLS, POSES, 3, KEYS, noise), planner.acquisition)
+    keys = jax.random.split(jax.random.key(8), 3)
+    del compilations[:]
+    more = nbv.episodes(planner, BALLS[::-1], FIRST, 4, keys, noise)
+    # The pose along an axis, and slices of another length. None of these is the program of an episode.
+    assert len(compilations) < 10
+    assert_equal(more, one_by_one(planner, BALLS[::-1], 3 * [FIRST], 4, keys, noise), planner.acquisition)
 
 
-def test_scenes_on_a_grid_with_a_leading_axis():
-    nodes = jnp.stack(jnp.meshgrid(*3 * [jnp.asarray(nbv.Grid(20).axis, jnp.float32)], indexing="ij"), axis=-1)
-    values = jnp.stack([ball(nodes) for ball in BALLS])
-    batch, planner = GridSurface.from_values(values, 0.0, nbv.Grid(20)), planner_of(nbv.FarthestView(12))
-    surfaces = [GridSurface.from_values(value, 0.0, nbv.Grid(20)) for value in values]
-    together = nbv.episodes(planner, batch, FIRST, 3, KEYS)
-    assert_equal(together, one_by_one(planner, surfaces, 3 * [FIRST], 3, KEYS), planner.acquisition)
-    assert_same_bits(nbv.episodes(planner, surfaces, FIRST, 3, KEYS), together)
+def test_answer_values_are_those_of_the_answer():
+    cloud = nbv.scan(nbv.SDFSurface(BALLS[0]), FARTHEST.camera, FIRST)
+    scores = nbv.CrossEntropy(by_height), nbv.SoftPartCount(by_octant), lambda cloud: jnp.sum(cloud.points**2)
+    for acquisition in (planner_of(score=score).acquisition for score in scores):
+        values = acquisition.answer_values(cloud)
+        assert values.size >= 1
+        np.testing.assert_allclose(values, acquisition.answer(cloud).values, rtol=1e-5)
 
 
-def test_several_at_once_choose_the_same_views():
-    """Two together, and the third by itself."""
-    planner = planner_of(nbv.FarthestView(12))
-    alone = stacked([each.cloud for each in one_by_one(planner, BALLS, POSES, 3, KEYS)])
-    together = nbv.episodes(planner, BALLS, POSES, 3, KEYS, batch_size=2)
-    np.testing.assert_array_equal(together.clouds.mask, alone.mask)
-    np.testing.assert_allclose(together.clouds.points, alone.points, atol=1e-5)
+def test_scenes_on_a_grid_may_have_a_leading_axis():
+    surfaces = [GridSurface.from_values(value, 0.0, nbv.Grid(20)) for value in VALUES]
+    together = nbv.episodes(FARTHEST, BATCH, POSES, 3, KEYS)
+    assert together.answers is None
+    assert (together.clouds.count > 10).all()
+    assert_same_bits(nbv.episodes(FARTHEST, surfaces, POSES, 3, KEYS), together)
 
 
 @pytest.mark.slow
@@ -169,12 +155,12 @@ def test_what_cannot_be_meant_is_refused(call, message):
 
 
 def test_episodes_that_go_wrong_are_named():
-    planner, away = planner_of(nbv.FarthestView(2)), nbv.look_at((0.0, 0.0, 2.5), (0.0, 0.0, 9.0))
+    away = nbv.look_at((0.0, 0.0, 2.5), (0.0, 0.0, 9.0))
     firsts = jax.tree.map(lambda row, rows: rows.at[1].set(row), away, POSES)
     with pytest.raises(InputError, match="first view of episode 1 sees nothing"):
-        nbv.episodes(planner, BALLS, firsts, 2, KEYS)
-    with pytest.raises(InputError, match="value of view 4 of episode 0 is -inf: all candidates have been visited"):
-        nbv.episodes(planner, BALLS, POSES, 4, KEYS)
+        nbv.episodes(FARTHEST, BATCH, firsts, 2, KEYS)
+    with pytest.raises(InputError, match="value of view 5 of episode 0 is -inf: all candidates have been visited"):
+        nbv.episodes(FARTHEST, BATCH, POSES, 5, KEYS)
 
 
 PROGRAM = """
@@ -191,26 +177,39 @@ PROGRAM = """
     camera, search = nbv.Camera(height=8, width=8), getattr(nbv, sys.argv[1])(8)
     planner = nbv.Planner(nbv.NewSurface(), search, camera, sampler, capacity=64, max_views=4)
     scenes = [nbv.sdf.Sphere(radius) for radius in (0.6, 0.7, 0.8)]
-    first, keys = nbv.look_at((0.8, 0.9, 2.2)), jax.random.split(jax.random.key(0), 3)
-    shared = nbv.episodes(planner, scenes, first, 3, keys)
+    first, keys, batch_size = nbv.look_at((0.8, 0.9, 2.2)), jax.random.split(jax.random.key(0), 3), int(sys.argv[2])
+    shared = nbv.episodes(planner, scenes, first, 3, keys, batch_size=batch_size)
     assert len(shared.values.sharding.device_set) == 2
-    with jax.default_device(jax.devices()[0]):
-        alone = nbv.episodes(planner, scenes, first, 3, keys)
-    assert len(alone.values.sharding.device_set) == 1
-    for a, b in zip(jax.tree.leaves(shared), jax.tree.leaves(alone), strict=True):
-        np.testing.assert_array_equal(a, b)
-    one = nbv.simulate(planner, scenes[2], first, 3, keys[2], progress=False)
-    np.testing.assert_array_equal(shared.values[2, 1:], np.stack([view.proposal.value for view in one.views[1:]]))
-    np.testing.assert_array_equal(shared.clouds.points[2], one.cloud.points)
+    runs = [nbv.simulate(planner, scene, first, 3, key, progress=False) for scene, key in zip(scenes, keys)]
+    values = [[view.proposal.value for view in run.views[1:]] for run in runs]
+    error = 1e-5 if batch_size > 1 else 0.0
+    np.testing.assert_allclose(shared.values[:, 1:], np.asarray(values), rtol=error)
+    np.testing.assert_allclose(shared.clouds.points, np.stack([run.cloud.points for run in runs]), rtol=0, atol=error)
+    if batch_size == 1:
+        with jax.default_device(jax.devices()[0]):
+            alone = nbv.episodes(planner, scenes, first, 3, keys)
+        assert len(alone.values.sharding.device_set) == 1
+        jax.tree.map(np.testing.assert_array_equal, shared, alone)
 """
 
 
-@pytest.mark.parametrize("search", ["FarthestView", pytest.param("DiscreteSearch", marks=pytest.mark.slow)])
-def test_two_devices_give_the_same_arrays(search, tmp_path, monkeypatch):
-    """In its own process, because devices are counted before it starts. It compiles as users' programs do."""
-    for name in ("XLA_FLAGS", "JAX_DISABLE_MOST_OPTIMIZATIONS"):
-        monkeypatch.delenv(name, raising=False)
+def run_on_two_devices(tmp_path, *arguments):
+    """In its own process, because devices are counted before it starts."""
     program = tmp_path / "program.py"
     program.write_text(textwrap.dedent(PROGRAM))
-    ended = subprocess.run([sys.executable, program, search], capture_output=True, text=True, timeout=600)
+    ended = subprocess.run([sys.executable, program, *arguments], capture_output=True, text=True, timeout=600)
     assert ended.returncode == 0, ended.stderr
+
+
+def test_several_at_once_on_two_devices_choose_the_same_views(tmp_path):
+    """Two together on the first device, and the third by itself on the other."""
+    run_on_two_devices(tmp_path, "FarthestView", "2")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("search", ["FarthestView", "DiscreteSearch"])
+def test_two_devices_give_the_same_arrays(search, tmp_path, monkeypatch):
+    """It compiles as users' programs do."""
+    for name in ("XLA_FLAGS", "JAX_DISABLE_MOST_OPTIMIZATIONS"):
+        monkeypatch.delenv(name, raising=False)
+    run_on_two_devices(tmp_path, search, "1")

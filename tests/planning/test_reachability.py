@@ -5,7 +5,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_session import CENTER, FIRST, POSES, planner_of, session_of, shot
+from small_session import CENTER, POSES, begun, planner_of, shot
 
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
@@ -13,17 +13,16 @@ from jaxnbv.planning.session import Session
 from jaxnbv.search import GradientSearch
 
 
-def begun(**changes):
-    session = session_of(**changes)
-    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
-    return session
+@pytest.fixture(scope="module")
+def values():
+    """Values of the poses when all can be reached."""
+    return np.asarray(begun().next().proposal.values)
 
 
 @pytest.fixture(scope="module")
-def free():
+def free(values):
     """Indices of the poses by value, the highest first, when all can be reached."""
-    session = begun()
-    return np.argsort(-np.asarray(session.next().proposal.values), kind="stable")
+    return np.argsort(-values, kind="stable")
 
 
 def number_of(matrix):
@@ -120,11 +119,10 @@ def test_unreachable_candidates_are_reported():
         session.next(seconds=0.0)
 
 
-def test_a_score_is_multiplied_by_the_value(free):
+def test_a_score_is_multiplied_by_the_value(free, values):
     """The choice has the highest product of value and score, although not all poses are checked."""
-    order = np.argsort(-free_values(), kind="stable")
     scores = np.random.default_rng(0).uniform(0.3, 1.0, len(POSES))
-    scores[order[3]] = 0.0
+    scores[free[3]] = 0.0
     calls = []
 
     def reachable(matrices):
@@ -132,7 +130,6 @@ def test_a_score_is_multiplied_by_the_value(free):
         return [scores[number_of(matrix)] for matrix in matrices]
 
     view = begun(reachable=reachable).next()
-    values = free_values()
     best = int(np.argmax(scores * values))
     assert best != free[0]
     assert number_of(view.matrix) == best
@@ -140,10 +137,6 @@ def test_a_score_is_multiplied_by_the_value(free):
     # At most one batch more than needed, and seven rolls of the pose with score zero.
     can_win = int((values > scores[best] * values[best]).sum())
     assert len(set(calls)) <= 8 * (can_win // 8 + 1)
-
-
-def free_values():
-    return np.asarray(begun().next().proposal.values)
 
 
 def test_a_turned_image_that_is_not_square_is_imagined_again(free):

@@ -9,15 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_session import BOX, FIRST, POSES, session_of, shot
+from small_session import BOX, FIRST, POSES, begun, session_of, shot
 
 from jaxnbv.checks import InputError
 
 
 def test_a_session_goes_on_from_its_folder(tmp_path):
     """After an image, and after a proposal, whose file is read and not computed again."""
-    session = session_of(tmp_path)
-    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    begun(tmp_path)
     session = session_of(tmp_path)
     assert len(session.views) == 1
     matrix = session.next().matrix
@@ -33,10 +32,9 @@ def test_a_session_goes_on_from_its_folder(tmp_path):
 
 
 def test_images_keep_their_pixels(tmp_path):
-    session, image = session_of(tmp_path), shot(FIRST)
-    session.add(image, FIRST, depth_scale=1e-3)
+    begun(tmp_path)
     with np.load(tmp_path / "image_00.npz") as saved:
-        np.testing.assert_array_equal(saved["depth"], image)
+        np.testing.assert_array_equal(saved["depth"], shot(FIRST))
         assert saved["depth"].dtype == np.uint16
         np.testing.assert_array_equal(saved["matrix"], FIRST)
     config = json.loads((tmp_path / "session.json").read_text())["config"]
@@ -45,7 +43,7 @@ def test_images_keep_their_pixels(tmp_path):
 
 
 def test_a_folder_of_another_session_is_refused(tmp_path):
-    session_of(tmp_path).add(shot(FIRST), FIRST, depth_scale=1e-3)
+    begun(tmp_path)
     with pytest.raises(InputError, match=r"belongs to another session; it differs in up: z there, y now"):
         session_of(tmp_path, up="y")
 
@@ -61,7 +59,7 @@ def test_two_sessions_in_one_folder_do_not_overwrite_each_other(tmp_path):
 
 
 def test_a_damaged_image_is_named(tmp_path):
-    session_of(tmp_path).add(shot(FIRST), FIRST, depth_scale=1e-3)
+    begun(tmp_path)
     file = tmp_path / "image_00.npz"
     file.write_bytes(file.read_bytes()[:-40])
     with pytest.raises(InputError, match=r"image_00\.npz is damaged .*restore it, or delete it and those after it"):
