@@ -23,22 +23,15 @@ from commands import run_command, run_process
 from jaxnbv.cli import app, play
 from jaxnbv.cli.tasks import TASKS
 from jaxnbv.planning.loop import Step
+from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.studies.registry import studies
 from jaxnbv.viz import Sketches
 
 
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory):
-    """A folder in which `jaxnbv demo --quick` has run, and its output."""
-    folder = tmp_path_factory.mktemp("demo")
-    result = run_process("demo", "--quick", "--known", "none", "--views", "2", cwd=folder)
+def check_demo(folder, result, name):
+    """Check a demo of two views, and return its folder."""
     assert result.returncode == 0, result.stderr
-    return folder, result
-
-
-def test_demo_leaves_an_episode_and_a_report(finished):
-    folder, result = finished
-    out = folder / "runs" / "truck-cross-entropy-halving-seed2"
+    out = folder / "runs" / name
     names = {path.name for path in out.iterdir()}
     assert {"episode.json", "view_00.npz", "view_01.npz", "cloud.ply", "report.html"} <= names
     assert "view 2" in result.stdout
@@ -48,8 +41,30 @@ def test_demo_leaves_an_episode_and_a_report(finished):
     assert max(map(len, result.stdout.splitlines())) <= 100
     assert "\r" not in result.stdout + result.stderr
     assert str(out.relative_to(folder) / "report.html") in result.stdout
+    return out
+
+
+def test_the_demo_leaves_an_episode_a_rival_and_a_report(tmp_path, monkeypatch):
+    """This search needs no samples, and the first view is one of a few. The slow test has the default settings."""
+    monkeypatch.setattr("jaxnbv.search.candidates.sphere_candidates", lambda count: sphere_candidates(12))
+    result = run_command("demo", "--quick", "--model", "paper", "--search", "random", "--views", "2", cwd=tmp_path)
+    out = check_demo(tmp_path, result, "truck-cross-entropy-random-paper-seed2")
+    assert re.search(r"(?m)^race     .*[Ff]arthest view", result.stdout), result.stdout
+    assert (out / "farthest" / "view_01.npz").exists()
     config = json.loads((out / "episode.json").read_text())["config"]
-    assert config["planner"]["search"]["type"].endswith(":HalvingSearch")
+    assert config["planner"]["search"]["type"].endswith(":RandomView")
+
+
+@pytest.mark.slow
+def test_the_demo_runs_in_its_own_process_and_the_same_command_continues_it(tmp_path):
+    options = ("demo", "--quick", "--known", "none")
+    name = "truck-cross-entropy-halving-seed2"
+    out = check_demo(tmp_path, run_process(*options, "--views", "2", cwd=tmp_path), name)
+    before = {path.name: path.read_bytes() for path in out.glob("view_*.npz")}
+    result = run_command(*options, "--views", "3", "--until", "never", "--no-report", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert (out / "view_02.npz").exists()
+    assert all((out / name).read_bytes() == content for name, content in before.items())
 
 
 def test_an_option_for_several_folders_takes_all_words_up_to_the_next():
@@ -89,18 +104,6 @@ def test_equal_warnings_are_printed_once_with_their_number(tmp_path, monkeypatch
         "warning: the mesh is there",
         "warning, 3 times in all: the mesh is here",
     ]
-
-
-@pytest.mark.slow
-def test_the_same_command_continues_with_more_views(finished):
-    folder, _ = finished
-    out = folder / "runs" / "truck-cross-entropy-halving-seed2"
-    before = {path.name: path.read_bytes() for path in out.glob("view_*.npz")}
-    options = ("--quick", "--known", "none", "--views", "3", "--until", "never", "--no-report")
-    result = run_command("demo", *options, cwd=folder)
-    assert result.returncode == 0, result.stderr
-    assert (out / "view_02.npz").exists()
-    assert all((out / name).read_bytes() == content for name, content in before.items())
 
 
 def test_a_rule_ends_it_and_says_what_is_saved(tmp_path):
@@ -153,10 +156,7 @@ def test_run_takes_a_mesh_each_search_and_each_model(search, model, tmp_path):
         (("demo", "--task", "coverage", "--first", "1", "2"), ("--first", "3 arguments")),
         (("demo", "--task", "coverage", "--first", "0", "0", "0"), ("target",)),
         (("demo", "--task", "coverage", "--first", "0", "0", "9", "--noise", "-1"), ("-1", "negative")),
-        (
-            ("demo", "--task", "coverage", "--first", "0.55", "-0.84", "0"),
-            ("(0.55, -0.84, 0.0)", "inside"),
-        ),
+        (("demo", "--task", "coverage", "--first", "0.55", "-0.84", "0"), ("(0.55, -0.84, 0.0)", "inside")),
         (("run", "ball.obj", "--first", "0.3", "-1", "0.2"), ("(0.3, -1.0, 0.2)", "inside the object", "outside")),
         (("demo", "--task", "coverage", "--first", "0", "0", "1e30"), ("position", "1.e+30")),
         (("demo", "--scene", "99999999999999"), ("--scene", "2147483647")),
@@ -167,13 +167,9 @@ def test_run_takes_a_mesh_each_search_and_each_model(search, model, tmp_path):
         (("demo", "--task", "coverage", "--until", "sure"), ("'sure'", "a number")),
         (("demo", "--task", "coverage", "--until", "sure=0.9"), ("NewSurface", "classifier")),
         (("demo", "--vews", "3"), ("--vews", "--views")),
-        (("demo", "--search", "best"), ("best", "discrete")),
-        (("demo", "--search", "halvng"), ("halvng", "Did you mean 'halving'?")),
-        (("demo", "--task", "covrage"), ("covrage", "Did you mean 'coverage'?")),
-        (("demo", "--task", "coverage", "--model", "papr"), ("papr", "Did you mean 'paper'?")),
+        (("demo", "--search", "halvng"), ("halvng", "discrete", "Did you mean 'halving'?")),
         (("demo", "--model", "paper", "--known", "truck"), ("--known truck", "no known shapes", "--model screened")),
         (("study", "pyramyd"), ("pyramyd", "Did you mean 'pyramid'?")),
-        (("study", "pyramid", "--meshes", "occupied"), ("--meshes",)),
         (("study", "recorded"), ("FOLDER",)),
         (("study", "recorded", "occupied", "--candidates", "9"), ("--candidates 9", "frames of the recording")),
         (("study", "pyramid", "--quick", "--settings", "paper"), ("--quick and --settings paper",)),
@@ -348,20 +344,8 @@ def test_the_study_writes_tables_and_figures_and_continues(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["heat", "reconstruction"])
 def test_each_study_writes_tables_figures_and_pictures(name, tmp_path):
-    arguments = (
-        "study",
-        name,
-        "--quick",
-        "--scenes",
-        "1",
-        "--views",
-        "2",
-        "--methods",
-        "farthest,random",
-        "--out",
-        "it",
-    )
-    result = run_command(*arguments, cwd=tmp_path)
+    sizes = ("--quick", "--scenes", "1", "--views", "2", "--methods", "farthest,random")
+    result = run_command("study", name, *sizes, "--out", "it", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert "not the full study" in result.stdout
     written = {path.name for path in (tmp_path / "it").iterdir()}
