@@ -44,7 +44,7 @@ KnownOption = Annotated[
 
 
 def by_task(key: Callable[[type[Task]], T]) -> dict[T, str]:
-    """Group tasks by the value of a function. Returns their names, joined by "/", keyed by the value."""
+    """Return a dict from each value of `key` to the names of the tasks with this value, joined by "/"."""
     names: dict[T, list[str]] = {}
     for name, task in TASKS.items():
         names.setdefault(key(task), []).append(name)

@@ -46,10 +46,10 @@ class Sizes(NamedTuple):
     """Sizes of a planner.
 
     - `samples`: number of posterior samples.
-    - `candidates`: number of candidates, or None for the number in the sensor's setting.
+    - `candidates`: number of candidates, or None for the number in the task's `Setting`.
     - `capacity`: number of points to keep in the cloud.
     - `grid`: grid of the samples, or None for the grid of the task.
-    - `rays`: number of rays along each side of an image, or None for the sensor's own numbers.
+    - `rays`: number of rays along each side of an image, or None for the numbers in the task's `Setting`.
     """
 
     samples: int

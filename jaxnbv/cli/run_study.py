@@ -30,7 +30,7 @@ from jaxnbv.studies.registry import studies
 
 
 def run_study(name: str, options: StudyOptions, **settings: Any) -> None:
-    """Run all parts of a study and write the results of each part.
+    """Run all parts of a study (for example, one part per framing) and write the results of each part.
 
     - `settings`: values of the study's own options, None for options without a value.
 
@@ -99,7 +99,7 @@ def _executor(options: StudyOptions) -> AbstractContextManager[Executor | None]:
 
 
 def _sources(folders: Iterable[Path], parts: Iterable[str]) -> dict[str, list[Path]]:
-    """Return the folders of records to join, keyed by part of the study."""
+    """Return the folders from which to copy records, keyed by part of the study, see `run_study`."""
     sources = {part: [folder / part for folder in folders if (folder / part / "study.json").exists()] for part in parts}
     for folder in folders:
         require(
@@ -110,7 +110,7 @@ def _sources(folders: Iterable[Path], parts: Iterable[str]) -> dict[str, list[Pa
 
 
 def _overrides(kind: type[Study], options: StudyOptions) -> dict[str, Any]:
-    """Return settings that replace those of the study: first from `--settings`, then from single options.
+    """Return settings that replace the study's own. Single options take precedence over `--settings`.
 
     **Raises:** `ValueError` if a quick run has the paper's settings.
     """
@@ -135,7 +135,7 @@ def _scenes(text: str) -> Sequence[int]:
 
 
 def _import_method(text: str) -> Factory:
-    """Import the function of a user that a text "module:function" names. It may be in the current folder."""
+    """Import a user's function, given as "module:function". The module may be in the current folder."""
     if (here := os.getcwd()) not in sys.path:
         sys.path.insert(0, here)
     try:

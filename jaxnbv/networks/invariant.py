@@ -25,7 +25,7 @@ class PairLevel(eqx.Module):
     everywhere.
 
     - `radius`: radius of a group, in the units of the points.
-    - `groups`: intended number of centres, which the caller chooses.
+    - `groups`: intended number of centres. The caller chooses the centres.
     - `neighbours`: maximum number of points in a group. If more are within the radius, the first rows are used.
     """
 

@@ -59,7 +59,7 @@ class PooledMLP(eqx.Module):
     layers: tuple[Linear, ...]
 
     def lift(self, points: Float[Array, "n 3"], features: Float[Array, "n inputs"] | None) -> Float[Array, "n outputs"]:
-        """Apply the first layer without its bias. The result is the same for all groups of points."""
+        """Apply the first layer without its bias to each point. All groups with a point share its result."""
         inputs = points if features is None else jnp.concatenate([points, features], axis=-1)
         return product(inputs, self.layers[0].weight)
 

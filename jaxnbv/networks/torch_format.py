@@ -163,7 +163,7 @@ class _TensorUnpickler(pickle.Unpickler):
         return self._storage(key, kind, count)
 
     def _dictionary(self, items: Any = ()) -> "_Dictionary":
-        """Copy items into a dictionary. Raises an error if all copies have more items than the file has bytes."""
+        """Copy items into a dictionary. Fails if all copies together have more items than the file has bytes."""
         self._items -= len(items)
         require(self._items >= 0, "copies the same dictionary over and over: it is damaged")
         return _Dictionary(items)

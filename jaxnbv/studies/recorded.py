@@ -53,7 +53,7 @@ class Recording(NamedTuple):
     """The frames of a recording, and the voxels of a box that at least three frames show.
 
     - `poses`: camera poses of the frames; `scans`: scans of the frames, cropped to the box; both in scene units.
-    - `is_shown`: True where any pixel of a frame shows a voxel.
+    - `is_shown`: entry (i, j) is True if any pixel of frame i shows voxel j.
     - `voxels`: centres of the voxels; `camera_positions`: positions of the frames' cameras; both in the recording's
       units.
     """
@@ -90,9 +90,9 @@ class FixedOrder(Baseline):
 
 
 class MostNewVoxels(Baseline):
-    """Greedy oracle that chooses the frame with the most new voxels: no frame chosen before shows them.
+    """Greedy oracle that chooses the frame with the most new voxels, which no chosen frame shows yet.
 
-    - `is_shown`: True where a candidate shows a voxel.
+    - `is_shown`: entry (i, j) is True if candidate i shows voxel j.
     """
 
     is_shown: Bool[Array, "candidates voxels"] = eqx.field(kw_only=True)

@@ -1,4 +1,4 @@
-"""Settings of the paper's part and heat experiments that differ from the default.
+"""Settings of the paper's experiments on parts and on heat, which differ from `USUAL_SETTING`.
 
 Each `Setting` holds the camera, the radius of the sphere of candidates and the number of candidates.
 """

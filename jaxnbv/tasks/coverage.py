@@ -145,7 +145,7 @@ def seen_share(
     """Return the fraction of the visible area that earlier views have seen.
 
     The visible area is the area of the sampled surfaces that is visible from `poses`. A point has been seen if its
-    newness is zero. For observations with looks, it must also be visible from an earlier view, because a point near a
+    newness is zero. For observations with `Looks`, it must also be visible from an earlier view, because a point near a
     measured point may still be hidden behind an edge.
 
     - `newness`: newness function of the observations.

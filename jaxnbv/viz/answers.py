@@ -41,8 +41,8 @@ class Chart(NamedTuple):
     - `label`: label of the vertical axis, with the unit.
     - `names`, `values`: names of the numbers, and their values after each view.
     - `true`: values of the numbers if all of the surface had been seen; None if they are not known.
-    - `marks_true_name`: whether `true` only marks one of the names as the true one. Otherwise `true` has values to
-      reach.
+    - `marks_true_name`: whether `true` is 1 for the true name and 0 for all others. If False, `true` has the values
+      that the numbers should reach.
     - `goal`: a value that the numbers should reach; None for no such value.
     """
 
@@ -75,7 +75,7 @@ class Words:
         return answer.form.format(answer.values[index])
 
     def said(self, before: Answer | None = None) -> str:
-        """Return the shown numbers as text, with their values in the answer `before` this one if given."""
+        """Return the shown numbers as text, each with its value in the earlier answer `before` if given."""
 
         def text_of(index: int) -> str:
             was = "" if before is None else f" (was {self.value(before, index)})"
@@ -90,7 +90,7 @@ class Words:
 
     @property
     def settled_means(self) -> str:
-        """The condition of `settled` as text."""
+        """Text that says when `settled` counts an answer as reliable."""
         return f"within {100 * _MAX_CHANGE:.0f} % of the view before"
 
     def settled(self, answers: Sequence[Answer], holds: Holds) -> list[bool]:
@@ -143,9 +143,9 @@ class _ClassWords(Words):
         return name if p == 1.0 else f"{name}, probability {p:.2f}"
 
     def settled(self, answers: Sequence[Answer], holds: Holds) -> list[bool]:
-        """Return, for each view, whether the rule `Sure` held.
+        """Return, for each view, whether the stop rule `Sure` held after it.
 
-        The result is also False if the rule held after the previous view for a different class.
+        If the rule held after the previous view too, but for a different class, the result is False.
         """
         is_sure = [holds(self.rule, index) for index in range(len(answers))]
         best = [int(np.argmax(answer.values)) for answer in answers]
@@ -153,7 +153,7 @@ class _ClassWords(Words):
         return [now and not other for now, other in zip(is_sure, is_contradicted, strict=True)]
 
     def charts(self, answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...]:
-        """Return a chart of the probabilities of all classes. If it is known, the true class is marked."""
+        """Return a chart of the probabilities of all classes. The true class is marked if it is known."""
         true = None if truth is None else truth.values
         return (
             Chart(
@@ -171,11 +171,11 @@ class _IdentityWords(_ClassWords):
     settled_means = f"probability {min_probability} or more"
 
     def settled(self, answers: Sequence[Answer], holds: Holds) -> list[bool]:
-        """Return the same as `_ClassWords.settled`, for the rule that a probability reaches `min_probability`."""
+        """Return the result of `_ClassWords.settled` for the rule that a part has `min_probability` or more."""
         return super().settled(answers, lambda _, index: bool(answers[index].values.max() >= self.min_probability))
 
     def charts(self, answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...]:
-        """Return a chart of the parts that had the highest probabilities after any view, six at most."""
+        """Return a chart of at most six parts: those whose probability was highest after any of the views."""
         values = _rows(answers)
         rows = np.sort(np.argsort(-values.max(axis=0), kind="stable")[:_MAX_PARTS])
         names = tuple(self.answer.names[index] for index in rows)
@@ -211,7 +211,7 @@ class _PartWords(Words):
         ]
 
     def charts(self, answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...]:
-        """Return a chart of the number of parts with `target` points or more, and one of each part's points."""
+        """Return two charts: number of parts with `target` points or more, and number of points per part."""
         all_answers = answers if truth is None else [*answers, truth]
         parts = sorted({index for answer in all_answers for index in words_of(answer).shown})
         values, target = _rows(answers)[:, parts], self.answer.target

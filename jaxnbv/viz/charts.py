@@ -24,7 +24,7 @@ _LEGEND: dict[str, Any] = {"loc": "outside lower center", "frameon": False, "fon
 
 
 def visible_lines(chart: Chart) -> dict[int, int]:
-    """Return the indices of the numbers to draw, each with the number of other lines that its line hides.
+    """Return the lines to draw, as a dict from a number's index to how many other lines its line hides.
 
     A line that nearly coincides with a drawn line is hidden. At most six lines are drawn: those whose largest value, or
     true value, is highest.
@@ -93,7 +93,7 @@ def set_view_axis(axes: Axes, count: int) -> None:
 
 
 def draw_values(axes: Axes, data: ReportData) -> list[Line2D]:
-    """Draw values of chosen views with standard errors, and of median candidates. Return legend entries."""
+    """Draw each chosen view's value, its standard error and the candidates' median. Return legend entries."""
     for view, view_data in enumerate(data.views, start=1):
         if view_data.proposal is None:
             axes.annotate("given", (view, 0), (0, 4), textcoords="offset points", ha="center", color=GREY, fontsize=8)

@@ -38,7 +38,7 @@ def descending_values(proposal: Proposal) -> Float[np.ndarray, " o"]:
 
 
 def colour_range(values: Float[np.ndarray, "*n"]) -> tuple[float, float]:
-    """Return the smallest and the largest value that is not NaN, and a wider range if they are equal."""
+    """Return the smallest and the largest value that is not NaN, or a wider range if the two are equal."""
     numbers = values[~np.isnan(values)]
     if not numbers.size:
         return 0.0, 1.0

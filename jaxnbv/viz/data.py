@@ -37,8 +37,8 @@ class ViewData(eqx.Module):
     - `view`: the view, with the values of its proposal in world units.
     - `before`: points of the cloud before the view, in scene coordinates.
     - `surface`: the surface after the view: the likeliest known shape, or else the pieces of the posterior mean's
-      surface near points. None if the grid holds no surface. Its deviation (world units) grows with the distance from
-      points.
+      surface near the cloud. None if the grid holds no surface. Its deviation (world units) grows with the distance
+      from the cloud.
     - `coverage`: amount of surface seen after the view.
     - `sentences`: sentences about the view, keyed by heading.
     - `imagined`: surfaces imagined before the view; None for a given view.

@@ -66,7 +66,7 @@ class Deviation(eqx.Module):
       distances for the latter.
     - `imagined`: fraction of the scanned mesh that no view measured. This part is left out.
     - `radius`: a place on the CAD is covered if at least three of the four nearest rows of `nearest_points` are within
-      this distance, on the same side of a wall.
+      this distance and on the same side of the wall, as their normals show.
     """
 
     pose: Float[np.ndarray, "4 4"]
@@ -257,7 +257,7 @@ def _register(
 
 
 def _mesh_of(source: _Mesh | TriangleMesh) -> trimesh.Trimesh:
-    """Convert to a trimesh mesh in its own units, with the attribute `measured` of faces if there is one."""
+    """Convert a mesh to trimesh in its own units, with its face attribute `measured` if it has one."""
     if isinstance(source, TriangleMesh):
         return trimesh.Trimesh(source.frame.to_world(source.vertices), source.faces, process=False)
     parts = [part for _, part in read_nodes(source)]

@@ -52,8 +52,8 @@ def mean_surface(sampler: SurfaceSampler, inputs: StepInputs) -> MeanSurface | N
 
     The mean is carved like the samples.
 
-    - `inputs`: inputs of a step, with a posterior. If the posterior has no closed forms, mean and deviation are those
-      of the inputs' samples, or of samples drawn with a fixed key.
+    - `inputs`: inputs of a step, with a posterior. If it has no closed forms, mean and deviation are computed from
+      the samples in `inputs`. If there are none, samples are drawn with a fixed key.
     """
     observations, posterior, surfaces = inputs.observations, inputs.posterior, inputs.surfaces
     assert posterior is not None

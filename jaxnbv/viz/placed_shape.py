@@ -76,7 +76,7 @@ class _Fits(NamedTuple):
 
     @classmethod
     def of(cls, bank: ShapeBank, hypotheses: Hypotheses, weights: Float[np.ndarray, " h"], rows: list[int]) -> "_Fits":
-        """Select the shapes in these rows, and normalise their weights, which are in the order of the rows."""
+        """Select these rows of `hypotheses`, and normalise their `weights`, one for each of `rows`."""
         indices = np.asarray(rows)
         return cls(bank, jax.tree.map(lambda leaf: leaf[indices], hypotheses), weights / max(weights.sum(), 1e-30))
 

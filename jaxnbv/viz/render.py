@@ -116,7 +116,7 @@ class Still:
         colours: Float[np.ndarray, "hits 4"],
         depth: Float[np.ndarray, " hits"],
     ) -> tuple[Bool[np.ndarray, " rays"], Float[np.ndarray, "all 4"], Float[np.ndarray, " all"]]:
-        """Blend a translucent surface into results of `_trace`, and return the new ones. It hides no points."""
+        """Return results of `_trace` with a translucent surface blended in. This surface hides no points."""
         is_disputed, over, disputed_depth = self._trace(disputed_space, None)
         under, front = np.zeros((len(mask), 4)), np.zeros((len(mask), 4))
         deep, near = np.full(len(mask), np.inf), np.full(len(mask), np.inf)
@@ -203,7 +203,7 @@ def draw_truth(axes: Axes, data: ReportData) -> bool:
 
 
 def render_view(data: ReportData, index: int) -> Still:
-    """Return a picture of the surface after view `index` (from 0), from the viewpoint of all views."""
+    """Return a picture of the surface after view `index` (from 0), from the report's viewpoint."""
     viewpoint, norm = data.viewpoint, LogNorm(*data.deviations)
     return Still(viewpoint.eye, data.views[index].surface, _STILL_SIZE, viewpoint.extent, norm)
 

@@ -115,9 +115,9 @@ def _matrix(data: ReportData, index: int) -> str:
 
 
 def _world_of(episode: Episode) -> tuple[Frame, str]:
-    """Return the world of the poses that a reader can copy, and its units.
+    """Return the frame of the world, and its unit, for the poses that a reader of the report can copy.
 
-    It is the world of the object's file if there is one, otherwise that of the session or the scene.
+    It is the frame of the object's file if there is one, otherwise that of the session or the scene.
     """
     if episode.scene is not None and (world_frame := episode.scene.world_frame) is not None:
         return world_frame, "the units of the object's file"

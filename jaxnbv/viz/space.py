@@ -88,9 +88,9 @@ def _cameras(item: Cameras) -> list[dict[str, Any]]:
 
 
 def _mesh(surface: MeanSurface, limit: int, grades: Float[np.ndarray, "2"]) -> dict[str, Any]:
-    """Return a plotly trace of a coarser mesh with at most `limit` vertices.
+    """Return a plotly trace of a surface, coarsened to at most `limit` vertices.
 
-    Colours show the logarithm of the deviation, or which parts of a known shape are measured and agreed.
+    Colours show the logarithm of the deviation or, for a known shape, where it is measured and where hypotheses agree.
 
     - `grades`: decimal logarithms of the deviations at the ends of the colours.
     """
@@ -109,7 +109,7 @@ def _mesh(surface: MeanSurface, limit: int, grades: Float[np.ndarray, "2"]) -> d
 def _triangles(
     surface: MeanSurface, limit: int, style: dict[str, Any], grade: Float[np.ndarray, " v"] | None = None
 ) -> dict[str, Any]:
-    """Return a plotly trace of a coarser mesh with at most `limit` vertices, coloured by `grade` if given."""
+    """Return a plotly trace of a surface, coarsened to at most `limit` vertices, in the colours of `grade`."""
     new_index, faces = clustered(surface.vertices, surface.faces, limit)
     count = np.bincount(new_index)
     vertices = np.stack([np.bincount(new_index, column) / count for column in surface.vertices.T], axis=1)

@@ -35,7 +35,7 @@ def gradient(colours: Colormap) -> str:
 
 
 def middle_range(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
-    """Return the range of positive values without 2 % at each end, extended to 1, 2 or 5 times 10^n."""
+    """Return the 2nd and 98th percentile of positive values, widened to 1, 2 or 5 times a power of ten."""
     low, high = np.percentile(values, [2.0, 98.0])
     ticks = log_ticks(low / 10.0, high * 10.0)
     return float(ticks[ticks <= low * 1.0001].max()), float(ticks[ticks >= high * 0.9999].min())

@@ -68,7 +68,7 @@ def task_of(
     rival: Episode | None = None,
     all_observations: Sequence[Observations] | None = None,
 ) -> TaskReport:
-    """Return the task of an episode: that of its acquisition, or to see all surface if it has no answers.
+    """Return the task of an episode: that of the acquisition, or coverage for one without answers.
 
     - `truth`: points of the true surface, in scene coordinates.
     - `rival`: an episode of a different search from the same first view.
@@ -181,7 +181,7 @@ def search_name(episode: Episode) -> str:
 def rival_text(rival: Episode, episode: Episode) -> str:
     """Return a sentence about a different search from the same first view: number of views, and answer.
 
-    It says if these views did not fulfil the stop rule that ended `episode`.
+    If a stop rule ended `episode` but not `rival`, the sentence says that `rival` was not done.
     """
     name, count = search_name(rival).capitalize(), len(rival.views)
     answers = _answers(episode, rival.views)

@@ -77,7 +77,7 @@ def _reason(quantity: Quantity, proposal: Proposal, frame: Frame) -> dict[str, s
 
 
 def pose_text(pose: Pose, frame: Frame) -> str:
-    """Describe a pose in words: world coordinates, elevation, and the angle by which it misses the origin."""
+    """Describe a pose in words: world position, elevation, and angle by which its axis misses the origin."""
     position, forward = (np.asarray(vector, dtype=np.float64) for vector in (pose.position, pose.forward))
     elevation = np.degrees(np.arcsin(unit(position)[1]))
     side = "above" if elevation >= 0 else "below"

@@ -91,7 +91,7 @@ class Processes(Executor):
 
 
 def _end_with(parent: int) -> None:
-    """Start a thread that ends this process when its `parent` (process id) is gone. A killed parent cannot end it."""
+    """Start a thread that ends this process when its `parent` (process id) is gone, even if it was killed."""
 
     def watch() -> None:
         while os.getppid() == parent:

@@ -23,8 +23,8 @@ def results(records: Sequence[Record], study: type[Study]) -> pd.DataFrame:
     The column `at` holds the key: the view, or what else the measure's values belong to. Each row holds the method's
     mean over the scenes, the standard error of the mean, and the bootstrap interval of the mean (`low`, `high`). The
     `lead` is the mean over the scenes of the reference method's value minus this method's value, and `lead_low` and
-    `lead_high` are its bootstrap interval. A method without values has no row. The statistics use only scenes in which
-    all other methods have a value.
+    `lead_high` are its bootstrap interval. A method without values has no row. A scene counts
+    only if every method that has a row has a value for the scene.
 
     **Raises:** `ValueError` if there are no records.
     """
@@ -80,9 +80,9 @@ def groups_of(table: pd.DataFrame) -> dict[str, int]:
 
 
 def tables(table: pd.DataFrame, study: type[Study], group: str = _ALL) -> list[tuple[str, pd.DataFrame]]:
-    """Return the titles and text cells of two tables per measure, made from a table of `results`.
+    """Return two tables of text per measure, each with its title, made from a table of `results`.
 
-    The first shows the means of the methods, and the second the leads: the reference's mean minus another method's.
+    The first has the means of the methods, the second has the leads: the reference's mean minus another method's.
     """
     texts = []
     for measure in study.measures:

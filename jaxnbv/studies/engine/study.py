@@ -271,7 +271,7 @@ class Study(eqx.Module):
     def episode_keys(self, method: str, scene: Scene) -> list[PRNGKeyArray]:
         """Return one random key per episode of a method.
 
-        By default there is one episode, and all methods share its key. `merge_runs` merges the records of several.
+        By default there is one episode, whose key all methods share. `merge_runs` merges records of several episodes.
         """
         return [self.key(scene.index, "episode")]
 

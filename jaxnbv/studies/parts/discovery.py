@@ -180,7 +180,7 @@ class PartDiscoveryStudy(Study):
     def segmenter_of(self, scene: Scene, num_points: int | None = None) -> PartSegmenter:
         """Return the segmenter for a scene.
 
-        - `num_points`: number of points that the segmenter gets; default: the number that it gets of an observed cloud.
+        - `num_points`: number of points that the segmenter gets; default: the number for an observed cloud.
         """
 
     @abstractmethod

@@ -18,7 +18,7 @@ class BankRecipe(NamedTuple):
 
     - `number`: number of shapes.
     - `kinds`: names of the kinds of shapes. Shape i is of kind `kinds[i % len(kinds)]`.
-    - `shape`: function that returns the shape with an index. Shapes are not rotated at random.
+    - `shape`: function that returns shape i, given i. Shapes are not rotated at random.
     """
 
     number: int

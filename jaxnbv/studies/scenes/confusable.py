@@ -120,7 +120,7 @@ def _pins() -> list[SignedDistance]:
 
 
 def _channels() -> list[SignedDistance]:
-    """Make blocks with a channel. The wall that carries a boss, and the boss's place along it, differ."""
+    """Make blocks with a channel and a boss on one of its walls. The wall and the place along it differ."""
     block = Difference(Cuboid(np.array([0.7, 0.6, 1.25])), _box([0.28, 0.28, 1.5], [0.0, 0.1, 0.0]))
     block = Difference(block, _box([0.2, 0.2, 0.2], [0.7, -0.6, 1.25]))
     places = [(wall, z) for wall in (-0.24, 0.24) for z in (-0.6, -0.2, 0.2, 0.6)]

@@ -48,7 +48,7 @@ def bed_of(truck: TriangleMesh) -> Float[np.ndarray, "2 3"]:
 
 
 def _rectangles(flags: Bool[np.ndarray, "m n"]) -> Iterator[tuple[int, slice, slice]]:
-    """Yield the widest all-True rectangle for each first and last row, as its area, rows and columns."""
+    """Yield area, rows and columns of the widest all-True rectangle for each pair of first and last row."""
     for top in range(len(flags)):
         is_whole = np.ones(flags.shape[1], bool)
         for bottom in range(top, len(flags)):
