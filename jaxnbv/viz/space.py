@@ -109,7 +109,7 @@ def _mesh(surface: MeanSurface, limit: int, grades: Float[np.ndarray, "2"]) -> d
 def _triangles(
     surface: MeanSurface, limit: int, style: dict[str, Any], grade: Float[np.ndarray, " v"] | None = None
 ) -> dict[str, Any]:
-    """Return a plotly trace of a surface, coarsened to at most `limit` vertices, in the colours of `grade`."""
+    """Return a plotly trace of a surface, coarsened to at most `limit` vertices, in colours of `grade`."""
     new_index, faces = clustered(surface.vertices, surface.faces, limit)
     count = np.bincount(new_index)
     vertices = np.stack([np.bincount(new_index, column) / count for column in surface.vertices.T], axis=1)
