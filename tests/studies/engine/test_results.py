@@ -16,9 +16,9 @@ def test_the_interval_of_a_share_is_that_of_a_binomial():
 
 
 def test_intervals_hold_the_truth_as_often_as_they_say():
-    low, high = interval(np.random.default_rng(2).normal(0.3, 1.0, (60, 400)))
-    # 0.90 minus the loss of the percentile bootstrap for 60 scenes, within three standard errors of 0.015.
-    assert 0.84 <= np.mean((low <= 0.3) & (high >= 0.3)) <= 0.94
+    low, high = interval(np.random.default_rng(2).normal(0.3, 1.0, (60, 200)))
+    # 0.90 minus the loss of the percentile bootstrap for 60 scenes, within three standard errors of 0.021.
+    assert 0.82 <= np.mean((low <= 0.3) & (high >= 0.3)) <= 0.96
 
 
 def test_scenes_are_resampled_as_a_whole():

@@ -16,7 +16,17 @@ from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.simulate import simulate
 from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning import SDFSurface, SensorNoise
-from jaxnbv.search import DiscreteSearch, GivenPoses, RandomView
+from jaxnbv.search import (
+    ConstrainedPoses,
+    DiscreteSearch,
+    FreePoses,
+    GivenPoses,
+    GradientSearch,
+    HalvingSearch,
+    HybridSearch,
+    RandomView,
+    SpherePoses,
+)
 from jaxnbv.studies.engine.run import replay, run_scene
 from jaxnbv.surfaces import GeometricSPSR
 from jaxnbv.tasks import Coverage
@@ -124,15 +134,30 @@ def test_the_first_view_shows_enough():
             return float(scan.points[scan.mask].mean(axis=0)[1]) > 0.3
 
     study = small(Picky)
-    for index in range(4):
-        assert float(study.candidates.poses().position[run_scene(study, index, ["random"])["first"]][1]) > 0.5
+    firsts = {study.first_view(study.scene(index)) for index in range(6)}
+    assert len(firsts) > 1
+    assert all(float(study.candidates.poses().position[first][1]) > 0.5 for first in firsts)
+    never = type("Never", (ToyStudy,), {"shows_enough": lambda *_: False})
     with pytest.raises(InputError, match="none of 3 candidates shows enough of ball 0"):
-        run_scene(small(Never, views=2, num_candidates=3), 0)
+        run_scene(small(never, views=2, num_candidates=3), 0)
 
 
-class Never(ToyStudy):
-    def shows_enough(self, scene, scan):
-        return False
+def test_a_method_without_shapes_runs_beside_the_same_with_shapes():
+    study = small(type("Twice", (ToyStudy,), {"without_bank": ("random",)}))
+    plain, again = run_scene(study, 0, ["random", "random-screened"])["methods"].values()
+    assert without_time(plain) == without_time(again)
+
+
+def test_the_name_of_a_method_tells_its_search():
+    """What each search proposes is tested with the searches."""
+    study = small(num_candidates=8, num_starts=2, iterations=3, learning_rate=0.1)
+    constrained = ConstrainedPoses(study.radius - 0.3, study.radius + 0.3)
+    spaces = {"2dof": SpherePoses(study.radius), "6dof": FreePoses(study.radius), "constrained": constrained}
+    expected = {f"gradient-{name}": GradientSearch(None, space, 2, 3, 0.1, 4) for name, space in spaces.items()}
+    expected |= {"halving": HalvingSearch(study.candidates), "any other": DiscreteSearch(study.candidates)}
+    expected["hybrid"] = HybridSearch(space=SpherePoses(study.radius), candidates=study.candidates)
+    for method, search in expected.items():
+        assert study.search(method, study.scene(0)) == search
 
 
 def test_unknown_methods_and_bad_numbers_are_refused():
@@ -156,12 +181,8 @@ def test_a_command_configures_it():
 def test_planners_have_the_studys_settings():
     study = small(sampler=dataclasses.replace(SAMPLER, carving=None))
     planner = study.planner("random", study.scene(0))
-    assert (
-        planner.sampler.num_samples,
-        planner.sampler.grid.resolution,
-        planner.capacity,
-        planner.max_views,
-    ) == (2, 16, 500, 3)
+    sizes = planner.sampler.num_samples, planner.sampler.grid.resolution, planner.capacity, planner.max_views
+    assert sizes == (2, 16, 500, 3)
     assert planner.sampler.carving is None
     assert isinstance(small().scene(0).surface, SDFSurface)
     keys = [small().key(*of) for of in ((0, "first"), (1, "first"), (0, "episode"))]

@@ -104,8 +104,7 @@ def name_of(pyramid):
 
 
 def test_the_mesh_lies_on_the_surface_and_holds_the_pyramid_less_its_imprint():
-    for index in range(5):
-        framing = list(Framing)[index % 2]
+    for index, framing in enumerate(Framing):
         pyramid = pyramid_scene(Split.VALIDATION, index, framing)
         plain = eqx.tree_at(lambda p: p.solid.depth, pyramid, jnp.asarray(0.0))
         grid = Grid(100, 0.52 * framing.longest_side)
@@ -189,7 +188,7 @@ def faces(pyramid, count=400):
 
 @pytest.mark.parametrize("framing", list(Framing))
 def test_points_of_the_faces_are_told_apart(framing):
-    for index in range(10):
+    for index in range(len(PATTERNS)):
         pyramid = pyramid_scene(Split.TEST, index, framing)
         for own, is_pattern in zip(faces(pyramid), (True, True, False, False), strict=True):
             assert len(own) > 100
@@ -229,7 +228,7 @@ def test_classes_take_turns_and_a_scene_is_the_same_however_it_is_built():
 
 
 def test_a_hidden_view_does_not_show_the_pattern():
-    candidates = sphere_candidates(40)
+    candidates = sphere_candidates(20)
     for index, framing in enumerate(Framing):
         pyramid = pyramid_scene(Split.TEST, index, framing)
         drawn = [hidden_view(pyramid, jax.random.key(seed), CAMERA, candidates) for seed in range(5)]

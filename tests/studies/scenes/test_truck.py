@@ -7,21 +7,18 @@ import pytest
 from solids import check_fills_its_box, mesh_of
 
 import jaxnbv as nbv
-from jaxnbv.studies.scenes import HOUSEHOLD, Split, truck_scene
+from jaxnbv.studies.scenes import Split, truck_scene
 
 COMPUTES = True
 CAMERA = nbv.Camera(height=40, width=40)
+
+distances = eqx.filter_jit(lambda solid, x: solid(x))
 
 
 @eqx.filter_jit
 def cargo_pixels(scene, poses):
     clouds = nbv.scan(nbv.SDFSurface(scene), CAMERA, poses)
     return jnp.sum(scene.on_cue(clouds.points) & clouds.mask, axis=-1), jnp.sum(clouds.mask, axis=-1)
-
-
-@eqx.filter_jit
-def distances(solid, x):
-    return solid(x)
 
 
 def alone(scene, wanted):
@@ -35,14 +32,14 @@ def up_of(scene):
     return np.asarray(scene.solid.rotation[0][:, 1])
 
 
-@pytest.mark.parametrize("label", range(len(HOUSEHOLD)))
+# A bathtub, a desk and a table: low and wide, high and hollow, round or square. All cargo is placed by its bounds.
+@pytest.mark.parametrize("label", [0, 3, 8])
 def test_the_cargo_stands_on_the_bed_and_within_its_walls(label):
     scene = truck_scene(Split.VALIDATION, label)
     check_fills_its_box(mesh_of(scene))
     own = np.asarray(scene.solid.rotation[0]).T
     truck, vertices = alone(scene, lambda of: of == 0), mesh_of(alone(scene, lambda of: of > 0)).vertices
-    cargo = vertices @ own.T
-    floor = np.asarray(scene.solid.centre[0]) @ own.T
+    cargo, floor = vertices @ own.T, np.asarray(scene.solid.centre[0]) @ own.T
     half = np.asarray(scene.solid.half_size[0])
     assert cargo[:, 1].min() == pytest.approx(floor[1] + half[1], abs=0.02)
     for axis in (0, 2):
@@ -51,16 +48,14 @@ def test_the_cargo_stands_on_the_bed_and_within_its_walls(label):
 
 
 def test_the_cargo_shows_from_above_alone():
-    for index in range(12):
+    for index in range(6):
         scene = truck_scene(Split.VALIDATION, index)
-        up = up_of(scene)
-        side = np.asarray(scene.solid.rotation[0][:, 2])
+        up, side = up_of(scene), np.asarray(scene.solid.rotation[0][:, 2])
         poses = nbv.look_at(2.5 * np.stack([up, -up, 0.95 * side - 0.3 * up]), up=side + 0.3 * up)
         pixels, clouds = cargo_pixels(scene, poses)
-        assert pixels[0] >= 40
+        assert 40 <= pixels[0] < 0.5 * clouds[0]
         assert pixels[1] == 0
         assert pixels[2] < 0.1 * clouds[2]
-        assert pixels[0] < 0.5 * clouds[0]
 
 
 def test_scenes_take_turns_are_the_same_each_time_and_differ_between_splits():
