@@ -8,6 +8,7 @@ from weight_space import WeightSpace, cloud
 
 import jaxnbv as nbv
 from jaxnbv.surfaces.covariance import function_normal_covariance, function_variance, normal_covariance
+from jaxnbv.surfaces.factor import CholeskyFactor
 
 RNG = np.random.default_rng(0)
 POINTS, NORMALS = RNG.uniform(-1.3, 1.3, (30, 3)), RNG.standard_normal((30, 3))
@@ -143,6 +144,10 @@ def test_kept_variance_is_the_prior_variance_of_weight_space(nu):
     variance = nbv.GeometricSPSR(lengthscale=0.1, variance=0.8, truncation=4, nu=nu).kept_variance
     oracle = WeightSpace(lengthscale=0.1, variance=0.8, truncation=4, nu=nu)
     np.testing.assert_allclose(variance, (oracle.amplitude**2).sum() / 0.8**3 + oracle.constant**2 / 0.8**3, rtol=1e-5)
+
+
+def test_a_matrix_that_is_not_positive_definite_has_a_factor_that_is_not_finite():
+    assert not np.isfinite(CholeskyFactor.of(jnp.asarray(np.diag([1.0, -1.0, 2.0]))).upper).all()
 
 
 def test_bad_clouds_are_refused():
