@@ -18,10 +18,8 @@ from jaxnbv.planning.alignment import _exponential, _in_camera, _linearise, _mat
 
 SIDES = np.array([0.12, 0.2, 0.15])
 AXES = np.concatenate([np.eye(3), -np.eye(3)])
-EYES = [
-    (0.6 * np.cos(angle) * np.cos(tilt), 0.6 * np.sin(angle) * np.cos(tilt), 0.6 * np.sin(tilt))
-    for angle, tilt in ((0.2, 0.6), (0.9, 0.9), (1.6, 0.3), (2.3, 0.8), (-0.5, 0.4), (0.5, 0.1))
-]
+ANGLES, TILTS = np.array([[0.2, 0.9, 1.6, 2.3, -0.5, 0.5], [0.6, 0.9, 0.3, 0.8, 0.4, 0.1]])
+EYES = 0.6 * np.stack([np.cos(ANGLES) * np.cos(TILTS), np.sin(ANGLES) * np.cos(TILTS), np.sin(TILTS)], axis=1)
 
 
 def random_motion(seed, degrees, length):
@@ -41,10 +39,8 @@ def views_of_a_box(errors, noise=0.0, eyes=EYES, roll=True):
         points[np.arange(4000), face % 3] = np.where(face < 3, 1.0, -1.0)
         points, normals = SIDES * points, AXES[face]
         is_visible = np.sum(normals * (np.array(eye) - points), axis=1) > 0
-        points, normals = (
-            points[is_visible] + noise * random.normal(size=(is_visible.sum(), 1)) * normals[is_visible],
-            normals[is_visible],
-        )
+        points, normals = points[is_visible], normals[is_visible]
+        points += noise * random.normal(size=(len(points), 1)) * normals
         up = Rotation.from_rotvec([0.0, 0.0, number * roll]).apply([1.0, 0.0, 0.2])
         true = np.asarray(look_at(eye, up=up).to_matrix(), np.float64)
         said = true @ np.linalg.inv(error)

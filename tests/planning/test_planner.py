@@ -217,6 +217,7 @@ def test_what_is_constant_under_jit_is_checked_too(planner, observations):
     begun = jax.jit(lambda: planner.init(FIRST, cloud))()
     np.testing.assert_array_equal(begun.cloud.points, observations.cloud.points)
     assert int(jax.jit(lambda observations: planner.observe(observations, FIRST, cloud).num_views)(observations)) == 2
+    assert eqx.filter_eval_shape(planner.propose, observations, jax.random.key(0)).value.shape == ()
     long = eqx.tree_at(lambda c: c.normals, cloud, 2 * cloud.normals)
     with pytest.raises(ValueError, match="not of unit length"):
         jax.jit(lambda: planner.init(FIRST, long))()

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 import trimesh
-from small_session import BOX, CAMERA, FIRST, POSES, WORLD, around, planner_of, session_of, shot
+from small_session import BOX, CAMERA, FIRST, POSES, WORLD, around, begun, planner_of, session_of, shot
 
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
@@ -18,25 +18,23 @@ from jaxnbv.geometry.volume import Box
 from jaxnbv.planning.loop import view_keys
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.session import Session
-from jaxnbv.planning.simulate import simulate
-from jaxnbv.planning.stopping import Budget, Covered, ValueBelow
+from jaxnbv.planning.stopping import Budget, StopRule, ValueBelow
 from jaxnbv.planning.travel import ValuePerCost
 from jaxnbv.sampler import StepInputs, SurfaceSampler
-from jaxnbv.scanning import Carving, Grid, Obstacles, SDFSurface, scan
-from jaxnbv.scanning.sdf import Sphere
+from jaxnbv.scanning import Carving, Grid, Obstacles, scan
 from jaxnbv.search import DiscreteSearch, FarthestView, GradientSearch, HalvingSearch, SphereCandidates
 from jaxnbv.surfaces import GeometricSPSR, OutsideBoundary, ScreenedSPSR
 from jaxnbv.tasks import Coverage
 from jaxnbv.viz import write_report
 
-CENTER_OF_BOX = np.mean(BOX, axis=0)
+CENTER_OF_BOX, KEY = np.mean(BOX, axis=0), jax.random.key(4)
+AWAY = POSES @ np.diag([-1.0, 1.0, -1.0, 1.0])
 
 
 @pytest.fixture(scope="module")
 def finished():
     """A session of three views."""
-    session = session_of()
-    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    session = begun(key=KEY)
     for _ in range(2):
         matrix = session.next().matrix
         session.add(shot(matrix), matrix, depth_scale=1e-3)
@@ -57,7 +55,7 @@ def test_a_session_equals_a_planner_in_the_scene(finished):
         cloud = PointCloud.from_depth(shot(matrix), CAMERA, pose, depth_scale=1e-3, box=box)
         in_scene = (frame.to_scene(pose), frame.to_scene(cloud), frame.to_scene(CAMERA))
         observations = planner.init(*in_scene) if observations is None else planner.observe(observations, *in_scene)
-        sample_key, search_key, _ = view_keys(jax.random.key(0), index + 1)
+        sample_key, search_key, _ = view_keys(KEY, index + 1)
         surfaces = planner.sampler.sample(observations, sample_key)
         proposal = planner.choose(StepInputs(observations, None, surfaces), search_key)
         matrix = np.asarray(frame.to_world(proposal.pose).matrix)
@@ -81,12 +79,18 @@ def test_its_matrices_are_the_users(finished):
     assert len(finished.views) == 3
 
 
-def test_its_cloud_lies_on_the_object_in_the_world(finished):
+def test_its_cloud_lies_on_the_object_in_the_world(finished, tmp_path):
+    """Without the rim about the box, which is modelled. The rim is not below the box, where the table is."""
     points, normals = finished.cloud.to_numpy()
     outward = points - np.array([0.3, 0.2, 0.101])
     assert len(points) == 400
     assert np.abs(np.linalg.norm(outward, axis=1) - 0.1).max() < 0.004
     assert np.median(np.sum(outward * normals, axis=1)) / 0.1 > 0.95
+    assert np.asarray(Box(*BOX)(points)).max() <= 0
+    modelled, _ = finished.frame.to_world(finished.observations.cloud).to_numpy()
+    assert modelled[:, 2].min() >= BOX[0][2] - 1e-6
+    finished.episode.save(tmp_path)
+    np.testing.assert_allclose(trimesh.load(tmp_path / "cloud.ply").vertices, points, atol=1e-6)
 
 
 def test_the_expected_depth_is_near_what_is_then_seen(finished):
@@ -102,16 +106,13 @@ def test_the_expected_depth_is_near_what_is_then_seen(finished):
     assert np.median(np.abs(expected - depth.reshape(12, 16))[both]) < 0.02
 
 
-@pytest.mark.parametrize(("convention", "unit"), [("opencv", 1.0), ("opengl", 1000.0)])
-def test_metres_and_millimetres_and_both_conventions_tell_the_same(convention, unit, finished):
-    axes = np.diag([1.0, -1.0, -1.0, 1.0]) if convention == "opengl" else np.eye(4)
-    session = session_of(convention=convention, poses=POSES @ axes)
-    session.add(shot(FIRST, unit), FIRST @ axes, depth_scale=1.0 / unit)
-    first = finished.episode.views[1].proposal
-    np.testing.assert_allclose(session.next().matrix @ axes, finished.frame.to_world(first.pose).matrix, atol=1e-5)
+def test_metres_and_millimetres_and_both_conventions_tell_the_same(finished):
+    axes = np.diag([1.0, -1.0, -1.0, 1.0])
+    session = session_of(convention="opengl", poses=POSES @ axes, key=KEY)
+    session.add(shot(FIRST, 1.0), FIRST @ axes)
     # Points that are rounded to millimetres differ, and so do the values.
-    if unit > 1:
-        assert float(session.next().proposal.value) == pytest.approx(float(first.value), rel=1e-4)
+    first = finished.episode.views[1].proposal.pose
+    np.testing.assert_allclose(session.next().matrix @ axes, finished.frame.to_world(first).matrix, atol=1e-5)
 
 
 @pytest.mark.parametrize("elevation", [-0.5 * np.pi, -0.3, 0.5])
@@ -125,23 +126,29 @@ def test_default_poses_are_above_the_object(elevation):
     assert least - 1e-3 < lowest < least + 0.1
 
 
-def test_poses_that_look_away_have_no_value_and_warn():
-    away = POSES @ np.diag([-1.0, 1.0, -1.0, 1.0])
-    session = session_of(poses=away)
-    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
-    with pytest.warns(UserWarning, match=r"the best view is worth 0.*give poses that look at the box"):
+@pytest.mark.parametrize(
+    ("planner", "worth"),
+    [(planner_of(), "0 ± 0"), (planner_of(num_samples=1), "0"), (planner_of(HalvingSearch()), "0 ± 0")],
+    ids=["several samples", "one sample", "default search"],
+)
+def test_poses_that_look_away_have_no_value_and_warn(planner, worth):
+    """A single sample has no standard error."""
+    session = begun(poses=AWAY, planner=planner)
+    with pytest.warns(UserWarning, match=rf"the best view is worth {worth}: none is sure.*give poses that look at the"):
         session.next()
+    assert (session.next().standard_error is None) == (worth == "0")
 
 
 def test_nothing_recompiles_after_the_second_image(compilations):
-    session, after = session_of(planner=planner_of(num_samples=2)), []
+    session, after = session_of(), []
     matrix = FIRST
     for _ in range(5):
         session.add(shot(matrix), matrix, depth_scale=1e-3)
         matrix = session.next().matrix
         after.append(len(compilations))
-    assert after[0] > 0
     assert after[2:] == [after[2]] * 3
+    jax.lax.neg(np.ones(1741, np.float32))
+    assert len(compilations) > after[-1], "the counter does not see eager operations"
 
 
 def test_an_unreached_pose_is_not_proposed_again():
@@ -190,45 +197,28 @@ def test_an_image_beside_the_box_is_warned_of():
         session.add(shot(POSES[0]), inverse, depth_scale=1e-3)
 
 
-@pytest.mark.parametrize("unit", [1.0, 1000.0])
-def test_an_image_of_an_earlier_moment_than_its_pose_is_refused(unit, tmp_path):
+def test_an_image_of_an_earlier_moment_than_its_pose_is_refused(tmp_path):
     """Also by a session that is loaded from its folder. From the same pose the image may be added again."""
-    stale = shot(FIRST, unit)
-    session_of(tmp_path).add(stale, FIRST, depth_scale=1.0 / unit)
-    session = session_of(tmp_path)
-    with pytest.raises(
-        InputError, match=r"bit for bit equal to image 1, which has a different pose.*Discard the frames"
-    ):
-        session.add(stale.copy(), POSES[0], depth_scale=1.0 / unit)
-    session.add(stale, FIRST.astype(np.float32), depth_scale=1.0 / unit)
+    begun(tmp_path)
+    session, stale = session_of(tmp_path), shot(FIRST)
+    with pytest.raises(InputError, match=r"bit for bit equal to image 1, which has a diff.*Discard the frames"):
+        session.add(stale.copy(), POSES[0], depth_scale=1e-3)
+    session.add(stale, FIRST.astype(np.float32), depth_scale=1e-3)
     stale[20, 20] += 1
-    session.add(stale, POSES[0], depth_scale=1.0 / unit)
+    session.add(stale, POSES[0], depth_scale=1e-3)
     assert len(session.views) == len(list(tmp_path.glob("image_*"))) == 3
 
 
-BLANK = {
-    "zeros": np.zeros((48, 64), np.uint16),
-    "65535": np.full((48, 64), 65535, np.uint16),
-    "10000": np.full((48, 64), 10000, np.uint16),
-    "nan": np.full((48, 64), np.nan),
-}
-
-
-@pytest.mark.parametrize("name", BLANK)
-def test_a_later_image_that_measured_nothing_is_no_view(name, tmp_path):
-    session = session_of(tmp_path)
-    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+def test_a_later_image_that_measured_nothing_is_no_view(tmp_path):
+    session = begun(tmp_path)
     before = session.observations
-    for matrix in POSES[:2]:
+    for index, value in enumerate((0, 65535, 10000, np.nan)):
+        image = np.full((48, 64), value, float if index == 3 else np.uint16)
         with pytest.warns(UserWarning, match="measured nothing .* left out: take it again"):
-            session.add(BLANK[name], matrix, depth_scale=1e-3)
+            session.add(image, POSES[index], depth_scale=1e-3)
     assert len(session.views) == len(list(tmp_path.glob("image_*"))) == 1
     assert session.observations is before
-
-
-def test_an_image_past_the_object_is_a_view():
-    session = session_of()
-    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    # An image past the object is a view.
     session.add(np.full((48, 64), np.inf), POSES[0], depth_scale=1e-3)
     assert len(session.views) == 2
 
@@ -237,9 +227,7 @@ def test_an_image_past_the_object_is_a_view():
     ("make", "message"),
     [
         (lambda: session_of().next(), "no image yet: add one first"),
-        (lambda: session_of().cloud, "no image yet: add one first"),
         (lambda: session_of().observations, "no image yet: add one first"),
-        (lambda: session_of().episode, "no image yet: add one first"),
         (lambda: session_of(box=((0.0, 0.0), (1.0, 1.0))), "give two corners"),
         (lambda: session_of(box=((0.0, 0.0, 0.0), (1.0, 1.0, -1.0))), "has no inside"),
         (lambda: session_of(planner=planner_of(GradientSearch())), "GradientSearch is no search over candidates"),
@@ -264,22 +252,10 @@ def test_the_box_is_the_volume_of_the_model_and_of_the_carving():
     assert fitted.camera.fov == pytest.approx(CAMERA.fov)
 
 
-def test_a_rim_about_the_box_is_modelled_and_not_given(finished):
-    """Beside and above the box, but not below it, where the table is."""
-    box, world = Box(*BOX), finished.frame.to_world(finished.observations.cloud)
-    beyond = np.asarray(world.points)[np.asarray(world.mask)]
-    assert (beyond[:, 2] >= BOX[0][2] - 1e-6).all()
-    points, _ = finished.cloud.to_numpy()
-    assert len(points) > 0
-    assert np.asarray(box(points)).max() <= 0
-
-
 def test_a_box_that_cuts_the_object_warns_once_for_each_face():
     """Two centimetres of the ball are beyond the box at +x, and nothing at the other faces."""
     session = session_of(box=(BOX[0], (0.38, 0.32, 0.24)))
-    with pytest.warns(
-        UserWarning, match=r"go on beyond the box at \+x: \d+ % of the points .* larger box"
-    ) as warning_list:
+    with pytest.warns(UserWarning, match=r"beyond the box at \+x: \d+ % of the points .* larger box") as warning_list:
         session.add(shot(FIRST), FIRST, depth_scale=1e-3)
     assert len(warning_list) == 1
     with warnings.catch_warnings():
@@ -289,10 +265,9 @@ def test_a_box_that_cuts_the_object_warns_once_for_each_face():
 
 def test_travel_counts_from_where_the_camera_was(finished):
     """Not from the proposed pose. In metres about the middle of the box."""
-    plain, priced = session_of(), session_of(planner=dataclasses.replace(planner_of(), cost=ValuePerCost(fixed=0.5)))
+    plain, priced = begun(), begun(planner=dataclasses.replace(planner_of(), cost=ValuePerCost(fixed=0.5)))
     actual = around(3.0, 0.7)
     for session in (plain, priced):
-        session.add(shot(FIRST), FIRST, depth_scale=1e-3)
         proposed = session.next().matrix
         assert np.abs(proposed - actual).max() > 0.1
         session.add(shot(actual), actual, depth_scale=1e-3)
@@ -308,8 +283,7 @@ def test_travel_counts_from_where_the_camera_was(finished):
 
 def test_distances_are_metres_to_cameras_that_were_there():
     """A proposal that was not followed is not proposed again, but no camera stood there."""
-    session = session_of(planner=planner_of(FarthestView()))
-    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    session = begun(planner=planner_of(FarthestView()))
     refused, actual = session.next().matrix, around(3.3, 0.4)
     session.add(shot(actual), actual, depth_scale=1e-3)
     places = np.array([FIRST[:3, 3], actual[:3, 3]])
@@ -319,21 +293,17 @@ def test_distances_are_metres_to_cameras_that_were_there():
     assert session.next().value == pytest.approx(distance[~is_refused].max(), rel=1e-4)
 
 
-def test_a_rule_sees_the_value_that_the_user_sees():
-    value = (session := session_of(until=ValueBelow(0.0))).add(shot(FIRST), FIRST, depth_scale=1e-3)
-    assert session.done() is None
-    value = session.next().value
-    for limit, ends in ((1.001 * value, True), (0.999 * value, False)):
-        session = session_of(until=ValueBelow(limit))
-        session.add(shot(FIRST), FIRST, depth_scale=1e-3)
-        assert (session.done() is not None) == ends
+class Samples(StopRule):
+    """A rule that uses the posterior samples, and never ends a session."""
+
+    def after(self, context):
+        assert context.surfaces().values.ndim == 4
 
 
 def test_done_and_next_share_their_samples(monkeypatch, tmp_path):
     drawn, sample = [], SurfaceSampler.sample
     monkeypatch.setattr(SurfaceSampler, "sample", lambda *args: drawn.append(1) or sample(*args))
-    session = session_of(tmp_path, until=ValueBelow(0.0) | Covered(1.0))
-    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    session = begun(tmp_path, until=ValueBelow(0.0) | Samples())
     assert session.done() is None
     assert not list(tmp_path.glob("proposal*")), "what is only asked about is not stored"
     session.next()
@@ -343,8 +313,7 @@ def test_done_and_next_share_their_samples(monkeypatch, tmp_path):
 
 def test_views_that_only_a_rule_scored_are_not_proposed(tmp_path):
     """After a call of `done` alone, an image of the user's follows no proposal, live and after loading."""
-    session = session_of(tmp_path, until=ValueBelow(0.0))
-    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    session = begun(tmp_path, until=ValueBelow(0.0))
     assert session.done() is None
     actual = around(3.0, 0.7)
     session.add(shot(actual), actual, depth_scale=1e-3)
@@ -357,67 +326,15 @@ def test_views_that_only_a_rule_scored_are_not_proposed(tmp_path):
     assert resumed.next_view.value == session.next().value
 
 
-def test_a_single_sample_has_no_error_and_warns_of_nothing_left():
-    away = POSES @ np.diag([-1.0, 1.0, -1.0, 1.0])
-    session = session_of(poses=away, planner=planner_of(num_samples=1))
-    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
-    with pytest.warns(UserWarning, match=r"the best view is worth 0: none is sure"):
-        session.next()
-    assert session.next().standard_error is None
-
-
-def test_the_default_search_says_when_nothing_is_left():
-    """Halving has standard errors too."""
-    away = POSES @ np.diag([-1.0, 1.0, -1.0, 1.0])
-    session = session_of(poses=away, planner=planner_of(HalvingSearch()))
-    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
-    with pytest.warns(UserWarning, match=r"the best view is worth 0 ± 0: none is sure"):
-        session.next()
-
-
-def test_its_episode_is_stored_in_the_world(finished, tmp_path):
-    finished.episode.save(tmp_path)
-    stored = trimesh.load(tmp_path / "cloud.ply")
-    np.testing.assert_allclose(stored.vertices, finished.cloud.to_numpy()[0], atol=1e-6)
-
-
-def test_a_session_proposes_as_a_simulation_does(monkeypatch):
-    """Equal scans with the world as the scene give equal poses, bit for bit."""
-    search = DiscreteSearch(SphereCandidates(12, min_elevation=-1.0))
-    planner = dataclasses.replace(planner_of(search), obstacles=Obstacles())
-    scene, first, key = SDFSurface(Sphere(0.9)), look_at((0.8, 0.9, 2.2)), jax.random.key(4)
-    episode = simulate(planner, scene, first, 4, key, progress=False)
-    scans = iter(view.scan for view in episode.views)
-    monkeypatch.setattr(PointCloud, "from_depth", lambda *args: next(scans))
-    session = session_of(
-        camera=planner.camera,
-        box=Box(),
-        planner=planner,
-        up="y",
-        poses=None,
-        obstacles=None,
-        key=key,
-        correct_mount=None,
-    )
-    pose = first
-    for view in episode.views:
-        np.testing.assert_array_equal(pose.position, view.pose.position)
-        np.testing.assert_array_equal(pose.rotation, view.pose.rotation)
-        session.add(np.zeros((12, 16)), np.asarray(pose.matrix, np.float64))
-        pose = session.next().proposal.pose
-    np.testing.assert_array_equal(session.cloud.points, episode.cloud.points)
-
-
-def test_it_is_done_by_its_rule(finished):
+def test_it_is_done_by_its_rule_of_the_value_that_the_user_sees(finished):
     assert finished.done() is None
-    session = session_of(until=ValueBelow(1e9))
-    assert session.done() is None
-    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    assert session_of(until=ValueBelow(1e9)).done() is None
+    assert begun(until=Budget(seconds=1e9)).done() is None
+    value = begun().next().value
+    session = begun(until=ValueBelow(1.001 * value))
     assert "less than" in session.done()
     assert session.episode.stop_reason == session.done()
-    session = session_of(until=Budget(seconds=1e9))
-    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
-    assert session.done() is None
+    assert begun(until=ValueBelow(0.999 * value)).done() is None
 
 
 @pytest.mark.slow
@@ -427,12 +344,14 @@ def test_a_report_stands_upright_and_needs_no_truth(finished, tmp_path):
     assert page.count("<li>View") == 3
 
 
+DEEP = (0.18, 0.08, -0.02), BOX[1]
 BELOW = np.array([[around(angle, -0.4), around(angle, 0.6)] for angle in (0.5, 2.5, 4.5)]).reshape(-1, 4, 4)
 
 
 def test_the_table_is_detected_and_avoided_with_a_warning():
-    """The box reaches two centimetres into the table. Half of the poses are below the table."""
-    session = session_of(box=((0.18, 0.08, -0.02), BOX[1]), poses=BELOW, obstacles=None)
+    """The box reaches two centimetres into the table. Half of the poses are below the table. The table is part of the
+    object on request."""
+    session = session_of(box=DEEP, poses=BELOW, obstacles=None)
     with pytest.warns(UserWarning, match=r"stands on a plane through \[.*, -0\.00.*Obstacles\(\) to keep it"):
         session.add(shot(FIRST), FIRST, depth_scale=1e-3)
     points, _ = session.cloud.to_numpy()
@@ -440,6 +359,13 @@ def test_the_table_is_detected_and_avoided_with_a_warning():
     assert (points[:, 2] > 0.001).mean() > 0.98
     assert np.isneginf(np.asarray(session.next().proposal.values)[::2]).all()
     assert session.next().matrix[2, 3] > 0.1
+    kept = session_of(box=DEEP, poses=BELOW)
+    with pytest.warns(UserWarning, match="go on beyond the box") as warning_list:
+        kept.add(shot(FIRST), FIRST, depth_scale=1e-3)
+    assert not any("stands on a plane" in str(one.message) for one in warning_list)
+    points, _ = kept.cloud.to_numpy()
+    assert (points[:, 2] < 0.001).mean() > 0.1
+    assert np.isfinite(np.asarray(kept.next().proposal.values)).all()
 
 
 def test_a_room_scanned_from_inside_needs_poses_inside():
@@ -463,10 +389,10 @@ def test_a_room_scanned_from_inside_needs_poses_inside():
     assert np.asarray(Box(*room)(inside.next().matrix[:3, 3])) < 0
 
 
-@pytest.mark.parametrize("up", ["y", "-y", "x", "-x", "-z"])
+@pytest.mark.parametrize("up", ["y", "-x", "-z"])
 def test_the_table_reveals_a_wrong_up(up):
     """The warning comes once, with the right axis."""
-    session = session_of(box=((0.18, 0.08, -0.02), BOX[1]), obstacles=None, up=up)
+    session = session_of(box=DEEP, obstacles=None, up=up)
     with pytest.warns(UserWarning, match="no table is found") as warning_list:
         session.add(shot(FIRST), FIRST, depth_scale=1e-3)
     message = f'no table is found with up="{up}", but a plane would be one with up="z": give that'
@@ -474,25 +400,12 @@ def test_the_table_reveals_a_wrong_up(up):
 
 
 def test_a_missing_table_warns_unless_obstacles_are_given():
-    image = np.where(
-        shot(FIRST) * 1e-3 * np.linalg.norm(CAMERA.pixel_directions(), axis=1).reshape(48, 64) < 0.6, shot(FIRST), 0
-    )
+    away = shot(FIRST) * np.linalg.norm(CAMERA.pixel_directions(), axis=1).reshape(48, 64)
+    image = np.where(away < 600.0, shot(FIRST), 0)
     session = session_of(obstacles=None)
-    with pytest.warns(
-        UserWarning, match=r'no table is found under the box with up="z".*Obstacles\(\) if there is none'
-    ):
+    with pytest.warns(UserWarning, match=r'no table .* under the box with up="z".*Obstacles\(\) if there is none'):
         session.add(image, FIRST, depth_scale=1e-3)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         session.add(image, FIRST, depth_scale=1e-3)
         session_of(obstacles=Obstacles()).add(image, FIRST, depth_scale=1e-3)
-
-
-def test_a_table_is_part_of_the_object_on_request():
-    session = session_of(box=((0.18, 0.08, -0.02), BOX[1]), poses=BELOW, obstacles=Obstacles())
-    with pytest.warns(UserWarning, match="go on beyond the box") as warning_list:
-        session.add(shot(FIRST), FIRST, depth_scale=1e-3)
-    assert not any("stands on a plane" in str(one.message) for one in warning_list)
-    points, _ = session.cloud.to_numpy()
-    assert (points[:, 2] < 0.001).mean() > 0.1
-    assert np.isfinite(np.asarray(session.next().proposal.values)).all()

@@ -35,10 +35,6 @@ def sensor_of(camera=CAMERA, noise=SensorNoise()):
     return lambda pose, key: observe_scene(SCENE, camera, pose, noise, key)
 
 
-def planner(search, views=4):
-    return planner_of(search, max_views=views)
-
-
 def views_of(planner, key=KEY, noise=SensorNoise(), camera=CAMERA, first=FIRST):
     for step in Loop(planner, key, camera=camera).steps(sensor_of(camera, noise), first):
         yield step.view
@@ -52,7 +48,7 @@ def assert_same(a, b):
 
 def test_a_finer_sensor_sees_more_from_the_same_poses():
     """Nothing is computed for views that nobody asks for."""
-    own = planner(FarthestView(CANDIDATES))
+    own = planner_of(FarthestView(CANDIDATES))
     fine = views_of(own, camera=Camera(height=16, width=16))
     for view, coarse in zip(itertools.islice(fine, 3), views_of(own), strict=False):
         assert view.scan.capacity == 256
@@ -63,16 +59,10 @@ def test_a_finer_sensor_sees_more_from_the_same_poses():
 
 
 def test_it_ends_at_full_capacity_and_fails_without_candidates():
-    assert len(list(views_of(planner(FarthestView(CANDIDATES), 1)))) == 1
-    few = views_of(planner(FarthestView(2), 4), first=sphere_candidates(2)[0])
-    assert len(list(itertools.islice(few, 2))) == 2
-    with pytest.raises(InputError, match="have been visited"):
-        next(few)
-
-
-def test_recorded_views_are_replayed_without_proposals():
-    own, requests = planner(RandomView(CANDIDATES)), []
+    """Recorded views are replayed without proposals."""
+    own, requests = planner_of(RandomView(CANDIDATES)), []
     whole = list(views_of(own))
+    assert len(whole) == 6
 
     def sensor(pose, key):
         requests.append(pose)
@@ -81,12 +71,16 @@ def test_recorded_views_are_replayed_without_proposals():
     done = [(view.pose, view.scan, view.proposal) for view in whole[:2]]
     for step, expected in zip(Loop(own, KEY).steps(sensor, FIRST, done), whole, strict=True):
         assert_same(step.view, expected)
-    assert len(requests) == 2
+    assert len(requests) == 4
+    few = views_of(planner_of(FarthestView(2)), first=sphere_candidates(2)[0])
+    assert len(list(itertools.islice(few, 2))) == 2
+    with pytest.raises(InputError, match="have been visited"):
+        next(few)
 
 
 def test_a_step_holds_the_samples_and_the_observations_that_the_next_view_is_chosen_from():
-    own = planner(DiscreteSearch(CANDIDATES), 3)
-    first, second, third = Loop(own, KEY).steps(sensor_of(), FIRST)
+    own = planner_of(DiscreteSearch(CANDIDATES))
+    first, second, third = itertools.islice(Loop(own, KEY).steps(sensor_of(), FIRST), 3)
     assert (first.inputs, first.seconds) == (None, 0.0)
     assert_same(third.inputs.observations, second.observations)
     again = own.choose(third.inputs, jax.random.key(0))
@@ -106,16 +100,16 @@ def test_an_episode_frees_each_posterior_before_the_next(monkeypatch):
         return result
 
     monkeypatch.setattr(SurfaceSampler, "posterior", told)
-    simulate(planner(DiscreteSearch(CANDIDATES), 4), SCENE, FIRST, 4, KEY, progress=False)
+    simulate(planner_of(DiscreteSearch(CANDIDATES)), SCENE, FIRST, 4, KEY, progress=False)
     assert len(references) == 3
 
 
 def test_another_acquisition_or_search_does_not_compile_the_sampler_again(compilations):
-    own = planner(DiscreteSearch(CANDIDATES))
+    own = planner_of(DiscreteSearch(CANDIDATES))
     observations = own.init(FIRST, next(views_of(own)).scan)
     surfaces = own.sampler.sample(observations, KEY)
     jax.block_until_ready(surfaces.values)
     del compilations[:]
-    other = eqx.tree_at(lambda p: p.acquisition, planner(UncertaintyView(CANDIDATES)), FirstRow())
+    other = eqx.tree_at(lambda p: p.acquisition, planner_of(UncertaintyView(CANDIDATES)), FirstRow())
     assert_same(other.sampler.sample(observations, KEY), surfaces)
     assert not compilations

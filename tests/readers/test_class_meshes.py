@@ -26,31 +26,20 @@ def found_in(folder, classes):
 
 def test_meshes_of_classes_take_turns_and_other_folders_are_passed_over(tmp_path):
     """In ModelNet's layout, with `test` and underscores, and at any depth."""
-    box_files(
-        tmp_path, "bench/a.obj", "chair/b.obj", "chair/a.ply", "Night_Stand/train/a.off", "Night_Stand/test/c.off"
-    )
-    box_files(tmp_path, "chair/deep/er/c.stl")
+    box_files(tmp_path, "bench/a.obj", "chair/b.obj", "chair/a.ply", "chair/deep/er/c.stl")
+    box_files(tmp_path, "Night_Stand/train/a.off", "Night_Stand/test/c.off")
     (tmp_path / "chair" / "readme.txt").write_text("no mesh")
-    files = class_meshes(tmp_path, HOUSEHOLD)
-    assert [(HOUSEHOLD[mesh.label], Path(mesh.path).name) for mesh in files] == [
-        ("chair", "a.ply"),
-        ("night stand", "c.off"),
-        ("chair", "b.obj"),
-        ("chair", "c.stl"),
-    ]
+    names = [(HOUSEHOLD[mesh.label], Path(mesh.path).name) for mesh in class_meshes(tmp_path, HOUSEHOLD)]
+    assert names == [("chair", "a.ply"), ("night stand", "c.off"), ("chair", "b.obj"), ("chair", "c.stl")]
 
 
 def test_copies_of_modelnet_are_turned_upright(tmp_path):
-    names = ("bathtub/test/bathtub_0107", "bathtub/test/bathtub_0108", "night_stand/test/night_stand_0201")
-    box_files(tmp_path, *(f"{name}.off" for name in names), "bathtub/train/bathtub_0001.off", "chair/y_up.off")
+    box_files(tmp_path / "bathtub", "test/bathtub_0107.off", "test/bathtub_0108.off", "train/bathtub_0001.off")
+    box_files(tmp_path, "night_stand/test/night_stand_0201.off", "chair/y_up.off")
     (tmp_path / "README.txt").write_text("of the data set")
     files, names = found_in(tmp_path, HOUSEHOLD)
-    assert names == [
-        ("bathtub", "bathtub_0107"),
-        ("chair", "y_up"),
-        ("night stand", "night_stand_0201"),
-        ("bathtub", "bathtub_0108"),
-    ]
+    bathtubs = [("bathtub", "bathtub_0107"), ("bathtub", "bathtub_0108")]
+    assert names == [bathtubs[0], ("chair", "y_up"), ("night stand", "night_stand_0201"), bathtubs[1]]
     for file, sides in ((files[0], [2.5, 0.625, 1.25]), (files[1], [2.5, 1.25, 0.625])):
         np.testing.assert_allclose(np.ptp(file.read().vertices, axis=0), sides)
 
