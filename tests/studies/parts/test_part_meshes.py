@@ -44,14 +44,8 @@ def folder(tmp_path):
 
 
 def small_study(folder, **settings):
-    model = GeometricSPSR(lengthscale=0.05, truncation=8)
-    small = {
-        "views": 3,
-        "num_candidates": 12,
-        "num_samples": 2,
-        "sampler": SurfaceSampler(model),
-        "grid_resolution": 20,
-    }
+    sampler = SurfaceSampler(GeometricSPSR(lengthscale=0.05, truncation=8))
+    small = {"views": 3, "num_candidates": 12, "num_samples": 2, "sampler": sampler, "grid_resolution": 20}
     limits = {"capacity": 1500, "camera": Camera(height=32, width=32), "imagined_rays": 12, "num_points": 100}
     return MeshPartStudy(meshes=MeshPartStudy.files_in(folder), room=3, **(small | limits | settings))
 
@@ -94,12 +88,8 @@ def test_it_asks_for_the_parts_that_can_be_seen_and_counts_their_points(folder, 
     study = small_study(folder)
     assert study.num_scenes == 2
     record = run_scene(study, 0, ("discrete", "farthest"))
-    assert (record["name"], record["category"], record["parts"], record["of"]) == (
-        "table a",
-        "table",
-        ["post", "slab"],
-        3,
-    )
+    assert (record["name"], record["category"], record["of"]) == ("table a", "table", 3)
+    assert record["parts"] == ["post", "slab"]
     scene = study.scene(0)
     for run in record["methods"].values():
         for counts, (_, observations) in zip(run["counts"], replay(study, scene, run), strict=True):
