@@ -296,7 +296,7 @@ REFUSED = {
     "a mesh that is no file": (lambda: nbv.load_mesh(D), "give str or Path or Trimesh or Scene"),
     "a face of ten million": (lambda: mesh_of_text("boast.off", BOAST), "of the 10000000 faces"),
     "a cost that is not a number": (lambda: costing(lambda a, b: jnp.nan * b.position[0]), "the cost of going"),
-    "a utility that is infinite later": (lambda: proposed(infinite_later), "must be finite"),
+    "a utility that is infinite later": (lambda: proposed(infinite_later), "points is inf: it must be finite"),
     "a utility of nothing": (lambda: planner(lambda cloud: None), "the utility of a cloud is None"),
     "a utility of complex numbers": (
         lambda: planner(lambda cloud: jnp.sum(cloud.points) * 1j),
