@@ -211,7 +211,7 @@ class ExpectedUtilityImprovement(Acquisition):
         return self.answer(cloud) if answer is None else answer
 
     def check(self, cloud: PointCloud) -> None:
-        """Raise `ValueError` if the utility's own `check` does, or if the utility of the cloud is not finite."""
+        """Raise `ValueError` for a utility that is not finite, and whenever the utility's `check` raises it."""
         self.utility.check(cloud)
         _, value = context_of(self, cloud)
         name, count = self.utility.name, int(cloud.count)
@@ -367,8 +367,8 @@ def expected_value(
     - `surfaces`: the samples along a leading axis.
     - `barrier`: distance along each ray to an obstacle, see `scan`.
 
-    **Raises:** `ValueError` if the acquisition's `check` does (traced values are not checked), or if JAX cannot trace a
-    user's function.
+    **Raises:** `ValueError` if JAX cannot trace a user's function, and whenever the acquisition's `check` raises it
+    (traced values are not checked).
     """
     inputs = _inputs(acquisition, observations)
     # `check` needs concrete results. Under jit, results (and this zero) are traced even if all inputs are concrete.

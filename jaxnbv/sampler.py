@@ -69,8 +69,9 @@ class SurfaceSampler(eqx.Module):
     - `model`: the prior over surfaces.
     - `grid`: the grid on which samples are evaluated and scanned, and on which empty space is stored.
     - `num_samples`: number of posterior samples per step.
-    - `carving`: removes sampled surface in empty space and outside a volume. A model that can use empty space is also
-      conditioned on empty space. With None, samples depend only on D, as in the paper.
+    - `carving`: removes sampled surface from space that was seen to be empty, and from outside a volume. A model that
+      uses empty space, such as `ScreenedSPSR`, is also conditioned on it. With None, nothing is removed, empty space is
+      not used, and samples depend only on the cloud D, as in the paper.
 
     No sample extends into a known obstacle, with or without carving. Methods accept `Observations` on the same grid, or
     a `PointCloud`.
@@ -111,8 +112,9 @@ class SurfaceSampler(eqx.Module):
         - `quick`: use fewer frequencies.
         - `volume`: by default a cube about the origin whose sides are `longest_side`. A volume that you pass may cut
           the object.
-        - `solid`: leave out `EmptySpace`. Set this for a body that is nowhere thin, such as the pyramid. The hidden
-          side of such a body is as large as its visible side, so unseen space next to empty space need not be empty.
+        - `solid`: leave out `EmptySpace`, which assumes that unseen space next to empty space is likely to be empty
+          too. Set this for a body that is nowhere thin, such as the pyramid: its hidden side is as large as its visible
+          side, so the assumption does not hold.
 
         **Raises:** `ValueError` for an unknown name, or a longest side that is not positive.
         """
@@ -169,8 +171,8 @@ class SurfaceSampler(eqx.Module):
     def posterior(self, observations: Observations | PointCloud) -> SurfacePosterior:
         """Return p(f | observations), without carving. Empty nodes outside the volume are ignored.
 
-        **Raises:** `ValueError` if the model's `condition` does, or if the observations have a different grid than the
-        sampler.
+        **Raises:** `ValueError` if the observations have a different grid than the sampler, and whenever the model's
+        `condition` raises it.
         """
         observations = self.adapt(observations)
         if self.carving is None or observations.empty_nodes is None:
@@ -188,7 +190,7 @@ class SurfaceSampler(eqx.Module):
 
         - `posterior`: the result of `posterior(observations)`, if it is already computed.
 
-        **Raises:** `ValueError` if `SurfaceSampler.posterior` does, or if the samples are not finite.
+        **Raises:** `ValueError` if the samples are not finite, and whenever `SurfaceSampler.posterior` raises it.
         """
         check_key(key)
         check_type(posterior, SurfacePosterior | None, "the posterior")
@@ -208,7 +210,7 @@ class SurfaceSampler(eqx.Module):
     def step_inputs(self, observations: Observations | PointCloud, key: PRNGKeyArray) -> StepInputs:
         """Return the observations, their posterior and `num_samples` samples of the posterior.
 
-        **Raises:** `ValueError` if `sample` does.
+        **Raises:** `ValueError` whenever `sample` raises it.
         """
         observations = self.adapt(observations)
         posterior = self.posterior(observations)
@@ -239,7 +241,7 @@ class SurfaceSampler(eqx.Module):
     ) -> Float[Array, "g g g"]:
         """Return E f minus the level at the grid's nodes, carved like the samples.
 
-        **Raises:** `ValueError` if `SurfaceSampler.posterior` does.
+        **Raises:** `ValueError` whenever `SurfaceSampler.posterior` raises it.
         """
         posterior = self.posterior(observations) if posterior is None else posterior
         values = posterior.mean_on_grid(self.grid.axis.astype(posterior.level.dtype)) - posterior.level
@@ -252,7 +254,7 @@ class SurfaceSampler(eqx.Module):
         At each node, the estimate is the fraction of the samples that are below the level there. `num_samples` samples
         are drawn with a fixed key and carved. This works for any model.
 
-        **Raises:** `ValueError` if `sample` does.
+        **Raises:** `ValueError` whenever `sample` raises it.
         """
         return jnp.mean(self.sample(observations, jax.random.key(0)).values < 0, axis=0)
 
@@ -261,11 +263,12 @@ class SurfaceSampler(eqx.Module):
         """Return a mesh of the surface where the carved posterior mean equals its level (marching cubes).
 
         The mesh is in scene coordinates (its frame is the identity), with faces wound outward. Where nothing was
-        scanned, the surface is the model's prediction. Connected components with fewer than four points of the cloud
-        are left out, and a warning gives their number. The mesh is open where it leaves the grid.
+        scanned, the mesh shows the surface that the model predicts. Connected components of the mesh that have fewer
+        than four points of the cloud near them are left out, and a warning gives their number. If the surface leaves
+        the grid, the mesh ends there with an open edge.
 
-        **Raises:** `ValueError` if the mean does not cross its level within the grid, or if `SurfaceSampler.posterior`
-        does.
+        **Raises:** `ValueError` if the mean equals its level nowhere in the grid, and whenever
+        `SurfaceSampler.posterior` raises it.
         """
         values = np.array(self.mean(observations))
         triangles = level_triangles(values, self.grid)

@@ -17,12 +17,13 @@ _NUM_CENTERS, _NUM_SELECTED = 384, 320
 
 
 class PairLevel(eqx.Module):
-    """One level of grouping: a perceptron on features of pairs and neighbours, then a maximum.
+    """One level of grouping: the features of each centre, computed from the neighbours in its group.
 
-    The maximum is over the neighbours in the group of a centre. The features of a centre with position x_i and normal
-    n_i and a neighbour with x_j and n_j are (|d|^2, n_i . d, n_j . d, n_i . n_j) with d = (x_j - x_i) / radius. These
-    are the point-pair features of Drost et al. (2010) without the square root and the arc cosines, so derivatives exist
-    everywhere.
+    A perceptron takes the pair features of centre and neighbour, and the neighbour's own features if there are any. The
+    features of the centre are the maximum of its outputs over the neighbours. The pair features of a centre with
+    position x_i and normal n_i and a neighbour with x_j and n_j are (|d|^2, n_i . d, n_j . d, n_i . n_j) with
+    d = (x_j - x_i) / radius. These are the point-pair features of Drost et al. (2010) without the square root and the
+    arc cosines, so derivatives exist everywhere.
 
     - `radius`: radius of a group, in the units of the points.
     - `groups`: intended number of centres. The caller chooses the centres.

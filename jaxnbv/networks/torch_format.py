@@ -177,7 +177,7 @@ class _Dictionary(OrderedDict):
 
 
 class _Placeholder:
-    """The replacement for all unknown names in a file. It accepts any arguments and does nothing."""
+    """Stands for each class or function that a pickle names and that is not allowed. It does nothing."""
 
     def __new__(cls, *_: Any) -> "_Placeholder":
         return super().__new__(cls)

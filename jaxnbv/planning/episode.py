@@ -137,7 +137,7 @@ class Episode(eqx.Module):
     def open(self, path: str | Path) -> RunFolder:
         """Open or create a folder for the views of this episode, and return it.
 
-        **Raises:** `ValueError` as `RunFolder` does.
+        **Raises:** `ValueError` if the folder holds results of a different configuration, or other files.
         """
         names = ("planner", "scene", "noise", "first", "key", "frame")
         config = {name: getattr(self, name) for name in names}

@@ -55,7 +55,7 @@ class Intake:
 
         - `accepted`: function that is called after all checks and before the view is added.
 
-        **Raises:** `ValueError` as `Session.add` does. Nothing changes then.
+        **Raises:** `ValueError` in the cases that `Session.add` lists. Nothing changes then.
         """
         index = len(self.images)
         image.check_not_stale(self.images)

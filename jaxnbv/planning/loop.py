@@ -177,7 +177,7 @@ class Loop:
         - `pose`: actual pose of the sensor, which may differ from the proposed pose.
         - `accepted`: function that is called after all checks and before the view is added, for example to store it.
 
-        **Raises:** `ValueError` as `Planner.init` and `Planner.observe` do. The loop does not change then.
+        **Raises:** `ValueError` whenever `Planner.init` or `Planner.observe` raises it. The loop does not change then.
         """
         if self._observations is None:
             observations = self.planner.init(pose, scan, self.camera)
@@ -202,7 +202,7 @@ class Loop:
 
         - `first`: pose of the first view.
 
-        **Raises:** `ValueError` as `propose` and `add` do.
+        **Raises:** `ValueError` whenever `propose` or `add` raises it.
         """
         pose, inputs, seconds = first, None, 0.0
         if self.views:
@@ -223,7 +223,7 @@ class Loop:
         - `first`: pose of the first view.
         - `stored`: stored views of the same episode, in order. They are added first, and the sensor is not used.
 
-        **Raises:** `ValueError` as `take` does, for example when every candidate has been visited.
+        **Raises:** `ValueError` whenever `take` raises it, for example when every candidate has been visited.
         """
         for pose, scan, proposal in stored:
             if proposal is not None:
@@ -238,7 +238,7 @@ class Loop:
     def propose(self) -> Proposal:
         """Return the proposal for the next view. The proposal stays the same until a view is added.
 
-        **Raises:** `ValueError` before the first view, and as `Planner.propose` does.
+        **Raises:** `ValueError` before the first view, and whenever `Planner.propose` raises it.
         """
         self._next.is_proposed = True
         return self._next_proposal()
@@ -273,7 +273,7 @@ class Loop:
 
         The rule is evaluated once for each view. If the rule needs samples or a proposal, `propose` reuses these.
 
-        **Raises:** `ValueError` as `propose` does, if the rule needs the next proposal.
+        **Raises:** `ValueError` if the rule needs the next proposal and `propose` raises it.
         """
         if self.until is None or self._first_view_time is None or not self.views:
             return None

@@ -134,8 +134,8 @@ class Planner(eqx.Module):
 
         **Raises:** `ValueError` if the cloud is empty, if a point is not finite or outside the scene's grid, if more
         than a few stray points are outside the carving's volume, if a normal's length differs from 1 by more than 1 %,
-        or if a sensor's scan does not have one row for each ray of the camera. Also raises what the acquisition's
-        `check` raises.
+        or if a sensor's scan does not have one row for each ray of the camera; and whenever the acquisition's `check`
+        raises it.
         """
         camera = camera or self.camera
         self._check(pose, scan, camera, is_first=True)
@@ -192,7 +192,7 @@ class Planner(eqx.Module):
         - `views`: pose and scan of each view.
         - `camera`: the camera that took the scans, by default the planner's.
 
-        **Raises:** `ValueError` as `init` and `observe` do.
+        **Raises:** `ValueError` whenever `init` or `observe` raises it.
         """
         observations = None
         for pose, scan in views:

@@ -241,9 +241,9 @@ class Session:
     @property
     @own_settings()
     def object_pose(self) -> ObjectPose:
-        """World pose of the most probable part.
+        """World pose of the most probable part, at its most probable placement.
 
-        **Raises:** `ValueError` as `identity` does.
+        **Raises:** `ValueError` before the first image, or if the planner has no known parts.
         """
         return object_pose(hypotheses_of(self.observations), self.observations, self.frame)
 
@@ -275,7 +275,7 @@ class Session:
         The rule is evaluated once for each image. If the rule needs posterior samples or a proposal, `next` reuses
         these. Nothing is stored in the folder.
 
-        **Raises:** `ValueError` as `next` does, if the rule needs the next proposal.
+        **Raises:** `ValueError` if the rule needs the next proposal and `next` raises it.
         """
         with self._planning():
             return self._loop.done()
@@ -300,7 +300,7 @@ class Session:
 
         **Raises:** `ValueError` in the following cases. The session does not change then.
 
-        - `PointCloud.from_depth`, `Pose.from_matrix`, `Planner.init` or `Planner.observe` raises.
+        - `PointCloud.from_depth`, `Pose.from_matrix`, `Planner.init` or `Planner.observe` raises it.
         - The first image shows nothing of the box.
         - The image is identical to an earlier image that has a different pose.
         - A different process has added images to the folder.
@@ -341,8 +341,8 @@ class Session:
         - `seconds`: time limit for calls of `reachable`, which may be slow. After this time, the best reachable pose so
           far is used.
 
-        **Raises:** `ValueError` as `Planner.propose` does, before the first image, if no pose can be reached, or if a
-        different process has added images to the folder.
+        **Raises:** `ValueError` before the first image, if no pose can be reached, if a different process has added
+        images to the folder, and whenever `Planner.propose` raises it.
         """
         if self._next is None:
             with self._lock_folder() as folder, self._planning():
@@ -368,7 +368,7 @@ class Session:
         The image has the resolution of the planner's camera. A pixel is the mean depth over the posterior samples, or
         NaN if the ray misses most samples. Return None if the search uses no samples.
 
-        **Raises:** `ValueError` as `next` does.
+        **Raises:** `ValueError` whenever `next` raises it.
         """
         proposal, surfaces = self.next().proposal, self._loop.inputs().surfaces
         if surfaces is None:

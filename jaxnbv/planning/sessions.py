@@ -47,7 +47,7 @@ class Sessions:
       segmentation. The default is 2 % of the longest side of the box.
     - `folder`: folder with a subfolder for each session. If a subfolder exists, its session continues.
 
-    **Raises:** `ValueError` as `Session` does, or for a planner without known parts.
+    **Raises:** `ValueError` for a planner without known parts, and whenever `Session` raises it.
     """
 
     @checked
@@ -106,7 +106,7 @@ class Sessions:
           all images. By default, objects are clusters of points above the table. A cluster belongs to an earlier object
           if the cluster is within `gap` of this object's points, or of the surface of this object's probable parts.
 
-        **Raises:** `ValueError` as `Session.add` does, or if no image so far shows an object.
+        **Raises:** `ValueError` if no image so far shows an object, and whenever `Session.add` raises it.
         """
         pixels = as_numbers(depth, "the depth image", None)
         pose = Pose.from_matrix(as_numbers(matrix, "the matrix of a pose", np.float64))
@@ -154,7 +154,8 @@ class Sessions:
         the stop rule does not hold yet, or over all objects if there is no such object. The result stays the same until
         an image is added. No pose is proposed twice.
 
-        **Raises:** `ValueError` before the first image, if all candidates were proposed, or as `Planner.propose` does.
+        **Raises:** `ValueError` before the first image, if all candidates were proposed, and whenever
+        `Planner.propose` raises it.
         """
         require(len(self.objects) > 0, "there is no image yet: add one first, sessions.add(depth, matrix)")
         if self._next is None:

@@ -42,12 +42,12 @@ class _Points(NamedTuple):
 
 
 def table_under(cloud: PointCloud, box: Box) -> Obstacles | None:
-    """Return the half space below the plane that an object stands on; None if no such plane is detected.
+    """Return the table under an object as an obstacle; None if no table is detected.
 
-    The margin of the returned obstacle is the default margin, or three standard deviations of the table points' heights
-    over the plane if this is larger. RANSAC (Fischler and Bolles 1981) draws planes through random points, which are
-    mostly close to the box. Among all planes that can be a table, the plane with the most points outside the box is
-    used. A plane can be a table if it satisfies four conditions:
+    The obstacle is the half space below the table's plane. Its margin is the default margin, or three standard
+    deviations of the table points' heights over the plane if this is larger. RANSAC (Fischler and Bolles 1981) draws
+    planes through random triples of points, which are mostly close to the box. Among the planes that can be a table,
+    the one with the most points outside the box is used. A plane can be a table if it satisfies four conditions:
 
     - It is level to within 30 degrees, so it is not a wall.
     - Its height at the middle of the box is below the top of the box. It is at most a quarter of the box's longest side

@@ -48,8 +48,9 @@ class Grid(eqx.Module):
     def cell_of(self, points: Float[Array, "*n 3"]) -> Int[Array, "*n 3"]:
         """Return the index of the cell that holds each point (scene coordinates).
 
-        Cells have the indices 0 to `resolution - 2` along each axis. For a point outside the grid, at least one index
-        is larger than that. No index is negative, since JAX would count a negative index from the other end.
+        Along each axis, cell i lies between the nodes i and i + 1, for i from 0 to `resolution - 2`. For a point
+        outside the grid, at least one index is above `resolution - 2`. No index is negative, since JAX would count it
+        from the other end.
         """
         cell = jnp.floor((points + self.half_extent) / self.spacing).astype(jnp.int32)
         return jnp.where(cell < 0, self.resolution, cell)

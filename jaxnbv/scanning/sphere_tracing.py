@@ -138,7 +138,7 @@ class _March(eqx.Module):
     - `max_depth`: depth at which the ray leaves the ball in which surfaces are searched.
     - `depth`, `value`: current depth, and the signed distance at this depth.
     - `previous_depth`, `previous_value`: depth one stride earlier, and the signed distance at that depth.
-    - `is_unfinished`: whether the ray is unfinished.
+    - `is_unfinished`: whether the ray has neither crossed the boundary nor left the ball.
     """
 
     origins: Float[Array, "n 3"]

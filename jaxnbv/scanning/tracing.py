@@ -40,7 +40,7 @@ class March(NamedTuple):
     - `t_end`: t at which the ray leaves the box. Once the ray has reached a cell with a zero, `t_end` is the t at which
       it leaves this cell. So if t < t_end after the march, there is a zero between t and t_end.
     - `sign`: sign of f at the start; zero until it has been computed.
-    - `is_unfinished`: whether the ray is unfinished.
+    - `is_unfinished`: whether the ray has neither reached the cell of its first zero nor left the box.
     """
 
     entry: Triple
@@ -151,7 +151,13 @@ _traced_zero = jax.custom_batching.custom_vmap(_first_zero)
 
 @_traced_zero.def_vmap
 def _traced_zero_batched(size: int, batched, field: GridField, u: list[Array], du: list[Array]):
-    """Trace the rays of all entries of a `vmap` as one batch if they share a field, which is faster."""
+    """Rule for `vmap` of `_traced_zero`.
+
+    If all entries share one field, their rays are traced as one batch, which is faster. Otherwise `_first_zero` is
+    mapped over the entries as usual.
+
+    - `size`, `batched`: number of entries, and a tree of bools that says which arguments have an axis of entries.
+    """
     u, du = jax.tree.map(
         lambda x, is_batched: x if is_batched else jnp.broadcast_to(x, (size, *x.shape)), (u, du), tuple(batched[1:])
     )

@@ -25,7 +25,9 @@ FirstFaces: TypeAlias = Callable[
 
 
 def first_faces(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> FirstFaces:
-    """Return a function that traces rays through these triangles (scene coordinates).
+    """Return a function that finds the first triangle on each ray, and its distance, see `FirstFaces`.
+
+    - `vertices`, `faces`: the triangles, in scene coordinates.
 
     **Raises:** `ValueError` if neither Embree nor libigl is installed.
     """

@@ -40,7 +40,7 @@ class RandomView(Baseline):
 class UncertaintyView(Baseline):
     """Baseline that proposes the candidate whose principal ray has the most uncertain hit.
 
-    The source is Holalkere et al. (2025). The transmittance T(t) is the fraction of samples whose surface the ray has
+    The source is Holalkere et al. (2025). The transmittance T(t) is the fraction of sampled surfaces that the ray has
     not entered before distance t. The value is the length of the ray between the first t with T(t) < 1 and the last t
     with T(t) > 0.05.
     """
@@ -63,9 +63,9 @@ class UncertaintyView(Baseline):
 def uncertain_length(problem: Problem, poses: Pose) -> Float[Array, " poses"]:
     """Return the length of each pose's principal ray along which its hit is uncertain, in scene units.
 
-    The length is from the first point with T < 1 to the last point with T > 0.05. The transmittance T is the fraction
-    of samples that the ray has not entered yet, evaluated every half cell within the samples' grid. The length is zero
-    for a ray that hits no sample or misses the grid.
+    The transmittance T at a point of the ray is the fraction of sampled surfaces that the ray has not entered before
+    this point. It is evaluated every half cell within the samples' grid. The length is from the first point with T < 1
+    to the last point with T > 0.05. It is zero for a ray that hits no sampled surface or misses the grid.
     """
     surfaces = problem.surfaces
     grid = surfaces.grid

@@ -44,7 +44,7 @@ class PoseSpace(eqx.Module):
         """
 
     def check_camera(self, camera: Camera) -> None:
-        """Raise `ValueError` if the camera's image is too narrow for the poses.
+        """Raise `ValueError` if the camera's field of view is too narrow for the poses.
 
         By default, every camera is valid.
         """
@@ -169,9 +169,9 @@ class ConstrainedPoses(PoseSpace):
         return Pose(_product(_product(rotation, rotation_between(target, to_origin)), roll_matrix), position)
 
     def check_camera(self, camera: Camera) -> None:
-        """Raise `ValueError` if an edge of the image is less than `off_axis` from the optical axis.
+        """Raise `ValueError` if the angle from the optical axis to an image edge is less than `off_axis`.
 
-        The origin could then be outside the image.
+        The scene's origin, which is the centre of the object, could then be outside the image.
         """
         left, top, right, bottom = camera.edges
         half = math.atan(min(-left, -top, right, bottom))

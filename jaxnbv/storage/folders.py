@@ -88,9 +88,11 @@ def read_json(file: Path, problem: str, remedy: str) -> dict[str, Any]:
 
 
 def write_arrays(file: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write arrays to a .npz file, completely or not at all.
+    """Write arrays to a compressed .npz file. If this fails, an existing file stays as it is.
 
-    **Raises:** `ValueError` if `write_whole` does, or if the arrays are larger than `read_arrays` accepts.
+    - `arrays`: the arrays, keyed by the name under which `read_arrays` returns them.
+
+    **Raises:** `ValueError` if the arrays are larger than `read_arrays` accepts, and whenever `write_whole` raises it.
     """
     size = sum(array.nbytes for array in arrays.values())
     require(size <= MAX_ARRAY_BYTES, f"cannot write {file}: its arrays have {size} bytes, more than {MAX_ARRAY_BYTES}")

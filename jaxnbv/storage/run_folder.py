@@ -99,7 +99,7 @@ class RunFolder(ResultFolder):
 
         - `parts`: Equinox modules, arrays or None, keyed by name.
 
-        **Raises:** `ValueError` if `write_whole` does.
+        **Raises:** `ValueError` whenever `write_whole` raises it.
         """
         self.bind()
         leaves = jax.tree_util.tree_leaves_with_path(parts)

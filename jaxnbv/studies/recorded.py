@@ -138,8 +138,8 @@ class RecordedStudy(Study):
     - `box`: the region of interest, in the recording's units.
     - `voxel`: side of the counted voxels, in the recording's units.
 
-    **Raises:** `ValueError` as `RecordedFrames` does, or if the box holds no voxel that three frames show. These errors
-    are raised when `recording` is first read.
+    **Raises:** `ValueError` if the box holds no voxel that three frames show, and whenever `RecordedFrames` raises it.
+    These errors are raised when `recording` is first read.
     """
 
     title: ClassVar[str] = "Voxels of a recorded place that were seen"

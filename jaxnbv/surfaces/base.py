@@ -189,7 +189,7 @@ class SurfaceModel(eqx.Module):
 
     @property
     def carries_hypotheses(self) -> bool:
-        """Whether `add_state` adds hypotheses about the identity of a known part, see `PartHypotheses`."""
+        """Whether `add_state` adds `PartHypotheses` about which known part the object is."""
         return False
 
     def check(self, cloud: PointCloud) -> None:

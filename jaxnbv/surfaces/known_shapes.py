@@ -2,13 +2,15 @@
 
     prior      f = m_k(T^-1 x) + g,   k ~ pi over shapes 1..K and 0 for none of these,   T the placement of the shape,
                g a Gaussian process, the residual
-    mean       m_k = h tanh(d_k / h), d_k the signed distance of shape k, h as in `ScreenedSPSR.offset`
-    weights    w_k proportional to exp(-beta E_k) over distinct fits (`Hypotheses.is_distinct`),  w_0 to exp(-beta E_0)
-    sample     shapes by systematic resampling of w; then f about the mean m_k, or for k = 0 a sample of the model
-               without known shapes
+    mean       m_k = h tanh(d_k / h), d_k the signed distance of shape k
+    weights    w_i proportional to exp(-beta E_i) for fit i = (k, T),   w_0 to exp(-beta E_0) for none of these
+    sample     fits by systematic resampling of w; then f about the mean m_k(T^-1 x), or for i = 0 a sample of the
+               model without known shapes
 
-E_k is the misfit of shape k to the scan (`surfaces/registration.py`), E_0 is `misfit_of_none`. The factor beta keeps
-several shapes possible. A likelihood that treats thousands of normals as independent would always select one shape.
+A fit, or hypothesis, is a shape with a placement. One shape may have several fits, and w is over the distinct ones
+(`Hypotheses.is_distinct`). h is half the rise of f across the surface, the unit of values in `ScreenedSPSR`. E_i is the
+misfit of fit i to the scan (`surfaces/registration.py`), E_0 is `misfit_of_none`. The factor beta keeps several shapes
+possible. A likelihood that treats thousands of normals as independent would always select one shape.
 """
 
 import dataclasses
@@ -93,7 +95,7 @@ class KnownShapes(SurfaceModel):
 
     @property
     def carries_hypotheses(self) -> bool:
-        """Whether the bank has parts at true size."""
+        """Whether `add_state` adds `PartHypotheses`: only for a bank with parts at true size."""
         return self.bank.is_true_size and self.bank.solids is not None
 
     def in_scene(self, frame: Frame) -> "KnownShapes":
@@ -119,7 +121,7 @@ class KnownShapes(SurfaceModel):
 
         The shapes are registered to the cloud and to the space that was seen to be empty.
 
-        **Raises:** `ValueError` if the `condition` of `residual` or of `model_of_none` does.
+        **Raises:** `ValueError` whenever the `condition` of `residual` or of `model_of_none` raises it.
         """
         observations = as_observations(observations)
         of_none = self.model_of_none.condition(observations)

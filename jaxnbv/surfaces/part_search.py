@@ -126,14 +126,15 @@ def _keep_distinct(hypotheses: Hypotheses, count: int) -> Hypotheses:
 def _starts(bank: ShapeBank, prior: Prior, targets: FitTargets, num_starts: int) -> Placement:
     """Return start placements (axis 1) of each shape (axis 0): rotations, each at a few positions.
 
-    At each position the bounding box of the shape contains the scan, if the box is large enough. The first position of
-    a rotation centres the scan across the line of sight, and puts it on the shape's front. The other positions are
-    spread over all positions that contain the scan, so they differ much if the scan is a small patch of the shape.
+    The scan stays where it is, and the shape is moved: at each position the bounding box of the rotated shape contains
+    the scan, if it is large enough. At the first position of a rotation, the box is centred on the scan across the line
+    of sight, and its side that faces the sensor touches the scan. The other positions are spread over all positions
+    that contain the scan, so they differ much if the scan is a small patch of the shape.
     """
     dtype = targets.points.dtype
     rotations = jnp.asarray(prior.poses.rotations_of(len(bank), max(1, num_starts // _NUM_POSITIONS)), dtype)
     count = rotations.shape[1]
-    # A low-discrepancy sequence (Roberts 2018). The first position centres the scan and puts it on the shape's front.
+    # A low-discrepancy sequence (Roberts 2018), after the first position.
     increments = np.array([0.8191725134, 0.6710436067, 0.5497004779])
     sequence = (0.5 + np.arange(1, count * (_NUM_POSITIONS - 1) + 1)[:, None] * increments) % 1.0
     first = np.tile([[[0.5, 0.5, 1.0]]], (1, count, 1))
@@ -163,7 +164,10 @@ def _starts(bank: ShapeBank, prior: Prior, targets: FitTargets, num_starts: int)
 
 
 def _axes_of_sight(targets: FitTargets) -> Float[Array, "3 3"]:
-    """Return as rows two directions across the line of sight, and the mean normal, which faces the sensor."""
+    """Return orthogonal unit vectors as rows: two across the line of sight, one toward the sensor.
+
+    The direction toward the sensor is estimated by the mean normal of the scan.
+    """
     mean = jnp.sum(jnp.where(targets.mask[:, None], targets.normals, 0.0), axis=0)
     length = jnp.linalg.norm(mean)
     normal = jnp.where(length > 0, mean / jnp.where(length > 0, length, 1.0), jnp.eye(3, dtype=mean.dtype)[2])

@@ -128,7 +128,7 @@ class Upright(ShapePoses):
     - `axis`: the vertical direction, which is the same in the frames of the shapes and in the scene.
     - `within`: the search starts at angles between -`within` and `within`, in radians. Refined angles may lie outside.
 
-    **Raises:** `ValueError` if `ShapePoses` does, for a zero axis, or for an angle `within` outside (0, pi].
+    **Raises:** `ValueError` for a zero axis, an angle `within` outside (0, pi], and whenever `ShapePoses` raises it.
     """
 
     axis: tuple[float, float, float] = eqx.field(static=True, default=(0.0, 1.0, 0.0))

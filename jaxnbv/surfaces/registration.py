@@ -270,7 +270,8 @@ def _mean(values: Float[Array, " n"], mask: Bool[Array, " n"]) -> Float[Array, "
 def _misfit(
     shape: Shape, prior: Prior, placement: Placement, targets: FitTargets, tau: Float[Array, ""] | float
 ) -> Float[Array, ""]:
-    """Return the misfit E of a placed shape. `jax.jvp` computes all n_j . grad d(x_j) in one pass."""
+    """Return the misfit E of a placed shape. `tau`: scale of the distances in E, in scene units."""
+    # One pass of `jax.jvp` computes all d(x_j) and n_j . grad d(x_j).
     distance, slope = jax.jvp(lambda x: placement.distance(shape.solid, x), (targets.points,), (targets.normals,))
     empty = placement.distance(shape.solid, targets.empty)
     return _sum_terms(distance, slope, empty, prior.deviation(shape, placement), targets, tau)

@@ -53,10 +53,10 @@ class ScreenedSPSR(SurfaceModel):
       lengthscale for the overall shape, which lets values affect f far from their points.
     - `values`: sources of values, see `jaxnbv.surfaces.values`.
     - `level_deviation`: prior standard deviation of the level, which is broad compared with the values of f.
-    - `offset`: distance in scene units. The rise of E f across the surface at a point x_j is the value outside minus
-      the value inside, E f(x_j + offset n_j) - E f(x_j - offset n_j), given the normals alone. The unit h of values is
-      half the median rise, but at least half the prior standard deviation of f, because the two sides of a thin sheet
-      cancel.
+    - `offset`: distance from the surface, in scene units, at which the unit h of values is measured. The rise at a
+      point x_j is the value outside minus the value inside, E f(x_j + offset n_j) - E f(x_j - offset n_j), given the
+      normals alone. h is half the median rise. On a thin sheet the two sides cancel and the rise is near zero, so h is
+      at least half the prior standard deviation of f.
 
     N normals and M values take 3 N^2 M + M^3 operations in addition to the cost of `base`.
 
@@ -88,9 +88,9 @@ class ScreenedSPSR(SurfaceModel):
 
         The cost is that of the base, plus one triangular solve with the base's factor for each value.
 
-        **Raises:** `ValueError` if `GeometricSPSR.condition` does, for a capacity above 16,384, for values that are not
-        finite or at points outside [-pi/2, pi/2]^3, or if the covariance of the values is singular in the dtype's
-        precision. Under `jit` values cannot be checked, and the posterior is NaN instead.
+        **Raises:** `ValueError` for a capacity above 16,384, for values that are not finite or at points outside
+        [-pi/2, pi/2]^3, if the covariance of the values is singular in the dtype's precision, and whenever
+        `GeometricSPSR.condition` raises it. Under `jit` values cannot be checked, and the posterior is NaN instead.
         """
         observations = as_observations(observations)
         capacity = observations.cloud.capacity

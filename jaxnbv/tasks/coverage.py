@@ -77,18 +77,18 @@ class NewSurface(Acquisition):
 
         alpha(D, scan) = sum_x a(x) clip(d(x) / s - 1, 0, 1),   a(x) = r^2 omega / cos
 
-    The sum is over the hits x of the scan. d(x) is the distance from x to the nearest surface that any earlier view
-    measured, see `Looks`. a(x) is the area of the pixel on the surface: omega is the pixel's solid angle, r the
-    distance from the camera, and cos the cosine of the angle of incidence, clipped to at least 0.5. Rays of one scan do
-    not overlap, so no surface counts twice. In the paper's `Coverage`, near surfaces dominate because they fill more
-    pixels, and a single far point may also dominate. `NewSurface` has neither problem.
+    The sum is over the hits x of the scan. d(x) is the distance from x to the nearest hit of any earlier view, see
+    `Looks`. A hit x counts as seen if d(x) <= s, as new if d(x) >= 2 s, and in part in between. a(x) is the area of the
+    pixel on the surface: omega is the pixel's solid angle, r the distance from the camera, and cos the cosine of the
+    angle of incidence, clipped to at least 0.5. Rays of one scan do not overlap, so no surface counts twice. In the
+    paper's `Coverage`, near surfaces dominate because they fill more pixels, and a single far point may also dominate.
+    `NewSurface` has neither problem.
 
     Use a search over candidates. `NewSurface` is differentiable in the pose wherever `Coverage` is, but most of the
     gain comes from jumps of rays, which the derivative leaves out.
 
-    - `size`: the length s, in scene units also in sessions. Surface within s of a hit has been seen, and surface
-      farther than 2 s is new. The default is the spacing of the grid of `Looks`. A smaller size is raised to this
-      spacing.
+    - `size`: the length s, in scene units also in sessions. The default is the spacing of the grid of `Looks`. A
+      smaller size is raised to this spacing.
 
     For observations without `Looks`, such as a single cloud, or if 2 s exceeds `Looks.reach`, d(x) is the distance to
     the nearest point of the cloud D. The default of s is then 0.05. A size below the median distance between nearest

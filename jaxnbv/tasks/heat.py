@@ -70,8 +70,9 @@ class ColdestPoint(Utility):
     def __call__(self, cloud: PointCloud) -> Float[Array, ""]:
         """Return the negative lowest temperature of one cloud, in degrees.
 
-        Under `vmap`, all clouds are computed in one call. If the minimum would be over no points, return the negative
-        of `HeatProblem.highest`, an upper bound of all temperatures. Any point then is an improvement.
+        Under `vmap`, all clouds are computed in one call on the host. A cloud without points over which to take the
+        minimum counts as having the temperature `HeatProblem.highest`, an upper bound of all temperatures. So any point
+        that a later scan adds improves the utility.
         """
         source = jnp.asarray(self.heat.source, cloud.points.dtype)
         # The source may be traced, so it is passed as an array together with the cloud.

@@ -54,7 +54,7 @@ class HostSegmenter(Segmenter):
     - `num_parts`: number of parts.
     - `version`: see `HostClassifier`.
 
-    **Raises:** as `HostClassifier` does.
+    **Raises:** `ValueError` for an attempt to differentiate. If the function fails, JAX raises a `RuntimeError`.
     """
 
     function: Callable = eqx.field(static=True)

@@ -62,7 +62,7 @@ class Words:
 
     @property
     def shown(self) -> Sequence[int]:
-        """Indices of the answer's numbers that are shown."""
+        """Indices, into `answer.names` and `answer.values`, of the numbers that texts show."""
         return range(len(self.answer.names))
 
     @property
@@ -96,7 +96,7 @@ class Words:
     def settled(self, answers: Sequence[Answer], holds: Holds) -> list[bool]:
         """Return, for each view, whether the answer after this view is reliable.
 
-        - `answers`: answers after all views. The last one is this answer.
+        - `answers`: one answer per view, in order. The last one is this answer.
         - `holds`: function that returns whether a stop rule held after a view, given the index of the view from 0.
         """
         return [False, *(np.allclose(now.values, was.values, rtol=_MAX_CHANGE) for was, now in pairwise(answers))]
@@ -104,7 +104,7 @@ class Words:
     def charts(self, answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...]:
         """Return charts of the answers over the views.
 
-        - `answers`: answers after all views. The last one is this answer.
+        - `answers`: one answer per view, in order. The last one is this answer.
         - `truth`: the answer if all of the surface had been seen, or None.
         """
         names = self.answer.names

@@ -86,7 +86,7 @@ def missing_regions(episode: Episode, smallest: float = 0.0) -> list[Region]:
 
     - `smallest`: area that a region must exceed, in squared world units.
 
-    **Raises:** `ValueError` as `surface_mesh` does.
+    **Raises:** `ValueError` for an episode without views, or whose grid holds no surface.
     """
     mesh, planner, frame = surface_mesh(episode), episode.planner, episode.frame
     is_measured = np.asarray(mesh.face_attributes["measured"], bool)
@@ -115,7 +115,7 @@ def save_cloud(episode: Episode, path: str | Path) -> Path:
 
     Only a PLY file holds the normals.
 
-    **Raises:** `ValueError` as `scanned_cloud` does, for a different suffix, or if the file cannot be written.
+    **Raises:** `ValueError` for an episode without views, for a different suffix, or if the file cannot be written.
     """
     points, normals = scanned_cloud(episode).to_numpy()
     kind = _kind(path, _CLOUD_FORMATS)
@@ -132,7 +132,8 @@ def save_mesh(episode: Episode, path: str | Path, imagined: bool = True) -> Path
 
     Only a PLY file holds the deviation of each vertex, and whether each face was measured.
 
-    **Raises:** `ValueError` as `surface_mesh` does, for a different suffix, or if the file cannot be written.
+    **Raises:** `ValueError` for a different suffix, if the file cannot be written, and whenever `surface_mesh` raises
+    it.
     """
     kind = _kind(path, _MESH_FORMATS)
     return _write(path, surface_mesh(episode, imagined).export(file_type=kind))

@@ -58,8 +58,11 @@ class Imagined(eqx.Module):
 
 
 def render_imagined(episode: Episode, index: int, inputs: StepInputs) -> Imagined | None:
-    """Return pictures of the surfaces imagined before view `index` (from 0); None for a given view.
+    """Return pictures of the surfaces imagined before view `index`, or None.
 
+    The result is None if the planner did not choose this view, or if the search used neither samples nor parts.
+
+    - `index`: number of the view, from 0. The planner does not choose view 0.
     - `inputs`: inputs of the step that chose the view, with the samples.
     """
     planner, sampler, view = episode.planner, episode.planner.sampler, episode.views[index]

@@ -94,7 +94,8 @@ def placed_parts(hypotheses: PartHypotheses, count: int) -> list[PlacedShape]:
 def likeliest_part(hypotheses: PartHypotheses, cloud: PointCloud | None = None) -> PlacedShape | None:
     """Return the likeliest part at its placement; None if "none of these" is more likely.
 
-    - `cloud`: scanned points. Without them, all of the part counts as measured, and hypotheses are not compared.
+    - `cloud`: scanned points. Without them, the result counts as measured and agreed everywhere, and its
+      `disputed_space` is None.
     """
     if next(iter(hypotheses.names())) == NONE:
         return None

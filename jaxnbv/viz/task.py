@@ -27,7 +27,12 @@ from jaxnbv.viz.answers import Chart, CoverageAnswer, capital, words_of
 
 
 class Comparison(NamedTuple):
-    """Result of a different search from the same first view: name, sentence, and charts of a `TaskReport`."""
+    """An episode with a different search from the same first view, for comparison in a `TaskReport`.
+
+    - `name`: kind of the search in words, such as "farthest view".
+    - `sentence`: number of its views, and its last answer.
+    - `charts`, `coverage_chart`: as in `TaskReport`, for this episode.
+    """
 
     name: str
     sentence: str
@@ -43,7 +48,7 @@ class TaskReport(NamedTuple):
       amounts.
     - `question`, `choice_text`, `answer_text`, `reliability_text`: texts for the head of the report: the question, how
       views were chosen, the answer, and from which view on the answer is reliable.
-    - `rival`: result of a different search, or None.
+    - `rival`: an episode with a different search, or None.
     """
 
     amounts: Sequence[CoverageAnswer]
@@ -168,7 +173,7 @@ def first_reliable(is_reliable: Sequence[bool]) -> int | None:
 
 
 def first_lost(is_reliable: Sequence[bool]) -> int | None:
-    """Return the first view (from 1) with a reliable answer if a later one is unreliable; None otherwise."""
+    """Return the first view (from 1) with a reliable answer if reliability is lost later; else None."""
     index = int(np.argmax(is_reliable))
     return index + 1 if is_reliable[index] and not all(is_reliable[index:]) else None
 

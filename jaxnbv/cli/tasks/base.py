@@ -71,7 +71,7 @@ class Task(ABC):
         """
 
     def bank(self, mesh: "TriangleMesh") -> "str | ShapeBank":
-        """Return the known shapes for a user's mesh, see `Subject`."""
+        """Return the known shapes for a user's mesh: a name as in `--known`, or parts in scene units."""
         return "none"
 
     @classmethod

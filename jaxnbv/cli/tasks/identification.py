@@ -91,7 +91,8 @@ def bank_of(folder: Path, scale: str, size: float, up: str = "y") -> "ShapeBank"
     - `size`: approximate size of the object in the world.
     - `up`: up axis in the files of the parts.
 
-    **Raises:** `ValueError` if `ShapeBank.from_meshes` does, or if all parts are far smaller or larger than the object.
+    **Raises:** `ValueError` if all parts are far smaller or larger than the object, and whenever
+    `ShapeBank.from_meshes` raises it.
     """
     import numpy as np
 

@@ -116,7 +116,7 @@ class TruckStudy(ClassificationStudy):
         - `meshes`: option with a folder that holds one subfolder `trucks` of truck meshes and one subfolder per class
           of cargo, see `class_meshes`.
 
-        **Raises:** `ValueError` as `ClassificationStudy` does, or if there is no truck.
+        **Raises:** `ValueError` if there is no truck, and whenever `ClassificationStudy.configured` raises it.
         """
         if "meshes" in options:
             options["trucks"] = mesh_files(Path(options["meshes"]) / "trucks")
@@ -163,7 +163,8 @@ class OmniObject3DStudy(ClassificationStudy):
     def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
         """Return the study, under the name "".
 
-        **Raises:** `ValueError` as `ClassificationStudy` does, or if `meshes` or `classifier` is missing.
+        **Raises:** `ValueError` if `meshes` or `classifier` is missing, and whenever `ClassificationStudy.configured`
+        raises it.
         """
         option_texts = {
             "meshes": f"--meshes FOLDER, a folder with a folder of meshes for each of {', '.join(cls.objects.classes)}",

@@ -162,8 +162,8 @@ class ClassificationStudy(Study):
 
         - `classifier`: option with the file of a network, see `load_checkpoint`; default: the shipped network.
 
-        **Raises:** `ValueError` as `load_checkpoint` does, or if the network has a different number of classes than the
-        study.
+        **Raises:** `ValueError` if the network has a different number of classes than the study, and whenever
+        `load_checkpoint` raises it.
         """
         if "meshes" in options:
             options["meshes"] = cls.files_in(options["meshes"])
@@ -288,8 +288,8 @@ class ClassificationStudy(Study):
         """Record the classifier's predictions after each view, and measures of each view.
 
         - Each view: the log probabilities of the classes, and the number of the view's rays that hit the cue.
-        - Each proposed view: the roughness of the samples, and the rank correlation between the values of the
-          candidates and the numbers of their rays that hit the cue.
+        - Each proposed view: the `roughness` of the posterior samples that the view was chosen with, and the rank
+          correlation between the candidates' values and the numbers of their rays that hit the cue.
         """
         lists: dict[str, list] = {name: [] for name in ("log_p", "pixels", "rank_correlation", "roughness")}
         for view, _, inputs, _ in episode:

@@ -44,7 +44,7 @@ class Chapter(NamedTuple):
 def write_page(folder: str | Path, out: str | Path) -> Path:
     """Write all studies in a folder to one HTML page, which needs no other files, and return its path.
 
-    **Raises:** `ValueError` if the name of the page does not end in .html, and as `chapters` does.
+    **Raises:** `ValueError` if the name of the page does not end in .html, and whenever `chapters` raises it.
     """
     out = Path(out)
     require(out.suffix == ".html", f"the page {out} must end in .html")

@@ -80,9 +80,13 @@ def groups_of(table: pd.DataFrame) -> dict[str, int]:
 
 
 def tables(table: pd.DataFrame, study: type[Study], group: str = _ALL) -> list[tuple[str, pd.DataFrame]]:
-    """Return two tables of text per measure, each with its title, made from a table of `results`.
+    """Return two tables of text per measure, each as a title and a data frame.
 
-    The first has the means of the methods, the second has the leads: the reference's mean minus another method's.
+    Rows are methods, and columns are views or other keys. The first table has the means of the methods. The second has
+    the leads: the reference's mean minus another method's. A table without rows is left out.
+
+    - `table`: the result of `results`.
+    - `group`: name of the group of scenes, see `groups_of`. The default is all scenes.
     """
     texts = []
     for measure in study.measures:

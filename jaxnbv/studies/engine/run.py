@@ -32,7 +32,7 @@ def run_scene(
     - `methods`: names of the study's methods to run; default: `Study.methods`.
     - `own`: the user's methods by name. Each is a function that makes the planner for a scene.
 
-    **Raises:** `ValueError` as `Study.scene` does, and in these cases:
+    **Raises:** `ValueError` whenever `Study.scene` raises it, and in these cases:
 
     - a method is unknown;
     - no candidate shows enough of the object;

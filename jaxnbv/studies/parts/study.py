@@ -79,7 +79,7 @@ class MeshPartStudy(PartDiscoveryStudy):
         return tuple(interleave(by_class.values()))
 
     def scene(self, index: int) -> Scene:
-        """Return a scene with a mesh. The task of the scene is its `PartMesh`."""
+        """Return the scene of a mesh file. Its `task` is a `PartMesh`, with the parts and the oracle."""
         file = self.mesh_file(index)
         assert file is not None
         parts = load_parts(file.path)
@@ -136,7 +136,7 @@ class PartStudy(PartDiscoveryStudy):
         return super().configured(model, views, quick, segmenter=part_segmenter(category=0), **options)
 
     def scene(self, index: int) -> Scene:
-        """Return a scene with a procedural object. The task of the scene is its `PartScene`."""
+        """Return the scene of a procedural object. Its `task` is a `PartScene`, with the solid and its parts."""
         part = part_scene(self.split, index)
         return Scene(index, CATEGORIES[int(part.category)].name, SDFSurface(part.solid), part)
 

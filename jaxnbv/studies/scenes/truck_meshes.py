@@ -70,7 +70,7 @@ def loaded_truck(truck: TriangleMesh, cargo: TriangleMesh, label: int, key: PRNG
 
     - `label`: index of the cargo's class.
 
-    **Raises:** `ValueError` as `bed_of` does.
+    **Raises:** `ValueError` if the truck has no bed that `bed_of` finds.
     """
     rng = generator(key)
     rotated_vertices = cargo.vertices @ rotation_about((0.0, 1.0, 0.0), rng.uniform(-np.pi, np.pi)).T
