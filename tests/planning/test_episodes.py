@@ -70,7 +70,8 @@ def assert_equal(together, alone, acquisition):
 def test_episodes_are_those_of_simulate(compilations):
     """Poses, values, clouds and answers. The first pose is for each episode, or one for all. One program runs any
     number of views."""
-    planner, noise = planner_of(score=nbv.CrossEntropy(by_height, num_points=64)), nbv.SensorNoise(0.03, 0.02)
+    score, noise = nbv.CrossEntropy(by_height, num_points=64), nbv.SensorNoise(0.03, 0.02)
+    planner = planner_of(nbv.FarthestView(12), score)
     together = nbv.episodes(planner, BALLS, POSES, 3, KEYS, noise)
     assert_equal(together, one_by_one(planner, BALLS, POSES, 3, KEYS, noise), planner.acquisition)
     assert len(np.unique(np.asarray(together.poses.position).reshape(-1, 3), axis=0)) >= 5
@@ -183,7 +184,7 @@ PROGRAM = """
     runs = [nbv.simulate(planner, scene, first, 3, key, progress=False) for scene, key in zip(scenes, keys)]
     values = [[view.proposal.value for view in run.views[1:]] for run in runs]
     error = 1e-5 if batch_size > 1 else 0.0
-    np.testing.assert_allclose(shared.values[:, 1:], np.asarray(values), rtol=error)
+    np.testing.assert_allclose(shared.values[:, 1:], np.asarray(values), rtol=10 * error)
     np.testing.assert_allclose(shared.clouds.points, np.stack([run.cloud.points for run in runs]), rtol=0, atol=error)
     if batch_size == 1:
         with jax.default_device(jax.devices()[0]):
@@ -203,7 +204,7 @@ def run_on_two_devices(tmp_path, *arguments):
 
 def test_several_at_once_on_two_devices_choose_the_same_views(tmp_path):
     """Two together on the first device, and the third by itself on the other."""
-    run_on_two_devices(tmp_path, "FarthestView", "2")
+    run_on_two_devices(tmp_path, "DiscreteSearch", "2")
 
 
 @pytest.mark.slow

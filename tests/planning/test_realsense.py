@@ -122,6 +122,7 @@ def start():
         pipeline.stop()
 
 
+@pytest.mark.slow
 def test_the_realsense_loop_scans_the_object(monkeypatch, tmp_path, capsys):
     """Each image is of the pose that the camera reached, and the cloud lies on the object."""
     camera = SoftwareCamera(CLOCKS.global_time, 0.00025, num_stale=25)
