@@ -103,6 +103,8 @@ def test_normals_face_the_sensor_for_any_winding_and_open_sheets():
     expected, hits = straight.trace(o, d), nbv.TriangleMesh.from_arrays(sphere.vertices, faces).trace(o, d)
     np.testing.assert_allclose(hits.points, expected.points, atol=1e-6)
     np.testing.assert_allclose(hits.normals, expected.normals, atol=1e-6)
+    # The planes of the faces are at least 1.2 away from the middle of the ball of 1.25.
+    assert (np.sum(np.asarray(expected.normals * expected.points), axis=1)[np.asarray(expected.mask)] > 1.2).all()
     sheet = nbv.TriangleMesh.from_arrays([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [2, 0, 3]])
     for side in (1.0, -1.0):
         hits = sheet.trace(np.array([[0.1, 0.2, side]]), np.array([[0.0, 0.0, -side]]))

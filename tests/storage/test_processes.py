@@ -1,7 +1,6 @@
 """Processes that are killed and started again, and two processes in one folder."""
 
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -96,18 +95,19 @@ def test_killed_at_any_moment_and_started_again_it_ends_with_the_same_files(tmp_
     assert contents(folder) == contents(tmp_path / "whole")
 
 
-def test_one_process_writes_at_a_time(finished, tmp_path):
-    folder = shutil.copytree(finished[1], tmp_path / "copy")
+def test_one_process_writes_at_a_time(tmp_path):
+    run(tmp_path, views=1)
+    before = contents(tmp_path)
     script = (
         "import sys\nfrom pathlib import Path\nfrom jaxnbv.storage.folders import writing_in\n"
         "with writing_in(Path(sys.argv[1])):\n"
         "    print('holding', flush=True)\n    sys.stdin.read()\n"
     )
-    holder = subprocess.Popen([sys.executable, "-c", script, folder], stdin=-1, stdout=-1, text=True)
+    holder = subprocess.Popen([sys.executable, "-c", script, tmp_path], stdin=-1, stdout=-1, text=True)
     assert holder.stdout.readline() == "holding\n"
     with pytest.raises(InputError, match=r"is being written by another process: wait until it ends"):
-        run(folder, views=5)
+        run(tmp_path, views=1)
     holder.kill()
     holder.communicate()
-    run(folder, views=5)
-    assert contents(folder) == contents(finished[1])
+    run(tmp_path, views=1)
+    assert contents(tmp_path) == before
