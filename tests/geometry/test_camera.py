@@ -31,7 +31,7 @@ def camera_and_matrix(given):
     return nbv.Camera.from_intrinsics(matrix, height, width), matrix
 
 
-@settings(max_examples=50)
+@settings(max_examples=30)
 @given(matrices)
 def test_rays_go_through_the_pixels_of_the_intrinsic_matrix(values):
     camera, matrix = camera_and_matrix(values)
@@ -44,7 +44,7 @@ def test_rays_go_through_the_pixels_of_the_intrinsic_matrix(values):
     np.testing.assert_allclose(camera.to_pixels(directions[:, :2]), pixels[:, :2] + 0.5, atol=2e-3)
 
 
-@settings(max_examples=50)
+@settings(max_examples=30)
 @given(matrices, st.integers(1, 7))
 def test_a_strided_camera_has_the_rays_of_every_nth_pixel(values, stride):
     camera, _ = camera_and_matrix(values)
@@ -59,7 +59,7 @@ def test_a_strided_camera_has_the_rays_of_every_nth_pixel(values, stride):
     np.testing.assert_allclose(strided.pixel_directions(), every.reshape(-1, 3), rtol=1e-4, atol=1e-5)
 
 
-@settings(max_examples=50)
+@settings(max_examples=30)
 @given(matrices, sizes, sizes)
 def test_a_resized_camera_sees_the_same_and_the_frustum_is_its_border(values, height, width):
     camera, matrix = camera_and_matrix(values)
@@ -205,7 +205,7 @@ def test_rays_of_a_limited_sensor_are_empty_up_to_its_range():
 rotations = st.tuples(st.integers(0, 2**32 - 1), st.lists(st.floats(-3, 3, width=32), min_size=3, max_size=3))
 
 
-@settings(max_examples=50)
+@settings(max_examples=30)
 @given(rotations)
 def test_poses_to_matrices_and_back_in_both_conventions(given):
     seed, position = given
@@ -238,7 +238,7 @@ def test_a_matrix_to_three_digits_is_made_a_rotation():
     assert off[was_off].max() < 1e-6
 
 
-@settings(max_examples=100)
+@settings(max_examples=60)
 @given(vector, vector, vector)
 def test_look_at_is_a_rotation_that_faces_its_target_with_up_above(position, target, up):
     position, target, up = (np.asarray(v, dtype=np.float32).astype(np.float64) for v in (position, target, up))

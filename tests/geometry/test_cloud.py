@@ -157,7 +157,7 @@ def tagged(points, mask):
 subsample = jax.jit(nbv.geometry.farthest_point_subsample, static_argnums=1)
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(
     st.lists(st.tuples(*[st.integers(-2, 2)] * 3), min_size=20, max_size=20),
     st.lists(st.booleans(), min_size=20, max_size=20),

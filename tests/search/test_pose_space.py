@@ -172,7 +172,7 @@ place = st.tuples(*[st.floats(-4.0, 4.0, width=32)] * 3)
 quaternion = st.tuples(*[st.floats(-1.0, 1.0, width=32)] * 4).filter(lambda q: np.linalg.norm(q) > 0.1)
 
 
-@settings(max_examples=300)
+@settings(max_examples=120)
 @given(place, quaternion, st.tuples(*[number] * 8))
 @example((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), (0.0,) * 8)
 @example((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -2.0, 0.0, 0.0, 0.0, -1.0, 0.0))
