@@ -7,6 +7,7 @@ import re
 from html.parser import HTMLParser
 
 import jax
+import jax.numpy as jnp
 
 import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Sphere
@@ -34,6 +35,27 @@ def scene_in_space(page: str) -> dict:
     """Unpack the data that a report stores for its view in space."""
     packed = re.search('id="inspace">([^<]*)<', page)
     return json.loads(gzip.decompress(base64.b64decode(packed[1])))
+
+
+class NoisySpheres(nbv.surfaces.Fields):
+    radii: jax.Array
+
+    def __call__(self, x):
+        return (jnp.linalg.norm(x, axis=-1) - self.radii[:, None]).astype(x.dtype)
+
+
+class SpherePosterior(nbv.surfaces.SurfacePosterior):
+    level: jax.Array
+
+    def sample(self, key, num_samples):
+        return NoisySpheres(0.9 + 0.03 * jax.random.normal(key, (num_samples,)))
+
+
+class SphereModel(nbv.SurfaceModel):
+    """A model whose samples are spheres with radii from N(0.9, 0.03^2), which depend only on the key."""
+
+    def condition(self, cloud):
+        return SpherePosterior(jnp.asarray(0.0))
 
 
 class Page(HTMLParser):

@@ -39,14 +39,11 @@ class Unnamed(nbv.Acquisition):
 def test_a_function_has_its_name_and_value():
     acquisition = nbv.ExpectedUtilityImprovement(greatest_height)
     assert label_of(acquisition.quantity) == "expected improvement of greatest height"
-    answer, before = acquisition.answer(CLOUD), acquisition.answer(_first())
+    first = nbv.PointCloud.from_arrays(POINTS[:1], np.eye(3)[:1], 5)
+    answer, before = acquisition.answer(CLOUD), acquisition.answer(first)
     assert words_of(answer).said(before) == "greatest height 0.8 (was 0.3)"
     assert words_of(answer).said() == words_of(answer).found == "greatest height 0.8"
     assert nbv.ExpectedUtilityImprovement(lambda cloud: 1.0).quantity.name == "expected utility improvement"
-
-
-def _first():
-    return nbv.PointCloud.from_arrays(POINTS[:1], np.eye(3)[:1], 5)
 
 
 def test_a_utility_says_what_it_likes():
@@ -65,12 +62,8 @@ def test_an_acquisition_without_words_has_its_type():
 
 
 def test_a_search_that_does_not_ask_the_score_says_so():
-    units = {
-        nbv.FarthestView: "scene units",
-        nbv.RandomView: "uniform on [0, 1)",
-        nbv.search.UncertaintyView: "scene units",
-    }
-    for kind, unit in units.items():
+    length, kinds = "scene units", (nbv.FarthestView, nbv.RandomView, nbv.search.UncertaintyView)
+    for kind, unit in zip(kinds, (length, "uniform on [0, 1)", length), strict=True):
         assert kind().quantity(nbv.Coverage()).unit_in(nbv.Frame()) == unit
         assert kind().quantity(Unnamed()) == kind().quantity(nbv.Coverage())
     assert not nbv.RandomView().quantity(Unnamed()).smooth
@@ -92,8 +85,6 @@ def test_an_impossible_utility_is_named_at_the_first_scan(utility, message):
 
 def test_under_jit_nothing_is_asked():
     acquisition = nbv.ExpectedUtilityImprovement(lambda cloud: jnp.nan * jnp.sum(cloud.mask))
-    model = nbv.GeometricSPSR(0.05, truncation=8)
-    planner = nbv.Planner(
-        acquisition, nbv.DiscreteSearch(4), sampler=nbv.SurfaceSampler(model, carving=None), capacity=5
-    )
+    sampler = nbv.SurfaceSampler(nbv.GeometricSPSR(0.05, truncation=8), carving=None)
+    planner = nbv.Planner(acquisition, nbv.DiscreteSearch(4), sampler=sampler, capacity=5)
     assert jax.eval_shape(lambda cloud: planner.init(None, cloud), CLOUD).cloud.capacity == 5

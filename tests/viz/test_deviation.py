@@ -15,63 +15,44 @@ SIDES = np.array([100.0, 60.0, 40.0])
 BOX = trimesh.creation.box(SIDES)
 # Place of the flaw on the top of the box, its radius there, and its height.
 PLACE, RADIUS, HEIGHT = np.array([20.0, -8.0]), 9.0, 2.0
-
-
-def flaw(places, height):
-    """Height and slope of a spherical cap on the top of the box."""
-    across = places - PLACE
-    radius = (RADIUS**2 + HEIGHT**2) / (2.0 * HEIGHT)
-    squared = np.minimum(np.sum(across**2, axis=1), RADIUS**2)
-    root = np.sqrt(radius**2 - squared)
-    is_inside = (np.sum(across**2, axis=1) < RADIUS**2)[:, None]
-    return np.sign(height) * (root - (radius - HEIGHT)), np.where(
-        is_inside, -np.sign(height) * across / root[:, None], 0
-    )
+SPHERE = (RADIUS**2 + HEIGHT**2) / (2.0 * HEIGHT)  # Radius of the sphere that the flaw is a cap of.
 
 
 def scanned_box(height, noise=0.0, count=6000):
     """Points and normals of the three sides of the box that meet at a corner, and their distances from the box."""
-    points, normals, distances = [], [], []
-    for axis in range(3):
-        places = (RNG.random((count // 3, 3)) - 0.5) * SIDES
-        places[:, axis] = 0.5 * SIDES[axis]
-        outward = np.tile(np.eye(3)[axis], (len(places), 1))
-        off = np.zeros(len(places))
-        if axis == 2:
-            off, slope = flaw(places[:, :2], height)
-            places[:, 2] += off
-            outward[:, :2] = -slope
-            outward /= np.linalg.norm(outward, axis=1, keepdims=True)
-        points.append(places)
-        normals.append(outward)
-        distances.append(off)
-    points, normals, distances = map(np.concatenate, (points, normals, distances))
-    error = noise * RNG.normal(size=len(points))
-    return points + error[:, None] * normals, normals, distances
+    axis = np.repeat(np.arange(3), count // 3)
+    points, normals = (RNG.random((len(axis), 3)) - 0.5) * SIDES, np.eye(3)[axis]
+    points[np.arange(len(axis)), axis] = 0.5 * SIDES[axis]
+    across = points[:, :2] - PLACE
+    squared, sign = np.sum(across**2, axis=1), np.sign(height)
+    is_cap = (axis == 2) & (squared < RADIUS**2)
+    root = np.sqrt(SPHERE**2 - np.minimum(squared, RADIUS**2))
+    distances = np.where(is_cap, sign * (root - (SPHERE - HEIGHT)), 0.0)
+    points[:, 2] += distances
+    normals[:, :2] += np.where(is_cap[:, None], sign * across / root[:, None], 0.0)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return points + noise * RNG.normal(size=(len(points), 1)) * normals, normals, distances
 
 
 def motion(seed, far=200.0):
-    rng = np.random.default_rng(seed)
     matrix = np.eye(4)
     matrix[:3, :3] = Rotation.random(random_state=seed).as_matrix()
-    matrix[:3, 3] = far * rng.normal(size=3)
+    matrix[:3, 3] = far * np.random.default_rng(seed).normal(size=3)
     return matrix
 
 
-def cloud(points, normals, matrix=None):
-    matrix = np.eye(4) if matrix is None else matrix
+def cloud(points, normals, matrix=np.eye(4)):  # noqa: B008
     return nbv.PointCloud.from_arrays(points @ matrix[:3, :3].T + matrix[:3, 3], normals @ matrix[:3, :3].T)
 
 
-@pytest.mark.parametrize("height", [-HEIGHT, HEIGHT])
-def test_a_dent_and_a_bump_are_found_on_a_partial_noisy_scan_from_anywhere(height):
+def test_a_dent_is_found_on_a_partial_noisy_scan_from_anywhere():
     matrix = motion(4)
-    points, normals, distances = scanned_box(height, noise=0.05)
+    points, normals, distances = scanned_box(-HEIGHT, noise=0.05)
     result = nbv.deviation(cloud(points, normals, matrix), BOX)
     # A box looks the same in four poses. In all of them its surface is that of the scanned box.
-    turns = np.abs((np.linalg.inv(matrix) @ result.pose)[:3, :3])
-    np.testing.assert_allclose(turns, np.eye(3), atol=2e-3)
-    np.testing.assert_allclose((np.linalg.inv(matrix) @ result.pose)[:3, 3], 0.0, atol=0.05)
+    motion_of_box = np.linalg.inv(matrix) @ result.pose
+    np.testing.assert_allclose(np.abs(motion_of_box[:3, :3]), np.eye(3), atol=2e-3)
+    np.testing.assert_allclose(motion_of_box[:3, 3], 0.0, atol=0.05)
     error = result.distances - distances
     assert np.abs(np.median(error)) < 0.01
     assert np.percentile(np.abs(error), 99) < 0.2
@@ -80,10 +61,9 @@ def test_a_dent_and_a_bump_are_found_on_a_partial_noisy_scan_from_anywhere(heigh
     first, second = result.worst(2)
     top = np.linalg.inv(matrix) @ [*first.position, 1.0]
     np.testing.assert_allclose(top[:2], PLACE, atol=3.0)
-    assert first.distance == pytest.approx(height, abs=0.15)
+    assert first.distance == pytest.approx(-HEIGHT, abs=0.15)
     # At this radius half of the cap's height is left.
-    radius = (RADIUS**2 + HEIGHT**2) / (2.0 * HEIGHT)
-    half = np.sqrt(radius**2 - (radius - 0.5 * HEIGHT) ** 2)
+    half = np.sqrt(SPHERE**2 - (SPHERE - 0.5 * HEIGHT) ** 2)
     assert first.extent == pytest.approx(2.0 * half, abs=3.0)
     assert abs(second.distance) < 0.2
 
@@ -98,21 +78,21 @@ def test_half_of_a_box_is_missing_where_three_of_its_sides_were_scanned():
     assert np.isnan(result.values_at(back, np.array([[0.0, 0.0, -1.0]])))
 
 
-@pytest.mark.parametrize("more", [0.8, -0.8])
-def test_a_sphere_that_is_too_large_or_too_small_is_so_everywhere(more):
-    ball = trimesh.creation.icosphere(subdivisions=4, radius=30.0)
-    scan = trimesh.creation.icosphere(subdivisions=4, radius=30.0 + more)
+def test_a_sphere_that_is_too_small_is_so_everywhere():
+    ball, more = trimesh.creation.icosphere(subdivisions=3, radius=30.0), -0.8
+    scan = trimesh.creation.icosphere(subdivisions=3, radius=30.0 + more)
     scan.apply_translation((50, 20, -70))
     result = nbv.deviation(scan, ball)
-    np.testing.assert_allclose(result.distances, more, atol=0.1)
+    # The facets of both are up to 0.1 inside their spheres.
+    np.testing.assert_allclose(result.distances, more, atol=0.2)
     np.testing.assert_allclose(result.pose[:3, 3], [50, 20, -70], atol=0.1)
     assert result.missing_area < 1e-3 * result.area
     (place,) = result.worst()
-    assert place.distance == pytest.approx(more, abs=0.1)
+    assert place.distance == pytest.approx(more, abs=0.2)
     assert place.extent == pytest.approx(2.0 * (30.0 + more), rel=0.02)
 
 
-@settings(max_examples=8)
+@settings(max_examples=3)
 @given(seed=st.integers(0, 10**6))
 def test_a_rigid_motion_of_both_changes_nothing(seed):
     matrix = motion(seed)
@@ -139,7 +119,7 @@ def test_a_start_is_refined_and_a_symmetric_pose_is_kept():
     np.testing.assert_allclose(result.pose, turned, atol=1e-3)
 
 
-def test_an_open_cad_has_an_inside_and_a_sheet_a_front():
+def test_an_open_cad_has_an_inside_a_sheet_a_front_and_a_wall_two_sides():
     without_lid = trimesh.Trimesh(BOX.vertices, BOX.faces[BOX.face_normals[:, 2] < 0.5], process=False)
     sheet = trimesh.Trimesh(BOX.vertices, BOX.faces[BOX.face_normals[:, 0] > 0.5], process=False)
     side = np.column_stack([np.full(400, 50.0), (RNG.random((400, 2)) - 0.5) * [50.0, 30.0]])
@@ -148,13 +128,10 @@ def test_an_open_cad_has_an_inside_and_a_sheet_a_front():
         for off in (0.7, -0.7):
             result = nbv.deviation(cloud(side + off * outward, outward), cad, register=False)
             np.testing.assert_allclose(result.distances, off, atol=1e-4)
-
-
-def test_the_scan_of_one_side_of_a_wall_does_not_cover_the_other():
-    wall = trimesh.creation.box((80, 50, 0.4))
+    # The scan of one side of a wall does not cover the other.
     places = np.column_stack([(RNG.random((4000, 2)) - 0.5) * [80.0, 50.0], np.full(4000, 0.2)])
-    result = nbv.deviation(cloud(places, np.tile([0.0, 0.0, 1.0], (4000, 1))), wall, register=False)
-    assert result.area == pytest.approx(80.0 * 50.0, rel=0.03)
+    scan, wall = cloud(places, np.tile([0.0, 0.0, 1.0], (4000, 1))), trimesh.creation.box((80, 50, 0.4))
+    assert nbv.deviation(scan, wall, register=False).area == pytest.approx(80.0 * 50.0, rel=0.03)
 
 
 @pytest.fixture(scope="module")
@@ -172,7 +149,7 @@ def test_only_measured_faces_are_compared(marked, tmp_path):
     path = tmp_path / "scan.ply"
     path.write_bytes(marked.export(file_type="ply"))
     top = SIDES[0] * SIDES[1]
-    for scan in (marked, path, str(path)):
+    for scan in (marked, str(path)):
         result = nbv.deviation(scan, BOX, register=False)
         assert result.imagined == pytest.approx(top / BOX.area, rel=1e-3)
         assert result.percentile(100.0) < 1e-3
@@ -206,40 +183,36 @@ def test_places_stand_apart_and_flanks_are_none():
     assert [place.distance for place in result.worst(2, min_distance=70.0)] == pytest.approx([2.0, 0.0], abs=0.2)
 
 
-def test_a_scan_of_another_part_is_warned_of():
+def test_a_scan_of_another_part_or_with_a_pose_that_is_not_unique_is_warned_of():
     ball = trimesh.creation.icosphere(subdivisions=3, radius=40.0)
     with pytest.warns(UserWarning, match="fits the scan poorly: the median distance is"):
         nbv.deviation(ball, trimesh.creation.box((20, 30, 120)), np.eye(4))
-
-
-def test_a_pose_that_is_not_unique_is_warned_of():
-    places = np.column_stack([(RNG.random((3000, 2)) - 0.5) * 30.0, np.full(3000, 20.0)])
+    places = np.column_stack([(RNG.random((1000, 2)) - 0.5) * 30.0, np.full(1000, 20.0)])
     with pytest.warns(UserWarning, match="nearly as well in another pose"):
-        nbv.deviation(cloud(places, np.tile([0.0, 0.0, 1.0], (3000, 1))), BOX)
+        nbv.deviation(cloud(places, np.tile([0.0, 0.0, 1.0], (1000, 1))), BOX)
 
 
 def test_what_cannot_be_compared_is_refused(marked, tmp_path):
     points, normals, _ = scanned_box(HEIGHT, count=60)
     scan = cloud(points, normals)
-    for factor in (1e-3, 1.0 / 25.4, 1e3):
-        with pytest.raises(InputError, match=r"across and the CAD .*units differ.*apply_scale\(0\.001\)"):
-            nbv.deviation(scan, BOX.copy().apply_scale(factor))
-    with pytest.raises(InputError, match="no mesh file at"):
-        nbv.deviation(scan, tmp_path / "gone.stl")
-    with pytest.raises(InputError, match="has no faces"):
-        nbv.deviation(scan, trimesh.Trimesh())
-    with pytest.raises(InputError, match="all 1 faces of the mesh have zero area"):
-        nbv.deviation(scan, trimesh.Trimesh(np.ones((3, 3)), [[0, 1, 2]], process=False))
-    with pytest.raises(InputError, match="the scan has 3 points: give at least 10"):
-        nbv.deviation(cloud(points[:3], normals[:3]), BOX)
     unmeasured = marked.copy()
     unmeasured.face_attributes["measured"][:] = 0
-    with pytest.raises(InputError, match="none of the 192 faces of the scan was measured"):
-        nbv.deviation(unmeasured, BOX)
-    with pytest.raises(InputError, match=r"the pose has shape \(2, 2\)"):
-        nbv.deviation(scan, BOX, [[1.0, 0.0], [0.0, 1.0]])
-    with pytest.raises(InputError, match="no rigid motion"):
-        nbv.deviation(scan, BOX, np.diag([2.0, 2.0, 2.0, 1.0]))
+    units = r"across and the CAD .*units differ.*apply_scale\(0\.001\)"
+    for arguments, message in (
+        *(((scan, BOX.copy().apply_scale(factor)), units) for factor in (1e-3, 1.0 / 25.4, 1e3)),
+        ((scan, tmp_path / "gone.stl"), "no mesh file at"),
+        ((scan, trimesh.Trimesh()), "has no faces"),
+        (
+            (scan, trimesh.Trimesh(np.ones((3, 3)), [[0, 1, 2]], process=False)),
+            "all 1 faces of the mesh have zero area",
+        ),
+        ((cloud(points[:3], normals[:3]), BOX), "the scan has 3 points: give at least 10"),
+        ((unmeasured, BOX), "none of the 192 faces of the scan was measured"),
+        ((scan, BOX, [[1.0, 0.0], [0.0, 1.0]]), r"the pose has shape \(2, 2\)"),
+        ((scan, BOX, np.diag([2.0, 2.0, 2.0, 1.0])), "no rigid motion"),
+    ):
+        with pytest.raises(InputError, match=message):
+            nbv.deviation(*arguments)
     result = nbv.deviation(scan, BOX, register=False)
     for call, message in (
         (lambda: result.percentile(101.0), "101.0 percent"),
@@ -253,7 +226,8 @@ def test_what_cannot_be_compared_is_refused(marked, tmp_path):
             call()
 
 
-def test_the_figure_shows_the_flaw_in_the_colour_of_its_sign_and_numbers_it(tmp_path):
+def test_the_figure_shows_the_flaw_in_the_colour_of_its_sign_and_numbers_it(tmp_path, monkeypatch):
+    monkeypatch.setattr("jaxnbv.viz.deviation_figure._SIZE", 200)
     points, normals, _ = scanned_box(-HEIGHT)
     figure = nbv.deviation(cloud(points / 1e3, normals), BOX.copy().apply_scale(1e-3), register=False).figure("mm", 1e3)
     first, second, bar = figure.axes

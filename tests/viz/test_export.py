@@ -11,7 +11,7 @@ import jaxnbv as nbv
 from jaxnbv.checks import InputError
 from jaxnbv.viz.export import missing_regions, save_cloud, save_mesh, scanned_cloud, surface_mesh
 
-CENTER = np.array([0.3, 0.2, 0.101])
+CENTER, EYES = np.array([0.3, 0.2, 0.101]), np.stack([FIRST[:3, 3], POSES[2][:3, 3]])
 
 
 @pytest.fixture(scope="module")
@@ -41,8 +41,7 @@ def test_the_surface_is_marked_where_it_was_measured(episode):
     centers = mesh.triangles_center
     assert off(centers[measured]).max() < 1.5 * cell
     # The far side of the ball is hidden from both cameras, and was not measured.
-    eyes = np.stack([FIRST[:3, 3], POSES[2][:3, 3]]) - CENTER
-    hidden = ((centers - CENTER) @ eyes.T < -0.02).all(axis=1)
+    hidden = ((centers - CENTER) @ (EYES - CENTER).T < -0.02).all(axis=1)
     assert hidden.any()
     assert not measured[hidden].any()
     deviation = mesh.vertex_attributes["deviation"]
@@ -55,15 +54,14 @@ def test_the_surface_is_marked_where_it_was_measured(episode):
 def test_what_is_missing_is_the_far_side_in_metres(episode):
     """The part of the ball that no camera sees is one region, which faces away from both."""
     regions = missing_regions(episode, smallest=1e-3)
-    eyes = np.stack([FIRST[:3, 3], POSES[2][:3, 3]])
-    eyes = (eyes - CENTER) / np.linalg.norm(eyes - CENTER, axis=1, keepdims=True)
+    distances = np.linalg.norm(EYES - CENTER, axis=1)
+    eyes = (EYES - CENTER) / distances[:, None]
     largest = regions[0]
     assert largest.normal @ eyes.sum(axis=0) < 0
     assert np.linalg.norm(largest.normal) == pytest.approx(1.0)
     # By points spread evenly over the ball. A camera at distance d sees points whose cosine to it is above r / d.
     points = np.random.default_rng(0).normal(size=(20_000, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
-    distances = np.linalg.norm(np.stack([FIRST[:3, 3], POSES[2][:3, 3]]) - CENTER, axis=1)
     hidden = (points @ eyes.T < 0.1 / distances).all(axis=1)
     area = hidden.mean() * 4 * np.pi * 0.1**2
     # Surface within a cell of the border may count as missing or not.
@@ -74,26 +72,21 @@ def test_what_is_missing_is_the_far_side_in_metres(episode):
 
 
 def test_files_hold_world_units(episode, tmp_path):
-    cloud = trimesh.load(save_cloud(episode, tmp_path / "cloud.ply"))
-    assert off(np.asarray(cloud.vertices)).max() < 0.005
-    plain = trimesh.load(save_cloud(episode, tmp_path / "cloud.xyz"))
-    np.testing.assert_allclose(np.asarray(plain.vertices), np.asarray(cloud.vertices), atol=1e-4)
-    low, high = np.array(BOX)
+    for kind in ("ply", "xyz"):
+        vertices = np.asarray(trimesh.load(save_cloud(episode, tmp_path / f"cloud.{kind}")).vertices)
+        np.testing.assert_allclose(vertices, scanned_cloud(episode).to_numpy()[0], atol=1e-4)
     for kind in ("ply", "obj", "stl", "glb"):
         mesh = trimesh.load(save_mesh(episode, tmp_path / f"mesh.{kind}"), force="mesh")
         assert len(mesh.faces) > 100
-        assert np.all(mesh.bounds[0] > low - 0.02)
-        assert np.all(mesh.bounds[1] < high + 0.02)
-    stored = trimesh.load(tmp_path / "mesh.ply", process=False)
-    raw = stored.metadata["_ply_raw"]
+        assert np.all((mesh.bounds - BOX) * [[1.0], [-1.0]] > -0.02)
+    raw = trimesh.load(tmp_path / "mesh.ply", process=False).metadata["_ply_raw"]
     assert "deviation" in raw["vertex"]["properties"]
     assert "measured" in raw["face"]["properties"]
 
 
 def test_what_cannot_be_written_is_refused(episode, tmp_path):
-    with pytest.raises(
-        InputError, match=r"does not say a format: end it with one of \.ply, \.obj, \.glb, \.stl, \.off"
-    ):
+    formats = r"does not say a format: end it with one of \.ply, \.obj, \.glb, \.stl, \.off"
+    with pytest.raises(InputError, match=formats):
         save_mesh(episode, tmp_path / "mesh.step")
     with pytest.raises(InputError, match="no view yet"):
         scanned_cloud(nbv.Episode(episode.planner, None, None, episode.first, episode.key))

@@ -15,19 +15,25 @@ import pytest
 from IPython.core.formatters import HTMLFormatter
 from matplotlib.figure import Figure
 from PIL import Image
-from small_run import small_planner, small_run
+from small_run import CAMERA, small_planner, small_run
 
 import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.viz import sphere
 from jaxnbv.viz.notebook import drawing_of, html_of
 
+SCENE, FIRST = nbv.SDFSurface(Sphere(1.0)), nbv.look_at((0.0, 0.0, 2.5))
+
 
 @pytest.fixture(scope="module")
 def episode():
     """An episode of a ball of radius 1, seen from two sides."""
-    scene, first = nbv.SDFSurface(Sphere(1.0)), nbv.look_at((0.0, 0.0, 2.5))
-    return small_run(nbv.DiscreteSearch(12), 2, scene, noise=nbv.SensorNoise(0.0, 0.0), first=first)
+    return small_run(nbv.DiscreteSearch(8), 2, SCENE, noise=nbv.SensorNoise(0.0, 0.0), first=FIRST)
+
+
+@pytest.fixture(scope="module")
+def posterior(episode):
+    return episode.planner.sampler.model.condition(episode.cloud)
 
 
 def parts(value):
@@ -43,7 +49,7 @@ def drawn(value):
     return axes
 
 
-def test_each_is_a_small_picture_and_a_line(episode):
+def test_each_is_a_small_picture_and_a_line(episode, posterior):
     count = int(episode.cloud.count)
     scan, proposal = episode.views[0].scan, episode.views[1].proposal
     facts = (
@@ -51,14 +57,14 @@ def test_each_is_a_small_picture_and_a_line(episode):
         (scan, f"{int(scan.count)} points of 144 rays, {144 - int(scan.count)} met nothing; box "),
         (proposal, f"value {float(proposal.value):.4g}"),
         (episode, f"2 views by expected coverage gain, {count:,} points"),
-        (episode.planner.sampler.model.condition(episode.cloud), "level "),
+        (posterior, "level "),
     )
     for value, expected in facts:
         size, caption = parts(value)
         assert size == (264, 264)
         assert expected in caption
         assert len(html_of(value)) < 100_000
-    assert "12 candidates" in parts(proposal)[1]
+    assert "8 candidates" in parts(proposal)[1]
 
 
 def test_a_cloud_is_seen_from_where_its_normals_look(episode):
@@ -72,8 +78,7 @@ def test_a_cloud_is_seen_from_where_its_normals_look(episode):
     assert away.max() == pytest.approx(np.linalg.norm(points[:, :2], axis=1).max(), rel=0.1)
 
 
-def test_the_slice_of_a_posterior_is_inside_the_ball(episode):
-    posterior = episode.planner.sampler.model.condition(episode.cloud)
+def test_the_slice_of_a_posterior_is_inside_the_ball(posterior):
     (image,) = drawn(posterior).images
     inside = np.asarray(image.get_array())
     assert inside.shape == (48, 48)
@@ -93,49 +98,40 @@ def test_a_proposal_has_its_star_and_an_episode_its_cameras(episode):
     assert [text.get_text() for text in drawn(episode).texts] == ["1", "2"]
 
 
-def test_what_has_no_picture_has_its_facts():
+def test_what_has_no_picture_has_its_facts(episode):
     none = nbv.PointCloud(jnp.zeros((7, 3)), jnp.zeros((7, 3)), jnp.zeros(7, bool))
     assert html_of(none) == "<div>0 points of at most 7</div>"
     batch = jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), none)
     assert html_of(batch) == "<div>a batch (3,) of clouds of up to 7 points</div>"
-
-
-def test_an_episode_is_shown_in_a_strip(episode, monkeypatch):
-    """Without surfaces, which take long. The tests of the report cover the figure."""
-    monkeypatch.setattr("jaxnbv.viz.shown_surface.mean_surface", lambda *arguments: None)
-    image = Image.open(io.BytesIO(nbv.show(episode, progress=False)._repr_png_()))
-    assert image.width == 480
-    assert image.height > 300
-
-
-def test_others_are_shown_large(episode):
-    posterior = episode.planner.sampler.model.condition(episode.cloud)
-    for value in (episode.cloud, episode.observations_after(2), episode.views[1].proposal, posterior):
-        assert Image.open(io.BytesIO(nbv.show(value)._repr_png_())).size == (528, 528)
     with pytest.raises(nbv.InputError, match="no picture: DiscreteSearch by expected coverage gain over"):
         nbv.show(episode.planner)
 
 
+def test_an_episode_is_shown_in_a_strip_and_others_large(episode, posterior, no_surfaces):
+    image = Image.open(io.BytesIO(nbv.show(episode, progress=False)._repr_png_()))
+    assert image.width == 480
+    assert image.height > 300
+    for value in (episode.cloud, episode.observations_after(2), episode.views[1].proposal, posterior):
+        assert Image.open(io.BytesIO(nbv.show(value)._repr_png_())).size == (528, 528)
+
+
 def test_a_session_tells_its_images_and_the_next_view():
-    camera = nbv.Camera(height=12, width=12)
-    session = nbv.Session(camera, ((-1.2,) * 3, (1.2,) * 3), small_planner(nbv.DiscreteSearch(8)), up="y")
+    session = nbv.Session(CAMERA, ((-1.2,) * 3, (1.2,) * 3), small_planner(nbv.DiscreteSearch(8)), up="y")
     assert html_of(session) == "<div>no image yet</div>"
-    pose = nbv.look_at((0.0, 0.0, 2.5))
-    scan = nbv.scan(nbv.SDFSurface(Sphere(1.0)), camera, pose)
-    session.add(np.asarray((scan.points - pose.position) @ pose.forward).reshape(12, 12), np.asarray(pose.matrix))
+    scan = nbv.scan(SCENE, CAMERA, FIRST)
+    session.add(np.asarray((scan.points - FIRST.position) @ FIRST.forward).reshape(12, 12), np.asarray(FIRST.matrix))
     assert "1 view by" in parts(session)[1]
     proposal = session.next()
     assert parts(session)[1].endswith(f"the next view is worth {proposal.value:.4g}")
     assert [text.get_text() for text in drawn(session).texts] == ["1"]
 
 
-def test_ipython_is_told_how_they_are_shown(monkeypatch, episode):
+def test_ipython_is_told_how_they_are_shown(monkeypatch, episode, posterior):
     """Through IPython's own formatter, as in a notebook. A subclass has the representation of its parent."""
     formatter = HTMLFormatter()
     shell = SimpleNamespace(display_formatter=SimpleNamespace(formatters={"text/html": formatter}))
     monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))
     importlib.reload(nbv)
-    posterior = episode.planner.sampler.model.condition(episode.cloud)
     observations, proposal = episode.observations_after(2), episode.views[1].proposal
     for value in (episode, episode.cloud, observations, proposal, posterior, episode.planner):
         assert formatter(value) == html_of(value)

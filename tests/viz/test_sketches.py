@@ -7,38 +7,31 @@ from small_run import FIRST, SCENE, small_planner
 import jaxnbv as nbv
 from jaxnbv.viz import Sketches, report_data
 
-PLANNER, KEY, NOISE = small_planner(nbv.DiscreteSearch(12)), jax.random.key(0), nbv.SensorNoise()
+PLANNER, KEY, NOISE = small_planner(nbv.DiscreteSearch(8)), jax.random.key(0), nbv.SensorNoise()
 
 
-def run(views, folder=None):
+def run(views, folder):
     """An episode and its sketches."""
     sketches = Sketches(nbv.Episode(PLANNER, SCENE, NOISE, FIRST, KEY, ()))
     return nbv.simulate(PLANNER, SCENE, FIRST, views, KEY, NOISE, folder, progress=False, each=sketches.add), sketches
 
 
-def assert_equal(drawn, again):
-    jax.tree.map(np.testing.assert_array_equal, drawn.views, again.views)
+def test_steps_are_drawn_as_they_would_be_again_and_a_model_is_asked_only_for_missing_ones(tmp_path, monkeypatch):
+    """Sketches of two views, and of the third view that is added to their folder."""
+    posterior, calls = nbv.SurfaceSampler.posterior, []
 
-
-def test_steps_are_drawn_as_they_would_be_again_and_the_model_is_asked_once_more(monkeypatch):
-    episode, sketches = run(3)
-    again, calls, posterior = report_data(episode, progress=False), [], nbv.SurfaceSampler.posterior
-
-    def told(sampler, observations):
-        calls.append(observations)
+    def counted(sampler, observations):
+        calls.append(int(observations.num_views))
         return posterior(sampler, observations)
 
-    monkeypatch.setattr(nbv.SurfaceSampler, "posterior", told)
-    drawn = report_data(episode, progress=False, sketches=sketches)
-    assert_equal(drawn, again)
-    assert drawn.views[2].imagined is not None
-    assert [int(observations.num_views) for observations in calls] == [3]
-
-
-def test_of_views_that_a_folder_holds_there_are_none_and_the_report_makes_them(tmp_path):
-    run(2, tmp_path)
-    episode, sketches = run(3, tmp_path)
-    assert [*sketches.held] == [2]
-    drawn = report_data(episode, progress=False, sketches=sketches)
-    assert_equal(drawn, report_data(episode, progress=False))
-    assert drawn.views[1].imagined is not None
+    runs = [run(views, tmp_path) for views in (2, 3)]
+    whole = report_data(runs[1][0], progress=False)
+    monkeypatch.setattr(nbv.SurfaceSampler, "posterior", counted)
+    for (episode, sketches), held, asked in zip(runs, ([1], [2]), ([2], [1, 3]), strict=True):
+        calls.clear()
+        assert [*sketches.held] == held
+        drawn = report_data(episode, progress=False, sketches=sketches)
+        assert calls == asked
+        last = len(episode.views) - 1
+        assert drawn.views[last].imagined is not None
+        jax.tree.map(np.testing.assert_array_equal, drawn.views, whole.views[: last + 1])

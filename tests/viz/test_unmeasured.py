@@ -13,6 +13,7 @@ from jaxnbv.scanning import Carving
 from jaxnbv.viz.unmeasured import unmeasured, unmeasured_text
 
 RADIUS, DARK, GRID, CAMERA = 0.6, 0.4, nbv.Grid(61, 1.2), nbv.Camera(0.6, 60, 60)
+PLACES = [(0.0, 0.3, 2.4), (0.3, -0.2, 2.4)]
 MESH = trimesh.creation.icosphere(5, RADIUS)
 BALL = nbv.TriangleMesh(MESH.vertices, MESH.faces, Frame())
 
@@ -24,10 +25,9 @@ def observed(places, dark=DARK):
     for place in places:
         pose = nbv.look_at(place)
         scan = nbv.scan(BALL, CAMERA, pose)
-        lost = scan.mask & (scan.points[:, 2] > dark)
-        away = jnp.linalg.norm(scan.points - pose.position, axis=-1)
-        sight = jnp.where(scan.mask & ~lost, away, jnp.inf)
-        scan = dataclasses.replace(scan, mask=scan.mask & ~lost, sight=sight)
+        mask = scan.mask & (scan.points[:, 2] <= dark)
+        sight = jnp.where(mask, jnp.linalg.norm(scan.points - pose.position, axis=-1), jnp.inf)
+        scan = dataclasses.replace(scan, mask=mask, sight=sight)
         observations = observations.add_view(pose, scan, CAMERA, None, None)
     return observations
 
@@ -35,7 +35,7 @@ def observed(places, dark=DARK):
 def test_a_cap_that_two_views_did_not_measure_is_one_patch():
     """Its area is 2 pi R h, and its middle is at half its height, by Archimedes. The border is accurate to about a
     cell."""
-    (patch,) = unmeasured(MESH, observed([(0.0, 0.3, 2.4), (0.3, -0.2, 2.4)]), None)
+    (patch,) = unmeasured(MESH, observed(PLACES), None)
     rim = 2.0 * np.pi * np.sqrt(RADIUS**2 - DARK**2) * GRID.spacing
     assert patch.area == pytest.approx(2.0 * np.pi * RADIUS * (RADIUS - DARK), abs=rim)
     np.testing.assert_allclose(patch.middle, [0.0, 0.0, 0.5 * (RADIUS + DARK)], atol=GRID.spacing)
@@ -46,8 +46,7 @@ def test_a_cap_that_two_views_did_not_measure_is_one_patch():
 
 
 def test_one_look_is_not_enough_and_what_was_measured_or_cut_is_none():
-    places = [(0.0, 0.3, 2.4), (0.3, -0.2, 2.4)]
-    assert unmeasured(MESH, observed(places[:1]), None) == []
-    assert unmeasured(MESH, observed(places, dark=np.inf), None) == []
+    assert unmeasured(MESH, observed(PLACES[:1]), None) == []
+    assert unmeasured(MESH, observed(PLACES, dark=np.inf), None) == []
     below = Carving(nbv.Box((-1.0, -1.0, -1.0), (1.0, 1.0, DARK)))
-    assert unmeasured(MESH, observed(places), below) == []
+    assert unmeasured(MESH, observed(PLACES), below) == []
