@@ -67,6 +67,7 @@ def assert_equal(together, alone, acquisition):
     np.testing.assert_array_equal(together.answers, np.asarray(answers, np.float32))
 
 
+@pytest.mark.as_users
 def test_episodes_are_those_of_simulate(compilations):
     """Poses, values, clouds and answers. The first pose is for each episode, or one for all. One program runs any
     number of views."""
@@ -209,6 +210,7 @@ def test_several_at_once_on_two_devices_choose_the_same_views(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("search", ["FarthestView", "DiscreteSearch"])
+@pytest.mark.as_users
 def test_two_devices_give_the_same_arrays(search, tmp_path, monkeypatch):
     """It compiles as users' programs do."""
     for name in ("XLA_FLAGS", "JAX_DISABLE_MOST_OPTIMIZATIONS"):

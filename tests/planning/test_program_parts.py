@@ -9,6 +9,7 @@ import pytest
 from jaxnbv.planning.program_parts import in_parts
 
 COMPUTES = True
+pytestmark = pytest.mark.as_users
 X, Y, Z = jax.random.normal(jax.random.key(0), (3, 500, 3))
 
 

@@ -145,6 +145,7 @@ def test_far_origins_and_rays_on_the_border_of_the_box():
     assert not np.asarray(hits.mask)[1:5].any()
 
 
+@pytest.mark.as_users
 def test_samples_in_a_batch_equal_single_ones():
     values = np.stack([rough_values(GRID, seed, 0.1) for seed in range(2)]).astype(np.float32)
     surfaces = nbv.scanning.GridSurface.from_values(values, 0.05, GRID)

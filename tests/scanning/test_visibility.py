@@ -133,6 +133,7 @@ def test_no_ray_sees_what_is_void():
     np.testing.assert_array_equal(left[away], (free & (np.asarray(points.points)[:, 0] > 0))[away])
 
 
+@pytest.mark.as_users
 def test_rays_of_a_batch_are_those_of_each():
     """More poses than are processed together."""
     surface, points = ball_and_points()

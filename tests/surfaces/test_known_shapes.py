@@ -149,6 +149,7 @@ def test_without_a_fit_none_is_the_answer():
     np.testing.assert_allclose(surfaces(x), plain.sample(unknown_key, 4)(x) - plain.level, atol=1e-6)
 
 
+@pytest.mark.as_users
 def test_without_shapes_the_model_is_the_unknown_one_to_the_bit():
     observations = observations_of(nbv.SDFSurface(Sphere(1.2)), AROUND[:1])
     empty = model(nbv.ShapeBank.of([])).condition(observations)
