@@ -149,7 +149,7 @@ def test_a_method_without_shapes_runs_beside_the_same_with_shapes():
 
 
 def test_the_name_of_a_method_tells_its_search():
-    """What each search proposes is tested with the searches."""
+    """The tests of the searches check what each search proposes."""
     study = small(num_candidates=8, num_starts=2, iterations=3, learning_rate=0.1)
     constrained = ConstrainedPoses(study.radius - 0.3, study.radius + 0.3)
     spaces = {"2dof": SpherePoses(study.radius), "6dof": FreePoses(study.radius), "constrained": constrained}
