@@ -140,6 +140,11 @@ def piped(folder):
     os.mkfifo(folder / "image_01.npz")
 
 
+def dangling(folder):
+    (folder / "image_01.npz").unlink()
+    (folder / "image_01.npz").symlink_to("elsewhere.npz")
+
+
 def older_session_asks():
     older, newer = (session(folder=FOLDER / "two") for _ in range(2))
     newer.add(*SHOT)
@@ -290,6 +295,7 @@ REFUSED = {
         "gives no signed distances of points",
     ),
     "a gap among images": (lambda: reopened("gap", lambda f: (f / "image_01.npz").unlink()), "not image_01.npz"),
+    "a link to no image": (lambda: reopened("link", dangling), "image_01.npz is damaged"),
     "a pipe as an image": (lambda: reopened("pipe", piped), "image_01.npz is damaged"),
     "an older session that asks": (older_session_asks, "another process has added some"),
     "a scene without a number": (lambda: records("unnumbered"), "scene_x.json is not a record"),

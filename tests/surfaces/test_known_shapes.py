@@ -177,8 +177,9 @@ def test_samples_of_one_exact_shape_equal_it_to_the_noise():
 
 def test_weights_are_tempered_fits():
     observations = observations_of(filling(0.5, UPRIGHT)[0], AROUND[:1])
-    posterior = model(inverse_temperature=7.0, misfit_of_none=0.4).condition(observations)
+    posterior = model(poses=nbv.surfaces.Upright(), inverse_temperature=7.0, misfit_of_none=0.4).condition(observations)
     fits = posterior.fits
+    np.testing.assert_allclose(fits.placement.rotation[:, 1, 1], 1.0, atol=1e-5)
     energy = np.append(
         np.where(fits.is_distinct, np.exp(-7.0 * np.asarray(fits.misfit, np.float64)), 0.0), np.exp(-2.8)
     )

@@ -92,7 +92,7 @@ def scanned_ball():
     assert beyond.sum() == 8
     boundary = nbv.surfaces.OutsideBoundary(num_points=60, noise=0.02)
     sources = boundary, nbv.surfaces.OnSurface(30, noise=0.02), nbv.surfaces.EmptySpace(30)
-    model = nbv.ScreenedSPSR(nbv.GeometricSPSR((0.03, 0.1), (0.2, 0.4), truncation=8), sources)
+    model = nbv.ScreenedSPSR(nbv.GeometricSPSR((0.03, 0.1), (0.2, 0.4), truncation=8), sources, offset=0.2)
     nothing = nbv.Observations.start(data, 1, grid)
     with_empty = eqx.tree_at(lambda e: e.empty_nodes, nothing, jnp.asarray(is_beside | beyond))
     return nodes[is_beside], (nothing, with_empty), [model.condition(seen) for seen in (nothing, with_empty)]
@@ -101,7 +101,7 @@ def scanned_ball():
 def test_values_are_reached_in_units_of_half_the_rise_of_the_mean_across_the_data(scanned_ball):
     _, (observations, _), (posterior, _) = scanned_ball
     mean, (points, normals) = posterior.base.mean, observations.cloud.to_numpy()
-    rise = np.asarray(mean(points + 0.1 * normals) - mean(points - 0.1 * normals))
+    rise = np.asarray(mean(points + 0.2 * normals) - mean(points - 0.2 * normals))
     h, rows = float(posterior.value_unit), posterior.rows
     # 256 rows are drawn from 80, so that each occurs three or four times.
     assert 0.5 * np.quantile(rise, 0.4) < h < 0.5 * np.quantile(rise, 0.6)

@@ -119,6 +119,8 @@ def test_the_sentence_tells_the_numbers_of_the_step(episode, data):
         ("What came", f"coverage went from {before:.0f} % to {after:.0f} %"),
     ):
         assert words in said[heading]
+    numbers = [number_text(value) for value in (0.001234, 186.59, 1234.5, -2.0)]
+    assert numbers == ["0.00123", "187", "1,234", "−2"]
 
 
 def test_without_truth_and_surface_the_page_has_the_area_that_was_seen(episode, tmp_path, no_surfaces):

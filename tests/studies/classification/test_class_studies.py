@@ -15,10 +15,11 @@ from PIL import Image
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import concatenate, limit_capacity
+from jaxnbv.geometry.pose import look_at
 from jaxnbv.networks import InvariantClassifier, save_checkpoint
 from jaxnbv.readers import class_meshes
 from jaxnbv.sampler import SurfaceSampler
-from jaxnbv.search import TieBreakSearch
+from jaxnbv.search import GradientSearch, TieBreakSearch
 from jaxnbv.studies.classification.objects import HouseholdStudy, OmniObject3DStudy, PyramidStudy, TruckStudy
 from jaxnbv.studies.classification.study import OracleView
 from jaxnbv.studies.engine.chart import chart
@@ -106,13 +107,14 @@ def test_the_first_view_is_that_of_all_methods_and_shows_no_pattern_but_somethin
 def test_each_method_has_its_search_and_score():
     study = small_study()
     scene = study.scene(SCENE)
-    planners = {method: study.planner(method, scene) for method in study.methods}
+    planners = {method: study.planner(method, scene) for method in (*study.methods, *study.extra_methods)}
     scores = {"entropy": EntropyReduction, "mixed": MixedEntropy}
     for method, planner in planners.items():
         plain = method in ("coverage", "farthest", "uncertainty", "random")
         assert type(planner.acquisition) is (Coverage if plain else scores.get(method, CrossEntropy))
         assert plain or planner.acquisition.num_points == 100
     assert isinstance(planners["oracle"].search, OracleView)
+    assert isinstance(planners["gradient-2dof"].search, GradientSearch)
     assert isinstance(planners["tie-break"].search, TieBreakSearch)
     assert isinstance(planners["tie-break"].search.second, Coverage)
 
@@ -138,6 +140,12 @@ def test_answers_are_the_classifiers_of_all_that_was_seen():
     ):
         np.testing.assert_array_equal(scan.points, scene.task.scans[candidate].points)
         np.testing.assert_allclose(log_p, study.classifier(observations.cloud), atol=1e-5)
+    # A search by gradient leaves the candidates. There the sensor scans anew, with noise.
+    between = look_at([[0.3, 1.0, 2.2]])
+    scan = study.sensor(scene)(between[0], jax.random.key(0))
+    _, clouds = scan_cue(scene.task.class_object, CAMERA, between)
+    np.testing.assert_array_equal(scan.mask, clouds.mask[0])
+    np.testing.assert_allclose(scan.points, clouds.points[0], atol=0.1)
 
 
 @pytest.mark.parametrize("kind", [HouseholdStudy, PyramidStudy])
