@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 import safetensors.numpy
-from published import classifier_state
+from published_networks import classifier_state
 from torch_files import checkpoint
 
 import jaxnbv as nbv

@@ -4,9 +4,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import published
+import published_networks as published
 import pytest
-from published import layers, near_sphere
+from published_networks import layers, near_sphere
 from safetensors.numpy import save_file
 
 import jaxnbv as nbv

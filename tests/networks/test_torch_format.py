@@ -8,7 +8,7 @@ import zipfile
 
 import numpy as np
 import pytest
-from published import classifier_state
+from published_networks import classifier_state
 from torch_files import (
     STORAGES,
     Op,

@@ -203,6 +203,8 @@ def run_on_two_devices(tmp_path, *arguments):
     assert ended.returncode == 0, ended.stderr
 
 
+@pytest.mark.slow
+@pytest.mark.as_users
 def test_several_at_once_on_two_devices_choose_the_same_views(tmp_path):
     """Two together on the first device, and the third by itself on the other."""
     run_on_two_devices(tmp_path, "DiscreteSearch", "2")
