@@ -6,7 +6,7 @@ Topics: `depth/image` (sensor_msgs/Image, 16UC1 or mono16 in millimetres, 32FC1 
 Camera frames of ROS look along z with y down, which is OpenCV's convention. The service `take` (std_srvs/Trigger) adds
 the latest image, since most images of a stream show nothing new.
 
-The functions and `Bridge` need no ROS: `tests/planning/test_ros2_next_view.py` plays bags through them. The node in
+The functions and `Bridge` need no ROS: `tests/planning/test_ros2_next_view.py` passes messages to them. The node in
 `main` has not run.
 """
 

@@ -113,6 +113,7 @@ def test_a_matrix_of_another_image_size_is_named(center, binning, recwarn):
 
 
 LENSES = [
+    (-0.3, 0.1, 0.001, -0.002),
     (0.1, -0.2, 0.0005, 0.0005, 0.1),
     (8.1, 4.5, 1e-4, -2e-5, 0.2, 8.4, 6.5, 1.2),
 ]

@@ -99,6 +99,9 @@ def test_random_columns_against_gram_schmidt_in_double_precision():
     # Rounding of two unit vectors turns the orthogonal remainder of the second by itself over the sine between them.
     assert (np.abs(got - gram_schmidt(columns)).max(axis=(1, 2)) * sine).max() < 1e-6
     assert_rotations(got, 2e-6)
+    # If the vectors are parallel up to rounding, the remainder is noise.
+    for parallel in (a, -3 * a, a * (1 + 5e-7 * RNG.normal(size=a.shape))):
+        assert_rotations(FROM_6D(np.concatenate([a, parallel], axis=1).astype(np.float32)))
 
 
 @settings(max_examples=150)

@@ -3,7 +3,7 @@
 The derivative is pathwise: every ray stays on the part of the surface that it hits. Where a ray leaves the surface, or
 moves to another part of it, the value jumps, and the derivative does not include that. Where a ray grazes the surface,
 or a hit moves to another cell of the grid, differences are inaccurate too. In these scenes that concerns less than a
-third of the directions.
+third of the directions, and hardly any on the sphere about an object that fills the image.
 """
 
 import equinox as eqx
@@ -145,7 +145,7 @@ def test_derivatives_are_those_of_central_differences(kind, space, x64):
     for name, weight in zip(ACQUISITIONS, jnp.eye(len(ACQUISITIONS)), strict=True):
         derivatives, expected, length = compare(OneOf(list(ACQUISITIONS.values()), weight), surfaces, *pairs)
         error = np.abs(derivatives - expected) / (1e-6 * length + 1e-7)
-        assert np.quantile(error, 0.66) < 1, f"{name}: {np.sort(error)}"
+        assert np.quantile(error, 0.94 if kind == "filling" else 0.66) < 1, f"{name}: {np.sort(error)}"
         assert (length > 1e-3).mean() > 0.5, f"{name} has no slope"
 
 

@@ -198,7 +198,8 @@ def test_an_image_beside_the_box_is_warned_of():
 
 
 def test_an_image_of_an_earlier_moment_than_its_pose_is_refused(tmp_path):
-    """Also by a session that is loaded from its folder. From the same pose the image may be added again."""
+    """Also by a session that is loaded from its folder. From the same pose the image may be added again. In metres, NaN
+    stands for no measurement."""
     begun(tmp_path)
     session, stale = session_of(tmp_path), shot(FIRST)
     with pytest.raises(InputError, match=r"bit for bit equal to image 1, which has a diff.*Discard the frames"):
@@ -206,7 +207,11 @@ def test_an_image_of_an_earlier_moment_than_its_pose_is_refused(tmp_path):
     session.add(stale, FIRST.astype(np.float32), depth_scale=1e-3)
     stale[20, 20] += 1
     session.add(stale, POSES[0], depth_scale=1e-3)
-    assert len(session.views) == len(list(tmp_path.glob("image_*"))) == 3
+    metres = np.where(stale > 400, 1e-3 * stale, np.nan)
+    session.add(metres, POSES[1])
+    with pytest.raises(InputError, match="bit for bit equal to image 4"):
+        session.add(metres.copy(), POSES[2])
+    assert len(session.views) == len(list(tmp_path.glob("image_*"))) == 4
 
 
 def test_a_later_image_that_measured_nothing_is_no_view(tmp_path):
@@ -228,6 +233,7 @@ def test_a_later_image_that_measured_nothing_is_no_view(tmp_path):
     [
         (lambda: session_of().next(), "no image yet: add one first"),
         (lambda: session_of().observations, "no image yet: add one first"),
+        (lambda: session_of().episode, "no image yet: add one first"),
         (lambda: session_of(box=((0.0, 0.0), (1.0, 1.0))), "give two corners"),
         (lambda: session_of(box=((0.0, 0.0, 0.0), (1.0, 1.0, -1.0))), "has no inside"),
         (lambda: session_of(planner=planner_of(GradientSearch())), "GradientSearch is no search over candidates"),

@@ -52,6 +52,7 @@ def step(planner, key):
     second = nbv.look_at((0.8, -0.9, 2.2))
     observations = planner.observe(observations, second, nbv.scan(SCENE, planner.camera, second))
     proposal = planner.propose(observations, key)
+    planner.observe(observations, proposal.pose, nbv.scan(SCENE, planner.camera, proposal.pose))
     return np.asarray(proposal.pose.matrix), np.asarray(proposal.value)
 
 

@@ -190,12 +190,13 @@ def test_what_an_object_stands_on_is_found(seed):
 @pytest.mark.parametrize(
     "parts",
     [
+        lambda rng: [level_board(rng, (0.45, 1.2), 0.4)],
         lambda rng: [level_board(rng, (0.45, 1.2), 1.0), level_board(rng, (2.0, 2.0), -1.5)],
         lambda rng: [level_board(rng, (2.0, 2.0), 0.3), rng.uniform(-0.4, 0.0, (200, 3))],
         lambda rng: [level_board(rng, (2.0, 2.0), 0.0)[:, [1, 0, 2]], rng.uniform(0.1, 0.4, (200, 3))],
         lambda rng: [rng.uniform(-0.4, 0.4, (30, 3))],
     ],
-    ids=["the top of a box", "things below", "a wall", "few points"],
+    ids=["a table that is the object", "the top of a box", "things below", "a wall", "few points"],
 )
 def test_points_of_no_support_are_kept(parts):
     assert under(*parts(np.random.default_rng(0))) is None
