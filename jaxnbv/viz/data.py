@@ -156,7 +156,7 @@ def report_data(
         sentences = sentences_about(planner.quantity, views[: index + 1], task.amounts[: index + 1], frame, gain)
         if not task.is_coverage:
             answer_text = words_of(task.answers[index]).said(task.answers[index - 1] if index else None)
-            sentences["What came"] += f" {capital(answer_text)}."
+            sentences["Result"] += f" {capital(answer_text)}."
         before = episode.views[index - 1].cloud.to_numpy()[0] if index else np.zeros((0, 3), np.float32)
         if next_sketch.unmeasured:
             sentences["Never measured"] = unmeasured_text(next_sketch.unmeasured, frame)

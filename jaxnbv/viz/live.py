@@ -28,7 +28,7 @@ from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.search import Proposal
 from jaxnbv.storage.files import write_text
 from jaxnbv.surfaces.part_hypotheses import PartHypotheses
-from jaxnbv.utility import Quantity
+from jaxnbv.utility import Answer, Quantity
 from jaxnbv.viz.answers import capital, kinds_text, value_text, words_of
 from jaxnbv.viz.choice import colour_range, open_values
 from jaxnbv.viz.mean_surface import MeanSurface
@@ -132,7 +132,7 @@ class LiveView:
                 )
             observations = episode.observations_after(len(views)) if observations is None else observations
             key, *_ = view_keys(episode.key, len(views))
-            surface, imagined, kinds = _surfaces(sampler, observations, key)
+            surface, imagined, kinds = _surfaces(sampler, observations, key, views[-1].answer(planner.acquisition))
             with self._server.atomic():
                 self._handles += [*_draw_surface(scene, surface), *_draw_imagined(scene, imagined)]
                 if proposal is not None:
@@ -157,11 +157,11 @@ class LiveView:
 
 
 def _surfaces(
-    sampler: SurfaceSampler, observations: Observations, key: PRNGKeyArray
+    sampler: SurfaceSampler, observations: Observations, key: PRNGKeyArray, answer: Answer | None
 ) -> tuple[MeanSurface | None, list[tuple[str, Triangles]], Kinds]:
     """Return the surface to show, some imagined surfaces with names, and the kinds of known shapes.
 
-    With known parts, the imagined surfaces are the likeliest parts.
+    With known parts, the imagined surfaces are the likeliest parts. The surface agrees with the `answer`.
     """
     if isinstance(observations.hypotheses, PartHypotheses):
         parts = placed_parts(observations.hypotheses, _NUM_SAMPLES)
@@ -171,7 +171,7 @@ def _surfaces(
     posterior, samples = inputs.posterior, inputs.surfaces
     assert posterior is not None
     assert samples is not None
-    surface = shown_surface(sampler, inputs)
+    surface = shown_surface(sampler, inputs, answer)
     # Marching cubes needs a writable array.
     meshes = [level_triangles(values, sampler.grid) for values in np.array(samples.values[:_NUM_SAMPLES])]
     names = posterior.names_of_samples(key, sampler.num_samples)

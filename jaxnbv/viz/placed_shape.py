@@ -22,6 +22,7 @@ from jaxnbv.surfaces.known_shapes import kind_of
 from jaxnbv.surfaces.part_hypotheses import NONE, PartHypotheses
 from jaxnbv.surfaces.registration import Hypotheses
 from jaxnbv.surfaces.shape_bank import ShapeBank
+from jaxnbv.utility import Answer
 from jaxnbv.viz.mean_surface import MeanSurface
 from jaxnbv.viz.sphere import unit
 
@@ -116,13 +117,19 @@ def likeliest_part(hypotheses: PartHypotheses, cloud: PointCloud | None = None) 
 
 
 def likeliest_shape(
-    bank: ShapeBank, hypotheses: Hypotheses, weights: Float[AnyArray, " h_and_none"], cloud: PointCloud
+    bank: ShapeBank,
+    hypotheses: Hypotheses,
+    weights: Float[AnyArray, " h_and_none"],
+    cloud: PointCloud,
+    answer: Answer | None = None,
 ) -> PlacedShape | None:
     """Return the likeliest shape of the likeliest kind; None if "none of these" is nearly certain.
 
     - `bank`: examples of categories.
     - `hypotheses`, `weights`: the registered shapes and their weights. The last weight is that of "none of these".
     - `cloud`: scanned points.
+    - `answer`: probabilities of classes. If each kind is one of the classes, they multiply the weights of the kinds, so
+      that a picture does not contradict the answer beside it.
     """
     weights = np.asarray(weights, np.float64)
     if weights[-1] > _MAX_NONE_PROBABILITY:
@@ -132,6 +139,10 @@ def likeliest_shape(
     for row in np.argsort(-weights[:-1], kind="stable").tolist():
         rows.setdefault(names[row], row)
         kinds[names[row]] = kinds.get(names[row], 0.0) + weights[row]
+    if answer is not None and kinds.keys() <= set(answer.names):
+        chances = dict(zip(answer.names, answer.values.tolist(), strict=True))
+        factor = sum(kinds.values()) / max(sum(kinds[kind] * chances[kind] for kind in kinds), 1e-30)
+        kinds = {kind: factor * weight * chances[kind] for kind, weight in kinds.items()}
     likely = sorted(kinds, key=lambda kind: -kinds[kind])[:_MAX_HYPOTHESES]
     first = _place_shape(bank, hypotheses, rows[likely[0]], kinds[likely[0]])
     shape = dataclasses.replace(first, name=likely[0], is_part=False)

@@ -6,6 +6,7 @@ from jaxnbv.observations import Observations
 from jaxnbv.sampler import StepInputs, SurfaceSampler
 from jaxnbv.surfaces.known_shapes import KnownShapes, KnownShapesPosterior
 from jaxnbv.surfaces.part_hypotheses import PartHypotheses
+from jaxnbv.utility import Answer
 from jaxnbv.viz.mean_surface import MeanSurface, mean_surface, near_points
 from jaxnbv.viz.placed_shape import likeliest_part, likeliest_shape
 
@@ -15,13 +16,14 @@ def needs_no_posterior(sampler: SurfaceSampler) -> bool:
     return isinstance(sampler.model, KnownShapes) and sampler.model.bank.solids is not None
 
 
-def shown_surface(sampler: SurfaceSampler, inputs: StepInputs) -> MeanSurface | None:
+def shown_surface(sampler: SurfaceSampler, inputs: StepInputs, answer: Answer | None = None) -> MeanSurface | None:
     """Return the likeliest known shape at its placement, or else the posterior mean's surface near points.
 
     Return None if there is no such surface. The mean over several known shapes is the shape of none of them, so it is
     not shown. If the object fits no known shape, the mean is that of the model without the bank.
 
     - `inputs`: inputs of a step, with a posterior unless `needs_no_posterior`.
+    - `answer`: the acquisition's answer, whose classes may also be the kinds of the known shapes.
     """
     observations, posterior, model = inputs.observations, inputs.posterior, sampler.model
     if isinstance(observations.hypotheses, PartHypotheses):
@@ -31,7 +33,7 @@ def shown_surface(sampler: SurfaceSampler, inputs: StepInputs) -> MeanSurface | 
             fits, weights = posterior.fits, posterior.weights
         else:
             fits, weights = model.fit(_within_volume(sampler, observations))
-        if (shape := likeliest_shape(model.bank, fits, weights, observations.cloud)) is not None:
+        if (shape := likeliest_shape(model.bank, fits, weights, observations.cloud, answer)) is not None:
             return shape
         sampler = sampler.without_bank
         posterior_of_none = (

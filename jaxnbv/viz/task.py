@@ -211,5 +211,5 @@ def _reliability_text(episode: Episode, answers: Sequence[Answer]) -> str:
     first, lost = first_reliable(is_reliable), first_lost(is_reliable)
     text = f"From view {first} on" if first else f"Not yet after {count} view{'s' * (count > 1)}"
     lost_text = f" At view {lost} it was sure already, but then not." if lost else ""
-    stop_text = "" if episode.stop_reason is None else f" It ended by its rule: {episode.stop_reason}."
+    stop_text = "" if episode.stop_reason is None else f" It stopped: {episode.stop_reason}."
     return f"{text}.{lost_text} Sure means {words_of(answers[-1]).settled_means}.{stop_text}"

@@ -33,7 +33,7 @@ def sentences_about(
     if view.proposal is None or not earlier:
         surface_text = "the true surface" if amounts[-1].unit == "%" else "surface"
         result = f"It found {points:,} points, {amount} of {surface_text}."
-        return {"Where": f"It was given. It looks from {pose_text(view.pose, frame)}.", "What came": result}
+        return {"Where": f"This view was given. It looks from {pose_text(view.pose, frame)}.", "Result": result}
     direction, earlier_directions = directions_of(view.pose), np.stack([directions_of(other.pose) for other in earlier])
     nearest = np.degrees(np.arccos(np.clip((earlier_directions @ direction).max(), -1.0, 1.0)))
     added = f"It added {points:,} points ({int(view.cloud.count):,} are kept)" if points else "It saw nothing"
@@ -44,7 +44,7 @@ def sentences_about(
     return {
         "Where": f"It looks from {pose_text(view.pose, frame)}, {nearest:.0f}° from the nearest earlier view.",
         **_reason(quantity, view.proposal, frame),
-        "What came": f"{added}; {'coverage' if amounts[-1].unit == '%' else 'surface seen'} {change}.",
+        "Result": f"{added}; {'coverage' if amounts[-1].unit == '%' else 'surface seen'} {change}.",
     }
 
 
@@ -52,7 +52,7 @@ def _reason(quantity: Quantity, proposal: Proposal, frame: Frame) -> dict[str, s
     """Return sentences, by heading, about the value of a view and the values of the other candidates."""
     value, others, num_tied = float(proposal.value), descending_values(proposal).tolist(), proposal.num_tied
     if not quantity.smooth:
-        return {"What it promised": f"It was drawn at random from {len(others)} open candidates."}
+        return {"Why this view": f"It was drawn at random from {len(others)} open candidates."}
     is_ascent = proposal.trajectories is not None and (not others or value > others[0])
     rank = 1 + sum(other > value for other in others)
     reason = f"{'the highest' if rank == 1 else f'rank {rank}'} of {len(others)} open candidates"
@@ -63,7 +63,7 @@ def _reason(quantity: Quantity, proposal: Proposal, frame: Frame) -> dict[str, s
         reason = f"found by gradient ascent from {num_starts} start{'s' * (num_starts > 1)}"
     # Print only areas and lengths, because readers do not know nats.
     amount = f"Its value, {value_text(quantity, value, frame)}," if quantity.length_power else "Its value"
-    sentences = {"What it promised": f"{amount} was {reason}."}
+    sentences = {"Why this view": f"{amount} was {reason}."}
     rest = others if is_ascent or rank > 1 else others[1:]
     if rest:
         visited_value = 0.0 if proposal.value_at_visited is None else float(proposal.value_at_visited)
@@ -72,7 +72,7 @@ def _reason(quantity: Quantity, proposal: Proposal, frame: Frame) -> dict[str, s
         )
         tied_text = "" if num_tied is None else f"; {num_tied or 'no'} other{'s' * (num_tied != 1)} within {level}"
         other, median = "candidate" if is_ascent else "other", number_text(float(np.median(others)))
-        sentences["Beside the others"] = f"Best {other} {number_text(rest[0])}, median {median}{tied_text}."
+        sentences["Other candidates"] = f"Best {other} {number_text(rest[0])}, median {median}{tied_text}."
     return sentences
 
 

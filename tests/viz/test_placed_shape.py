@@ -15,6 +15,7 @@ from jaxnbv.surfaces.part_hypotheses import NONE, PartHypotheses
 from jaxnbv.surfaces.placement import Placement
 from jaxnbv.surfaces.registration import Hypotheses
 from jaxnbv.tasks.identification import identity_answer
+from jaxnbv.utility import Answer
 from jaxnbv.viz.answers import words_of
 from jaxnbv.viz.data import report_data
 from jaxnbv.viz.figures import overview_figure
@@ -71,7 +72,8 @@ def test_a_shape_of_a_bank_is_drawn_as_registered_and_the_others_as_disputed_spa
     placed = Hypotheses(jnp.array([0, 1]), Placement(still, jnp.zeros((2, 3)), scale), jnp.zeros(2), jnp.ones(2, bool))
     corner = [[0.5, 0.6, 0.2], [0.6, 0.6, 0.2]]
     cloud = nbv.PointCloud.from_arrays(corner, [[0.0, 1.0, 0.0]] * 2)
-    shape = likeliest_shape(bank, placed, np.array([0.2, 0.3, 0.5]), cloud)
+    weights = np.array([0.2, 0.3, 0.5])
+    shape = likeliest_shape(bank, placed, weights, cloud)
     assert (shape.name, shape.is_part) == ("slab", False)
     assert shape.probability == pytest.approx(0.3)
     np.testing.assert_allclose(np.abs(shape.vertices).max(axis=0), [0.9, 0.6, 0.5], atol=0.01)
@@ -80,6 +82,10 @@ def test_a_shape_of_a_bank_is_drawn_as_registered_and_the_others_as_disputed_spa
     assert shape.measured[near > 0.3].max() == 0.0
     np.testing.assert_allclose(np.abs(shape.disputed_space.vertices).max(axis=0), 0.7, atol=0.05)
     assert likeliest_shape(bank, placed, np.array([0.02, 0.03, 0.95]), cloud) is None
+    # A classifier that recognises a cube changes 0.2 : 0.3 to 0.18 : 0.03, of 0.5 in all. Other classes change nothing.
+    by_class = likeliest_shape(bank, placed, weights, cloud, Answer(("slab", "cube"), np.array([0.1, 0.9])))
+    assert (by_class.name, by_class.probability) == ("cube", pytest.approx(0.5 * 0.18 / 0.21))
+    assert likeliest_shape(bank, placed, weights, cloud, Answer(("ball",), np.ones(1))).name == "slab"
 
 
 def test_words_name_the_likeliest_or_its_group_and_none_of_these():

@@ -112,11 +112,11 @@ def test_the_sentence_tells_the_numbers_of_the_step(episode, data):
     values = values[np.isfinite(values)]
     before, after = (data.views[i].coverage.values[0] for i in (0, 1))
     for heading, words in (
-        ("What it promised", f"the highest of {len(values)} open candidates"),
-        ("Beside the others", f"Best other {number_text(values[1])}, median {number_text(np.median(values))}"),
-        ("Beside the others", "two standard errors"),
-        ("What came", f"added {int(view.scan.count):,} points"),
-        ("What came", f"coverage went from {before:.0f} % to {after:.0f} %"),
+        ("Why this view", f"the highest of {len(values)} open candidates"),
+        ("Other candidates", f"Best other {number_text(values[1])}, median {number_text(np.median(values))}"),
+        ("Other candidates", "two standard errors"),
+        ("Result", f"added {int(view.scan.count):,} points"),
+        ("Result", f"coverage went from {before:.0f} % to {after:.0f} %"),
     ):
         assert words in said[heading]
     numbers = [number_text(value) for value in (0.001234, 186.59, 1234.5, -2.0)]

@@ -223,7 +223,7 @@ def test_a_rival_is_told_of_and_drawn(classified, farthest):
     assert rival_text(farthest, ended) == f"Farthest view was not done after 3 views from the same start ({text})."
     ended_too = dataclasses.replace(farthest, stop_reason="sure of it")
     assert rival_text(ended_too, ended).startswith("Farthest view needed 3 views")
-    assert task_of(ended).reliability_text.endswith("It ended by its rule: sure of it.")
+    assert task_of(ended).reliability_text.endswith("It stopped: sure of it.")
     np.testing.assert_allclose(rival.charts[0].values[2], p, atol=1e-6)
     truth = nbv.scanning.metrics.truth_points(nbv.SDFSurface(PYRAMID), jax.random.key(0))
     shares = np.array(nbv.scanning.metrics.coverage(farthest.views, truth))
@@ -250,7 +250,7 @@ def test_the_page_opens_with_the_answer_and_folds_the_settings_away(measured):
     body = measured[-1].partition("<body>")[2]
     titles = (
         "<h1>Greatest height?",
-        "<dt>Found</dt>",
+        "<dt>Answer</dt>",
         "<dt>Sure</dt>",
         'id="slider"',
         "<summary>Settings and versions",

@@ -96,8 +96,8 @@ def test_the_sentence_the_summary_and_the_page_tell_of_ascents(ascended, capsys)
     episode, data = ascended
     best = float(np.max(episode.views[1].proposal.values))
     said = data.views[1].sentences
-    assert said["What it promised"].endswith("was found by gradient ascent from 4 starts.")
-    assert said["Beside the others"].startswith(f"Best candidate {number_text(best)}, median")
+    assert said["Why this view"].endswith("was found by gradient ascent from 4 starts.")
+    assert said["Other candidates"].startswith(f"Best candidate {number_text(best)}, median")
     printer = ViewPrinter(episode.planner)
     for view in episode.views:
         printer(view)
