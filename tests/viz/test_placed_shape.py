@@ -117,7 +117,7 @@ def test_a_report_shows_the_part_over_the_scan(episode):
     assert task_of(episode).choice_text.endswith("over the likeliest parts and how they may lie.")
     page = report_html(data, "thing")
     assert Page(page).tables["Probability"][1][0] == "view 1"
-    for words in ("Which part is it?", "Slab, probability 0.75", "The likeliest known shape where it fits"):
+    for words in ("Which part is it?", "Slab, probability 0.75", "The likeliest known shape, placed where it fits"):
         assert words in page
     assert "What the colour measures" not in page
     assert "likeliest shape" in {drawn["name"] for drawn in scene_in_space(page)[1]["data"]}

@@ -96,8 +96,8 @@ def test_probabilities_by_view_are_those_of_the_classifier(classified):
     assert int(PYRAMID.label) == 1
     assert true == ["in truth", "0", "1", "0"]
     best = int(np.argmax(expected[-1]))
-    assert head(text)["Found"].startswith(f"{NAMES[best].capitalize()}, probability {expected[-1][best]:.2f}")
-    assert head(text)["Found"].endswith("In truth: right")
+    assert head(text)["Answer"].startswith(f"{NAMES[best].capitalize()}, probability {expected[-1][best]:.2f}")
+    assert head(text)["Answer"].endswith("In truth: right")
     assert "What is it?" in text
 
 
