@@ -40,7 +40,7 @@ install_import_hook(["jaxnbv", "forecasts", "covering", "peers", "training", "tr
 settings.register_profile("repeatable", derandomize=True, deadline=None)
 settings.load_profile("repeatable")
 
-# .ci/run repeats the tests marked as_users with this, so that they are compiled as users compile.
+# .ci/run runs the tests marked as_users with this, so that they are compiled as users compile.
 AS_USERS = os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] == "0"
 # Memory of a worker in bytes.
 MEMORY = 3 << 30

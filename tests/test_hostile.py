@@ -9,7 +9,11 @@ import pytest
 
 @pytest.mark.parametrize(
     "program",
-    [pytest.param(("hostile.py", "25"), marks=pytest.mark.slow), ("refused.py",), ("byte_order.py",)],
+    [
+        ("refused.py",),
+        pytest.param(("hostile.py", "25"), marks=pytest.mark.slow),
+        pytest.param(("byte_order.py",), marks=pytest.mark.slow),
+    ],
     ids=lambda program: program[0],
 )
 def test_arguments_work_or_are_refused_by_name(program):

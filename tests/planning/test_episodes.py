@@ -176,10 +176,10 @@ PROGRAM = """
     import jaxnbv as nbv
 
     sampler = nbv.SurfaceSampler(nbv.GeometricSPSR(0.05, truncation=6), nbv.Grid(20), num_samples=2)
-    camera, search = nbv.Camera(height=8, width=8), getattr(nbv, sys.argv[1])(8)
+    camera, search = nbv.Camera(height=8, width=8), nbv.DiscreteSearch(8)
     planner = nbv.Planner(nbv.NewSurface(), search, camera, sampler, capacity=64, max_views=4)
     scenes = [nbv.sdf.Sphere(radius) for radius in (0.6, 0.7, 0.8)]
-    first, keys, batch_size = nbv.look_at((0.8, 0.9, 2.2)), jax.random.split(jax.random.key(0), 3), int(sys.argv[2])
+    first, keys, batch_size = nbv.look_at((0.8, 0.9, 2.2)), jax.random.split(jax.random.key(0), 3), int(sys.argv[1])
     shared = nbv.episodes(planner, scenes, first, 3, keys, batch_size=batch_size)
     assert len(shared.values.sharding.device_set) == 2
     runs = [nbv.simulate(planner, scene, first, 3, key, progress=False) for scene, key in zip(scenes, keys)]
@@ -195,26 +195,11 @@ PROGRAM = """
 """
 
 
-def run_on_two_devices(tmp_path, *arguments):
-    """In its own process, because devices are counted before it starts."""
+@pytest.mark.as_users
+@pytest.mark.parametrize("batch_size", ["1", "2"])
+def test_episodes_on_two_devices_are_those_of_simulate(batch_size, tmp_path):
+    """In a process of its own, because JAX counts devices once. Two at once are equal up to rounding."""
     program = tmp_path / "program.py"
     program.write_text(textwrap.dedent(PROGRAM))
-    ended = subprocess.run([sys.executable, program, *arguments], capture_output=True, text=True, timeout=600)
+    ended = subprocess.run([sys.executable, program, batch_size], capture_output=True, text=True, timeout=600)
     assert ended.returncode == 0, ended.stderr
-
-
-@pytest.mark.slow
-@pytest.mark.as_users
-def test_several_at_once_on_two_devices_choose_the_same_views(tmp_path):
-    """Two together on the first device, and the third by itself on the other."""
-    run_on_two_devices(tmp_path, "DiscreteSearch", "2")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("search", ["FarthestView", "DiscreteSearch"])
-@pytest.mark.as_users
-def test_two_devices_give_the_same_arrays(search, tmp_path, monkeypatch):
-    """It compiles as users' programs do."""
-    for name in ("XLA_FLAGS", "JAX_DISABLE_MOST_OPTIMIZATIONS"):
-        monkeypatch.delenv(name, raising=False)
-    run_on_two_devices(tmp_path, search, "1")
