@@ -38,7 +38,7 @@ def to_image(figure: Figure, dpi: int) -> Image.Image:
 
 def save(figure: Figure, path: Path) -> None:
     """Write a figure with few colours, which makes the file small."""
-    to_image(figure, 170).quantize(128, dither=Image.Dither.NONE).save(path, optimize=True)
+    to_image(figure, 170).quantize(255, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
 def draw_posterior(

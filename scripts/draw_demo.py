@@ -22,7 +22,7 @@ from jaxnbv.viz.imagined import Tile, colour_image, image_tiles
 from jaxnbv.viz.render import draw_scene, render_view
 from jaxnbv.viz.style import GREY, NEW
 
-SIZE, DPI, COLOURS = (9.2, 3.5), 120, 128
+SIZE, DPI, COLOURS = (9.2, 3.5), 120, 256
 # The demo's own seed.
 SEED = 2
 MAX_VIEWS, MAX_RIVAL_VIEWS = 5, 10
@@ -87,7 +87,7 @@ class Film:
     def save(self, path: Path) -> None:
         """Write the film with one palette, on a white background: Pillow looks colours up by their leading bits."""
         strip = Image.fromarray(np.concatenate([np.asarray(frame)[::3, ::3] for frame in self.frames]))
-        palette = strip.quantize(COLOURS - 1, dither=Image.Dither.NONE)
+        palette = strip.quantize(COLOURS - 1, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
         colours = [*palette.getpalette()[: 3 * (COLOURS - 1)], 255, 255, 255]
         frames = []
         for frame in self.frames:

@@ -78,7 +78,7 @@ def draw_hero(figure: Figure) -> None:
     sketch, proposal = data.views[1].imagined, data.views[1].proposal
     assert sketch is not None
     heads = (
-        ("a truck: what does it carry?", "purple, translucent: shapes that may be"),
+        ("a truck: what does it carry?", "purple: shapes that it may have"),
         ("what may be there", "four guesses; blue: not seen yet"),
         ("what each view is worth", "purple: may change the answer"),
         ("the next view, and the answer", data.task.answer_text.partition(". ")[0]),
