@@ -131,7 +131,7 @@ CALLS = {
         "residual": RESIDUAL,
         "poses": nbv.surfaces.Upright(),
         "box": nbv.Box(),
-        "unknown": MODEL,
+        "model_of_none": MODEL,
     }
     | {"num_starts": 8, "noise_scale": 0.1, "inverse_temperature": 20.0, "misfit_of_none": 0.6},
     nbv.ShapeBank.from_meshes: {"meshes": [MESH], "resolution": 8, "sheet": 0.05, "names": ["a"], "progress": False},

@@ -113,7 +113,7 @@ def test_answers_about_known_parts():
     together = nbv.episodes(planner, blocks, POSES[:2], 3, KEYS[:2])
     assert together.answers.shape == (2, 3, 3)
     # Names are in alphabetical order.
-    assert (np.argmax(together.answers[:, -1], axis=1) == [1, 0]).all()
+    np.testing.assert_array_equal(np.argmax(together.answers[:, -1], axis=1), [1, 0])
     assert_equal(together, one_by_one(planner, blocks, POSES[:2], 3, KEYS[:2]), planner.acquisition)
 
 
