@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SCRIPT = """
 import os, sys, time
 from pathlib import Path
-import jaxnbv.planning.episode, jaxnbv.storage.files
+import jaxnbv.planning.simulate, jaxnbv.storage.files
 from small_episode import run
 
 folder, stage, view = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3])
@@ -34,7 +34,7 @@ def stall_at(module, name, moment):
 
 done = len(list(folder.glob("view_*.npz")))
 if stage == "scan":
-    stall_at(jaxnbv.planning.episode, "observe_scene", lambda call: done + call == view + 1)
+    stall_at(jaxnbv.planning.simulate, "observe_scene", lambda call: done + call == view + 1)
 if stage == "write":
     record = 0 if (folder / "episode.json").exists() else 1
     stall_at(jaxnbv.storage.files.os, "fsync", lambda call: done + call == view + 1 + record)
