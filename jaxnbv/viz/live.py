@@ -132,7 +132,8 @@ class LiveView:
                 )
             observations = episode.observations_after(len(views)) if observations is None else observations
             key, *_ = view_keys(episode.key, len(views))
-            surface, imagined, kinds = _surfaces(sampler, observations, key, views[-1].answer(planner.acquisition))
+            answer = views[-1].answer(planner.acquisition)
+            surface, imagined, kinds = _surfaces(sampler, observations, key, answer)
             with self._server.atomic():
                 self._handles += [*_draw_surface(scene, surface), *_draw_imagined(scene, imagined)]
                 if proposal is not None:
@@ -141,7 +142,7 @@ class LiveView:
                     self._image.remove()
                 label = "depth expected there"
                 self._image = None if picture is None else self._server.gui.add_image(picture, label=label)
-                self._text.content = _live_text(episode, kinds, proposal)
+                self._text.content = _live_text(episode, answer, kinds, proposal)
                 self._legend.content = _legend(surface, proposal, planner.quantity, episode.frame)
 
     def save(self, path: str | Path) -> Path:
@@ -179,13 +180,13 @@ def _surfaces(
     return surface, imagined, tuple(posterior.kinds().items())
 
 
-def _live_text(episode: Episode, kinds: Kinds, proposal: Proposal | None) -> str:
+def _live_text(episode: Episode, answer: Answer | None, kinds: Kinds, proposal: Proposal | None) -> str:
     """Return the answer, the next view, the amount seen and the kinds of known shapes, as Markdown.
 
     - `proposal`: the next view, with values in world units.
     """
     num_views, quantity, frame = len(episode.views), episode.planner.quantity, episode.frame
-    answer, lines = episode.views[-1].answer(episode.planner.acquisition), list[str]()
+    lines = list[str]()
     if answer is not None:
         words = words_of(answer.in_world(frame))
         lines += [f"**{words.question} {capital(words.found)}.**", f"{capital(words.said())}."]

@@ -77,7 +77,9 @@ def sketches_of(
 
 def _sketch(episode: Episode, index: int, inputs: StepInputs, imagine: bool = True) -> Sketch:
     sampler, observations = episode.planner.sampler, inputs.observations
-    surface = shown_surface(sampler, inputs, episode.views[index - 1].answer(episode.planner.acquisition))
+    # An answer can take seconds, and only known shapes use it.
+    answer = episode.views[index - 1].answer(episode.planner.acquisition) if needs_no_posterior(sampler) else None
+    surface = shown_surface(sampler, inputs, answer)
     patches = [] if surface is None else unmeasured(surface.mesh, observations, sampler.carving)
     samples = render_imagined(episode, index, inputs) if imagine and index < len(episode.views) else None
     return Sketch(surface, samples, patches)
