@@ -23,8 +23,8 @@ def results(records: Sequence[Record], study: type[Study]) -> pd.DataFrame:
     The column `at` holds the key: the view, or what else the measure's values belong to. Each row holds the method's
     mean over the scenes, the standard error of the mean, and the bootstrap interval of the mean (`low`, `high`). The
     `lead` is the mean over the scenes of the reference method's value minus this method's value, and `lead_low` and
-    `lead_high` are its bootstrap interval. A method without values has no row. A scene counts
-    only if every method that has a row has a value for the scene.
+    `lead_high` are its bootstrap interval. A method without values has no row. A scene counts only if every method that
+    has a row has a value for the scene.
 
     **Raises:** `ValueError` if there are no records.
     """
