@@ -91,7 +91,7 @@ def _blank_network(text: str) -> Any:
 
 
 def _fill(blank: Any, arrays: _Tensors) -> Any:
-    """Return a copy of the network `blank` with these arrays in place of its shapes."""
+    """Return a copy of the network `blank` with arrays in place of its shapes."""
     expected = {name: leaf.shape for name, leaf in _named_leaves(blank)}
     leaves: dict[str, np.ndarray] = {}
     for name in sorted(expected.keys() | arrays.keys()):

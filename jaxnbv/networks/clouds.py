@@ -17,13 +17,13 @@ from jaxnbv.tasks.segmentation import Segmenter
 
 
 class CloudClassifier(Classifier):
-    """A classifier made from a network. It maps a `PointCloud` to log-probabilities.
+    """A classifier made from a network. It maps a `PointCloud` in scene coordinates to log-probabilities.
 
     - `network`: called as `network(points, normals, mask)`. It returns log-probabilities of the classes.
     - `num_points`: number of points that the network gets, selected by farthest point sampling. A smaller cloud is
       padded with rows whose mask is False.
     - `scale`: network units per scene unit.
-    - `classes`: names of the classes, or None. By default the names that the network has, if any.
+    - `classes`: names of the classes; default: the names that the network has, if any.
 
     **Raises:** `ValueError` if `num_points` or `scale` is not positive, or if the network segments parts.
     """
@@ -48,7 +48,6 @@ class CloudClassifier(Classifier):
         require(self.scale > 0, f"the scale is {self.scale}; it must be positive")
 
     def __call__(self, cloud: PointCloud) -> Float[Array, " classes"]:
-        """Compute the log-probabilities of the classes of one cloud in scene coordinates."""
         inputs = farthest_point_subsample(cloud, self.num_points)
         return self.network(self.scale * inputs.points, inputs.normals, inputs.mask)
 
@@ -60,7 +59,7 @@ class CloudSegmenter(Segmenter):
 
     - `network`: called as `network(points, normals, category, mask)`. It returns log-probabilities of the fifty parts
       of ShapeNet-part.
-    - `category`: category of the object, given as its name or as its index in `CATEGORIES`.
+    - `category`: name of the object's category, or its index in `CATEGORIES`.
     - `num_points`: number of points that the network gets, selected by farthest point sampling. A smaller cloud is
       padded with rows whose mask is False.
     - `scale`: network units per scene unit.

@@ -25,7 +25,7 @@ class PairLevel(eqx.Module):
     d = (x_j - x_i) / radius. These are the point-pair features of Drost et al. (2010) without the square root and the
     arc cosines, so derivatives exist everywhere.
 
-    - `radius`: radius of a group, in the units of the points.
+    - `radius`: radius of a group, in units of the points.
     - `groups`: intended number of centres. The caller chooses the centres.
     - `neighbours`: maximum number of points in a group. If more are within the radius, the first rows are used.
     """
@@ -52,9 +52,8 @@ class PairLevel(eqx.Module):
         neighbourhood: tuple[Float[Array, "n 3"], Float[Array, "n 3"], Float[Array, "n inputs"] | None],
         mask: Bool[Array, " n"],
     ) -> Float[Array, "m outputs"]:
-        """Compute the features of each centre.
+        """Compute the features of each centre, given by position and normal.
 
-        - `centers`: positions and normals of the centres.
         - `neighbourhood`: points, normals and features of all rows. Rows whose `mask` is False are ignored.
         """
         points, normals, features = neighbourhood
@@ -71,7 +70,6 @@ class PairLevel(eqx.Module):
 
 
 def _affine(layer: Any, rows: Float[Array, "*rows inputs"]) -> Float[Array, "*rows outputs"]:
-    """Apply a linear layer to all rows."""
     return product(rows, layer.weight.T) + layer.bias
 
 
@@ -79,9 +77,9 @@ class Focus(eqx.Module):
     """A network that finds the cue: the points of an object that determine its class.
 
     For example, the cargo is the cue for the class of a truck. The network is invariant under rotations and
-    translations. It computes features of each point's neighbourhood and groups them around farthest point samples. It
-    interpolates the features of the groups back to the points, and applies a perceptron to both kinds of features. It
-    has about 12,000 parameters.
+    translations, and has about 12,000 parameters. It computes features of each point's neighbourhood, and groups them
+    around farthest point samples. It interpolates the features of the groups back to the points, and applies a
+    perceptron to both kinds of features.
     """
 
     edge: PairLevel
@@ -124,8 +122,7 @@ class InvariantClassifier(eqx.Module):
     The network has two levels of grouping (the first at the scale of an edge, the second at the scale of a pattern), a
     maximum over all groups, and about 75,000 parameters.
 
-    - `num_classes`: number of classes.
-    - `radii`: radii of the two levels, in the units of the points.
+    - `radii`: radii of the two levels, in units of the points.
     - `classes`: names of the classes, or None.
     - `groups`: number of groups of each level. With more groups the network can use smaller details.
     - `focused`: whether a `Focus` first selects the points that the classifier gets.

@@ -23,7 +23,6 @@ from jaxnbv.checks import require
 from jaxnbv.geometry.farthest_points import farthest_point_indices
 
 _WORD_BITS = 32
-_NEIGHBOURS = 3
 # Keeps the weight finite if a point and a coarse point coincide. In squared units of the points, as published.
 _SOFTENING = 1e-8
 
@@ -35,17 +34,12 @@ def product(x: Float[Array, "*rows inputs"], weight: Float[Array, "inputs output
 
 
 class Linear(eqx.Module):
-    """A linear layer, x W + b, in full precision.
-
-    - `weight`: the matrix W.
-    - `bias`: the vector b.
-    """
+    """A linear layer, x W + b in full precision, with the matrix W (`weight`) and the vector b (`bias`)."""
 
     weight: Float[Array, "inputs outputs"]
     bias: Float[Array, " outputs"]
 
     def __call__(self, x: Float[Array, "*rows inputs"]) -> Float[Array, "*rows outputs"]:
-        """Return x W + b for each row of `x`."""
         return product(x, self.weight) + self.bias
 
 
@@ -64,10 +58,7 @@ class PooledMLP(eqx.Module):
         return product(inputs, self.layers[0].weight)
 
     def pool(self, lifted: Float[Array, "*groups members inputs"]) -> Float[Array, "*groups outputs"]:
-        """Apply everything after `lift`: the first bias and rectifier, the other layers, and the maximum.
-
-        - `lifted`: results of `lift` for the members of each group.
-        """
+        """Apply what follows `lift` to its results: first bias and rectifier, the other layers, the maximum."""
         hidden = jax.nn.relu(lifted + self.layers[0].bias)
         for layer in self.layers[1:-1]:
             hidden = jax.nn.relu(layer(hidden))
@@ -79,9 +70,8 @@ class PooledMLP(eqx.Module):
 class SetAbstraction(eqx.Module):
     """One level of PointNet++, with one perceptron per radius.
 
-    - `branches`: the perceptron of each radius.
-    - `radii`: radii of the balls, in units of the points.
-    - `members`: for each radius, the number of points in a group.
+    - `branches`, `radii`: perceptrons, and radii of their balls in units of the points.
+    - `members`: number of points in a group, for each radius.
     - `centers`: number of centres.
     """
 
@@ -93,7 +83,7 @@ class SetAbstraction(eqx.Module):
     def __call__(
         self, points: Float[Array, "n 3"], features: Float[Array, "n inputs"] | None, mask: Bool[Array, " n"]
     ) -> tuple[Float[Array, "centers 3"], Float[Array, "centers outputs"]]:
-        """Return the centres and the features of each. Centres repeat if there are fewer points than centres."""
+        """Return the centres and their features. Centres repeat if there are fewer points than centres."""
         centers = points[farthest_point_indices(points, mask, self.centers)]
         outputs = []
         for branch, radius, members in zip(self.branches, self.radii, self.members, strict=True):
@@ -105,10 +95,10 @@ class SetAbstraction(eqx.Module):
 
 
 class FeaturePropagation(eqx.Module):
-    """One level of feature propagation: interpolation, then the same perceptron for all points.
+    """One level of feature propagation: interpolation, then one perceptron for all points.
 
-    - `layers`: the layers, each followed by a rectifier. Inputs of the first layer are the point's own features, then
-      the interpolated features.
+    - `layers`: layers of the perceptron, each followed by a rectifier. Inputs of the first layer are the point's own
+      features, then the interpolated features.
     """
 
     layers: tuple[Linear, ...]
@@ -120,9 +110,9 @@ class FeaturePropagation(eqx.Module):
         own: Float[Array, "n inputs"],
         features: Float[Array, "m f"],
     ) -> Float[Array, "n outputs"]:
-        """Compute new features of the points from their own features and those of the coarse points."""
+        """Compute new features of the points from their `own` and from the `features` of the coarse points."""
         first = self.layers[0]
-        # Interpolation is linear, so compute the first product at the coarse points. There are fewer coarse points.
+        # Interpolation is linear, so compute the first product at the coarse points, which are fewer.
         lifted = interpolate(points, coarse, product(features, first.weight[own.shape[1] :]))
         x = jax.nn.relu(product(own, first.weight[: own.shape[1]]) + lifted + first.bias)
         for layer in self.layers[1:]:
@@ -140,9 +130,8 @@ def ball_query(
 ) -> Int[Array, "m count"]:
     """Return the indices of the first `count` rows within `radius` of each centre.
 
-    If a ball has fewer points, the first index is repeated. A point at exactly `radius` is in the ball. If a ball has
-    no point, all of its indices are those of the first valid row. Indices have no derivative, but `points[index]` is
-    differentiable.
+    A point at exactly `radius` is in the ball. If a ball has fewer points, its first index is repeated. If it has no
+    point, all its indices are the first row whose mask is True. `points[index]` is differentiable.
 
     **Raises:** `ValueError` if `count` < 1.
     """
@@ -158,8 +147,8 @@ def _positions_of_true(flags: Bool[Array, "m n"], count: int) -> Int[Array, "m c
     """Return the columns of the first `count` true entries of each row.
 
     If a row has fewer true entries, the remaining columns are at least n. Each row is packed into words of 32 bits. Bit
-    counts of the words determine the word that holds the k-th true entry, and five bisections of this word determine
-    the bit. This takes one pass over the flags. Sorting the columns would take many passes.
+    counts give the word that holds the k-th true entry, and five bisections of this word give the bit. This takes one
+    pass over the flags. Sorting the columns would take many.
     """
     flags = jnp.pad(flags, ((0, 0), (0, -flags.shape[1] % _WORD_BITS))).reshape(len(flags), -1, _WORD_BITS)
     bit = jnp.left_shift(jnp.uint32(1), jnp.arange(_WORD_BITS, dtype=jnp.uint32))
@@ -190,7 +179,7 @@ def interpolate(
     """Interpolate features at each point from the three nearest coarse points.
 
     If there are fewer than three coarse points, all of them are used. Weights are inverse squared distances. The result
-    is differentiable in features, points and coarse points. The derivative ignores changes of the nearest points.
+    is differentiable in all arguments. The derivative ignores that the nearest points may change.
     """
     index, is_valid = _nearest(points, coarse)
     squared = jnp.sum((points[:, None] - coarse[index]) ** 2, axis=-1)
@@ -202,8 +191,7 @@ def interpolate(
 def _nearest(points: Float[Array, "n 3"], coarse: Float[Array, "m 3"]) -> tuple[Int[Array, "n 3"], Bool[Array, "n 3"]]:
     """Return the rows of the three nearest coarse points of each point, and whether each of the three exists.
 
-    Loops over the coarse points and keeps the three nearest. On a CPU this is two to three times as fast as
-    `jax.lax.top_k`.
+    On a CPU this loop over the coarse points is two to three times as fast as `jax.lax.top_k`.
     """
     points, coarse = jax.lax.stop_gradient((points, coarse))
     x, y, z = points.T
@@ -225,9 +213,6 @@ def _nearest(points: Float[Array, "n 3"], coarse: Float[Array, "m 3"]) -> tuple[
         )
         return distances, rows
 
-    none = (
-        (jnp.full(len(points), jnp.inf, points.dtype),) * _NEIGHBOURS,
-        (jnp.zeros(len(points), jnp.int32),) * _NEIGHBOURS,
-    )
-    distances, rows = jax.lax.fori_loop(0, len(coarse), closer, none, unroll=8)
+    infinite, zeros = jnp.full(len(points), jnp.inf, points.dtype), jnp.zeros(len(points), jnp.int32)
+    distances, rows = jax.lax.fori_loop(0, len(coarse), closer, ((infinite,) * 3, (zeros,) * 3), unroll=8)
     return jnp.stack(rows, axis=1), jnp.isfinite(jnp.stack(distances, axis=1))

@@ -31,19 +31,16 @@ def skip_pickle(file: BytesIO | mmap.mmap, size: int) -> None:
     operations: Iterator[tuple[Any, Any, Any]] = pickletools.genops(file)  # type: ignore[arg-type]
     for code, argument, position in operations:
         if code.name in _PUTS:
-            require(
-                argument <= position - start,
-                f"asks for room for {argument} things in {position - start} bytes: it is damaged",
-            )
+            room = position - start
+            require(argument <= room, f"asks for room for {argument} things in {room} bytes: it is damaged")
             memo[argument] = stack[-1]
         elif code.name == "MEMOIZE":
             memo[len(memo)] = stack[-1]
         elif code.name in _GETS:
             stack.append(memo[argument])
         elif code.name == "FRAME":
-            require(
-                argument <= size - position, f"declares a frame of {argument} bytes, more than it has: it is damaged"
-            )
+            is_whole = argument <= size - position
+            require(is_whole, f"declares a frame of {argument} bytes, more than it has: it is damaged")
         elif code.name == "MARK":
             marks.append(len(stack))
         elif code.name == "DUP":

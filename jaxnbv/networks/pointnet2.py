@@ -48,17 +48,19 @@ def _fill_masked(
     return jnp.where(mask[:, None], points, 0.0), jnp.where(mask[:, None], normals, 0.0), mask
 
 
-def _encode(network: Any, rows: Any, mask: Bool[Array, " n"]) -> tuple[list[Any], Float[Array, " outputs"]]:
-    """Compute the centres and features of each level of a network, and the features of the whole cloud.
+def _encode(
+    levels: tuple[SetAbstraction, ...], whole: PooledMLP, rows: Any, mask: Bool[Array, " n"]
+) -> tuple[list[Any], Float[Array, " outputs"]]:
+    """Return the centres and features of each level, and the features of the whole cloud.
 
     - `rows`: points and their features, or None for no features.
     """
-    levels = []
-    for level in network.levels:
+    outputs = []
+    for level in levels:
         rows = level(*rows, mask)
         mask = jnp.ones(len(rows[0]), dtype=bool)
-        levels.append(rows)
-    return levels, network.whole.pool(network.whole.lift(*rows))
+        outputs.append(rows)
+    return outputs, whole.pool(whole.lift(*rows))
 
 
 class PointNet2Classifier(eqx.Module):
@@ -69,10 +71,8 @@ class PointNet2Classifier(eqx.Module):
     reverse-mode differentiable in points and normals. The derivative ignores changes in the sampling and grouping of
     points.
 
-    - `levels`: the set abstractions.
     - `whole`: the PointNet over the coordinates and features of the last level's centres.
-    - `hidden`: layers of the perceptron, each followed by a rectifier.
-    - `last`: last layer of the perceptron, with one output for each class.
+    - `hidden`, `last`: the perceptron. Rectifiers follow the hidden layers. The last layer has one output per class.
     """
 
     levels: tuple[SetAbstraction, ...]
@@ -97,7 +97,7 @@ class PointNet2Classifier(eqx.Module):
         **Raises:** `ValueError` if points and normals are not both (n, 3), or there are no rows.
         """
         points, normals, mask = _fill_masked(points, normals, mask)
-        _, x = _encode(self, (points, normals if self.uses_normals else None), mask)
+        _, x = _encode(self.levels, self.whole, (points, normals if self.uses_normals else None), mask)
         for layer in self.hidden:
             x = jax.nn.relu(layer(x))
         return jax.nn.log_softmax(self.last(x))
@@ -111,11 +111,9 @@ class PointNet2PartSegmenter(eqx.Module):
     reverse-mode differentiable in points and normals. The derivative ignores changes in the sampling, grouping and
     neighbours of points.
 
-    - `levels`: the set abstractions.
     - `whole`: the PointNet over the coordinates and features of the last level's centres.
     - `propagations`: the feature propagations, the coarsest level first.
-    - `hidden`: first layer of the perceptron, followed by a rectifier.
-    - `last`: last layer of the perceptron, with one output for each part.
+    - `hidden`, `last`: the perceptron. A rectifier follows the hidden layer. The last layer has one output per part.
     """
 
     levels: tuple[SetAbstraction, ...]
@@ -126,7 +124,7 @@ class PointNet2PartSegmenter(eqx.Module):
 
     @property
     def num_categories(self) -> int:
-        """The number of categories, from the shapes of the weights."""
+        """Number of categories, from the shapes of the weights."""
         carried_width = self.propagations[-2].layers[-1].bias.shape[0]
         point_width = 3 + (6 if self.uses_normals else 3)
         return self.propagations[-1].layers[0].weight.shape[0] - carried_width - point_width
@@ -145,9 +143,9 @@ class PointNet2PartSegmenter(eqx.Module):
     ) -> Float[Array, "n parts"]:
         """Compute the log-probabilities of the parts of all categories, at each point.
 
-        Rows whose mask is False do not affect the other rows, and have values without a meaning. The order of the other
-        rows affects the result: the first row is the first centre, and a ball with too many points keeps only its first
-        rows.
+        Rows whose mask is False do not affect the other rows, and their own values have no meaning. The order of the
+        other rows affects the result: the first row is the first centre, and a ball with too many points keeps only its
+        first rows.
 
         - `category`: index of the category, which may be traced.
 
@@ -160,11 +158,10 @@ class PointNet2PartSegmenter(eqx.Module):
             is_traced(category) or 0 <= int(category) < count,
             f"the category is {category}; the network has 0 to {count - 1}",
         )
-        # The published network has the coordinates as features, in addition to the coordinates relative to a ball's
-        # centre.
+        # The published network takes coordinates relative to a ball's centre, and absolute coordinates as features.
         features = jnp.concatenate([points, normals], axis=-1) if self.uses_normals else points
         one_hot = jnp.broadcast_to(jax.nn.one_hot(category, count, dtype=points.dtype), (len(points), count))
-        levels, x = _encode(self, (points, features), mask)
+        levels, x = _encode(self.levels, self.whole, (points, features), mask)
         inputs = [(points, jnp.concatenate([one_hot, points, features], axis=-1)), *levels]
         x, coarse = x[None], jnp.zeros((1, 3), points.dtype)
         for (points, features), propagation in zip(reversed(inputs), self.propagations, strict=True):
@@ -212,13 +209,10 @@ class CompactPartSegmenter(eqx.Module):
         - `category`: index of the object's category in `CATEGORIES`.
         - `mask`: False for rows to ignore. The values of these rows have no meaning.
         """
-        mask = jnp.ones(len(points), bool) if mask is None else mask
-        inputs = jnp.where(mask[:, None], jnp.concatenate([points, normals], axis=-1), 0.0)
-        points = inputs[:, :3]
-        centers, fine = self.fine(points, inputs, mask)
-        is_center = jnp.ones(len(centers), bool)
-        coarse_centers, coarse = self.coarse(centers, fine, is_center)
-        whole = self.whole.pool(self.whole.lift(coarse_centers, coarse))
+        points, normals, mask = _fill_masked(points, normals, mask)
+        inputs = jnp.concatenate([points, normals], axis=-1)
+        levels, whole = _encode((self.fine, self.coarse), self.whole, (points, inputs), mask)
+        (centers, fine), (coarse_centers, coarse) = levels
         context = jnp.concatenate([whole, jax.nn.one_hot(category, len(CATEGORIES), dtype=whole.dtype)])
         coarse = self.to_coarse(coarse_centers, jnp.zeros((1, 3), points.dtype), coarse, context[None])
         fine = self.to_fine(centers, coarse_centers, fine, coarse)

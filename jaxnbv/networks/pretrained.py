@@ -20,16 +20,15 @@ def pretrained_classifier(
 
     - `name`: "pyramid", "truck" or "household".
     - `longest_side`: longest side of the object's box, in scene units.
-    - `num_points`: number of input points, by default the number used in training. With half as many points the
-      classifier is twice as fast and a little less accurate.
+    - `num_points`: number of input points; default: as in training. With half as many points the classifier is twice as
+      fast and a little less accurate.
 
     **Raises:** `ValueError` if there is no classifier with this name, or if `longest_side` or `num_points` is not
     positive.
     """
     names = ", ".join(TRAINED_POINTS)
     require(name in TRAINED_POINTS, f"there is no shipped classifier {name!r}: choose from {names}, or load your own")
-    network = _shipped(name)
-    count = TRAINED_POINTS[name] if num_points is None else num_points
+    network, count = _shipped(name), TRAINED_POINTS[name] if num_points is None else num_points
     return CloudClassifier(network, count, network_scale(network, longest_side))
 
 
@@ -49,12 +48,10 @@ def part_segmenter(category: str | int, num_points: int = 2048, longest_side: fl
 
 
 def network_scale(network: Network, longest_side: float = TRAINED_SIDE) -> float:
-    """Return the number of network units per scene unit.
+    """Return network units per scene unit, for objects whose box has this longest side (scene units).
 
     `InvariantClassifier` expects objects with a longest side of 2.5. The other networks expect objects that fill the
     unit sphere or its bounding box.
-
-    - `longest_side`: longest side of the object's box, in scene units.
 
     **Raises:** `ValueError` if `longest_side` is not positive.
     """

@@ -30,8 +30,7 @@ _EPSILON = 1e-5
 def published_network(tensors: Tensors) -> PointNet2Classifier | PointNet2PartSegmenter:
     """Make the network of these tensors: a part segmenter if there are propagations, else a classifier.
 
-    **Raises:** `ValueError` if a tensor is missing, unexpected or not finite, or has a wrong shape. The error names the
-    tensor.
+    **Raises:** `ValueError`, which names the tensor, if one is missing, unexpected, of a wrong shape or not finite.
     """
     state = _State(tensors)
     segments = any(name.startswith("fp") for name in tensors)
@@ -54,16 +53,14 @@ def _part_segmenter(state: "_State") -> PointNet2PartSegmenter:
     levels, whole, widths = _encoder(state, PARTS_SCALES, {6: "points", 9: "with normals"})
     width = _width(whole.layers)
     propagations = []
-    # The point's own inputs of the last propagation are one input per category, the coordinates, and the point's
-    # features.
+    # The last propagation takes, beside the interpolated features, the category, coordinates and features of the point.
     for number, own in ((3, widths[2]), (2, widths[1]), (1, None)):
         layers = state.layers(f"fp{number}.mlp_convs", None if own is None else own + width)
         propagations.append(FeaturePropagation(layers))
         width = _width(layers)
     hidden = state.linear("conv1", width, "bn1")
-    network = PointNet2PartSegmenter(
-        levels, whole, tuple(propagations), hidden, state.linear("conv2", _width((hidden,)))
-    )
+    last = state.linear("conv2", _width((hidden,)))
+    network = PointNet2PartSegmenter(levels, whole, tuple(propagations), hidden, last)
     require(network.num_categories > 0, "the tensor fp1.mlp_convs.0.weight has no inputs for categories")
     return network
 
@@ -71,9 +68,7 @@ def _part_segmenter(state: "_State") -> PointNet2PartSegmenter:
 def _encoder(
     state: "_State", scales: tuple[tuple[Level, ...], tuple[Level, ...]], kinds: dict[int, str]
 ) -> tuple[tuple[SetAbstraction, ...], PooledMLP, list[int]]:
-    """Make the set abstractions and the PointNet over all points, and count features.
-
-    Also return the number of features of the points, then of each level.
+    """Return the set abstractions, the PointNet over all points, and the widths of the points' and levels' features.
 
     - `scales`: sizes of the levels for networks with one radius per level, and with several.
     - `kinds`: allowed numbers of inputs, and the meaning of each.
@@ -136,7 +131,7 @@ class _State:
         return Linear(*map(jnp.asarray, arrays))
 
     def layers(self, name: str, inputs: int | None, roll: bool = False) -> tuple[Linear, ...]:
-        """Make the layers <name>.0, <name>.1, ..., and merge the batch normalisations into them."""
+        """Make the layers <name>.0, <name>.1, ..., each merged with its batch normalisation."""
         norm = name.replace("mlp_convs", "mlp_bns").replace("conv_blocks", "bn_blocks")
         layers: list[Linear] = []
         while not layers or f"{name}.{len(layers)}.weight" in self.tensors:
@@ -146,7 +141,6 @@ class _State:
         return tuple(layers)
 
     def pooled(self, name: str, inputs: int, roll: bool = False) -> PooledMLP:
-        """Make a PointNet of the layers that `layers` returns."""
         layers = self.layers(name, inputs, roll)
         require(len(layers) > 1, f"{name} has one layer only; two or more are needed")
         return PooledMLP(layers)

@@ -1,7 +1,7 @@
 """Reads the tensors of a PyTorch file, without PyTorch and without running code from the file.
 
 A `.pth` file holds a pickle, which is a program, and the raw bytes of the arrays. This reader knows only the names that
-a pickle needs for tensors and dictionaries. Any other name resolves to an object that does nothing, and nothing is
+a pickle needs for tensors and dictionaries. Any other name resolves to an object that does nothing. Nothing is
 imported. Two layouts are supported: the zip archive since PyTorch 1.6 (`data.pkl`, `data/0`, `data/1`, ...), and the
 older stream of pickles followed by the arrays.
 """
@@ -133,7 +133,7 @@ def _read_stream(file: BufferedIOBase, size: int) -> Any:
 
 
 def _unpickle(file: BytesIO | mmap.mmap, size: int, load: _Load) -> Any:
-    """Load the object in the next pickle of a file. `load`: function that loads a storage."""
+    """Load the object in the next pickle of a file."""
     start = file.tell()
     skip_pickle(file, size)
     end = file.tell()
@@ -150,7 +150,7 @@ class _TensorUnpickler(pickle.Unpickler):
         self._items = len(file.getbuffer())
 
     def find_class(self, module: str, name: str) -> Any:
-        """Return the object that stands for a global name in the pickle. Nothing is imported."""
+        """Return the object that stands for a global name in the pickle."""
         if module in ("torch", "torch.cuda") and name in _TYPES:
             return _TYPES[name]
         if (module, name) == ("collections", "OrderedDict"):
@@ -163,7 +163,7 @@ class _TensorUnpickler(pickle.Unpickler):
         return self._storage(key, kind, count)
 
     def _dictionary(self, items: Any = ()) -> "_Dictionary":
-        """Copy items into a dictionary. Fails if all copies together have more items than the file has bytes."""
+        """Copy items into a dictionary, unless all copies together have more items than the file has bytes."""
         self._items -= len(items)
         require(self._items >= 0, "copies the same dictionary over and over: it is damaged")
         return _Dictionary(items)
