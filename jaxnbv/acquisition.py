@@ -11,21 +11,11 @@ from abc import abstractmethod
 from typing import Any, ClassVar, TypeAlias
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnbv.checks import (
-    InputError,
-    check_fields,
-    checked,
-    checked_result,
-    functions_of_users,
-    is_traced,
-    require,
-    short_text,
-)
+from jaxnbv.checks import check_fields, checked, checked_result, functions_of_users, is_traced, require, short_text
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud, concatenate, limit_capacity
 from jaxnbv.geometry.pose import Pose
@@ -39,10 +29,7 @@ from jaxnbv.utility import Answer, AnyUtility, Quantity, Utility, as_utility, de
 
 
 class ImaginedView(eqx.Module):
-    """One imagined scan, its camera and its pose, in scene coordinates.
-
-    `scan.mask` marks the rows with a point.
-    """
+    """One imagined scan, in scene coordinates, with its camera and its pose."""
 
     scan: PointCloud
     camera: Camera
@@ -92,10 +79,10 @@ class Acquisition(eqx.Module):
     ) -> Float[Array, "samples poses *scores"]:
         """Return the scores of the imagined scans of each sampled surface from each pose of a batch.
 
-        An acquisition that is not a mean over samples may return a single row. The scans of several samples (their
-        number is `scanning.grid.samples_at_once`) from all poses are computed together, and must fit into memory. Then
-        `self.batch_size` scans at a time are scored. The samples are divided among the devices, or the poses if there
-        are fewer samples than devices.
+        An acquisition that is not a mean over samples may return a single row. The scans of
+        `scanning.grid.samples_at_once` samples from all poses are computed together, and must fit into memory.
+        `batch_size` scans are scored together. The samples are divided among the devices, or the poses if there are
+        fewer samples than devices.
 
         - `barrier`: distance along each ray to an obstacle, see `scan`.
         """
@@ -127,16 +114,12 @@ class Acquisition(eqx.Module):
         return None
 
     def answer_values(self, cloud: PointCloud) -> Float[Array, " n"] | None:
-        """Return the values of `answer`, computed by JAX operations.
-
-        None if there is no answer, or if the answer needs code outside JAX.
-        """
+        """Return the values of `answer` by JAX operations; None without an answer, or if it needs other code."""
         return None
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> Answer | None:
-        """Return the correct answer, or None if it is not known.
+        """Return the correct answer for the true surface `scene`, or None if it is not known.
 
-        - `scene`: the true surface.
         - `cloud`: points on the whole true surface, uniform by area.
         """
         return self.answer(cloud)
@@ -144,8 +127,7 @@ class Acquisition(eqx.Module):
     def check(self, cloud: PointCloud) -> None:
         """Raise `ValueError` if a network or function of the acquisition returns an invalid result.
 
-        This method is called with the first cloud D. It is also called with the union of D and a scan, if the score of
-        this scan is not finite.
+        - `cloud`: the first cloud D, or the union of D and a scan whose score is not finite.
         """
         return
 
@@ -185,12 +167,10 @@ class ExpectedUtilityImprovement(Acquisition):
 
     @property
     def batch_size(self) -> int:
-        """The utility's batch size."""
         return self.utility.batch_size
 
     @property
     def quantity(self) -> Quantity:
-        """Name, unit and meaning of the utility's expected improvement."""
         return self.utility.improvement
 
     def answer(self, cloud: PointCloud) -> Answer:
@@ -219,9 +199,7 @@ class ExpectedUtilityImprovement(Acquisition):
 
 
 def as_acquisition(value: Any) -> Acquisition:
-    """Return an acquisition unchanged, or the expected improvement of a utility.
-
-    A plain function of a cloud also counts as a utility.
+    """Return an acquisition unchanged, or the expected improvement of a utility or function of a cloud.
 
     **Raises:** `ValueError` for anything else.
     """
@@ -233,8 +211,8 @@ def as_acquisition(value: Any) -> Acquisition:
 class AcquisitionList(Acquisition):
     """Several acquisitions on the same samples and the same scans. Each pose is scanned only once.
 
-    The value is a vector: the values of `members`, concatenated in order. The value of a member may itself be a vector.
-    Use an `AcquisitionList` with `expected_value` and `Problem.scores`, not in a planner.
+    The value is a vector: the values of `members`, which may be vectors too, concatenated in order. Use an
+    `AcquisitionList` with `expected_value` and `Problem.scores`, not in a planner.
     """
 
     members: tuple[Acquisition, ...]
@@ -252,39 +230,30 @@ class AcquisitionList(Acquisition):
         return any(member.needs_posterior for member in self.members)
 
     def context(self, step: StepInputs) -> tuple[Any, ...]:
-        """Return the context of each member."""
         return tuple(member.context(member.inputs(step)) for member in self.members)
 
     def score(self, context: tuple[Any, ...], view: ImaginedView) -> Float[Array, " values"]:
-        """Return the members' scores of one view, concatenated."""
         pairs = zip(self.members, context, strict=True)
-        values = [member.score(member_context, view) for member, member_context in pairs]
-        return jnp.concatenate([jnp.atleast_1d(value) for value in values])
+        return jnp.concatenate([jnp.atleast_1d(member.score(part, view)) for member, part in pairs])
 
     @property
     def batch_size(self) -> int:
-        """The smallest batch size among the members."""
         return min(member.batch_size for member in self.members)
 
     def check(self, cloud: PointCloud) -> None:
-        """Raise `ValueError` if the check of any member does."""
         for member in self.members:
             member.check(cloud)
 
 
 def inputs_of(observations: StepInputs | Observations | PointCloud) -> StepInputs:
-    """Return step inputs unchanged, or convert observations or a cloud to step inputs.
-
-    Converted step inputs have no posterior and no samples.
-    """
+    """Return step inputs unchanged, or make them from observations or a cloud, without posterior."""
     return observations if isinstance(observations, StepInputs) else StepInputs(as_observations(observations))
 
 
 def context_of(acquisition: Acquisition, observations: StepInputs | Observations | PointCloud) -> Any:
     """Return the acquisition's context of these observations, computed by a compiled function.
 
-    **Raises:** `ValueError` if JAX cannot trace a user's function, or if the acquisition needs a posterior and there is
-    none.
+    **Raises:** `ValueError` if JAX cannot trace a user's function, or for a missing posterior.
     """
     inputs = _inputs(acquisition, observations)
     with functions_of_users():
@@ -306,47 +275,8 @@ def _context_of(acquisition: Acquisition, inputs: StepInputs) -> Any:
 
 
 def zero_if_empty(scan: PointCloud, value: Float[Array, "*values"]) -> Float[Array, "*values"]:
-    """Return the value or values unchanged, or zero if the scan is empty."""
+    """Return the values unchanged, or zero if the scan is empty."""
     return jnp.where(jnp.any(scan.mask), value, 0.0)
-
-
-def check_traceable(
-    acquisition: Acquisition, observations: Observations | int, camera: Camera, differentiable: bool = False
-) -> None:
-    """Check that JAX can trace an acquisition. The check uses only shapes and computes nothing.
-
-    - `observations`: observations, or the capacity of a cloud D.
-    - `camera`: the camera of the scans to score.
-    - `differentiable`: whether to check that scores have derivatives in the points and normals of a scan.
-
-    **Raises:** `ValueError` if JAX cannot trace the acquisition (for example a utility in NumPy), or cannot
-    differentiate it (because it calls code outside JAX).
-    """
-    if acquisition.needs_posterior or acquisition.needs_hypotheses:
-        # This acquisition cannot be tested, because there are no posterior and no hypotheses yet.
-        return
-
-    def cloud(rows: int) -> PointCloud:
-        return PointCloud(jnp.zeros((rows, 3)), jnp.ones((rows, 3)), jnp.ones(rows, bool))
-
-    def value(rows):
-        points, normals = rows
-        scan, pose = PointCloud(points, normals, cloud(camera.num_rays).mask), Pose(jnp.eye(3), jnp.zeros(3))
-        step = inputs_of(cloud(observations) if isinstance(observations, int) else observations)
-        return acquisition.score(acquisition.context(acquisition.inputs(step)), ImaginedView(scan, camera, pose))
-
-    rows = cloud(camera.num_rays).points, cloud(camera.num_rays).normals
-    with functions_of_users():
-        jax.eval_shape(value, rows)
-    if not differentiable:
-        return
-    try:
-        jax.eval_shape(jax.grad(value), rows)
-    except ValueError as error:
-        raise InputError(
-            f"{type(acquisition).__name__} cannot be differentiated, so no gradient search can use it ({error}). "
-            "Use DiscreteSearch, which asks for values only"
-        ) from error
 
 
 @checked
@@ -360,8 +290,8 @@ def expected_value(
 ) -> Float[Array, "poses *scores"]:
     """Return the expected value at each pose: the mean score of imagined scans over the samples.
 
-    The function supports `jit`, `grad` and `vmap`, in the poses and in `observations`. An `AcquisitionList` adds an
-    axis for its members.
+    Supports `jit`, `grad` and `vmap`, in the poses and in `observations`. An `AcquisitionList` adds an axis for its
+    members.
 
     - `observations`: the observations, or a cloud D. An acquisition that needs the posterior requires `StepInputs`.
     - `surfaces`: the samples along a leading axis.
@@ -384,9 +314,8 @@ def scores(
 ) -> Float[Array, "poses *scores"]:
     """Return the scores of a batch of scans, one scan from each pose.
 
-    At a time, `acquisition.batch_size // samples_per_batch` scans are scored.
-
-    - `samples_per_batch`: number of posterior samples for which this function runs at the same time.
+    - `samples_per_batch`: number of posterior samples for which this function runs at the same time. The number of
+      scans that are scored together is `acquisition.batch_size` divided by it.
     """
     return batched_map(
         lambda rows: acquisition.score(context, ImaginedView(rows[0], camera, rows[1])),

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxnbv.acquisition import Acquisition, as_acquisition, check_traceable
+from jaxnbv.acquisition import Acquisition, as_acquisition
 from jaxnbv.checks import (
     InputError,
     check_fields,
@@ -33,6 +33,7 @@ from jaxnbv.sampler import StepInputs, SurfaceSampler
 from jaxnbv.scanning import Grid, GridSurface, Obstacles, barrier_of, mean_depth, scan_samples
 from jaxnbv.scanning.scanner import distance_problem
 from jaxnbv.search import DiscreteSearch, Problem, Proposal, Search
+from jaxnbv.search.traceable import check_traceable
 from jaxnbv.surfaces import FreeRotation, ShapeBank, ShapePoses
 from jaxnbv.surfaces.base import HALF_WIDTH
 from jaxnbv.surfaces.part_hypotheses import hypotheses_of

@@ -12,7 +12,7 @@ import optax
 import optimistix as optx
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxnbv.acquisition import Acquisition, check_traceable
+from jaxnbv.acquisition import Acquisition
 from jaxnbv.checks import check_fields, checked, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
@@ -21,6 +21,7 @@ from jaxnbv.search.candidates import Candidates, as_candidates
 from jaxnbv.search.pose_space import FreePoses, PoseSpace, SpherePoses
 from jaxnbv.search.problem import Problem
 from jaxnbv.search.proposal import Proposal, Trajectories
+from jaxnbv.search.traceable import check_traceable
 
 # Penalty per scene unit by which a pose violates the clearance, as a multiple of the range of the candidates' values.
 _PENALTY = 10.0
