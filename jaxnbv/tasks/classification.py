@@ -91,8 +91,8 @@ class ClassAcquisition(Acquisition):
     """Base class of acquisitions that compare a classifier's results before and after a simulated scan.
 
     - `classifier`: a `Classifier`, or a function from a cloud to log-probabilities.
-    - `num_points`: number of points to which the cloud is thinned by farthest point sampling. This happens once for
-      each proposal, before scans are added.
+    - `num_points`: number of points to which the cloud is thinned by farthest point sampling, once for each proposal,
+      before scans are added.
     """
 
     cloud_only: ClassVar[bool] = True
@@ -109,11 +109,7 @@ class ClassAcquisition(Acquisition):
 
     @abstractmethod
     def compare(self, log_p: Float[Array, " classes"], log_q: Float[Array, " classes"]) -> Float[Array, "*values"]:
-        """Return the value of a scan in nats.
-
-        - `log_p`: the classifier's log-probabilities before the scan.
-        - `log_q`: the classifier's log-probabilities once the scan is added to the cloud.
-        """
+        """Return the value of a scan in nats, from the log-probabilities before and after the scan is added."""
 
     def score(self, context: Context, view: ImaginedView) -> Float[Array, "*values"]:
         """Return the result of `compare` for the cloud without and with the scan; zero for an empty scan."""
@@ -122,11 +118,9 @@ class ClassAcquisition(Acquisition):
 
     @property
     def batch_size(self) -> int:
-        """Batch size of the classifier."""
         return self.classifier.batch_size
 
     def answer(self, cloud: PointCloud) -> "ClassAnswer":
-        """Return the class probabilities, given the cloud, as an answer."""
         p = np.asarray(self.answer_values(cloud), np.float64)
         names = self.classifier.classes or tuple(f"class {index}" for index in range(len(p)))
         return ClassAnswer(tuple(names), p)
@@ -166,12 +160,11 @@ class CrossEntropy(ClassAcquisition):
     This is the paper's alpha^(CE). p^(t) are the probabilities given the cloud D, and p^(t+1) those given D with a
     simulated scan.
 
-    - `classifier`: a function from a cloud to log-probabilities.
+    - `classifier`: a `Classifier`, or a function from a cloud to log-probabilities.
     - `num_points`: number of points to which D is thinned by farthest point sampling, once for each proposal.
     """
 
     def compare(self, log_p: Float[Array, " classes"], log_q: Float[Array, " classes"]) -> Float[Array, ""]:
-        """Return the cross-entropy in nats, at least zero."""
         return cross_entropy(log_p, log_q)
 
     @property
@@ -189,7 +182,6 @@ class EntropyReduction(ClassAcquisition):
     """
 
     def compare(self, log_p: Float[Array, " classes"], log_q: Float[Array, " classes"]) -> Float[Array, ""]:
-        """Return the reduction of entropy in nats, at least zero."""
         return jnp.maximum(0.0, entropy(log_p) - entropy(log_q))
 
     @property
@@ -202,8 +194,8 @@ class MixedEntropy(ClassAcquisition):
     """Cross-entropy while the class is uncertain, then reduction of entropy, as in the authors' code.
 
     - `classifier`, `num_points`: see `CrossEntropy`.
-    - `threshold`: entropy in nats. If the entropy before the scan is above it, the value is that of `CrossEntropy`,
-      otherwise that of `EntropyReduction`.
+    - `threshold`: entropy before the scan, in nats, above which the value is that of `CrossEntropy`, and up to which it
+      is that of `EntropyReduction`.
     """
 
     threshold: float = eqx.field(static=True, default=0.75)
@@ -213,7 +205,6 @@ class MixedEntropy(ClassAcquisition):
         require(self.threshold >= 0, f"the entropy's threshold is {self.threshold}; it must not be negative")
 
     def compare(self, log_p: Float[Array, " classes"], log_q: Float[Array, " classes"]) -> Float[Array, ""]:
-        """Return the cross-entropy or the reduction of entropy, in nats."""
         before = entropy(log_p)
         reduction = jnp.maximum(0.0, before - entropy(log_q))
         return jnp.where(before > self.threshold, cross_entropy(log_p, log_q), reduction)

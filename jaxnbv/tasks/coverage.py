@@ -28,7 +28,7 @@ _POINTS = 1024
 
 
 def _large_batch() -> int:
-    """Return the batch size for scores that are cheap to compute."""
+    # Scores of new surface are cheap to compute.
     return 128 if on_cpu() else 2048
 
 
@@ -58,7 +58,7 @@ class Coverage(Acquisition):
 
 
 class Newness(eqx.Module):
-    """Function that returns the newness of surface at a point, given the observations.
+    """Newness of surface at a point, given the observations.
 
     - `distances`: distance field to all hits of earlier views, or to the cloud for observations without `Looks`.
     - `size`: the length s of `NewSurface`, in scene units.
@@ -81,8 +81,7 @@ class NewSurface(Acquisition):
     `Looks`. A hit x counts as seen if d(x) <= s, as new if d(x) >= 2 s, and in part in between. a(x) is the area of the
     pixel on the surface: omega is the pixel's solid angle, r the distance from the camera, and cos the cosine of the
     angle of incidence, clipped to at least 0.5. Rays of one scan do not overlap, so no surface counts twice. In the
-    paper's `Coverage`, near surfaces dominate because they fill more pixels, and a single far point may also dominate.
-    `NewSurface` has neither problem.
+    paper's `Coverage`, near surfaces, which fill more pixels, or a single far point may dominate. Here neither does.
 
     Use a search over candidates. `NewSurface` is differentiable in the pose wherever `Coverage` is, but most of the
     gain comes from jumps of rays, which the derivative leaves out.
@@ -106,7 +105,6 @@ class NewSurface(Acquisition):
         require(self.size is None or self.size > 0, f"the size is {self.size}; it must be positive, in scene units")
 
     def context(self, step: StepInputs) -> Newness:
-        """Return the newness function, from the `Looks` of the observations, or else from the cloud."""
         cloud, looks = step.observations.cloud, step.observations.looks
         if looks is not None and 2.0 * (self.size or 0.0) <= looks.reach:
             return Newness(looks, jnp.asarray(max(looks.grid.spacing, self.size or 0.0), cloud.points.dtype))
@@ -124,7 +122,6 @@ class NewSurface(Acquisition):
 
     @property
     def batch_size(self) -> int:
-        """Number of scans to score together: large, because a score is cheap to compute."""
         return _large_batch()
 
 
@@ -148,7 +145,6 @@ def seen_share(
     newness is zero. For observations with `Looks`, it must also be visible from an earlier view, because a point near a
     measured point may still be hidden behind an edge.
 
-    - `newness`: newness function of the observations.
     - `surfaces`: posterior samples, along a leading axis.
     - `views`: poses of the views so far.
     - `barrier`: distances to obstacles from `poses`, see `scan`.

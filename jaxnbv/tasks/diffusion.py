@@ -31,16 +31,13 @@ def _array(source) -> AnyArray:
 
 
 class HeatProblem(eqx.Module):
-    """A body of uniform temperature that is heated near a point.
-
-    The temperature u follows the paper's equation du/dt = Delta u + f, u(0) = u0.
+    """A body of uniform temperature, heated near a point: the paper's du/dt = Delta u + f, u(0) = u0.
 
     - `source`: centre of the heated ball, in scene coordinates. The heating f is `power` within `radius` of the source
       and zero elsewhere. At the rim it is smoothed according to the area of each point, see `heating`. A body without a
       point in the ball is not heated.
     - `radius`: radius of the ball, in scene units.
-    - `power`: value of f, in degrees per unit of time. The unit of time is the one in which the diffusivity is one
-      squared scene unit per unit of time.
+    - `power`: value of f, in degrees per unit of time, in which the diffusivity is one squared scene unit.
     - `duration`: time of heating, T.
     - `steps`: number of steps of implicit Euler, each of length h = T / steps.
     - `initial`: initial temperature u0, in degrees.
@@ -73,13 +70,12 @@ class HeatProblem(eqx.Module):
         return self.initial + self.duration * max(0.0, self.power)
 
     def heating(self, points: Float[np.ndarray, "n 3"], areas: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """Return the heating f at points.
+        """Return the heating f at points: `power` times the fraction of a point's disc in the heated ball.
 
-        f is `power` times the fraction of a point's disc that is within `radius` of the source. The disc has the area
-        of the point. The fraction is approximated by 1/2 + (radius - d) / (2 rho), clipped to [0, 1], where d is the
-        distance from the source and rho the radius of the disc. In the authors' code this fraction is 0 or 1, which
-        makes no difference for dense points. With 1,024 points on an object, the lowest temperatures of two random
-        samplings differ by a third with the authors' code, and by a tenth with fractions.
+        The disc has the area of the point. The fraction is approximated by 1/2 + (radius - d) / (2 rho), clipped to
+        [0, 1], where d is the distance from the source and rho the radius of the disc. In the authors' code it is 0 or
+        1, which makes no difference for dense points. With 1,024 points on an object, the lowest temperatures of two
+        random samplings differ by a third with the authors' code, and by a tenth with fractions.
         """
         distance = np.linalg.norm(points - np.asarray(self.source, np.float64), axis=1)
         return self.power * np.clip(0.5 + 0.5 * (self.radius - distance) / np.sqrt(areas / np.pi), 0.0, 1.0)
@@ -99,7 +95,7 @@ class Laplacian(NamedTuple):
 class Temperature(NamedTuple):
     """The solution of a `HeatProblem` after its duration.
 
-    - `values`: temperature u of each point, in degrees.
+    - `values`: temperature of each point, in degrees.
     - `reached`: mask of the points that are connected to a heated point. All others keep the initial temperature.
     """
 
@@ -107,9 +103,9 @@ class Temperature(NamedTuple):
     reached: Bool[np.ndarray, " n"]
 
     def coldest(self, reached_only: bool) -> int | None:
-        """Return the index of the coldest point, the first if several are equal; None if there is no point.
+        """Return the index of the coldest point, or of the coldest `reached` one; None if there is none.
 
-        - `reached_only`: consider only the points that are connected to a heated point.
+        If several points are equally cold, it is the first.
         """
         candidates = np.flatnonzero(self.reached) if reached_only else np.arange(len(self.values))
         return int(candidates[np.argmin(self.values[candidates])]) if len(candidates) else None
@@ -137,7 +133,6 @@ def mesh_laplacian(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f
 
 
 def _insulator(count: int) -> Laplacian:
-    """Return the Laplacian of points that conduct no heat."""
     return Laplacian(sparse.csc_matrix((count, count)), np.ones(count))
 
 
@@ -166,9 +161,8 @@ def diffuse(
 ) -> Float[np.ndarray, " n"]:
     """Return the temperature after `duration`, by implicit Euler: (M + h L) u_{k+1} = M (u_k + h f).
 
-    L and M are the matrices of the Laplacian, u_k is the temperature and f the heating at each point, and the step
-    length is h = duration / steps. The matrix is factorised once. The method is stable for any h, and its error is of
-    order h. The total heat, mass @ u, grows by h mass @ f in each step.
+    u_k is the temperature and f the heating at each point, and h = duration / steps. The method is stable for any h,
+    and its error is of order h. The total heat, mass @ u, grows by h mass @ f in each step.
     """
     step = duration / steps
     # The matrix is symmetric positive definite, so no pivoting is needed, and a fill-reducing order can be used.
@@ -194,8 +188,8 @@ def mesh_temperature(
 ) -> Temperature:
     """Return the temperature at the vertices of a mesh in scene coordinates.
 
-    The temperature is linear between vertices, so a coarse mesh should be refined first, see `refine`. Coincident
-    vertices count as one, so heat also flows between the triangles of a triangle soup.
+    The temperature is linear between vertices, so `refine` a coarse mesh first. Coincident vertices count as one, so
+    heat also flows between the triangles of a triangle soup.
 
     **Raises:** `ValueError` for vertices that are not finite.
     """

@@ -37,16 +37,15 @@ class ColdestPoint(Utility):
     equation is solved outside JAX, so there is no gradient. Use a search over candidates, as in the paper. The values
     do not depend on the order of the points or the number of workers, not even in the last bit.
 
-    - `heat`: a `HeatProblem`, or only the source (3,) in scene coordinates. The other values are then the authors'.
-      Problems that differ only in the source share the same compiled program.
+    - `heat`: a `HeatProblem`, or only the source (3,) in scene coordinates, for the authors' other values. Problems
+      that differ only in the source share one compiled program.
     - `reached_only`: take the minimum only over points that are connected to a heated point. The paper takes the
       minimum over all points. If D or a simulated scan has points that are not connected to the source, that minimum is
       the initial temperature, and no view can improve it.
     - `workers`: number of processes that share the clouds, by default one for each core. With 1, the current process
       does the work.
 
-    **Raises:** `ValueError` for fewer than one worker, for a source that `HeatProblem` does not accept, and for an
-    attempt to differentiate the utility.
+    **Raises:** `ValueError` for fewer than one worker, an invalid source, or an attempt to differentiate the utility.
     """
 
     heat: HeatProblem
@@ -70,9 +69,9 @@ class ColdestPoint(Utility):
     def __call__(self, cloud: PointCloud) -> Float[Array, ""]:
         """Return the negative lowest temperature of one cloud, in degrees.
 
-        Under `vmap`, all clouds are computed in one call on the host. A cloud without points over which to take the
-        minimum counts as having the temperature `HeatProblem.highest`, an upper bound of all temperatures. So any point
-        that a later scan adds improves the utility.
+        Under `vmap`, all clouds are computed in one call on the host. If there is no point over which to take the
+        minimum, the temperature is `HeatProblem.highest`, an upper bound. So any point of a later scan improves the
+        utility.
         """
         source = jnp.asarray(self.heat.source, cloud.points.dtype)
         # The source may be traced, so it is passed as an array together with the cloud.
@@ -82,7 +81,6 @@ class ColdestPoint(Utility):
 
     @property
     def improvement(self) -> Quantity:
-        """Name, unit and meaning of the expected improvement."""
         meaning = "how much colder than now the coldest point is with an imagined scan, mean over posterior samples."
         return Quantity("expected fall of the least temperature", "degrees", meaning)
 
@@ -133,7 +131,7 @@ class Coldest(Answer):
     """The coldest point of a body. The answer's only value is the temperature there, in degrees.
 
     - `point`: the coldest point, in scene coordinates.
-    - `frame`: frame of the world. A text of the answer shows the point in coordinates of this world.
+    - `frame`: frame of the world in whose coordinates a text of the answer shows the point.
     """
 
     point: Float[np.ndarray, "3"] = eqx.field(default_factory=lambda: np.zeros(3))
@@ -150,9 +148,7 @@ class Coldest(Answer):
 
 @checked
 def coldest_point(body: PointCloud | TriangleMesh, heat: HeatProblem, reached_only: bool = False) -> Coldest:
-    """Return the coldest point of a cloud (the estimate) or of a mesh (the truth).
-
-    If several points are equally cold, the first is returned.
+    """Return the coldest point of a cloud or a mesh, the first if several are equally cold.
 
     - `reached_only`: see `ColdestPoint`. If False and some points are not connected to the source, the result is one of
       these unheated points.

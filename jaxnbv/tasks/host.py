@@ -4,7 +4,7 @@ Such functions have no derivative, so gradient searches cannot use them.
 """
 
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -23,7 +23,6 @@ class HostClassifier(Classifier):
 
     - `function`: function that returns the log-probabilities (b, num_classes) of b clouds, given their points
       (b, n, 3), unit normals (b, n, 3) and mask (b, n) as NumPy arrays. b is at most 128.
-    - `num_classes`: number of classes.
     - `version`: a text or number, such as "2026-11", that you change whenever the function changes. A stored run needs
       a version unless the function's source code and all variables that it reads can be described. The weights of a
       PyTorch model cannot be described.
@@ -43,7 +42,8 @@ class HostClassifier(Classifier):
 
     def __call__(self, cloud: PointCloud) -> Float[Array, " classes"]:
         """Return the log-probabilities of one cloud. Under `vmap`, the function gets all clouds in one call."""
-        return _of_cloud(self.function, (self.num_classes,), "HostClassifier", cloud)
+        arrays = cloud.points, cloud.normals, cloud.mask
+        return call_on_host(self.function, (self.num_classes,), "HostClassifier", *arrays)
 
 
 class HostSegmenter(Segmenter):
@@ -51,7 +51,6 @@ class HostSegmenter(Segmenter):
 
     - `function`: function of the same arrays as in `HostClassifier` that returns part probabilities (b, n, num_parts).
       Rows of the result for which the mask is False are ignored.
-    - `num_parts`: number of parts.
     - `version`: see `HostClassifier`.
 
     **Raises:** `ValueError` for an attempt to differentiate. If the function fails, JAX raises a `RuntimeError`.
@@ -67,36 +66,26 @@ class HostSegmenter(Segmenter):
         require(self.num_parts >= 1, f"num_parts is {self.num_parts}; it must be at least 1")
 
     def __call__(self, cloud: PointCloud) -> Float[Array, "points parts"]:
-        """Return the part probabilities of a cloud's points.
-
-        Under `vmap`, the function gets all clouds in one call.
-        """
-        p = _of_cloud(self.function, (cloud.capacity, self.num_parts), "HostSegmenter", cloud)
+        """Return the part probabilities of one cloud. Under `vmap`, the function gets all clouds in one call."""
+        arrays = cloud.points, cloud.normals, cloud.mask
+        p = call_on_host(self.function, (cloud.capacity, self.num_parts), "HostSegmenter", *arrays)
         return jnp.where(cloud.mask[:, None], p, 0.0)
 
 
-def _of_cloud(function: Callable, shape: tuple[int, ...], name: str, cloud: PointCloud) -> Float[Array, "..."]:
-    return call_on_host(function, shape, name, cloud.points, cloud.normals, cloud.mask)
-
-
+@eqx.filter_custom_jvp
 def call_on_host(
     function: Callable, shape: tuple[int, ...], name: str, *arrays: Shaped[Array, "..."]
 ) -> Float[Array, "..."]:
     """Call a NumPy function with JAX arrays, also under `jit` and `vmap`, and return the result.
 
-    The function gets the arrays with an additional leading axis. The length of this axis is the number of entries of a
-    `vmap`, or one outside `vmap`.
+    The function gets the arrays with an additional leading axis, whose length is the number of entries of a `vmap`, or
+    one outside `vmap`.
 
     - `shape`: shape of the result for one entry. The result has the dtype of the first array.
     - `name`: name of the caller for error messages.
 
     **Raises:** `ValueError` for an attempt to differentiate the result.
     """
-    return _call(arrays, function, shape, name)
-
-
-@eqx.filter_custom_jvp
-def _call(arrays: tuple[Any, ...], function: Callable, shape: tuple[int, ...], name: str) -> Float[Array, "..."]:
     num_axes, dtype = arrays[0].ndim, arrays[0].dtype
 
     def call(*inputs):
@@ -109,7 +98,7 @@ def _call(arrays: tuple[Any, ...], function: Callable, shape: tuple[int, ...], n
     return jax.pure_callback(call, jax.ShapeDtypeStruct(shape, dtype), *arrays, vmap_method="broadcast_all")
 
 
-@_call.def_jvp
-def _call_jvp(primals, tangents):
-    *_, name = primals
+@call_on_host.def_jvp
+def _call_on_host_jvp(primals, tangents):
+    name = primals[2]
     raise InputError(f"{name} has no derivative, as it runs outside JAX: use DiscreteSearch, or write it in JAX")

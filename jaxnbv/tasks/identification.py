@@ -57,9 +57,8 @@ class Identify(Acquisition):
     is a part with a pose, and w_h is its probability. c is the name of the part, H is entropy, and I(h | c) is the
     information about h that c does not contain. z_h is the depth image of h from the pose theta, and w_h' | z_h is the
     probability of h' after this image. L is the misfit of two images, which the probabilities of the hypotheses also
-    use, see `part_evidence`. Every hypothesis is rendered once for each candidate, and the images are compared in
-    pairs. No posterior of the surface is needed. The name has the larger weight, because a search that first determines
-    the pose needs more views to find the name.
+    use, see `part_evidence`. The images of all hypotheses are compared in pairs. The name has the larger weight,
+    because a search that first determines the pose needs more views to find the name.
 
     - `pose`: whether to include the information about the pose.
     - `group`: a class name for each part of the bank, such as `[name.split("-")[0] for name in bank.names]`. Then c is
@@ -76,7 +75,6 @@ class Identify(Acquisition):
         check_fields(self)
 
     def context(self, step: StepInputs) -> ImaginedParts:
-        """Return the surfaces, weights and classes of the hypotheses."""
         observations, hypotheses = step.observations, hypotheses_of(step.observations)
         grid = Grid() if observations.grid is None else observations.grid
         grid = Grid(min(_RESOLUTION, grid.resolution), grid.half_extent)
@@ -96,7 +94,7 @@ class Identify(Acquisition):
         return jax.nn.one_hot(jnp.asarray(numbers)[shapes], int(numbers.max()) + 1)
 
     def score(self, context: Any, view: ImaginedView) -> Float[Array, ""]:
-        """Raise `ValueError`, because the value of a view needs the scans of all hypotheses."""
+        """Raise `ValueError`: the value of a view needs the scans of all hypotheses."""
         raise InputError("Identify cannot score a single scan: use its sample_scores")
 
     def sample_scores(
@@ -107,10 +105,7 @@ class Identify(Acquisition):
         poses: Pose,
         barrier: Float[Array, "poses rays"] | None = None,
     ) -> Float[Array, "1 poses"]:
-        """Return the expected information of each pose, from the surfaces in the context.
-
-        The argument `surfaces` is not used.
-        """
+        """Return the expected information of each pose, from the surfaces in the context, not `surfaces`."""
         at_once = samples_at_once(camera, poses)
         images = shared_map(_image, context.surfaces, camera, poses, barrier, at_once=at_once)
         by_pose = jax.tree.map(lambda rows: jnp.moveaxis(rows, 1, 0), images)
@@ -152,7 +147,6 @@ def weights_by_name(
 
 
 def _image(surface: GridSurface, camera: Camera, poses: Pose, barrier: Float[Array, "poses rays"] | None) -> _Image:
-    """Render a part from each pose. The image has three values per ray, see `_Image`."""
     scans = scan(surface, camera, poses, barrier)
     offset = scans.points - poses.position[:, None]
     distances = jnp.linalg.norm(offset, axis=-1)
@@ -180,10 +174,9 @@ def _information(images: _Image, context: ImaginedParts, camera: Camera) -> Floa
 
 
 def _misfits(image: _Image, others: _Image, tau: Float[Array, ""]) -> Float[Array, "h rays"]:
-    """Return each ray's misfit between the image of one hypothesis and the images of all hypotheses.
+    """Return each ray's misfit between the image of one hypothesis and those of all, at most `MAX_MISFIT`.
 
-    The misfit grows with the distance between the surfaces. It is the upper bound `MAX_MISFIT` if the ray hits only one
-    of the two surfaces.
+    It grows with the distance between the surfaces, and has this bound if the ray hits only one of them.
     """
     (reach, _, hits), (expected, cosine, are_expected) = image, others
     both = hits & are_expected

@@ -1,8 +1,8 @@
 """Semantic parts: have all parts of the object been found?
 
 A segmenter is any function p = segmenter(cloud) from a `PointCloud` to an array (points, parts). p_ic is the
-probability that point i belongs to part c. Rows without a point (the cloud's mask is False) contain zeros. The array
-has fewer rows than the cloud if the segmenter thins the cloud. `jaxnbv.networks.CloudSegmenter` wraps a network, and
+probability that point i belongs to part c, and zero in rows without a point (the cloud's mask is False). The array has
+fewer rows than the cloud if the segmenter thins the cloud. `jaxnbv.networks.CloudSegmenter` wraps a network, and
 `HostSegmenter` wraps a function that runs outside JAX. A `Segmenter` may also name its parts.
 """
 
@@ -112,12 +112,10 @@ class SoftPartCount(Utility):
 
     @property
     def batch_size(self) -> int:
-        """Batch size of the segmenter."""
         return self.segmenter.batch_size
 
     @property
     def improvement(self) -> Quantity:
-        """Name, unit and meaning of the expected improvement."""
         meaning = "how much an imagined scan raises the soft count of the parts, mean over posterior samples."
         return Quantity("expected gain in parts", "parts", meaning)
 
@@ -137,10 +135,9 @@ class SoftPartCount(Utility):
         return _counts(self.segmenter, cloud).astype(cloud.points.dtype)
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> "PartAnswer":
-        """Return the true number of surface points of each part, from the scene's labels.
+        """Return the number of surface points of each part, by the scene's labels or else the segmenter.
 
-        If the scene has no labels, return the segmenter's answer for the whole surface. The answer's `target` is 1,
-        because a part with at least one point is present.
+        The answer's `target` is 1, because a part with at least one point is present.
 
         - `cloud`: points on the whole surface.
         """
@@ -175,9 +172,6 @@ def _counts(segmenter: Segmenter, cloud: PointCloud) -> Int[Array, " parts"]:
 
 
 def part_counts(p: Float[Array, "points parts"]) -> Int[Array, " parts"]:
-    """Return the number of points for which each part has the highest probability.
-
-    Rows of zeros in the part probabilities `p` do not count.
-    """
+    """Return the number of points whose most probable part is each part. Rows of zeros do not count."""
     predicted = jax.nn.one_hot(jnp.argmax(p, axis=1), p.shape[1], dtype=jnp.int32)
     return jnp.sum(jnp.where(jnp.any(p > 0, axis=1)[:, None], predicted, 0), axis=0)
