@@ -15,7 +15,7 @@ from jaxnbv.studies.engine.study import Study
 from jaxnbv.viz.figures import STYLE
 from jaxnbv.viz.style import GREY, INK, LINE
 
-# Name of the chart's file in the folder of a study.
+# File in the folder of a study.
 CHART = "chart.png"
 # Offset between methods, as a share of the distance between two columns, so that equal values stay visible.
 _DODGE = 0.06
@@ -66,7 +66,6 @@ def chart(table: pd.DataFrame, study: type[Study]) -> bytes:
         panels = figure.subplots(num_rows, num_columns, squeeze=False).ravel()
         for axes, measure in zip(panels, measures, strict=False):
             _draw(axes, rows[rows["quantity"] == measure.name], measure, rows["method"].unique().tolist())
-            # The label does not say what the percentage is of, because the title does.
             unit = f"%, mean of {scenes} scenes" if measure.unit == "%" else measure.unit
             axes.set(title=measure.title, xlabel=measure.key_name, ylabel=unit)
         for axes in panels[len(measures) :]:

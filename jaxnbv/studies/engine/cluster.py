@@ -26,8 +26,8 @@ class Cluster(Executor):
 
     - `address`: address of the scheduler, such as "tcp://HOST:8786".
 
-    The constructor blocks until there is a worker. If a worker dies, Dask runs the worker's call again on a different
-    worker. By default, Dask gives up once four workers have died with the same call. The call's future then raises
+    The constructor blocks until there is a worker. If a worker dies, Dask runs its call again on a different worker. By
+    default, Dask gives up once four workers have died with one call. The future of this call then raises
     `BrokenExecutor`.
 
     **Raises:** `ValueError` if Dask is not installed or no scheduler answers. The constructor and the futures also
@@ -70,19 +70,14 @@ class Cluster(Executor):
             raise
 
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future:
-        """Run a call on a worker, and return its future.
-
-        Consecutive calls of one function send the function once.
-        """
+        """Run a call on a worker, and return its future. Consecutive calls of one function send it once."""
         require(self._client.status == "running", self._lost_message())
         if function is not self._pickled[0]:
-            # The function is pickled here so that a worker can compare versions before it imports the function's
-            # modules.
+            # Pickle the function here, so that a worker compares versions before it imports the function's modules.
             content = optional("cloudpickle").dumps(function)
             self._pickled = function, self._client.submit(bytes, content, pure=False)
         task = self._client.submit(
-            # A lambda is pickled as code. So the scheduler does not need jaxnbv, and a worker without jaxnbv can report
-            # that it is missing.
+            # A lambda is pickled as code. So the scheduler needs no jaxnbv, and a worker without it can say so.
             lambda *values: importlib.import_module("jaxnbv.studies.engine.cluster")._call(*values),
             self._pickled[1],
             self._versions,
@@ -101,7 +96,7 @@ class Cluster(Executor):
         return answer
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Wait until all calls are done, then disconnect from the cluster. The cluster keeps running.
+        """Wait until all calls are done, then disconnect from the cluster, which keeps running.
 
         - `wait`: False disconnects at once.
         - `cancel_futures`: True disconnects at once and drops the calls that are not done.
@@ -145,7 +140,7 @@ def _call(
 ) -> Any:
     """Call a pickled function on this worker, and return its result.
 
-    - `content`: the function, pickled; `args`, `kwargs`: its arguments.
+    - `content`: the pickled function.
     - `client_versions`: software, threads and (except in the first call) device that this worker must have.
     - `blas_threads`: number of threads for linear algebra.
 
@@ -176,10 +171,7 @@ def _call(
 
 @functools.cache
 def _prepare() -> dict[str, Any]:
-    """Enable the cache of compiled programs, as commands do, and return `versions` of this process.
-
-    Only the first call in a process does this. Later calls return the same versions.
-    """
+    """Enable the cache of compiled programs, as commands do, and return `versions` of this process."""
     with contextlib.suppress(InputError):
         keep_compiled()
     return versions()

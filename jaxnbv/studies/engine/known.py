@@ -35,18 +35,14 @@ def study_sampler(
     sampler = SurfaceSampler.preset("screened", longest_side, quick, solid=solid)
     if files:
         names = [_name(files, index) for index in range(len(files))]
-        return sampler.with_bank(
-            ShapeBank.from_meshes([file.path for file in files], names=names), Upright(by_axis=True)
-        )
+        bank_of_meshes = ShapeBank.from_meshes([file.path for file in files], names=names)
+        return sampler.with_bank(bank_of_meshes, Upright(by_axis=True))
     require(bool(bank), "there are no known shapes for this study: give another model")
     return sampler.with_bank(shape_bank(bank), bank_poses(bank))
 
 
 def keep_shapes(sampler: SurfaceSampler, is_selected: Callable[[str], bool]) -> SurfaceSampler:
-    """Return a copy of the sampler that keeps only the known shapes whose names satisfy `is_selected`.
-
-    A sampler without known shapes is returned unchanged.
-    """
+    """Return the sampler with only those of its known shapes, if it has any, whose names satisfy `is_selected`."""
     model = sampler.model
     if not isinstance(model, KnownShapes):
         return sampler
@@ -57,10 +53,7 @@ def keep_shapes(sampler: SurfaceSampler, is_selected: Callable[[str], bool]) -> 
 
 
 def without_own_shape(sampler: SurfaceSampler, files: Sequence[MeshFile], index: int) -> SurfaceSampler:
-    """Return a copy of the sampler without the known shape that was made from the mesh `files[index]`.
-
-    A sampler without this shape is returned unchanged.
-    """
+    """Return the sampler without the known shape, if it has one, that was made from the mesh `files[index]`."""
     return keep_shapes(sampler, lambda name: name != _name(files, index))
 
 

@@ -21,7 +21,6 @@ class Measure(NamedTuple):
     - `key_name`: name of the keys, such as "view".
     - `unit`: unit of the values; "%" for fractions in [0, 1], which are shown in percent.
     - `digits`: decimal places in tables.
-    - `lower_is_better`: True if lower values are better.
     """
 
     name: str
@@ -39,7 +38,7 @@ class Claim(NamedTuple):
     - `text`: the claim in words.
     - `measure`: name of the measure that decides the claim; `at`: the view or other key whose values are compared.
     - `others`: the methods with which the reference is compared.
-    - `must_be_better`: True if the reference must be better, False if it must not be worse.
+    - `must_be_better`: False if it is enough that the reference is not worse.
     """
 
     text: str

@@ -23,11 +23,10 @@ _REMEDY = "give a folder that `jaxnbv study` has written"
 class Chapter(NamedTuple):
     """The section about one study on the HTML page.
 
-    - `title`: title of the section; `verdicts`: checks of the study's claims.
     - `scenes`: number of scenes; `facts`: sentences on times and versions.
     - `explanation`: text that explains the measures and the cells of the tables.
     - `tables`: titles and HTML of the tables, for each group of scenes.
-    - `images`: names and PNG content of the pictures in the study's folder, and of the chart, drawn from the records.
+    - `images`: names and PNG content of the chart, drawn from the records, and of the pictures in the study's folder.
     - `settings`: settings of the study as JSON.
     """
 
@@ -78,7 +77,7 @@ def chapters(folder: str | Path) -> list[Chapter]:
 
 
 def _kinds() -> dict[str, type[Study]]:
-    """Return the classes of studies by name. The classes of the registry come before other subclasses of `Study`."""
+    """Return the classes of studies by name: first those of the registry, then other subclasses of `Study`."""
     kinds = {kind.__qualname__: kind for kind in (entry.load() for entry in studies().values())}
     todo = [Study]
     while todo:
@@ -91,12 +90,10 @@ def _kinds() -> dict[str, type[Study]]:
 def _chapter(path: Path, subfolder: Path, record: dict[str, Any], kind: type[Study]) -> Chapter:
     records = read_records(path)
     table = results(records, kind)
-    parts = {
-        f"{group}: {with_plural(scenes, 'scene')}": [
-            (title, cells.to_html(border=0)) for title, cells in tables(table, kind, group)
-        ]
-        for group, scenes in groups_of(table).items()
-    }
+    parts: dict[str, list[tuple[str, str]]] = {}
+    for group, scenes in groups_of(table).items():
+        texts = [(title, cells.to_html(border=0)) for title, cells in tables(table, kind, group)]
+        parts[f"{group}: {with_plural(scenes, 'scene')}"] = texts
     images = [(CHART, chart(table, kind))]
     images += [(file.stem, file.read_bytes()) for file in sorted(path.glob("*.png")) if file.name != CHART]
     seconds = sum(scene["seconds"] for scene in records)

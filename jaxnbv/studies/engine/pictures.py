@@ -1,10 +1,11 @@
 """Pictures of a study. The picture of a scene has one small image (tile) per method and view."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.lines import Line2D
@@ -30,7 +31,7 @@ def write_pictures(
     The pictures show the methods `study.pictured`, or all methods of a record that has none of these. No picture is
     written if `study.scene_picture` returns None.
 
-    - `scenes`: number of pictures; `pixels`: width and height of each small image in a picture.
+    - `scenes`: number of pictures; `pixels`: width and height of each tile.
     """
     folder, paths = make_folder(folder), []
     for record in sorted(records, key=lambda record: record["scene"])[:scenes]:
@@ -47,22 +48,13 @@ def write_pictures(
 def _draw_picture(picture: ScenePicture, record: Record, methods: Sequence[str]) -> Figure:
     runs = [record["methods"][method] for method in methods]
     columns = picture.columns or tuple(f"view {view + 1}" for view in range(max(len(run["views"]) for run in runs)))
+    title, start = f"Scene {record['scene']}: {record['name']}", int(picture.truth is not None)
     if len(columns) == 1:
-        return _draw_one_tile_per_method(picture, record, methods, columns[0])
-    start, num_rows = int(picture.truth is not None), len(methods)
-    num_columns = start + len(columns)
-    size = (
-        num_columns * _TILE_SIZE[0] + _SIDE_MARGIN * (3 if picture.scale else 1),
-        num_rows * _TILE_SIZE[1] + _TOP_MARGIN,
-    )
-    figure = Figure(figsize=size, layout="constrained")
-    figure.suptitle(f"Scene {record['scene']}: {record['name']}", x=0.01, ha="left", fontsize=10, fontweight="bold")
-    grid = figure.subplots(num_rows, num_columns, squeeze=False)
-    for axes, title in zip(grid[0], ("truth", *columns)[1 - start :], strict=True):
-        axes.set_title(title, fontsize=9, loc="center", pad=4)
+        return _draw_one_tile_per_method(picture, f"{title}, {columns[0]}", methods)
+    figure, grid = _empty_tiles(picture, title, len(methods), start + len(columns))
+    for axes, name in zip(grid[0], ("truth", *columns)[1 - start :], strict=True):
+        axes.set_title(name, fontsize=9, loc="center", pad=4)
     for row, (method, run) in enumerate(zip(methods, runs, strict=True)):
-        for axes in grid[row]:
-            draw_border(axes, LINE, 0.8)
         if picture.truth is not None:
             picture.truth(grid[row, 0]) if row == 0 else grid[row, 0].axis("off")
         for column, axes in enumerate(grid[row, start:]):
@@ -71,39 +63,37 @@ def _draw_picture(picture: ScenePicture, record: Record, methods: Sequence[str])
             else:
                 axes.axis("off")
         grid[row, start].set_ylabel(method, fontsize=9, fontweight="bold")
-    _draw_legend(figure, picture, grid)
     return figure
 
 
-def _draw_one_tile_per_method(picture: ScenePicture, record: Record, methods: Sequence[str], column: str) -> Figure:
-    """Draw a picture with one tile per method, several in a row. Its title ends in `column`."""
-    cells = ([("truth", None)] if picture.truth is not None else []) + [(method, method) for method in methods]
+def _draw_one_tile_per_method(picture: ScenePicture, title: str, methods: Sequence[str]) -> Figure:
+    cells: list[tuple[str, Callable[[Axes], object]]] = []
+    if picture.truth is not None:
+        cells.append(("truth", picture.truth))
+    cells += [(method, lambda axes, method=method: picture.tile(axes, method, 0)) for method in methods]
     num_columns = min(len(cells), _MAX_TILES_PER_ROW)
-    num_rows = -(-len(cells) // num_columns)
+    figure, grid = _empty_tiles(picture, title, -(-len(cells) // num_columns), num_columns, _MIN_WIDTH)
+    for axes, (name, draw) in zip(grid.ravel(), cells, strict=False):
+        axes.set_title(name, fontsize=9, loc="center", pad=4)
+        draw(axes)
+    for axes in grid.ravel()[len(cells) :]:
+        axes.axis("off")
+    return figure
+
+
+def _empty_tiles(
+    picture: ScenePicture, title: str, num_rows: int, num_columns: int, min_width: int = 1
+) -> tuple[Figure, np.ndarray]:
+    """Return a figure with title, caption, legend and colour bar, and its grid of tiles, which are empty."""
     size = (
-        max(num_columns, _MIN_WIDTH) * _TILE_SIZE[0] + _SIDE_MARGIN * (3 if picture.scale else 1),
+        max(num_columns, min_width) * _TILE_SIZE[0] + _SIDE_MARGIN * (3 if picture.scale else 1),
         num_rows * _TILE_SIZE[1] + _TOP_MARGIN,
     )
     figure = Figure(figsize=size, layout="constrained")
-    title = f"Scene {record['scene']}: {record['name']}, {column}"
     figure.suptitle(title, x=0.01, ha="left", fontsize=10, fontweight="bold")
     grid = figure.subplots(num_rows, num_columns, squeeze=False)
-    for axes in grid.ravel()[len(cells) :]:
-        axes.axis("off")
-    for axes, (name, method) in zip(grid.ravel(), cells, strict=False):
+    for axes in grid.ravel():
         draw_border(axes, LINE, 0.8)
-        axes.set_title(name, fontsize=9, loc="center", pad=4)
-        if method is not None:
-            picture.tile(axes, method, 0)
-        elif picture.truth is not None:
-            picture.truth(axes)
-    _draw_legend(figure, picture, grid)
-    return figure
-
-
-def _draw_legend(figure: Figure, picture: ScenePicture, grid: np.ndarray) -> None:
-    """Draw the legend with the caption, and the colour bar."""
-    num_rows = len(grid)
     handles = [Line2D([], [], ls="none", label=name, **look) for name, look in picture.marks.items()]
     legend = figure.legend(handles=handles, loc="outside lower left", ncols=max(len(handles), 1), frameon=False)
     legend.set_title(picture.caption, prop=FontProperties(size=8))
@@ -114,3 +104,4 @@ def _draw_legend(figure: Figure, picture: ScenePicture, grid: np.ndarray) -> Non
         bar.set_label(label, fontsize=8)
         bar.ax.tick_params(labelsize=7, length=2)
         bar.outline.set_visible(False)
+    return figure, grid

@@ -17,14 +17,11 @@ _THREADS = ("NPROC", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS
 
 
 class Processes(Executor):
-    """Executor that runs calls in processes on this machine.
+    """Executor that runs calls in `workers` processes on this machine.
 
-    The processes share the machine's cores evenly. They end when this process ends.
-
-    - `workers`: number of processes.
-
-    If a process dies during a call, for example from lack of memory, the call runs again in a new process. If the new
-    process dies too, the future raises `BrokenExecutor`. An error that leaves a `with` block kills running calls.
+    The processes share the machine's cores evenly. They end when this process ends. If a process dies during a call,
+    for example from lack of memory, the call runs again in a new process. If the new process dies too, the future
+    raises `BrokenExecutor`. An error that leaves a `with` block kills running calls.
     """
 
     def __init__(self, workers: int):
@@ -38,10 +35,7 @@ class Processes(Executor):
         self._lock, self._is_closed = threading.Lock(), False
 
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future:
-        """Run a call in one of the processes, and return its future.
-
-        The function and its arguments are pickled with cloudpickle.
-        """
+        """Run a call, which cloudpickle pickles, in one of the processes, and return its future."""
         return self._threads.submit(self._call, function, args, kwargs)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:

@@ -50,10 +50,8 @@ class RecordFolder(ResultFolder):
     def collect(self, scenes: Sequence[int], run: Trial, progress: bool = True) -> list[Record]:
         """Run the scenes that have no record yet, and return the records of all `scenes` in order.
 
-        - `run`: function that takes the index of a scene and returns its record.
-
-        Each record is written as soon as its scene is done. If `run` fails for a scene, the scene has no record.
-        `failures` then returns the error, and the next call of `collect` runs the scene again.
+        `run` takes the index of a scene and returns its record, which is written at once. If `run` fails for a scene,
+        `failures` returns the error, and the next call of `collect` runs the scene again.
 
         **Raises:** `ValueError` if a record is damaged, or if another process is writing in the folder.
         """
@@ -66,7 +64,8 @@ class RecordFolder(ResultFolder):
             with bar, closing(outcomes(run, missing, self.executor)) as pairs:
                 for index, outcome in pairs:
                     if isinstance(outcome, Failure):
-                        self._write_failure(index, outcome)
+                        file = self._file(index).with_suffix(_FAILURE_SUFFIX)
+                        write_text(file, f"{outcome.error}\n\n{outcome.traceback}")
                     else:
                         records[index] = self._write(index, outcome)
                     bar.update()
@@ -101,23 +100,19 @@ class RecordFolder(ResultFolder):
             if not target.exists():
                 self._write(index, other)
             elif changes := differences(_without_seconds(other), _without_seconds(_read(target, index))):
-                raise InputError(
-                    f"{file} and {target} differ in {'; '.join(changes[:3])}: delete the one that is wrong"
-                )
+                problem = f"{file} and {target} differ in {'; '.join(changes[:3])}"
+                raise InputError(f"{problem}: delete the one that is wrong")
 
     def failures(self, scenes: Sequence[int]) -> dict[int, str]:
-        """Return the error of each failed scene as one line. Tracebacks are in the files scene_*.failed."""
+        """Return the error of each failed scene in one line. Tracebacks are in the files scene_*.failed."""
         files = {index: self._file(index).with_suffix(_FAILURE_SUFFIX) for index in scenes}
         return {index: file.read_text().partition("\n")[0] for index, file in files.items() if os.path.isfile(file)}
 
     def _file(self, index: int) -> Path:
         return self.path / f"scene_{index:04d}.json"
 
-    def _write_failure(self, index: int, failure: Failure) -> None:
-        write_text(self._file(index).with_suffix(_FAILURE_SUFFIX), f"{failure.error}\n\n{failure.traceback}")
-
     def _write(self, index: int, record: Record) -> Record:
-        """Write a record, and return the record as `_read` would return it."""
+        """Write a record, and return it as `_read` would."""
         # Turn number keys into text, as the file does, because the checksum depends on the order of sorted keys.
         record = json.loads(json.dumps(record))
         self.bind()

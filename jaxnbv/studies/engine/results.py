@@ -22,9 +22,9 @@ def results(records: Sequence[Record], study: type[Study]) -> pd.DataFrame:
 
     The column `at` holds the key: the view, or what else the measure's values belong to. Each row holds the method's
     mean over the scenes, the standard error of the mean, and the bootstrap interval of the mean (`low`, `high`). The
-    `lead` is the mean over the scenes of the reference method's value minus this method's value, and `lead_low` and
-    `lead_high` are its bootstrap interval. A method without values has no row. A scene counts only if every method that
-    has a row has a value for the scene.
+    `lead` is the mean over the scenes of the reference method's value minus this method's, and `lead_low` and
+    `lead_high` are its bootstrap interval. A method without values has no row. A scene counts only if it has a value
+    for every method that has a row.
 
     **Raises:** `ValueError` if there are no records.
     """
@@ -62,10 +62,9 @@ def _statistics(values: pd.DataFrame, reference: str) -> pd.DataFrame:
 
 
 def interval(values: Float[np.ndarray, "scenes columns"]) -> Float[np.ndarray, "2 columns"]:
-    """Return the ends of Efron's percentile bootstrap interval for the mean of each column.
+    """Return lower and upper ends of Efron's percentile bootstrap interval for the mean of each column.
 
-    The first row of the result holds the lower ends, and the second row the upper ends. Scenes are drawn with
-    replacement, and all columns use the same draws. For one scene, the interval has width zero.
+    Scenes are drawn with replacement, and all columns use the same draws. For one scene, the interval has width zero.
     """
     if len(values) < 2:
         return np.stack([values.sum(axis=0)] * 2)
@@ -75,18 +74,15 @@ def interval(values: Float[np.ndarray, "scenes columns"]) -> Float[np.ndarray, "
 
 
 def groups_of(table: pd.DataFrame) -> dict[str, int]:
-    """Return the number of scenes in each group of a table. The first group, "all", holds all scenes."""
+    """Return the number of scenes in each group of a table. The first group, "all", has all scenes."""
     return table.groupby("group", sort=False)["scenes"].max().to_dict()
 
 
 def tables(table: pd.DataFrame, study: type[Study], group: str = _ALL) -> list[tuple[str, pd.DataFrame]]:
-    """Return two tables of text per measure, each as a title and a data frame.
+    """Return two tables of text per measure, each as a title and a data frame, from the `table` of `results`.
 
     Rows are methods, and columns are views or other keys. The first table has the means of the methods. The second has
     the leads: the reference's mean minus another method's. A table without rows is left out.
-
-    - `table`: the result of `results`.
-    - `group`: name of the group of scenes, see `groups_of`. The default is all scenes.
     """
     texts = []
     for measure in study.measures:
@@ -94,10 +90,8 @@ def tables(table: pd.DataFrame, study: type[Study], group: str = _ALL) -> list[t
         unit = f" ({measure.unit})" if measure.unit else ""
         others = part[(part["method"] != study.reference) & ~((measure.key_name == "view") & (part["at"] == 1))]
         others = others.dropna(subset="lead")
-        best = (
-            part.groupby("at", sort=False)["mean"].transform("min" if measure.lower_is_better else "max")
-            == part["mean"]
-        )
+        means = part.groupby("at", sort=False)["mean"]
+        best = means.transform("min" if measure.lower_is_better else "max") == part["mean"]
         for title, rows, cells in (
             (f"{measure.title}{unit}, by {measure.key_name}", part, _means(part, measure, best)),
             (f"{measure.title}{unit}: {study.reference} minus another method", others, _leads(others, measure)),
@@ -159,8 +153,7 @@ def table_legend(study: type[Study]) -> str:
 class Verdict(NamedTuple):
     """Result of the check of one claim.
 
-    - `claim`: text of the claim.
-    - `num_held`: number of compared methods for which the claim holds; `num_methods`: number of compared methods.
+    - `num_methods`, `num_held`: number of compared methods, and for how many of them the claim holds.
     - `sentence`: text that lists the methods that the reference is ahead of, level with or behind.
     """
 
@@ -173,8 +166,8 @@ class Verdict(NamedTuple):
 def verdicts(table: pd.DataFrame, study: type[Study]) -> list[Verdict]:
     """Check each claim over all scenes by comparing the reference with the claim's methods.
 
-    The comparison includes the runs of these methods without known shapes. The reference is "level with" a method if
-    the interval of its lead over the method includes zero. A claim is left out if none of its methods was run.
+    The comparison includes runs of these methods without known shapes. The reference is "level with" a method if the
+    interval of its lead includes zero. A claim is left out if none of its methods was run.
     """
     checks = []
     for claim in study.claims:
@@ -185,15 +178,12 @@ def verdicts(table: pd.DataFrame, study: type[Study]) -> list[Verdict]:
         for row, text in zip(rows.itertuples(), _leads(rows, measure), strict=True):
             is_level = row.lead_low <= 0 <= row.lead_high
             is_better = (row.lead < 0) == measure.lower_is_better
-            by_position[_POSITIONS[1 if is_level else 0 if is_better else 2]].append(
-                f"{row.method} ({text.rstrip('* ')})"
-            )
+            position = _POSITIONS[1 if is_level else 0 if is_better else 2]
+            by_position[position].append(f"{row.method} ({text.rstrip('* ')})")
         if len(rows):
             num_held = sum(len(by_position[position]) for position in _POSITIONS[: 1 if claim.must_be_better else 2])
-            parts = "; ".join(
-                f"{position} {', '.join(methods)}" for position, methods in by_position.items() if methods
-            )
-            sentence = f"Holds against {num_held} of {len(rows)}: {parts}."
+            parts = [f"{position} {', '.join(methods)}" for position, methods in by_position.items() if methods]
+            sentence = f"Holds against {num_held} of {len(rows)}: {'; '.join(parts)}."
             checks.append(Verdict(claim.text, num_held, len(rows), sentence))
     return checks
 

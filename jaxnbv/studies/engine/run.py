@@ -1,4 +1,4 @@
-"""Functions that run all methods of a study on a scene, load stored studies, and replay views."""
+"""Functions that run the methods of a study on a scene, load stored studies, and replay views."""
 
 import functools
 import time
@@ -9,9 +9,10 @@ from typing import TypeAlias
 from jaxnbv.checks import InputError, check_type, require
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.observations import Observations
+from jaxnbv.planning.loop import view_keys
 from jaxnbv.planning.planner import Planner
 from jaxnbv.storage.rebuilding import read_config
-from jaxnbv.studies.engine.episodes import episode_record, poses_of, replay_views
+from jaxnbv.studies.engine.episodes import episode_record, poses_of
 from jaxnbv.studies.engine.measures import KNOWN, WITHOUT_BANK, Record
 from jaxnbv.studies.engine.records import RecordFolder, read_records
 from jaxnbv.studies.engine.study import Scene, Study
@@ -28,7 +29,6 @@ def run_scene(
     All methods share the first view, which is drawn from the candidates that show enough of the object. The methods
     also share the sensor noise and the prior samples at each view.
 
-    - `index`: index of the scene.
     - `methods`: names of the study's methods to run; default: `Study.methods`.
     - `own`: the user's methods by name. Each is a function that makes the planner for a scene.
 
@@ -67,8 +67,8 @@ def load_study(folder: str | Path) -> tuple[Study, list[Record]]:
 def methods_of(study: type[Study], names: Sequence[str] | None, model: str) -> tuple[str, ...]:
     """Return the names of the methods to run, in the study's order.
 
-    - `names`: the methods to run. The default is `Study.methods`. With the model `known`, the default also includes the
-      methods of `Study.without_bank`, under the name "METHOD-screened".
+    - `names`: the methods to run; default: `Study.methods`. With the model `known`, the default includes the methods of
+      `Study.without_bank` a second time, under the name "METHOD-screened".
     - `model`: name of the surface model.
 
     **Raises:** `ValueError` for an unknown method.
@@ -100,9 +100,9 @@ def _user_planner(study: Study, scene: Scene, name: str, make: Factory) -> Plann
 
 def replay(study: Study, scene: Scene, run: Record) -> list[tuple[PointCloud, Observations]]:
     """Recompute each scan and the observations after each scan from the poses in `run`, a method's record."""
-    planner, sensor, key = (
-        study.planner(study.methods[0], scene),
-        study.sensor(scene),
-        study.key(scene.index, "episode"),
-    )
-    return replay_views(planner, sensor, poses_of(run), key, study.camera)
+    # Observations depend only on the capacity and the carving of a planner, which are the same for all methods.
+    planner, sensor = study.planner(study.methods[0], scene), study.sensor(scene)
+    keys = [view_keys(study.key(scene.index, "episode"), index)[2] for index in range(len(run["views"]))]
+    views = [(pose, sensor(pose, key)) for pose, key in zip(poses_of(run), keys, strict=True)]
+    scans = [scan for _, scan in views]
+    return list(zip(scans, planner.replay(views, study.camera), strict=True))

@@ -18,7 +18,7 @@ from jaxnbv.search import (
     UncertaintyView,
 )
 
-# The baselines that all studies share. They ignore the acquisition.
+# Baselines of all studies.
 BASELINES = ("farthest", "uncertainty", "random")
 _OVER_CANDIDATES: dict[str, Callable[..., Search]] = {
     "farthest": FarthestView,

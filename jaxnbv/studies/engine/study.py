@@ -14,14 +14,14 @@ from jaxnbv.acquisition import Acquisition
 from jaxnbv.checks import InputError, require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
-from jaxnbv.planning.loop import Sensor, Step
+from jaxnbv.planning.loop import Sensor, Step, view_keys
 from jaxnbv.planning.planner import Planner
+from jaxnbv.planning.simulate import observe_scene
 from jaxnbv.readers.class_meshes import MeshFile, mesh_files
 from jaxnbv.sampler import SurfaceSampler
-from jaxnbv.scanning import Grid, Surface
+from jaxnbv.scanning import Grid, SensorNoise, Surface
 from jaxnbv.scanning.sensors import SENSOR_RADIUS
 from jaxnbv.search import Candidates, Search, SphereCandidates
-from jaxnbv.studies.engine.episodes import random_first_view, simulated_sensor
 from jaxnbv.studies.engine.known import study_sampler, without_own_shape
 from jaxnbv.studies.engine.measures import WITHOUT_BANK, Claim, Measure, Record
 from jaxnbv.studies.engine.searches import search_of
@@ -33,7 +33,7 @@ _PURPOSES = ("first", "episode", "scene", "measure")
 class Scene(eqx.Module):
     """One object of a study.
 
-    - `index`: index of the scene; `name`: name in tables and pictures; `surface`: true surface of the object.
+    - `name`: name in tables and pictures; `surface`: true surface of the object.
     - `task`: other facts about the object, such as its heat source or its parts. The type depends on the study.
     """
 
@@ -52,7 +52,7 @@ class Study(eqx.Module):
     - `num_candidates`: number of candidate poses on the sphere of `radius` (scene units). Gradient searches score half
       of this number before they follow the gradient.
     - `sampler`, `capacity`: sampler of surfaces, and largest number of points of the cloud, as in `Planner`.
-    - `num_samples`, `grid_resolution`: number of samples, and nodes of the grid along each axis, in place of the
+    - `num_samples`, `grid_resolution`: number of samples, and nodes of the grid along each axis, which replace the
       sampler's own.
     - `camera`: camera of the sensor. Imagined scans may have fewer rays, see `imagined_camera`.
     - `num_starts`, `iterations`, `learning_rate`: starting poses, steps and learning rate of gradient searches.
@@ -129,7 +129,7 @@ class Study(eqx.Module):
 
         - `model`: name of the surface model. With the model `known` and `meshes`, the bank of each scene holds all
           meshes except the scene's own.
-        - `quick`: True to use the settings `Study.quick`.
+        - `quick`: whether to use the settings `Study.quick`.
         - `options`: other settings, which override `Study.quick`. `meshes` is a folder, see `files_in`.
 
         **Raises:** `ValueError` as `files_in` and `study_sampler` do.
@@ -179,11 +179,11 @@ class Study(eqx.Module):
 
     def search(self, method: str, scene: Scene) -> Search:
         """Return the search of a method, see `search_of`."""
-        gradient_settings = self.num_starts, self.iterations, self.learning_rate
-        return search_of(method, self.candidates, self.num_candidates, self.radius, *gradient_settings)
+        sizes = self.num_candidates, self.radius, self.num_starts, self.iterations
+        return search_of(method, self.candidates, *sizes, self.learning_rate)
 
     def planner(self, method: str, scene: Scene) -> Planner:
-        """Return the planner of a method. If the name ends in "-screened", the planner has no known shapes."""
+        """Return the planner of a method, without known shapes if the name ends in "-screened"."""
         name = method.removesuffix(WITHOUT_BANK)
         planner = self.planner_of(self.acquisition(name, scene), self.search(name, scene), scene)
         if name == method:
@@ -198,14 +198,14 @@ class Study(eqx.Module):
     def follow(self, scene: Scene, truth: Any, planner: Planner, episode: Iterator[Step]) -> Record:
         """Run an episode and return its record, which must be JSON-serialisable.
 
-        - `truth`: the result of `truth` for the scene.
+        - `truth`: the scene's `truth`.
         - `episode`: iterator that runs one step at a time. `follow` may stop before the iterator ends.
         """
 
     def scene_record(self, scene: Scene, truth: Any, first: int) -> Record:
         """Return the facts about the scene that its record stores, which must be JSON-serialisable.
 
-        - `truth`: the result of `truth` for the scene; `first`: index of the first view among the candidates.
+        - `truth`: the scene's `truth`; `first`: index of the first view among the candidates.
         """
         return {"name": scene.name}
 
@@ -218,7 +218,7 @@ class Study(eqx.Module):
 
     def sensor(self, scene: Scene) -> Sensor:
         """Return the simulated sensor that scans the scene."""
-        return simulated_sensor(scene.surface, self.camera)
+        return lambda pose, key: observe_scene(scene.surface, self.camera, pose, SensorNoise(), key)
 
     def shows_enough(self, scene: Scene, scan: PointCloud) -> bool:
         """Return whether a scan shows enough of the object to be the first scan of an episode."""
@@ -226,10 +226,7 @@ class Study(eqx.Module):
 
     @classmethod
     def group(cls, record: Record) -> str:
-        """Return the name of the group of scenes to which a record belongs, or "" for no group.
-
-        Each group has its own tables.
-        """
+        """Return the name of the record's group of scenes, which has its own tables, or "" for no group."""
         return ""
 
     @property
@@ -259,9 +256,7 @@ class Study(eqx.Module):
         return Planner(*settings, capacity=self.capacity, max_views=self.views)
 
     def key(self, index: int, purpose: str) -> PRNGKeyArray:
-        """Return the random key for a purpose in the scene with this index.
-
-        The key depends only on `index`, `purpose` and the study's seed.
+        """Return the random key for a purpose in a scene, which depends only on both and on the study's seed.
 
         - `purpose`: "first" (first view), "episode", "scene" or "measure".
         """
@@ -269,14 +264,11 @@ class Study(eqx.Module):
         return jax.random.fold_in(scene_key, _PURPOSES.index(purpose))
 
     def episode_keys(self, method: str, scene: Scene) -> list[PRNGKeyArray]:
-        """Return one random key per episode of a method.
-
-        By default there is one episode, whose key all methods share. `merge_runs` merges records of several episodes.
-        """
+        """Return one random key per episode of a method. By default all methods have one episode with one key."""
         return [self.key(scene.index, "episode")]
 
     def merge_runs(self, runs: Sequence[Record]) -> Record:
-        """Merge the records of a method's episodes into one record."""
+        """Merge the records of the episodes of `episode_keys` into one record."""
         return runs[0]
 
     def first_view(self, scene: Scene) -> int:
@@ -284,12 +276,10 @@ class Study(eqx.Module):
 
         **Raises:** `ValueError` if no candidate shows enough.
         """
-
-        def is_enough(scan: PointCloud) -> bool:
-            return self.shows_enough(scene, scan)
-
-        keys = self.key(scene.index, "first"), self.key(scene.index, "episode")
-        first = random_first_view(is_enough, self.candidates.poses(), self.sensor(scene), *keys)
-        if first is None:
-            raise InputError(f"none of {self.num_candidates} candidates shows enough of {scene.name}: ask for more")
-        return first
+        poses, sensor = self.candidates.poses(), self.sensor(scene)
+        *_, noise_key = view_keys(self.key(scene.index, "episode"), 0)
+        order = jax.random.permutation(self.key(scene.index, "first"), poses.position.shape[0]).tolist()
+        for index in order:
+            if self.shows_enough(scene, sensor(poses[index], noise_key)):
+                return index
+        raise InputError(f"none of {self.num_candidates} candidates shows enough of {scene.name}: ask for more")

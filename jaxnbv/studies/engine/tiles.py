@@ -17,8 +17,8 @@ from jaxnbv.viz.render import Still
 from jaxnbv.viz.style import GREY
 
 _CORRECT_COLOUR = "#00734f"
-# Longest edge of the triangles in a rendered image, which is short because colours are set at vertices, and radius of
-# the ball that the image shows, both in scene units.
+# Longest edge of the triangles in a rendered image (short, because vertices have the colours), and radius of the ball
+# that the image shows, in scene units.
 _MAX_EDGE, _IMAGE_RADIUS = 0.05, 1.6
 
 
@@ -26,7 +26,7 @@ class ScenePicture(NamedTuple):
     """The picture of a scene: a grid of small images (tiles), with one row per method.
 
     - `caption`: text below the picture.
-    - `tile`: function that draws the tile of a method (name) and a column (index) on the given axes.
+    - `tile`: function that draws the tile of a method (name) and a column (index) on axes.
     - `truth`: function that draws the tile of the true object, left of the first row; None for no such tile.
     - `columns`: titles of the columns; empty for one column per view.
     - `marks`: entries of the legend: for each label, the keyword arguments of its `Line2D`.
@@ -42,16 +42,13 @@ class ScenePicture(NamedTuple):
 
 
 def caption_tile(axes: Axes, text: str, is_correct: bool = False) -> None:
-    """Write a line of text below an image. If `is_correct`, it is bold and green, with a tick."""
+    """Write a line of text below a tile. If `is_correct`, it is bold and green, with a tick."""
     colour, weight = (_CORRECT_COLOUR, "bold") if is_correct else (GREY, "normal")
     axes.set_xlabel(f"{'✓ ' if is_correct else ''}{text}", fontsize=9, color=colour, fontweight=weight)
 
 
 def opposite_direction(record: Record) -> Float[np.ndarray, "3"]:
-    """Return a direction from which pictures show the side of the object that the first view hides.
-
-    The direction is opposite the first view, which all methods share, and slopes upwards.
-    """
+    """Return a direction opposite the first view, which all methods share, but sloping upwards."""
     run = next(iter(record["methods"].values()))
     position = np.asarray(run["views"][0]["position"])
     direction = -position[[0, 2]]
@@ -69,9 +66,8 @@ def render_mesh(
 ) -> Still:
     """Render a mesh, seen from the direction `eye`, in an image of `size` x `size` pixels.
 
-    - `value`: function that returns a value for each point. The values colour the surface, and values below 1e-6 count
-      as 1e-6; default: one colour.
-    - `norm`: colour scale of the values.
+    - `value`: function that returns a value for each point, which colours the surface by the scale `norm`; default: one
+      colour. Values below 1e-6 count as 1e-6.
     """
     vertices, faces = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, _MAX_EDGE, max_iter=12)
     fine = trimesh.Trimesh(vertices, faces)
@@ -81,10 +77,7 @@ def render_mesh(
 
 
 def draw_on(
-    axes: Axes,
-    rendering: Still,
-    points: Float[np.ndarray, "n 3"],
-    colours: Float[np.ndarray, "n channels"],
+    axes: Axes, rendering: Still, points: Float[np.ndarray, "n 3"], colours: Float[np.ndarray, "n channels"]
 ) -> None:
     """Draw a rendered image and the points that its surface does not hide. Near points cover far ones."""
     axes.imshow(rendering.image, interpolation="antialiased", zorder=1)
@@ -94,8 +87,6 @@ def draw_on(
     order = order[in_front[order]]
     axes.scatter(pixels[order, 0], pixels[order, 1], s=2.5, c=colours[order], linewidths=0, zorder=2)
     object_pixels = np.argwhere(rendering.image[..., 3] > 0)
-    middle, half = (
-        0.5 * (object_pixels.min(axis=0) + object_pixels.max(axis=0)),
-        0.55 * np.ptp(object_pixels, axis=0).max(),
-    )
+    middle = 0.5 * (object_pixels.min(axis=0) + object_pixels.max(axis=0))
+    half = 0.55 * np.ptp(object_pixels, axis=0).max()
     axes.set(xlim=middle[1] + [-half, half], ylim=middle[0] + [half, -half])

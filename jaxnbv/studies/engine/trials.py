@@ -19,17 +19,14 @@ class Failure(NamedTuple):
     traceback: str
 
 
-# Type of a function that runs all methods on the scene with an index.
+# Function that runs all methods on the scene with an index.
 Trial: TypeAlias = Callable[[int], Record]
 Outcome: TypeAlias = Record | Failure
 Outcomes: TypeAlias = Generator[tuple[int, Outcome], None, None]
 
 
 def outcomes(trial: Trial, indices: Sequence[int], executor: Executor | None = None) -> Outcomes:
-    """Run trials, and yield the index and outcome of each trial when it ends.
-
-    - `indices`: indices of the scenes.
-    - `executor`: an executor of `concurrent.futures`; default: this process runs the trials one after the other.
+    """Run trials on the scenes with these indices, and yield the index and outcome of each trial when it ends.
 
     The outcome is the trial's record, or a `Failure` if the trial raises an error or its process dies (the executor
     raises `BrokenExecutor`). Other errors of the executor are raised. Closing the generator cancels the trials that
