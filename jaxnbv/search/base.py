@@ -17,7 +17,7 @@ from jaxnbv.search.problem import Problem
 from jaxnbv.search.proposal import Proposal
 from jaxnbv.utility import Quantity
 
-# The field's converter also accepts numbers and poses, which mypy cannot see.
+# A converter accepts numbers and poses too, which mypy cannot see.
 if TYPE_CHECKING:
     AnyCandidates: TypeAlias = Any
 else:
@@ -48,9 +48,9 @@ class Search(eqx.Module):
         return acquisition.quantity
 
     def poses_around(self) -> Pose:
-        """Return poses around the object. Surface that at least one of these poses sees counts as visible.
+        """Return poses around the object, by default the paper's candidates.
 
-        The default is the paper's candidates.
+        Surface that at least one of these poses sees counts as visible.
         """
         return SphereCandidates().poses()
 
@@ -76,17 +76,14 @@ class Search(eqx.Module):
 class CandidateSearch(Search):
     """Base class of searches that score all candidates, then pick one of them.
 
-    `score` and `pick` are separate methods. A study can therefore compute the scores of `acquisitions` once for several
-    searches, and call `pick` of each search with these scores.
+    A study can compute the scores of `acquisitions` once, and call `pick` of several searches with them.
 
-    - `candidates`: `Candidates`, for example `SphereCandidates`. A number is converted to `SphereCandidates`, and a
-      batch of poses to `GivenPoses`.
+    - `candidates`: `Candidates`, a number of `SphereCandidates`, or a batch of poses.
     """
 
     candidates: AnyCandidates = eqx.field(converter=as_candidates, default=SphereCandidates())
 
     def poses_around(self) -> Pose:
-        """Return the poses of the candidates."""
         return self.candidates.poses()
 
     def upper_half(self) -> "CandidateSearch":
@@ -100,7 +97,7 @@ class CandidateSearch(Search):
         return (acquisition,)
 
     def score(self, problem: Problem, candidates: Pose) -> Scores:
-        """Return the score of each candidate for each acquisition of `acquisitions` and each posterior sample."""
+        """Return the scores of the candidates, which `pick` needs."""
         acquisitions = self.acquisitions(problem.acquisition)
         if not acquisitions:
             return jnp.zeros((0, 0, self.candidates.count))
@@ -110,14 +107,9 @@ class CandidateSearch(Search):
 
     @abstractmethod
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
-        """Choose one of the candidates by their scores, and return it as a proposal.
-
-        - `scores`: scores of all candidates, as `score` returns them.
-        - `key`: random key of searches that choose at random.
-        """
+        """Propose one of the candidates by the scores that `score` returns, or at random."""
 
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
-        """Score the candidates, then pick one of them."""
         candidates = self.candidates.poses()
         return self.pick(problem, candidates, self.score(problem, candidates), key)
 
@@ -129,18 +121,13 @@ class Baseline(CandidateSearch):
     uses_cost: ClassVar[bool] = False
 
     def acquisitions(self, acquisition: Acquisition) -> tuple[Acquisition, ...]:
-        """Return an empty tuple, since `pick` needs no scores."""
         return ()
 
     @abstractmethod
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
-        """Return the value of each candidate.
-
-        The search proposes the best candidate that `problem` does not exclude.
-        """
+        """Return the value of each candidate. The search proposes the best one that is not excluded."""
 
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
-        """Propose the candidate with the highest value of `values`. The scores are not used."""
         return best_unvisited(problem, candidates, self.values(problem, candidates, key))
 
 
@@ -153,9 +140,9 @@ def best_unvisited(
 ) -> Proposal:
     """Propose the candidate with the highest value among those that `problem` does not exclude.
 
-    - `tie`: relative difference up to which values count as equal. The first candidate of equal values is proposed. The
-      default exceeds the rounding error that depends on the order of a sum.
-    - `scores`: scores whose means are `values`. The proposal has standard errors only if scores are passed.
+    - `tie`: relative difference up to which values count as equal, and the first is proposed. The default exceeds the
+      rounding error that depends on the order of a sum.
+    - `scores`: scores whose means are `values`, for the proposal's standard errors.
     """
     values = jnp.where(problem.is_excluded(candidates), -jnp.inf, values)
     index = first_best(values, tie)
@@ -169,11 +156,10 @@ def best_unvisited(
 
 
 def best_or_farthest(problem: Problem, candidates: Pose, scores: Float[Array, "samples candidates"]) -> Proposal:
-    """Propose the best candidate or, among tied candidates, the one farthest from earlier cameras.
+    """Propose the best candidate or, among those tied with it, the one farthest from earlier cameras.
 
-    Ties are those of `Proposal.tied_with_best`. The distance matters only if a second view from the same pose gains
-    nothing (`Acquisition.gains_once`), and if there is no cost, because a cost already favours near candidates.
-    Otherwise propose as `best_unvisited` does.
+    The distance matters only if a second view from the same pose gains nothing (`Acquisition.gains_once`), and if there
+    is no cost, because a cost already favours near candidates.
     """
     proposal = best_unvisited(problem, candidates, jnp.mean(scores, axis=0), scores=scores)
     if not problem.acquisition.gains_once or problem.cost is not None:
@@ -185,9 +171,9 @@ def best_or_farthest(problem: Problem, candidates: Pose, scores: Float[Array, "s
 
 
 def preferred(proposal: Proposal, preference: Float[Array, " candidates"]) -> Proposal:
-    """Change a proposal to the candidate of the highest `preference` among those tied with the best.
+    """Change a proposal to the candidate of the highest `preference` among its `tied_with_best`.
 
-    Ties are those of `Proposal.tied_with_best`. Excluded candidates (value -inf) are not considered.
+    Excluded candidates (value -inf) are left out.
     """
     is_tied, errors = proposal.tied_with_best(), proposal.standard_errors
     assert is_tied is not None

@@ -21,7 +21,6 @@ class FarthestView(Baseline):
         return Quantity("distance to the nearest camera", "", meaning, length_power=1)
 
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
-        """Return each candidate's distance to its nearest earlier camera, in scene units. The key is not used."""
         return problem.observations.poses.distance(candidates)
 
 
@@ -33,17 +32,11 @@ class RandomView(Baseline):
         return Quantity("lot drawn", "uniform on [0, 1)", meaning, smooth=False)
 
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
-        """Return random numbers, uniform on [0, 1)."""
         return jax.random.uniform(key, (self.candidates.count,))
 
 
 class UncertaintyView(Baseline):
-    """Baseline that proposes the candidate whose principal ray has the most uncertain hit.
-
-    The source is Holalkere et al. (2025). The transmittance T(t) is the fraction of sampled surfaces that the ray has
-    not entered before distance t. The value is the length of the ray between the first t with T(t) < 1 and the last t
-    with T(t) > 0.05.
-    """
+    """Baseline that proposes the candidate of the largest `uncertain_length` (Holalkere et al. 2025)."""
 
     uses_samples: ClassVar[bool] = True
     uses_cost: ClassVar[bool] = True
@@ -53,19 +46,15 @@ class UncertaintyView(Baseline):
         return Quantity("uncertain length of the principal ray", "", meaning, length_power=1)
 
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
-        """Return `uncertain_length` of each candidate, after the cost of the move is applied.
-
-        The key is not used.
-        """
         return problem.apply_cost(uncertain_length(problem, candidates), candidates)
 
 
 def uncertain_length(problem: Problem, poses: Pose) -> Float[Array, " poses"]:
     """Return the length of each pose's principal ray along which its hit is uncertain, in scene units.
 
-    The transmittance T at a point of the ray is the fraction of sampled surfaces that the ray has not entered before
-    this point. It is evaluated every half cell within the samples' grid. The length is from the first point with T < 1
-    to the last point with T > 0.05. It is zero for a ray that hits no sampled surface or misses the grid.
+    The transmittance T(t) is the fraction of sampled surfaces that the ray has not entered before distance t. It is
+    evaluated every half cell within the samples' grid. The length is from the first t with T(t) < 1 to the last t with
+    T(t) > 0.05. It is zero for a ray that hits no sampled surface or misses the grid.
     """
     surfaces = problem.surfaces
     grid = surfaces.grid

@@ -58,8 +58,8 @@ class SphereCandidates(Candidates):
 
     - `count`: number of cameras. They form a Fibonacci sphere, evenly spaced above `min_elevation`.
     - `radius`: radius in scene units.
-    - `min_elevation`: smallest elevation in radians, above the plane through the origin that is normal to `up`. The
-      cameras are a dome over a table if it is 0.
+    - `min_elevation`: smallest elevation in radians, above the plane through the origin that is normal to `up`; 0 for a
+      dome over a table.
     - `up`: upward direction in the scene and in the images.
 
     **Raises:** `ValueError` for no cameras, a radius that is not positive and finite, an elevation that is not within
@@ -119,8 +119,7 @@ class Reach(Candidates):
         low, high = math.sin(self.min_elevation), math.sin(self.max_elevation)
         y = high - (high - low) * (index + 0.5) / self.count
         ring, angle = np.sqrt(1.0 - y**2), index * math.pi * (3.0 - math.sqrt(5.0))
-        # Roberts' low-discrepancy sequence (2018) of the plastic number spreads directions and distances evenly
-        # together.
+        # Roberts' low-discrepancy sequence (2018) spreads directions and distances evenly together.
         fraction = (0.5 + index / _PLASTIC**2) % 1.0
         distance = np.cbrt(self.nearest**3 + fraction * (self.farthest**3 - self.nearest**3))
         positions = distance[:, None] * np.stack([ring * np.cos(angle), y, ring * np.sin(angle)], axis=1)
@@ -128,9 +127,7 @@ class Reach(Candidates):
 
 
 class GivenPoses(Candidates):
-    """Candidates from a batch of poses.
-
-    - `batch`: the poses (n,).
+    """Candidates from a `batch` of poses.
 
     **Raises:** `ValueError` unless the poses are a batch (n,) with n >= 1.
     """
@@ -170,9 +167,7 @@ def _look_at_origin(positions: Float[Array, "n 3"], up: tuple[float, float, floa
 
 
 def as_candidates(value: object) -> Candidates:
-    """Convert a number to `SphereCandidates`, or a batch of poses to `GivenPoses`.
-
-    Candidates are returned unchanged.
+    """Return candidates unchanged, or `SphereCandidates` of a number, or `GivenPoses` of a batch.
 
     **Raises:** `ValueError` for any other value, and for the same reasons as `SphereCandidates` and `GivenPoses`.
     """

@@ -43,8 +43,8 @@ class GradientSearch(Search):
 
     The default numbers of starts and steps and the default learning rate are the paper's. The paper starts from six
     random views without evaluating other candidates first, and returns the best final value. `num_candidates=6` is
-    closest to the paper. Differentiation stores the acquisition's intermediate results for all starts and samples. This
-    needs several gigabytes with PointNet++.
+    closest to it. Differentiation stores intermediate results for all starts and samples, which takes several gigabytes
+    with PointNet++.
 
     **Raises:** `ValueError` for a `dof` other than 2 or 6, for both `dof` and `space`, fewer candidates than starts, no
     starts or iterations, or a learning rate that is not positive. A `Planner` with this search also raises it for an
@@ -97,7 +97,7 @@ class GradientSearch(Search):
 
     @property
     def minimiser(self) -> optx.AbstractMinimiser:
-        """The minimiser that is used: `solver`, or Adam if `solver` is None."""
+        """The minimiser that is used: `solver`, or else Adam."""
         if self.solver is not None:
             return self.solver
         # Zero tolerances are never met, so all iterations run.
@@ -112,14 +112,13 @@ class GradientSearch(Search):
         return eqx.tree_at(lambda search: search.candidates, self, self.candidates.upper_half())
 
     def check(self, acquisition: Acquisition, camera: Camera, capacity: int) -> None:
-        """Raise `ValueError` if the acquisition has no gradient, or the camera does not fit the space."""
         self.space.check_camera(camera)
         check_traceable(acquisition, capacity, camera, differentiable=True)
 
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
         """Propose the best pose of all trajectories, or the best candidate if its value is higher.
 
-        The key decides how the candidates are rotated, unless the field `candidates` is set.
+        The key rotates the space's own candidates.
         """
         if self.candidates is None:
             candidates = self.space.candidates(self.num_candidates, key if self.rotates_candidates else None)
@@ -188,9 +187,8 @@ class GradientSearch(Search):
 class HybridSearch(GradientSearch):
     """Discrete search, followed by gradient ascent from the best candidates.
 
-    This is a `GradientSearch` whose defaults differ: it takes fewer and longer steps from fewer starts. Its candidates
-    are not rotated. On the sphere they are the candidates of a `DiscreteSearch` with the same number of candidates. The
-    value of the proposal is therefore at least the best value of that search.
+    This is a `GradientSearch` with fewer and longer steps from fewer starts by default. Its candidates are not rotated.
+    On the sphere they are those of a `DiscreteSearch`, so the value is at least the best value of that search.
     """
 
     rotates_candidates: ClassVar[bool] = False

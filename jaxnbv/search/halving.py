@@ -23,10 +23,10 @@ _NO_RANK = np.iinfo(np.int32).max
 class HalvingSearch(CandidateSearch):
     """Successive halving over candidates (Karnin et al. 2013), a faster `DiscreteSearch`.
 
-    All candidates are scored on the first few posterior samples. In each later round, the better half of the remaining
-    candidates is scored on further samples, until all samples are used. Each round doubles the number of samples on
-    which the remaining candidates were scored. For 16 samples and `num_first_samples=2`, a candidate is scored on
-    5 samples on average instead of 16. The proposal may differ from that of `DiscreteSearch`.
+    All candidates are scored on the first few posterior samples. Each later round keeps the better half of them, and
+    doubles the number of samples on which they were scored, until all samples are used. For 16 samples and
+    `num_first_samples=2`, a candidate is scored on 5 samples on average. The proposal may differ from that of
+    `DiscreteSearch`.
 
     - `num_first_samples`: number of posterior samples on which every candidate is scored.
     """
@@ -41,7 +41,6 @@ class HalvingSearch(CandidateSearch):
         )
 
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
-        """Propose as `pick` does, but score only the remaining candidates in each round."""
         candidates = self.candidates.poses()
 
         def score(rows: Int[Array, " rows"], sample: Int[Array, ""]) -> Float[Array, " rows"]:
@@ -52,8 +51,7 @@ class HalvingSearch(CandidateSearch):
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
         """Propose the best candidate of the last round.
 
-        For a candidate that was dropped in an earlier round, the value and standard error come from the scores before
-        that round.
+        The value and standard error of another candidate are those of its last round.
         """
         return self._halve(problem, candidates, lambda rows, sample: scores[0, sample][rows])
 
@@ -95,10 +93,9 @@ class HalvingSearch(CandidateSearch):
         )
 
     def _blocks(self, num_samples: int) -> tuple["_Block", int]:
-        """Divide all rounds into blocks, and return these and the number of candidates in the last round.
+        """Return the blocks of all rounds, and the number of candidates in the last round.
 
-        A block is a group of candidates that are scored together on one posterior sample. All blocks have the same
-        size, so the program that scores a block is compiled once.
+        All blocks have the same size, so the program that scores a block is compiled once.
         """
         rounds: list[tuple[int, range]] = []
         num_left, num_scored = self.candidates.count, 0

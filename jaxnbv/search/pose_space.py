@@ -1,8 +1,7 @@
 """Pose spaces of gradient searches: a sphere, all poses, or poses within constraints.
 
-A space moves a start pose by a vector of parameters (a *retraction* in optimisation on manifolds). The parameters are
-relative to the start, and zero parameters are the start itself. Therefore no start is near a singularity of the
-parameters, such as the poles of spherical coordinates.
+A space moves a start pose by a vector of parameters (a *retraction* in optimisation on manifolds). Zero parameters are
+the start itself, so no start is near a singularity of the parameters, such as the poles of spherical coordinates.
 """
 
 import math
@@ -31,23 +30,14 @@ class PoseSpace(eqx.Module):
 
     @abstractmethod
     def candidates(self, count: int, key: PRNGKeyArray | None) -> Pose:
-        """Return `count` poses that are spread evenly over the space.
-
-        If `key` is not None, all poses are rotated by a random rotation.
-        """
+        """Return `count` poses, spread evenly over the space. A key rotates all by a random rotation."""
 
     @abstractmethod
     def retract(self, start: Pose, parameters: Float[Array, " parameters"]) -> Pose:
-        """Move `start` by the parameters. The result is differentiable in the parameters.
-
-        Zero parameters return `start` if `start` is in the space.
-        """
+        """Move `start` by the parameters, differentiably. Zero parameters keep a start that is in the space."""
 
     def check_camera(self, camera: Camera) -> None:
-        """Raise `ValueError` if the camera's field of view is too narrow for the poses.
-
-        By default, every camera is valid.
-        """
+        """Raise `ValueError` if the camera's field of view is too narrow for the poses."""
         return
 
 
@@ -55,8 +45,8 @@ class SpherePoses(PoseSpace):
     """2-DOF poses on a sphere about the origin, all looking at the origin.
 
     The parameters (3,) are added to the unit vector from the origin to the start, and the sum is normalised. The camera
-    then turns to the origin by the smallest rotation, which has no singularity at the poles. A start at a different
-    radius is moved to the sphere.
+    turns to the origin by the smallest rotation, which has no singularity at the poles. A start at a different radius
+    is moved to the sphere.
 
     - `radius`: radius of the sphere, in scene units.
 
@@ -146,7 +136,6 @@ class ConstrainedPoses(PoseSpace):
         return 0.5 * (self.nearest + self.farthest)
 
     def candidates(self, count: int, key: PRNGKeyArray | None) -> Pose:
-        """Return poses on a sphere in the middle of the range of distances."""
         return _sphere_poses(count, self._middle, key)
 
     def retract(self, start: Pose, parameters: Float[Array, " parameters"]) -> Pose:
@@ -169,9 +158,9 @@ class ConstrainedPoses(PoseSpace):
         return Pose(_product(_product(rotation, rotation_between(target, to_origin)), roll_matrix), position)
 
     def check_camera(self, camera: Camera) -> None:
-        """Raise `ValueError` if the angle from the optical axis to an image edge is less than `off_axis`.
+        """Raise `ValueError` if an image edge is nearer than `off_axis` to the optical axis.
 
-        The scene's origin, which is the centre of the object, could then be outside the image.
+        The scene's origin could then be outside the image.
         """
         left, top, right, bottom = camera.edges
         half = math.atan(min(-left, -top, right, bottom))
@@ -183,7 +172,7 @@ class ConstrainedPoses(PoseSpace):
 
 
 def _sphere_poses(count: int, radius: float, key: PRNGKeyArray | None) -> Pose:
-    """Return a Fibonacci sphere of cameras that look at the origin. If `key` is not None, rotate it at random."""
+    """Return a Fibonacci sphere of cameras that look at the origin, rotated at random if there is a key."""
     positions = fibonacci_sphere(count, radius)
     if key is not None:
         rotation = rotation_from_6d(jax.random.normal(key, (6,)))

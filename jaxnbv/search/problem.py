@@ -19,10 +19,7 @@ from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning import GridSurface, Obstacles, barrier_of
 
 ApplyCost: TypeAlias = Callable[[Float[Array, "*samples poses"], Observations, Pose], Float[Array, "*samples poses"]]
-"""Function that applies the cost of moving from the last view to the values of poses.
-
-It takes the values, the observations and the poses, a batch (n,), and returns the new values.
-"""
+"""Function of values, observations and a batch of poses: the values after the cost of moving from the last view."""
 
 
 class Problem(eqx.Module):
@@ -30,8 +27,6 @@ class Problem(eqx.Module):
 
     - `inputs`: the observations and, if the search uses samples, the posterior and its samples.
     - `camera`: the camera whose scans are simulated.
-    - `acquisition`: the expected value of a view.
-    - `obstacles`: solids around the object, or None. Obstacles may hide the object, and cameras keep clear of them.
     - `cost`: function that changes the values of poses by the cost of moving there; None to ignore the cost.
     - `pending`: poses of earlier proposals without a view; None if there are none.
     - `context`: context of the acquisition, computed once from the inputs by `prepared`.
@@ -47,14 +42,10 @@ class Problem(eqx.Module):
 
     @property
     def observations(self) -> Observations:
-        """The observations so far."""
         return self.inputs.observations
 
     def prepared(self) -> "Problem":
-        """Return a copy with the acquisition's context, which is None without samples.
-
-        Call this before a search, because scores need the context.
-        """
+        """Return a copy with the acquisition's context, which scores need; None without samples."""
         context = None if self.inputs.surfaces is None else context_of(self.acquisition, self.inputs)
         return dataclasses.replace(self, context=context)
 
@@ -63,7 +54,7 @@ class Problem(eqx.Module):
         return dataclasses.replace(self, acquisition=acquisition).prepared()
 
     def values(self, poses: Pose) -> Float[Array, " poses"]:
-        """Return the value of each pose, which is the mean of the pose's scores over all posterior samples."""
+        """Return the value of each pose: the mean of its scores over all posterior samples."""
         return jnp.mean(self.scores(poses), axis=0)
 
     def scores(
@@ -72,8 +63,6 @@ class Problem(eqx.Module):
         """Return the acquisition's score for each sample and pose, after the cost of the move is applied.
 
         For an `AcquisitionList`, the result has a leading axis of acquisitions.
-
-        - `samples`: the samples to use, by default all.
         """
         surfaces = jax.tree.map(lambda leaf: leaf[samples], self.surfaces)
         barrier = barrier_of(self.obstacles, self.camera, poses)
@@ -81,15 +70,14 @@ class Problem(eqx.Module):
         return self.apply_cost(jnp.moveaxis(values, (0, 1), (-2, -1)), poses)
 
     def apply_cost(self, values: Float[Array, "*samples poses"], poses: Pose) -> Float[Array, "*samples poses"]:
-        """Return values that include the cost of moving from the last view to each pose, if there is a cost."""
+        """Return values after the cost of moving from the last view to each pose, if there is a cost."""
         return values if self.cost is None else self.cost(values, self.observations, poses)
 
     def value_at_visited(self) -> Float[Array, ""]:
         """Return the mean value that the acquisition expects at the visited poses, without the cost of moves.
 
-        If a second view from the same pose gains nothing, this value is an error, and the error may be as large at
-        other poses. Return zero for fewer than two views, because the value at a single visited pose is not an error:
-        it counts surface that the view saw only at a steep angle.
+        If a second view from the same pose gains nothing, this value is an error, which may be as large at other poses.
+        Return zero for one view, whose value is not an error: it counts surface that was seen only at a steep angle.
         """
         visited_poses = self.observations.poses
         without_cost = dataclasses.replace(self, cost=None)
@@ -124,10 +112,7 @@ class Problem(eqx.Module):
         return is_excluded | (self.violation(poses) > 0)
 
     def violation(self, poses: Pose) -> Float[Array, " poses"]:
-        """Return the length by which each pose is too close to an obstacle or to the cloud D.
-
-        The length is in scene units, and zero for a permitted pose, see `Obstacles.violation`.
-        """
+        """Return the length by which each pose is too close to an obstacle or to D, see `Obstacles.violation`."""
         if self.obstacles is None:
             return jnp.zeros(poses.position.shape[:-1], poses.position.dtype)
         return self.obstacles.violation(poses, self.observations.cloud)

@@ -12,10 +12,7 @@ from jaxnbv.geometry.pose import Pose
 
 
 class Trajectories(eqx.Module):
-    """Poses and values of a gradient search, for each start and each of its `iterations` + 1 steps.
-
-    - `poses`: a batch of poses with the same axes as `values`.
-    """
+    """Poses and values of a gradient search, for each start and each of its `iterations` + 1 steps."""
 
     poses: Pose
     values: Float[Array, "*starts steps"]
@@ -33,14 +30,13 @@ class Proposal(eqx.Module):
     - `pose`, `value`: the proposed pose and its value, in the unit of the search's quantity.
     - `candidates`, `values`: all candidates and their values. The value of an excluded candidate is -inf.
     - `trajectories`: trajectories of a gradient search from the best candidates; None for other searches.
-    - `standard_errors`: standard errors of the values as means over posterior samples; None for a search without
-      scores. If a search scores a candidate on some samples only, the standard error is for these samples.
+    - `standard_errors`: standard errors of the values as means over those posterior samples on which a candidate was
+      scored; None for a search without scores.
     - `difference_errors`: standard errors of the differences between the values and the best value. They are smaller
       than `standard_errors`, because all candidates are scored on the same samples. None for a search that does not
       score all candidates on all samples.
     - `standard_error`: standard error of `value`. NaN for one sample; None for a search without scores.
-    - `value_at_visited`: mean value expected at visited poses, see `Problem.value_at_visited`. None if ties are not
-      decided by the distance from earlier cameras.
+    - `value_at_visited`: see `Problem.value_at_visited`. None unless the distance from earlier cameras decides ties.
     """
 
     pose: Pose
@@ -78,11 +74,10 @@ class Proposal(eqx.Module):
     def best(self, count: int, min_angle: float = 30.0) -> Pose:
         """Return a batch of the best candidates from different directions, best first.
 
-        Candidates are selected in descending order of value. Excluded candidates are never selected. The batch is
-        shorter than `count` if there are not enough candidates.
+        Excluded candidates are left out. The batch is shorter than `count` if there are not enough candidates.
 
-        - `min_angle`: least angle in degrees, at the origin, between two selected candidates. A candidate that is
-          closer to one of those selected before is skipped.
+        - `min_angle`: least angle in degrees, at the origin, between two candidates. One that is closer to a better one
+          is left out.
 
         **Raises:** `ValueError` for a count below 1, or an angle outside [0, 180].
         """
