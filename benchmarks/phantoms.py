@@ -38,7 +38,8 @@ from jaxnbv.planning.loop import Loop
 from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning import pixel_area, scan
 from jaxnbv.scanning.looks import STEEP
-from jaxnbv.studies.recorded import NEW_AREA, RecordedStudy, frame_of_box
+from jaxnbv.studies.recorded import NEW_AREA, RecordedStudy
+from jaxnbv.studies.shown_voxels import frame_of_box
 from jaxnbv.tasks.coverage import Newness, seen_share
 
 KINDS = ("cut", "empty", "silent", "unseen")

@@ -100,7 +100,7 @@ def identify(options: IdentifyOptions, box: Any, intrinsics: Any, depth_scale: A
     from jaxnbv.planning.sessions import Sessions
     from jaxnbv.readers.recorded import RecordedFrames
     from jaxnbv.readers.segmentation import Segmentation
-    from jaxnbv.studies.recorded import bounds_of
+    from jaxnbv.studies.shown_voxels import bounds_of
     from jaxnbv.surfaces import FreeRotation, Upright
 
     frames = RecordedFrames(options.recording, None, intrinsics, depth_scale)

@@ -1,87 +1,62 @@
 """Registry entries (`Entry`) of the studies that ship with the package."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from jaxnbv.studies.registry import Entry
 from jaxnbv.studies.scenes.framing import FirstView, Framing, Setup
 
-MESHES = {
-    "meshes": Annotated[
-        Path | None, typer.Option(help="A folder of meshes to scan.", show_default="procedural objects")
-    ]
-}
+
+def _option(kind: Any, text: str, default: str, metavar: str | None = None) -> Any:
+    """Return the annotation of an option, with its help text, and with text that stands for its default, None."""
+    return Annotated[kind | None, typer.Option(help=text, show_default=default, metavar=metavar)]
+
+
+MESHES = {"meshes": _option(Path, "A folder of meshes to scan.", "procedural objects")}
 CLASSES = {
-    "classifier": Annotated[
-        Path | None,
-        typer.Option(help="Checkpoint of a network: .safetensors, .pth or .pt.", show_default="the shipped network"),
-    ],
-    "first": Annotated[
-        FirstView | None,
-        typer.Option(
-            help="Allowed first views: any, or only views after which the classifier is wrong.",
-            show_default="any",
-        ),
-    ],
+    "classifier": _option(Path, "Checkpoint of a network: .safetensors, .pth or .pt.", "the shipped network"),
+    "first": _option(FirstView, "Allowed first views: any, or only views after which the classifier is wrong.", "any"),
 }
 FRAMING = {
-    "framing": Annotated[
-        Framing | None,
-        typer.Option(
-            help="Size of the pyramid: a view shows a patch of it, or nearly all of one side.", show_default="both"
-        ),
-    ]
+    "framing": _option(Framing, "Size of the pyramid: a view shows a patch of it, or nearly all of one side.", "both")
 }
 RECORDING = {
     "folder": Annotated[
         Path | None, typer.Argument(metavar="FOLDER", help="The folder of a recording.", show_default=False)
     ],
-    "box": Annotated[
-        tuple[float, float, float, float, float, float] | None,
-        typer.Option(
-            metavar="LOW HIGH",
-            help="Region of interest of a recording: two corners of a box, six numbers in its units.",
-            show_default="a box around nearly all recorded points",
-        ),
-    ],
-    "up": Annotated[
-        tuple[float, float, float] | None,
-        typer.Option(
-            metavar="X Y Z",
-            help="Upward direction of a recording. It becomes the z axis of the box.",
-            show_default="as recorded",
-        ),
-    ],
-    "intrinsics": Annotated[
-        tuple[float, float, float, float] | None,
-        typer.Option(
-            metavar="FX FY CX CY",
-            help="Intrinsics of a recording's depth camera, in pixels.",
-            show_default="the file in its folder or the parent folder",
-        ),
-    ],
-    "depth_scale": Annotated[
-        float | None,
-        typer.Option(
-            help="Length of one unit of the depth images, in the units of the poses: 0.0002 for TUM RGB-D.",
-            show_default="the common scale for which the frames agree",
-        ),
-    ],
+    "box": _option(
+        tuple[float, float, float, float, float, float],
+        "Region of interest of a recording: two corners of a box, six numbers in its units.",
+        "a box around nearly all recorded points",
+        "LOW HIGH",
+    ),
+    "up": _option(
+        tuple[float, float, float],
+        "Upward direction of a recording. It becomes the z axis of the box.",
+        "as recorded",
+        "X Y Z",
+    ),
+    "intrinsics": _option(
+        tuple[float, float, float, float],
+        "Intrinsics of a recording's depth camera, in pixels.",
+        "the file in its folder or the parent folder",
+        "FX FY CX CY",
+    ),
+    "depth_scale": _option(
+        float,
+        "Length of one unit of the depth images, in the units of the poses: 0.0002 for TUM RGB-D.",
+        "the common scale for which the frames agree",
+    ),
 }
 KNOWN_PARTS = {
-    "parts": Annotated[
-        Path | None,
-        typer.Option(help="A folder of meshes of the parts, at true size.", show_default="parts that look alike"),
-    ],
-    "setup": Annotated[
-        Setup | None,
-        typer.Option(
-            help="Setup of the part: one side in view, a patch in view, on a table, or on a table beside a box.",
-            show_default="all four",
-        ),
-    ],
+    "parts": _option(Path, "A folder of meshes of the parts, at true size.", "parts that look alike"),
+    "setup": _option(
+        Setup,
+        "Setup of the part: one side in view, a patch in view, on a table, or on a table beside a box.",
+        "all four",
+    ),
 }
 
 PYRAMID = Entry(

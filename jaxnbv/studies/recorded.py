@@ -1,9 +1,8 @@
 """Study of a recording. A method chooses frames one by one, and the study measures how much of a box they show."""
 
-import functools
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -15,14 +14,11 @@ from matplotlib.axes import Axes
 from jaxnbv.acquisition import Acquisition
 from jaxnbv.checks import InputError, require
 from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.cloud import PointCloud
-from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
 from jaxnbv.planning.images import stride_of
 from jaxnbv.planning.loop import Sensor, Step
 from jaxnbv.planning.planner import Planner
-from jaxnbv.progress import progress_bar
 from jaxnbv.readers.recorded import RecordedFrames
 from jaxnbv.sampler import MODELS, SurfaceSampler
 from jaxnbv.scanning import Surface
@@ -33,45 +29,25 @@ from jaxnbv.studies.engine.measures import Claim, Measure, Record
 from jaxnbv.studies.engine.searches import BASELINES
 from jaxnbv.studies.engine.study import Scene, Study
 from jaxnbv.studies.engine.tiles import ScenePicture, caption_tile
+from jaxnbv.studies.shown_voxels import Recording, bounds_of, frame_of_box, read_recording
 from jaxnbv.tasks import Coverage, NewSurface
 from jaxnbv.utility import Quantity
 from jaxnbv.viz.style import GREY, INK, LINE, NEW
 
 NEW_AREA, COVERAGE, EVEN, ORACLE = "new surface", "coverage", "evenly spaced", "oracle"
-# Number of frames that must show a voxel. A voxel that fewer frames show may be noise.
-_MIN_FRAMES = 3
 _VOXELS_ALONG_BOX = 80
 # A first view shows at least this fraction of the box's voxels.
 _MIN_SHOWN_FRACTION = 0.05
 # Rows and columns of rays of an imagined scan.
 _RAYS = (24, 32)
-# Pixel stride with which the default box is computed, and the margin of the box as a fraction of its longest side.
-_BOUNDS_STRIDE, _MARGIN = 16, 0.05
-
-
-class Recording(NamedTuple):
-    """The frames of a recording, and the voxels of a box that at least three frames show.
-
-    - `poses`: camera poses of the frames; `scans`: scans of the frames, cropped to the box; both in scene units.
-    - `is_shown`: entry (i, j) is True if any pixel of frame i shows voxel j.
-    - `voxels`: centres of the voxels; `camera_positions`: positions of the frames' cameras; both in the recording's
-      units.
-    """
-
-    poses: Pose
-    scans: tuple[PointCloud, ...]
-    is_shown: Bool[np.ndarray, "frames voxels"]
-    voxels: Float[np.ndarray, "voxels 3"]
-    camera_positions: Float[np.ndarray, "frames 3"]
 
 
 class _UnknownSurface(Surface):
-    """Placeholder for the true surface of a recording, which is unknown."""
+    """Placeholder for the true surface of a recording."""
 
     in_jit: ClassVar[bool] = False
 
     def trace(self, origins, directions) -> Hits:
-        """Always raise `ValueError`, because the surface is unknown."""
         raise InputError("the true surface of a recording is unknown: take scans from the study's sensor")
 
 
@@ -84,7 +60,7 @@ class FixedOrder(Baseline):
     order: Int[Array, " views"] = eqx.field(kw_only=True)
 
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
-        """Return 1 for the next candidate in the order, and 0 for all other candidates. The key is not used."""
+        """Return 1 for the next candidate in the order, and 0 for all others."""
         is_next = jnp.arange(candidates.position.shape[0]) == self.order[problem.observations.num_views]
         return is_next.astype(candidates.position.dtype)
 
@@ -101,36 +77,30 @@ class MostNewVoxels(Baseline):
         return Quantity("new voxels", "", "voxels that a frame shows and no earlier frame does.", smooth=False)
 
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:
-        """Return, for each candidate, the number of voxels that it shows and no visited candidate shows.
-
-        The key is not used.
-        """
+        """Return, for each candidate, the number of voxels that it shows and no visited candidate shows."""
         is_shown = jnp.any(self.is_shown & problem.observations.poses.contains(candidates)[:, None], axis=0)
         gain = jnp.sum(self.is_shown & ~is_shown, axis=1)
         return gain.astype(candidates.position.dtype)
 
 
 def _gain_over_oracle(record: Record, method: str) -> dict[int, float | None]:
-    """Return, for each view after the first, the ratio of voxels added by a method and by the oracle.
+    """Return, for each later view, the ratio of a method's and the oracle's gain in voxels over view 1.
 
-    Both count the voxels that views 2 to this view have added to those of view 1. The ratio is None if the oracle has
-    added no voxels. Without a run of the oracle, the result is {}.
+    The ratio is None if the oracle has added no voxels. Without a run of the oracle, the result is {}.
     """
     if ORACLE not in record["methods"]:
         return {}
     fractions, oracle_fractions = (record["methods"][name]["covered"] for name in (method, ORACLE))
-    pairs = enumerate(zip(fractions[1:], oracle_fractions[1:], strict=True), start=2)
-    return {
-        view: (a - fractions[0]) / (b - oracle_fractions[0]) if b > oracle_fractions[0] else None
-        for view, (a, b) in pairs
-    }
+    gains, oracle_gains = (np.subtract(values[1:], values[0]).tolist() for values in (fractions, oracle_fractions))
+    pairs = enumerate(zip(gains, oracle_gains, strict=True), start=2)
+    return {view: gain / oracle_gain if oracle_gain > 0 else None for view, (gain, oracle_gain) in pairs}
 
 
 class RecordedStudy(Study):
     """Measures how much of a box is shown by the frames that a method chooses from a recording.
 
-    The candidates are the recorded poses, and the scan of a candidate is its recorded scan. The first view is a random
-    frame that shows at least 5 % of the box's voxels. Scenes differ only in their first view.
+    The candidates are the recorded poses with their recorded scans. The first view is a random frame that shows at
+    least 5 % of the box's voxels. Scenes differ only in their first view.
 
     It has the settings of `Study`, and:
 
@@ -138,8 +108,7 @@ class RecordedStudy(Study):
     - `box`: the region of interest, in the recording's units.
     - `voxel`: side of the counted voxels, in the recording's units.
 
-    **Raises:** `ValueError` if the box holds no voxel that three frames show, and whenever `RecordedFrames` raises it.
-    These errors are raised when `recording` is first read.
+    **Raises:** `ValueError` as `read_recording` does, when `recording` is first read.
     """
 
     title: ClassVar[str] = "Voxels of a recorded place that were seen"
@@ -218,7 +187,7 @@ class RecordedStudy(Study):
         carving, frame = self.sampler.carving, frame_of_box(self.box)
         scan_box = self.box if carving is None else carving.with_room(self.box, self.grid, frame)
         sensor = self.up, self.intrinsics, self.depth_scale
-        return _recording((self.folder, *sensor), self.box, self.voxel, scan_box)
+        return read_recording((self.folder, *sensor), self.box, self.voxel, scan_box)
 
     @property
     def candidates(self) -> GivenPoses:
@@ -263,11 +232,7 @@ class RecordedStudy(Study):
         return self.recording.is_shown
 
     def follow(
-        self,
-        scene: Scene,
-        truth: Bool[np.ndarray, "frames voxels"],
-        planner: Planner,
-        episode: Iterator[Step],
+        self, scene: Scene, truth: Bool[np.ndarray, "frames voxels"], planner: Planner, episode: Iterator[Step]
     ) -> Record:
         """Record the chosen frames, and the fraction of the voxels that they show after each view."""
         frames = [self.frame_of(step.view.pose) for step in episode]
@@ -277,8 +242,7 @@ class RecordedStudy(Study):
     def scene_picture(self, record: Record, methods: Sequence[str], pixels: int) -> ScenePicture:
         """Return images of the box's voxels after each view, projected along the shortest side of the box.
 
-        Voxels that a chosen frame shows are coloured. The line is the path of the recorded camera, and the numbers mark
-        the chosen frames in their order.
+        The line is the path of the recorded camera.
         """
         recording, runs = self.recording, record["methods"]
         plane_axes = np.sort(np.argsort(self.box.high - self.box.low)[1:])
@@ -301,73 +265,5 @@ class RecordedStudy(Study):
     def frame_of(self, pose: Pose) -> int:
         """Return the index of the frame whose pose is nearest to `pose`."""
         poses = self.recording.poses
-        distances = jnp.abs(poses.position - pose.position).sum(-1) + jnp.abs(poses.rotation - pose.rotation).sum(
-            (-1, -2)
-        )
-        return int(jnp.argmin(distances))
-
-
-def _points(frames: RecordedFrames, index: int, stride: int) -> Float[np.ndarray, "n 3"]:
-    """Return the points of a frame in world coordinates, from every `stride`-th pixel along each axis."""
-    camera, matrix = frames.camera.strided(stride), frames.matrices[index]
-    rows = slice(stride // 2, None, stride)
-    depth = frames.depth_scale * frames.depth(index)[rows, rows].reshape(-1)
-    local = np.asarray(camera.pixel_directions(), np.float64)[depth > 0] * depth[depth > 0, None]
-    return local @ matrix[:3, :3].T + matrix[:3, 3]
-
-
-def bounds_of(frames: RecordedFrames) -> list[float]:
-    """Return two corners of a box around nearly all points of a recording, as six numbers in its units.
-
-    Along each axis, the box spans the 1st to the 99th percentile of the points' coordinates. A margin of 5 % of the
-    longest side is added on all sides.
-
-    **Raises:** `ValueError` if no frame has a valid depth.
-    """
-    points = np.concatenate([_points(frames, index, _BOUNDS_STRIDE) for index in range(len(frames))])
-    require(len(points) > 0, f"no frame of {frames.folder} has a valid depth")
-    low, high = np.percentile(points, [1, 99], axis=0)
-    margin = _MARGIN * float((high - low).max())
-    return [*(low - margin).tolist(), *(high + margin).tolist()]
-
-
-def frame_of_box(box: Box) -> Frame:
-    """Return the frame that maps the recording's coordinates to the scene, with the box in the centre."""
-    return Frame.fit(np.array([box.low, box.high]), up="z")
-
-
-@functools.cache
-def _recording(source: tuple[Any, ...], box: Box, voxel: float, scan_box: Box) -> Recording:
-    """Read a recording.
-
-    - `source`: the arguments of `RecordedFrames`.
-    - `box`: the box whose voxels are counted; `voxel`: side of a voxel, both in the recording's units.
-    - `scan_box`: the box to which scans are cropped.
-    """
-    frames, frame = RecordedFrames(*source), frame_of_box(box)
-    poses, stride = Pose.from_matrix(frames.matrices), stride_of(frames.camera)
-    count = frames.camera.strided(stride).num_rays
-    zeros, is_point = jnp.zeros((count, 3)), jnp.zeros(count, bool)
-    scans, cells_of_frames = [], []
-    for index in progress_bar(range(len(frames)), desc="reading frames"):
-        # Use all pixels, although scans use every `stride`-th. Fewer pixels would miss voxels that the frame shows.
-        points = _points(frames, index, 1)
-        points = points[np.all((points >= box.low) & (points <= box.high), axis=1)]
-        # A frame without points in the box gives an empty scan. Its rays are not used for carving either.
-        scan = PointCloud(zeros, zeros, is_point, is_point, jnp.zeros(count))
-        if len(points) > 0:
-            image = frames.depth(index), frames.camera, poses[index], frames.depth_scale, stride
-            scan = PointCloud.from_depth(*image, scan_box)
-        scans.append(frame.to_scene(scan))
-        cells_of_frames.append(np.unique(np.floor(points / voxel).astype(int), axis=0))
-    cells, cell_indices, counts = np.unique(
-        np.concatenate(cells_of_frames), axis=0, return_inverse=True, return_counts=True
-    )
-    is_shown = np.zeros((len(frames), len(counts)), bool)
-    is_shown[np.repeat(np.arange(len(frames)), [len(rows) for rows in cells_of_frames]), cell_indices] = True
-    is_counted = counts >= _MIN_FRAMES
-    require(
-        bool(is_counted.any()), f"no voxel of {box} shows in {_MIN_FRAMES} frames of {frames.folder}: give another box"
-    )
-    voxels, positions = voxel * (cells[is_counted] + 0.5), frames.matrices[:, :3, 3]
-    return Recording(frame.to_scene(poses), tuple(scans), is_shown[:, is_counted], voxels, positions)
+        shifts, turns = jnp.abs(poses.position - pose.position), jnp.abs(poses.rotation - pose.rotation)
+        return int(jnp.argmin(shifts.sum(-1) + turns.sum((-1, -2))))

@@ -1,7 +1,7 @@
 """Registry of the studies of `jaxnbv study`.
 
 Any installed package can register a study as an entry point of the group `jaxnbv.studies`. The entry point names an
-`Entry` in a module that does not import JAX, because importing JAX would slow down the command's help.
+`Entry` in a module that does not import JAX, which would slow down the command's help.
 """
 
 import functools
@@ -22,9 +22,8 @@ class Entry(NamedTuple):
     - `question`: the question that the study answers, shown in the help.
     - `scenes`, `views`: default numbers of scenes and views.
     - `model`: default surface model: "known" (with known shapes), or the name of a model without known shapes.
-    - `options`: maps names of the study's settings to typer annotations, for options that only this study has. A
-      setting annotated by a `typer.Argument` must be given. All others default to None. Options of all studies, such as
-      `capacity`, are not listed here.
+    - `options`: typer annotations of the settings that only this study has. A setting annotated by a `typer.Argument`
+      must be given. All others default to None.
     """
 
     study: str
