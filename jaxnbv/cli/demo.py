@@ -25,12 +25,12 @@ def demo(options: DemoOptions) -> None:
     check_device()
     from jaxnbv.cli.play import DEMO, check_options, first_pose, run_episode
 
-    check_options(options)
     task = TASKS[options.task]
+    stop_rule = check_options(options, task.until)
     subject = task.demo(options.scene, options.seed)
     if options.first is not None:
         subject = subject._replace(first=first_pose(options.first, subject.surface))
-    run_episode(options, subject, task.setting(), DEMO, task.until)
+    run_episode(options, subject, task.setting(), DEMO, stop_rule, has_rival=bool(task.until))
 
 
 demo.__doc__ = "\n\n".join(

@@ -141,29 +141,34 @@ def first_pose(place: Position, surface: Surface) -> Pose:
     return pose
 
 
-def check_options(options: EpisodeOptions) -> None:
+def check_options(options: EpisodeOptions, until: Sequence[str] = ()) -> StopRule | None:
     """Check options that would otherwise fail only after the object and the known shapes were made.
+
+    Returns the stop rule. `until` is the default of `--until`.
 
     **Raises:** `ValueError` for fewer than one view, an invalid stop rule, or known shapes for the paper's model.
     """
     require(options.views >= 1, f"asked for {options.views} views; ask for at least one")
-    stop_rule_of(options.until or ())
+    stop_rule = stop_rule_of(options.until or until)
     require(
         options.model != "paper" or options.known in (None, "none"),
         f"--known {options.known}: the paper's model has no known shapes: leave it out, or give --model screened",
     )
+    return stop_rule
 
 
 def run_episode(
-    options: EpisodeOptions, subject: Subject, setting: Setting, sizes: Sizes, until: Sequence[str] = ()
+    options: EpisodeOptions,
+    subject: Subject,
+    setting: Setting,
+    sizes: Sizes,
+    stop_rule: StopRule | None,
+    has_rival: bool = False,
 ) -> None:
     """Simulate an episode, print each view when it is finished, and write the episode and a report.
 
-    - `subject`: the object, the acquisition and the first pose.
-    - `setting`: the camera, and the distance and number of candidates.
     - `sizes`: sizes of the planner, unless `--quick` replaces them.
-    - `until`: texts of stop rules, the default of `--until`. If there are any, the baseline farthest view also runs
-      from the same first view for comparison.
+    - `has_rival`: whether to run the baseline farthest view from the same first view, if there is a stop rule.
     """
     start_time = time.perf_counter()
     if options.quick:
@@ -177,8 +182,7 @@ def run_episode(
         planner_of(setting, subject.acquisition, search, sampler, sizes) for search in (options.search, "farthest")
     )
     folder = options.out or Path("runs") / _folder_name(options, subject)
-    stop_rule = stop_rule_of(options.until or until)
-    has_rival = bool(until) and stop_rule is not None and options.search != "farthest"
+    has_rival = has_rival and stop_rule is not None and options.search != "farthest"
     key, noise = jax.random.key(options.seed), SensorNoise(options.noise, options.noise)
     print_view = ViewPrinter(planner)
     sketches = (

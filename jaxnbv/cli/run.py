@@ -59,14 +59,15 @@ def run(options: RunOptions, **task_options: Any) -> None:
     from jaxnbv.scanning import load_mesh
     from jaxnbv.scanning.sensors import fit_distance
 
-    check_options(options)
+    stop_rule = check_options(options)
     surface, setting = load_mesh(options.mesh, options.up), task.setting()
     if not options.paper:
         setting = fit_distance(setting, surface.bounding_radius)
     default_pose = default_first_pose(None if options.paper else setting.radius)
     first = default_pose if options.first is None else first_pose(options.first, surface)
     acquisition = task.acquisition(surface, setting.camera, first)
-    run_episode(options, Subject(options.mesh.stem, surface, acquisition, first, task.bank(surface)), setting, USUAL)
+    subject = Subject(options.mesh.stem, surface, acquisition, first, task.bank(surface))
+    run_episode(options, subject, setting, USUAL, stop_rule)
 
 
 def _task(name: str, settings: dict[str, Any]) -> Task:

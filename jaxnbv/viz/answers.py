@@ -39,7 +39,6 @@ class Chart(NamedTuple):
     """Data of a line chart: named numbers with a value after each view.
 
     - `label`: label of the vertical axis, with the unit.
-    - `names`, `values`: names of the numbers, and their values after each view.
     - `true`: values of the numbers if all of the surface had been seen; None if they are not known.
     - `marks_true_name`: whether `true` is 1 for the true name and 0 for all others. If False, `true` has the values
       that the numbers should reach.
@@ -71,11 +70,10 @@ class Words:
         return f"{capital(' and '.join(self.answer.names[index] for index in self.shown))}?"
 
     def value(self, answer: Answer, index: int) -> str:
-        """Return number `index` of an answer as text."""
         return answer.form.format(answer.values[index])
 
     def said(self, before: Answer | None = None) -> str:
-        """Return the shown numbers as text, each with its value in the earlier answer `before` if given."""
+        """Return the shown numbers as text, each with its value in the earlier answer `before`."""
 
         def text_of(index: int) -> str:
             was = "" if before is None else f" (was {self.value(before, index)})"
@@ -94,18 +92,13 @@ class Words:
         return f"within {100 * _MAX_CHANGE:.0f} % of the view before"
 
     def settled(self, answers: Sequence[Answer], holds: Holds) -> list[bool]:
-        """Return, for each view, whether the answer after this view is reliable.
-
-        - `answers`: one answer per view, in order. The last one is this answer.
-        - `holds`: function that returns whether a stop rule held after a view, given the index of the view from 0.
-        """
+        """Return whether the answer after each view is reliable. The last of `answers` is this answer."""
         return [False, *(np.allclose(now.values, was.values, rtol=_MAX_CHANGE) for was, now in pairwise(answers))]
 
     def charts(self, answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...]:
-        """Return charts of the answers over the views.
+        """Return charts of the answers over the views. The last of `answers` is this answer.
 
-        - `answers`: one answer per view, in order. The last one is this answer.
-        - `truth`: the answer if all of the surface had been seen, or None.
+        - `truth`: the answer if all of the surface had been seen.
         """
         names = self.answer.names
         return (Chart(", ".join(names), names, _rows(answers), None if truth is None else truth.values),)
@@ -117,14 +110,12 @@ def _rows(answers: Sequence[Answer]) -> Float[np.ndarray, "views n"]:
 
 @functools.singledispatch
 def words_of(answer: Answer) -> Words:
-    """Return the words and charts of an answer, according to its type."""
+    """Return the words and charts of an answer."""
     return Words(answer)
 
 
 @words_of.register(ClassAnswer)
 class _ClassWords(Words):
-    """Words about class probabilities. They name the three likeliest classes, in percent."""
-
     question = "What is it?"
     rule = Sure()
     settled_means = f"probability {rule.probability} or more, given half of the points too"
@@ -143,35 +134,24 @@ class _ClassWords(Words):
         return name if p == 1.0 else f"{name}, probability {p:.2f}"
 
     def settled(self, answers: Sequence[Answer], holds: Holds) -> list[bool]:
-        """Return, for each view, whether the stop rule `Sure` held after it.
-
-        If the rule held after the previous view too, but for a different class, the result is False.
-        """
+        """Return whether `Sure` held after each view, unless it held for a different class after the previous view."""
         is_sure = [holds(self.rule, index) for index in range(len(answers))]
         best = [int(np.argmax(answer.values)) for answer in answers]
         is_contradicted = [False, *(was and a != b for was, (a, b) in zip(is_sure, pairwise(best), strict=False))]
         return [now and not other for now, other in zip(is_sure, is_contradicted, strict=True)]
 
     def charts(self, answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...]:
-        """Return a chart of the probabilities of all classes. The true class is marked if it is known."""
-        true = None if truth is None else truth.values
-        return (
-            Chart(
-                "probability", self.answer.names, _rows(answers), true, marks_true_name=True, goal=self.rule.probability
-            ),
-        )
+        true, goal = None if truth is None else truth.values, self.rule.probability
+        return (Chart("probability", self.answer.names, _rows(answers), true, marks_true_name=True, goal=goal),)
 
 
 @words_of.register(IdentityAnswer)
 class _IdentityWords(_ClassWords):
-    """Words about part probabilities. They name the three likeliest parts, or "none of these"."""
-
     question = "Which part is it?"
     min_probability = Identified().probability
     settled_means = f"probability {min_probability} or more"
 
     def settled(self, answers: Sequence[Answer], holds: Holds) -> list[bool]:
-        """Return the result of `_ClassWords.settled` for the rule that a part has `min_probability` or more."""
         return super().settled(answers, lambda _, index: bool(answers[index].values.max() >= self.min_probability))
 
     def charts(self, answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...]:
@@ -184,8 +164,6 @@ class _IdentityWords(_ClassWords):
 
 @words_of.register(PartAnswer)
 class _PartWords(Words):
-    """Words about the predicted points of each part. They name the parts to find."""
-
     answer: PartAnswer
     question = "Which parts does it have?"
 
@@ -211,7 +189,6 @@ class _PartWords(Words):
         ]
 
     def charts(self, answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...]:
-        """Return two charts: number of parts with `target` points or more, and number of points per part."""
         all_answers = answers if truth is None else [*answers, truth]
         parts = sorted({index for answer in all_answers for index in words_of(answer).shown})
         values, target = _rows(answers)[:, parts], self.answer.target
@@ -226,8 +203,6 @@ class _PartWords(Words):
 
 @words_of.register(Coldest)
 class _ColdestWords(Words):
-    """Words about the coldest point of the cloud: its position and temperature."""
-
     answer: Coldest
     question = "Where does it stay coldest while it is heated?"
 
@@ -237,10 +212,7 @@ class _ColdestWords(Words):
         return f"coldest at {position}, {number_text(float(self.answer.values[0]))} degrees{was}"
 
     def charts(self, answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...]:
-        """Return a chart of the lowest temperature.
-
-        Given the truth, also return a chart of the distance between the coldest point and the true coldest point.
-        """
+        """Return charts of the lowest temperature and, given the truth, of the distance from the true point."""
         true = None if truth is None else truth.values
         temperature = Chart("lowest temperature (degrees)", ("coldest",), _rows(answers), true)
         if not isinstance(truth, Coldest):
@@ -259,7 +231,6 @@ class CoverageAnswer(Answer):
 
     @property
     def amount(self) -> str:
-        """The amount as text, with its unit."""
         value = float(self.values[0])
         return f"{value:.0f} %" if self.unit == "%" else f"{number_text(value)} {self.unit}"
 
@@ -277,7 +248,7 @@ class _CoverageWords(Words):
 
 
 def label_of(quantity: Quantity, frame: Frame = Frame()) -> str:  # noqa: B008
-    """Return a quantity's name with its unit in world units, such as "expected new area (m²)"."""
+    """Return a quantity's name and its unit in world units, such as "expected new area (m²)"."""
     unit = quantity.unit_in(frame)
     return f"{quantity.name} ({unit})" if unit else quantity.name
 
@@ -288,7 +259,7 @@ def value_text(quantity: Quantity, value: float, frame: Frame) -> str:
 
 
 def point_text(point: Float[np.ndarray, "3"], frame: Frame = Frame()) -> str:  # noqa: B008
-    """Convert a point from scene to world coordinates, and return it as text "(x, y, z)"."""
+    """Return a point in scene coordinates as text in world coordinates, "(x, y, z)"."""
     x, y, z = (length_text(coordinate, frame) for coordinate in frame.to_world(np.asarray(point)))
     return f"({x}, {y}, {z})"
 

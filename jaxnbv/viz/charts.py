@@ -50,7 +50,6 @@ def draw_chart(axes: Axes, chart: Chart, rival: Chart | None = None, rival_name:
     """Draw the numbers and their true values as lines over the views, and return the entries of a legend.
 
     - `rival`: chart of a different search. One of its lines is drawn: that of the true name, or the only one.
-    - `rival_name`: name of this search in the legend.
     """
     views, is_one = np.arange(1, len(chart.values) + 1), len(chart.names) == 1
     true_index = None if chart.true is None or not chart.marks_true_name else int(np.argmax(chart.true))
@@ -108,31 +107,24 @@ def draw_values(axes: Axes, data: ReportData) -> list[Line2D]:
     low, high = axes.get_ylim()
     axes.set_ylim(min(low, 0.0), high * 1.12)
     set_view_axis(axes, len(data.views))
-    has_errors = any(
-        view_data.proposal.standard_error is not None for view_data in data.views if view_data.proposal is not None
-    )
+    has_errors = any(proposal.standard_error is not None for proposal in data.proposals)
     label = "chosen view" + " ± standard error" * has_errors
     star = Line2D([], [], ls="none", marker="*", color=NEW, ms=9, label=label)
     return [star, Line2D([], [], ls="none", marker="_", color=INK, ms=9, mew=1.4, label="median candidate")]
 
 
 def task_charts(data: ReportData) -> list[tuple[str, Figure]]:
-    """Return the charts of the task with their titles."""
+    """Return the titles and charts of the task."""
     task, size = data.task, _LARGE if len(data.task.charts) == 1 else _SMALL
     others = [None] * len(task.charts) if task.rival is None else task.rival.charts
     return [_labelled_figure(data, chart, other, size) for chart, other in zip(task.charts, others, strict=True)]
 
 
 def other_charts(data: ReportData) -> list[tuple[str, Figure]]:
-    """Return charts with titles: surface seen (unless that is the task), and values of the chosen views."""
-    task, charts = data.task, []
-    if not task.is_coverage:
-        charts.append(
-            _labelled_figure(
-                data, task.coverage_chart, None if task.rival is None else task.rival.coverage_chart, _LARGE
-            )
-        )
-    if any(view.proposal is not None for view in data.views):
+    """Return titles and charts: surface seen (unless that is the task), and values of the chosen views."""
+    rival = None if data.task.rival is None else data.task.rival.coverage_chart
+    charts = [] if data.task.is_coverage else [_labelled_figure(data, data.task.coverage_chart, rival, _LARGE)]
+    if data.proposals:
         figure = Figure(figsize=_LARGE, layout="constrained")
         figure.legend(handles=draw_values(figure.subplots(), data), ncols=2, **_LEGEND)
         charts.append((label_of(data.quantity, data.episode.frame), figure))

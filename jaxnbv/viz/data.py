@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxnbv.checks import AnyArray
-from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.planning.episode import Episode
 from jaxnbv.planning.loop import View
@@ -35,14 +34,13 @@ class ViewData(eqx.Module):
     """One view, ready to be drawn.
 
     - `view`: the view, with the values of its proposal in world units.
-    - `before`: points of the cloud before the view, in scene coordinates.
+    - `before`, `new`: points of the cloud before the view, and points that the view added, in scene coordinates.
     - `surface`: the surface after the view: the likeliest known shape, or else the pieces of the posterior mean's
       surface near the cloud. None if the grid holds no surface. Its deviation (world units) grows with the distance
       from the cloud.
     - `coverage`: amount of surface seen after the view.
-    - `sentences`: sentences about the view, keyed by heading.
-    - `imagined`: surfaces imagined before the view; None for a given view.
-    - `image`: picture of the view's scan; None if the scan is not an image.
+    - `sentences`: see `sentences_about`.
+    - `imagined`, `image`: see `render_imagined` and `view_image`.
     """
 
     view: View
@@ -55,7 +53,6 @@ class ViewData(eqx.Module):
 
     @property
     def has_shape(self) -> bool:
-        """Whether the view's surface is a known shape."""
         return isinstance(self.surface, PlacedShape)
 
     @property
@@ -64,28 +61,30 @@ class ViewData(eqx.Module):
 
     @property
     def proposal(self) -> Proposal | None:
-        """The proposal of the search, or None for a given view."""
         return self.view.proposal
 
     @property
     def new(self) -> Float[np.ndarray, "m 3"]:
-        """The points that the view added, in scene coordinates."""
         return self.view.scan.to_numpy()[0]
 
 
 class ReportData(eqx.Module):
-    """Data of a report: all views of an episode, the search's quantity, the task, and the viewpoint."""
+    """Data of a report.
+
+    - `true_surface`: mesh of the true surface; None if it is not known.
+    """
 
     episode: Episode
     views: tuple[ViewData, ...]
     quantity: Quantity
     task: TaskReport
     viewpoint: Viewpoint
+    true_surface: TriangleMesh | None
 
     @property
-    def camera(self) -> Camera:
-        """The camera of the views."""
-        return self.episode.sensor
+    def proposals(self) -> list[Proposal]:
+        """The proposals of the chosen views."""
+        return [view.proposal for view in self.views if view.proposal is not None]
 
     @property
     def deviations(self) -> tuple[float, float]:
@@ -109,11 +108,6 @@ class ReportData(eqx.Module):
         """Whether any view shows a known shape."""
         return any(view.has_shape for view in self.views)
 
-    @property
-    def true_surface(self) -> TriangleMesh | None:
-        """The mesh of the true surface; None if it is not known."""
-        return None if self.episode.scene is None else true_mesh(self.episode.scene)
-
 
 def report_data(
     episode: Episode,
@@ -132,17 +126,14 @@ def report_data(
       again.
     """
     planner, frame = episode.planner, episode.frame
-    if truth is None and episode.scene is not None:
-        truth = truth_points(episode.scene, jax.random.key(0))
+    true_surface = None if episode.scene is None else true_mesh(episode.scene)
+    if truth is None and true_surface is not None:
+        truth = truth_points(true_surface, jax.random.key(0))
     all_observations = tuple(episode.observations())
-    task = task_of(episode, truth, rival, all_observations)
+    task = task_of(episode, truth, rival, all_observations, true_surface)
     by_view = {} if sketches is None else sketches.held
-    next_sketches = progress_bar(
-        sketches_of(episode, all_observations, by_view, imagine),
-        progress,
-        desc="drawing views",
-        total=len(episode.views),
-    )
+    next_sketches = sketches_of(episode, all_observations, task.answers, by_view, imagine)
+    next_sketches = progress_bar(next_sketches, progress, desc="drawing views", total=len(episode.views))
     power, view_data = planner.quantity.length_power, list[ViewData]()
     views = [
         view if view.proposal is None else dataclasses.replace(view, proposal=view.proposal.in_world(frame, power))
@@ -167,4 +158,4 @@ def report_data(
         view_data.append(ViewData(view, before, surface, task.amounts[index], sentences, sketch.imagined, image))
         sketch = next_sketch
     means = [view.surface.mesh for view in view_data if view.surface is not None]
-    return ReportData(episode, tuple(view_data), planner.quantity, task, viewpoint_of(episode, means))
+    return ReportData(episode, tuple(view_data), planner.quantity, task, viewpoint_of(episode, means), true_surface)

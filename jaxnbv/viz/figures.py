@@ -30,17 +30,18 @@ STYLE: dict[Any, Any] = {
     "figure.facecolor": "white",
 }
 _ROW_HEIGHT, _LINE_HEIGHT = 5.0, 0.26
+# Pixels of a view's still, which is drawn three inches wide.
+_STILL_SIZE = 320
 
 
 def overview_figure(data: ReportData) -> Figure:
     """Draw each view's scene above its map of the acquisition, at most five views in a row, and a legend."""
     columns = min(len(data.views), 5)
     rows, width = -(-len(data.views) // columns), max(3.0 * columns, 6.0)
-    proposals = [view.proposal for view in data.views if view.proposal is not None]
     shapes = [("■ scanned", PART), ("■ imagined", "#a5cfc0"), ("■ others disagree", "#b3a9dc")]
     legend = shapes if data.has_shapes else []
     legend += [("● points before", BEFORE), ("● new points and camera", NEW), ("★ chosen view", NEW)]
-    legend += [(mark, INK) for mark in marks(*proposals)]
+    legend += [(mark, INK) for mark in marks(*data.proposals)]
     legend_columns = int(width // 3)
     legend_height = 1.3 + _LINE_HEIGHT * -(-len(legend) // legend_columns)
     figure = Figure(figsize=(width, _ROW_HEIGHT * rows + legend_height))
@@ -48,7 +49,8 @@ def overview_figure(data: ReportData) -> Figure:
     grid = figure.add_gridspec(rows + 1, columns, **margins, hspace=0, wspace=0, height_ratios=heights)
     for index, view in enumerate(data.views):
         panel = figure.add_subfigure(grid[divmod(index, columns)])
-        draw_scene(panel.add_axes((0.0, 0.32, 1.0, 0.6)), data, index, render_view(data, index), weight=1.3)
+        still = render_view(data, index, _STILL_SIZE)
+        draw_scene(panel.add_axes((0.0, 0.32, 1.0, 0.6)), data, index, still, weight=1.3)
         panel.text(0.04, 0.95, f"View {index + 1}", fontsize=15, fontweight="bold", va="center")
         coverage_text = f"{view.coverage.amount}{' seen' * (view.coverage.unit == '%')}"
         panel.text(0.96, 0.95, coverage_text, fontsize=14, ha="right", va="center")
@@ -69,7 +71,6 @@ def overview_figure(data: ReportData) -> Figure:
 
 
 def _draw_deviations(axes: Any, data: ReportData) -> None:
-    """Draw the colour bar of the surfaces' standard deviations."""
     low, high = data.deviations
     bar = axes.figure.colorbar(ScalarMappable(LogNorm(low, high), DEVIATION), cax=axes, orientation="horizontal")
     bar.outline.set_visible(False)

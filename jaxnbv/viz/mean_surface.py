@@ -112,15 +112,18 @@ def near_points(surface: MeanSurface | None, cloud: PointCloud) -> MeanSurface |
     return MeanSurface(surface.vertices[is_kept], new_index[faces], surface.normals[is_kept], deviation[is_kept])
 
 
-def _farthest_rows(features: np.ndarray, count: int) -> np.ndarray:
+def padded(rows: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "m d"]:
+    """Add zero rows up to a power of two, so that surfaces of different sizes share a compiled program."""
+    return np.pad(rows, ((0, (1 << (len(rows) - 1).bit_length()) - len(rows)), (0, 0)))
+
+
+def _farthest_rows(features: Float[np.ndarray, "n d"], count: int) -> Int[np.ndarray, " count"]:
     """Return the indices of `count` rows far from each other, in order of choice.
 
     If there are fewer rows, the first index is repeated.
     """
-    # Pad to a power of two, so that surfaces of different sizes share a compiled program.
-    capacity = 1 << (len(features) - 1).bit_length()
-    padded = np.pad(features.astype(np.float32), ((0, capacity - len(features)), (0, 0)))
-    return np.asarray(farthest_point_indices(jnp.asarray(padded), jnp.arange(capacity) < len(features), count))
+    rows = jnp.asarray(padded(features.astype(np.float32)))
+    return np.asarray(farthest_point_indices(rows, jnp.arange(len(rows)) < len(features), count))
 
 
 def _interpolate(features: np.ndarray, anchors: np.ndarray, values: np.ndarray) -> np.ndarray:

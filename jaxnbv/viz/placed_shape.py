@@ -1,7 +1,7 @@
 """The likeliest known shape at its placement, and where the other hypotheses differ from it."""
 
 import dataclasses
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +26,7 @@ from jaxnbv.utility import Answer
 from jaxnbv.viz.mean_surface import MeanSurface
 from jaxnbv.viz.sphere import unit
 
+T = TypeVar("T")
 _Values: TypeAlias = Float[np.ndarray, "_ _ _"]
 
 # Nodes along each axis of the grids for the surface of a shape, for its disputed space, and for the distances to the
@@ -78,8 +79,12 @@ class _Fits(NamedTuple):
     @classmethod
     def of(cls, bank: ShapeBank, hypotheses: Hypotheses, weights: Float[np.ndarray, " h"], rows: list[int]) -> "_Fits":
         """Select these rows of `hypotheses`, and normalise their `weights`, one for each of `rows`."""
-        indices = np.asarray(rows)
-        return cls(bank, jax.tree.map(lambda leaf: leaf[indices], hypotheses), weights / max(weights.sum(), 1e-30))
+        return cls(bank, _select(hypotheses, rows), weights / max(weights.sum(), 1e-30))
+
+
+def _select(tree: T, rows: int | list[int]) -> T:
+    """Return rows of all leaves. Indexing JAX's arrays would compile a program for each shape of a leaf."""
+    return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[rows]), tree)
 
 
 def placed_parts(hypotheses: PartHypotheses, count: int) -> list[PlacedShape]:
@@ -105,14 +110,8 @@ def likeliest_part(hypotheses: PartHypotheses, cloud: PointCloud | None = None) 
         return part
     weights, shapes = np.asarray(hypotheses.weights, np.float64)[:-1], np.asarray(hypotheses.placed.shape)
     first = int(np.argmax(shapes == hypotheses.most_likely[0]))
-    rows = [
-        first,
-        *(
-            row
-            for row in np.argsort(-weights, kind="stable")[:_MAX_HYPOTHESES].tolist()
-            if row != first and weights[row] > 0
-        ),
-    ]
+    likely = np.argsort(-weights, kind="stable")[:_MAX_HYPOTHESES].tolist()
+    rows = [first, *(row for row in likely if row != first and weights[row] > 0)]
     return _with_hypotheses(part, _Fits.of(hypotheses.bank, hypotheses.placed, weights[rows], rows), cloud)
 
 
@@ -151,18 +150,19 @@ def likeliest_shape(
 
 
 def _place_shape(bank: ShapeBank, hypotheses: Hypotheses, row: int, probability: float) -> PlacedShape:
-    shape = bank.shape(hypotheses.shape[row])
-    grid = Grid(_NODES, _MARGIN * float(jnp.max(jnp.abs(shape.extremes))))
+    index = int(np.asarray(hypotheses.shape)[row])
+    shape = _select(bank.shapes, index)
+    grid = Grid(_NODES, _MARGIN * float(np.abs(shape.extremes).max()))
     triangles = level_triangles(np.array(_own_distances(shape.solid, jnp.asarray(grid.axis, jnp.float32))), grid)
     assert triangles is not None
     vertices, faces, normals = triangles
-    placement = jax.tree.map(lambda rows: np.asarray(rows[row], np.float64), hypotheses.placement)
+    placement = jax.tree.map(lambda rows: np.asarray(rows, np.float64)[row], hypotheses.placement)
     return PlacedShape(
         (placement.scale * vertices) @ placement.rotation.T + placement.shift,
         faces,
         unit(normals / placement.scale) @ placement.rotation.T,
         np.zeros(len(vertices)),
-        bank.names[int(hypotheses.shape[row])],
+        bank.names[index],
         probability,
         np.ones(len(vertices)),
         np.ones(len(vertices)),

@@ -202,10 +202,13 @@ def draw_truth(axes: Axes, data: ReportData) -> bool:
     return True
 
 
-def render_view(data: ReportData, index: int) -> Still:
-    """Return a picture of the surface after view `index` (from 0), from the report's viewpoint."""
+def render_view(data: ReportData, index: int, size: int | None = None) -> Still:
+    """Return a picture of the surface after view `index` (from 0), from the report's viewpoint.
+
+    - `size`: pixels along each side; by default those of a report.
+    """
     viewpoint, norm = data.viewpoint, LogNorm(*data.deviations)
-    return Still(viewpoint.eye, data.views[index].surface, _STILL_SIZE, viewpoint.extent, norm)
+    return Still(viewpoint.eye, data.views[index].surface, size or _STILL_SIZE, viewpoint.extent, norm)
 
 
 def draw_scene(
@@ -223,7 +226,7 @@ def draw_scene(
     view, viewpoint = data.views[index], data.viewpoint
     axes.imshow(still.image, interpolation="bilinear", zorder=1)
     poses = [viewpoint.drawn_pose(other.pose) for other in data.views[: index + 1]]
-    items = scene_items(view.before, view.new, poses, data.camera, viewpoint.depth)
+    items = scene_items(view.before, view.new, poses, data.episode.sensor, viewpoint.depth)
     if isinstance(view.surface, PlacedShape):
         # Scanned points must stand out on the imagined surface.
         items = tuple(item._replace(weight=2.0 * item.weight) if isinstance(item, Points) else item for item in items)
@@ -259,7 +262,7 @@ def _content_pixels(data: ReportData, still: Still) -> list[Float[np.ndarray, "_
     content = [still.project(rows)[0] for rows in (*surfaces, *(view.new for view in data.views)) if len(rows)]
     for view in data.views:
         pose = data.viewpoint.drawn_pose(view.pose)
-        content.append(still.project(frustum(pose, data.camera, data.viewpoint.depth).reshape(-1, 3))[0])
+        content.append(still.project(frustum(pose, data.episode.sensor, data.viewpoint.depth).reshape(-1, 3))[0])
         content.append(still.project(1.1 * np.asarray(pose.position, np.float64)[None])[0])
     return [np.clip(pixels, 0, still.size) for pixels in content]
 

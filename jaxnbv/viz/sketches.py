@@ -8,6 +8,7 @@ from jaxnbv.observations import Observations
 from jaxnbv.planning.episode import Episode
 from jaxnbv.planning.loop import Step, view_keys
 from jaxnbv.sampler import StepInputs
+from jaxnbv.utility import Answer
 from jaxnbv.viz.imagined import Imagined, render_imagined
 from jaxnbv.viz.mean_surface import MeanSurface
 from jaxnbv.viz.shown_surface import needs_no_posterior, shown_surface
@@ -30,7 +31,7 @@ class Sketch(NamedTuple):
 class Sketches:
     """Sketches of a running episode. Pass `add` to `simulate(each=...)`, and the object to `write_report`.
 
-    - `episode`: the episode without views. `add` adds the views.
+    - `episode`: the episode without views.
     - `held`: sketches keyed by the index of the view, from 0. The first view and views read from a file have none.
     """
 
@@ -38,48 +39,49 @@ class Sketches:
         self.episode, self.held = episode, dict[int, Sketch]()
 
     def add(self, step: Step) -> None:
-        """Add the view of a step to the episode, and the step's sketch to `held`."""
+        """Add the view of a step to `episode`, and its sketch to `held`."""
         self.episode = dataclasses.replace(self.episode, views=(*self.episode.views, step.view))
         if step.inputs is not None:
-            index = len(self.episode.views) - 1
-            self.held[index] = _sketch(self.episode, index, step.inputs)
+            planner, index = self.episode.planner, len(self.episode.views) - 1
+            # An answer can take seconds, and only known shapes use it.
+            is_used = needs_no_posterior(planner.sampler)
+            answer = self.episode.views[index - 1].answer(planner.acquisition) if is_used else None
+            self.held[index] = _sketch(self.episode, index, step.inputs, answer)
 
 
 def sketches_of(
-    episode: Episode, all_observations: Iterable[Observations], by_view: Mapping[int, Sketch], imagine: bool
+    episode: Episode,
+    all_observations: Iterable[Observations],
+    answers: Iterable[Answer],
+    by_view: Mapping[int, Sketch],
+    imagine: bool,
 ) -> Iterator[Sketch]:
     """Yield the sketch of the step after each view, including the step after the last view.
 
-    - `all_observations`: observations after each view.
+    - `all_observations`, `answers`: observations and answer after each view.
     - `by_view`: sketches that exist already, keyed by the index of the step's view.
     - `imagine`: whether new sketches show what was imagined.
     """
-    for index, observations in enumerate(all_observations, start=1):
+    planner, sampler = episode.planner, episode.planner.sampler
+    for index, (observations, answer) in enumerate(zip(all_observations, answers, strict=True), start=1):
         if index in by_view:
             yield by_view[index]
             continue
-        if episode.planner.acquisition.needs_hypotheses:
-            yield _sketch(episode, index, StepInputs(observations), imagine)
-            continue
-        sampler, is_imagined = episode.planner.sampler, imagine and index < len(episode.views)
-        if needs_no_posterior(sampler) and not is_imagined:
-            yield _sketch(episode, index, StepInputs(observations), imagine)
-            continue
-        posterior = sampler.posterior(observations)
-        inputs = StepInputs(observations, posterior)
-        # The step's own key gives the samples that it imagined. Moments without closed form need samples.
-        if is_imagined or not posterior.has_closed_forms:
-            sample_key, *_ = view_keys(episode.key, index)
-            surfaces = sampler.sample(observations, sample_key, posterior)
-            inputs = dataclasses.replace(inputs, surfaces=surfaces)
-        yield _sketch(episode, index, inputs, imagine)
+        inputs, is_imagined = StepInputs(observations), imagine and index < len(episode.views)
+        if not planner.acquisition.needs_hypotheses and (is_imagined or not needs_no_posterior(sampler)):
+            posterior, surfaces = sampler.posterior(observations), None
+            # The step's own key gives the samples that it imagined. Moments without closed form need samples.
+            if is_imagined or not posterior.has_closed_forms:
+                sample_key, *_ = view_keys(episode.key, index)
+                surfaces = sampler.sample(observations, sample_key, posterior)
+            inputs = StepInputs(observations, posterior, surfaces)
+        yield _sketch(episode, index, inputs, answer, is_imagined)
 
 
-def _sketch(episode: Episode, index: int, inputs: StepInputs, imagine: bool = True) -> Sketch:
-    sampler, observations = episode.planner.sampler, inputs.observations
-    # An answer can take seconds, and only known shapes use it.
-    answer = episode.views[index - 1].answer(episode.planner.acquisition) if needs_no_posterior(sampler) else None
+def _sketch(
+    episode: Episode, index: int, inputs: StepInputs, answer: Answer | None, is_imagined: bool = True
+) -> Sketch:
+    sampler = episode.planner.sampler
     surface = shown_surface(sampler, inputs, answer)
-    patches = [] if surface is None else unmeasured(surface.mesh, observations, sampler.carving)
-    samples = render_imagined(episode, index, inputs) if imagine and index < len(episode.views) else None
-    return Sketch(surface, samples, patches)
+    patches = [] if surface is None else unmeasured(surface.mesh, inputs.observations, sampler.carving)
+    return Sketch(surface, render_imagined(episode, index, inputs) if is_imagined else None, patches)

@@ -32,7 +32,7 @@ def figures_in_space(data: ReportData) -> list[go.Figure]:
             traces.append(
                 _triangles(view.surface.disputed_space, vertices // 2, _legend_entry("other shapes") | _GLASS)
             )
-        for item in scene_items(view.before, view.new, poses, data.camera, viewpoint.depth):
+        for item in scene_items(view.before, view.new, poses, data.episode.sensor, viewpoint.depth):
             traces += _points(item, points) if isinstance(item, Points) else _cameras(item)
         figures.append(go.Figure(traces, _layout(viewpoint.eye, viewpoint.extent)))
     return figures

@@ -19,7 +19,7 @@ from jaxnbv.planning.loop import View, view_keys
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.stopping import Sure
 from jaxnbv.programs import program
-from jaxnbv.scanning import Surface, pixel_area
+from jaxnbv.scanning import Surface, TriangleMesh, pixel_area
 from jaxnbv.scanning.metrics import GRAZING, coverage, true_mesh
 from jaxnbv.tasks.coverage import NewSurface, new_surface_of
 from jaxnbv.utility import Answer
@@ -29,8 +29,7 @@ from jaxnbv.viz.answers import Chart, CoverageAnswer, capital, words_of
 class Comparison(NamedTuple):
     """An episode with a different search from the same first view, for comparison in a `TaskReport`.
 
-    - `name`: kind of the search in words, such as "farthest view".
-    - `sentence`: number of its views, and its last answer.
+    - `name`, `sentence`: see `search_name` and `rival_text`.
     - `charts`, `coverage_chart`: as in `TaskReport`, for this episode.
     """
 
@@ -46,9 +45,7 @@ class TaskReport(NamedTuple):
     - `amounts`, `coverage_chart`: amount of surface seen after each view, and its chart.
     - `answers`, `charts`: answers after each view, and their charts. If the acquisition has no answers, these are the
       amounts.
-    - `question`, `choice_text`, `answer_text`, `reliability_text`: texts for the head of the report: the question, how
-      views were chosen, the answer, and from which view on the answer is reliable.
-    - `rival`: an episode with a different search, or None.
+    - `choice_text`, `reliability_text`: how views were chosen, and from which view on the answer is reliable.
     """
 
     amounts: Sequence[CoverageAnswer]
@@ -72,18 +69,20 @@ def task_of(
     truth: Float[AnyArray, "n 3"] | None = None,
     rival: Episode | None = None,
     all_observations: Sequence[Observations] | None = None,
+    true_surface: TriangleMesh | None = None,
 ) -> TaskReport:
     """Return the task of an episode: that of the acquisition, or coverage for one without answers.
 
     - `truth`: points of the true surface, in scene coordinates.
     - `rival`: an episode of a different search from the same first view.
-    - `all_observations`: observations after each view, if they are already computed.
+    - `all_observations`, `true_surface`: observations after each view and `true_mesh` of the scene, if they are already
+      computed.
     """
     planner = episode.planner
     amounts, true_answer = coverage_answers(episode, truth, all_observations), None
     answers = _answers(episode, episode.views) or amounts
     if episode.scene is not None and answers is not amounts:
-        cloud = true_cloud(episode.scene, planner.capacity)
+        cloud = true_cloud(true_surface or episode.scene, planner.capacity)
         true_answer = None if cloud is None else planner.acquisition.true_answer(episode.scene, cloud)
     comparison = None
     if rival is not None:
@@ -124,8 +123,7 @@ def coverage_answers(
     scans show, in squared world units. `NewSurface` defines what is new, with the acquisition's settings if it is a
     `NewSurface`. An area measured at a slant counts in full here, but for less in the acquisition.
 
-    - `truth`: points of the true surface, in scene coordinates.
-    - `all_observations`: observations after each view, if they are already computed.
+    - `truth`, `all_observations`: see `task_of`.
     """
     views, acquisition = episode.views, episode.planner.acquisition
     if truth is not None:
@@ -189,7 +187,7 @@ def rival_text(rival: Episode, episode: Episode) -> str:
     If a stop rule ended `episode` but not `rival`, the sentence says that `rival` was not done.
     """
     name, count = search_name(rival).capitalize(), len(rival.views)
-    answers = _answers(episode, rival.views)
+    answers = _answers(episode, rival.views[-1:])
     views = f"{count} view{'s' * (count > 1)}"
     text = f"{name} {'needed' if rival.stop_reason else 'took'} {views} from the same start"
     if episode.stop_reason and not rival.stop_reason:

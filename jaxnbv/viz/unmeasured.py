@@ -13,6 +13,7 @@ from jaxnbv.geometry.frame import Frame
 from jaxnbv.observations import Observations
 from jaxnbv.scanning import Carving, TriangleMesh
 from jaxnbv.viz.answers import number_text, point_text
+from jaxnbv.viz.mean_surface import padded
 
 # Least number of views that looked at a patch, since one may be chance. Least fraction of the surface in a patch.
 # Maximum number of patches.
@@ -38,7 +39,8 @@ def unmeasured(surface: trimesh.Trimesh, observations: Observations, carving: Ca
     if looks is None or len(surface.faces) == 0:
         return []
     mesh, count = TriangleMesh(surface.vertices, surface.faces, Frame()), int(observations.num_views)
-    cells = np.asarray(looks.grid.cell_of(jnp.asarray(surface.triangles_center)))
+    centers = jnp.asarray(padded(surface.triangles_center))
+    cells = np.asarray(looks.grid.cell_of(centers))[: len(surface.faces)]
     num_looks = np.zeros((looks.grid.resolution + 1,) * 3, int)
     for index in range(count):
         is_missed = np.zeros(num_looks.shape, bool)
@@ -49,7 +51,7 @@ def unmeasured(surface: trimesh.Trimesh, observations: Observations, carving: Ca
     looks_of_face = num_looks[tuple(np.minimum(cells, looks.grid.resolution).T)]
     is_unmeasured = looks_of_face >= _MIN_LOOKS
     if carving is not None:
-        is_unmeasured &= np.asarray(carving.volume(jnp.asarray(surface.triangles_center))) < -looks.grid.spacing
+        is_unmeasured &= np.asarray(carving.volume(centers))[: len(surface.faces)] < -looks.grid.spacing
     pieces = trimesh.graph.connected_components(
         surface.face_adjacency[is_unmeasured[surface.face_adjacency].all(axis=1)], nodes=np.nonzero(is_unmeasured)[0]
     )
