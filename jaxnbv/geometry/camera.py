@@ -21,8 +21,6 @@ from jaxnbv.programs import program
 _Points = TypeVar("_Points", Float[Array, "*n 2"], Float[np.ndarray, "*n 2"])
 # Skew below this fraction of fx counts as zero.
 _MAX_SKEW = 1e-6
-
-
 # Depth cameras have no rays more than 70 degrees off the axis (`_MAX_TANGENT` is the tangent). A principal point may be
 # the centre of an image if it is off by at most `_MAX_CENTER_OFFSET` times half the width and half the height.
 _MAX_TANGENT, _MAX_CENTER_OFFSET = math.tan(math.radians(70.0)), 0.2
@@ -32,10 +30,9 @@ _MAX_CENTER_FRACTION = 0.96
 
 
 def _limit(depth: Any) -> Any:
-    """Convert a limit of the camera's range to an array.
+    """Convert a limit of the camera's range to an array, so that compiled programs run for any limit.
 
-    A program compiled for one limit then runs for any limit. A missing limit stays 0.0 or None, so that programs can
-    branch on it.
+    A missing limit stays 0.0 or None, so that programs can branch on it.
     """
     is_number = isinstance(depth, int | float) and not isinstance(depth, bool) and depth != 0
     return np.float64(depth) if is_number else depth
@@ -53,8 +50,8 @@ class Camera(eqx.Module):
       up to `farthest` is missed, so it is empty up to `farthest`.
     - `max_incidence`: largest angle between a ray and the surface normal at which the sensor measures a hit, in radians
       within (0, pi/2].
-    - `distortion`: coefficients of the lens distortion, see `from_intrinsics`. The rays are those of the pinhole
-      without distortion. `PointCloud.from_depth` undoes the distortion of an image first.
+    - `distortion`: coefficients of the lens distortion, see `from_intrinsics`. The rays have no distortion, since
+      `PointCloud.from_depth` undoes it.
 
     The defaults are the paper's: 30 degrees, 50 x 50 pixels, no limits.
 
@@ -106,14 +103,13 @@ class Camera(eqx.Module):
 
         The centre of the first pixel is at (0, 0), as in OpenCV and the calibrations of camera makers. The principal
         point may lie outside the image, since the image may be a window of a larger image. Warns if the matrix is
-        probably for an image of a different size than `height` x `width`.
+        probably for another image size than `height` x `width`.
 
         - `nearest`, `farthest`, `max_incidence`: see `Camera`.
         - `distortion`: OpenCV's coefficients k1, k2, p1, p2[, k3[, k4, k5, k6]].
 
-        **Raises:** `ValueError` for a matrix of a different form, such as a matrix with skew, for a matrix that is
-        certainly for a different image size, for a wrong number of coefficients, or for coefficients that map two
-        points to the same pixel.
+        **Raises:** `ValueError` for a matrix of another form (such as with skew) or certainly for another image size,
+        for a wrong number of coefficients, or for coefficients that map two points to the same pixel.
         """
         intrinsics = as_numbers(matrix, "the intrinsic matrix", np.float64)
         require(intrinsics.shape == (3, 3), f"the intrinsic matrix has shape {intrinsics.shape}: give one of (3, 3)")
@@ -137,7 +133,7 @@ class Camera(eqx.Module):
 
     @property
     def intrinsics(self) -> Float[np.ndarray, "3 3"]:
-        """The intrinsic matrix in pixels. As in `from_intrinsics`, the centre of the first pixel is at (0, 0)."""
+        """The intrinsic matrix in pixels, in which the centre of the first pixel is at (0, 0)."""
         (fx, fy), (x, y) = self.focal_lengths, self.center
         return np.array([[fx, 0.0, x * self.width - 0.5], [0.0, fy, y * self.height - 0.5], [0.0, 0.0, 1.0]])
 
@@ -166,7 +162,7 @@ class Camera(eqx.Module):
 
     @property
     def num_rays(self) -> int:
-        """Number of pixels, each with one ray."""
+        """Number of rays, one for each pixel."""
         return self.height * self.width
 
     @property
@@ -197,10 +193,7 @@ class Camera(eqx.Module):
         return jnp.asarray(directions, dtype=jnp.result_type(float))
 
     def to_pixels(self, plane_points: _Points) -> _Points:
-        """Convert points (x, y) in the plane z = 1 of the camera's frame to (column, row) in pixels.
-
-        The centre of the first pixel has column and row 0.5.
-        """
+        """Convert points (x, y) of the plane z = 1 to (column, row). The first pixel's centre is (0.5, 0.5)."""
         (fx, fy), (cx, cy) = self.focal_lengths, self.center
         scale, offset = np.array([[fx, fy], [cx * self.width, cy * self.height]], plane_points.dtype)
         return plane_points * scale + offset
@@ -217,10 +210,10 @@ class Camera(eqx.Module):
 def _check_image_size(matrix: np.ndarray, height: int, width: int, center: tuple[float, float]) -> None:
     """Warn if a matrix's principal point is probably the centre of an image of a different size.
 
-    - `matrix`: the intrinsic matrix. `center`: its principal point, as fractions of the width and the height.
+    - `center`: the principal point, as fractions of the width and the height.
 
     **Raises:** `ValueError` instead of the warning if the principal point is at the corner of the given image or beyond
-    it. Also raises it if the point lies outside the image and the image would extend more than 70 degrees off the axis.
+    it, or if it lies outside the image and the image would extend more than 70 degrees off the axis.
     """
     (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
     tangent_x, tangent_y = (

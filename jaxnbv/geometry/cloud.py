@@ -36,8 +36,8 @@ _MAX_NORMAL_LENGTH = 10.0
 class PointCloud(eqx.Module):
     """Points with normals (the paper's cloud D), in arrays with a fixed number of rows.
 
-    The number of rows is the cloud's capacity. It is fixed under `jit`, since it is a shape. Rows whose mask is False
-    are empty, and their points and normals are zero. Leading axes make a batch of clouds.
+    The number of rows is the cloud's capacity. Rows whose mask is False are empty, and their points and normals are
+    zero. Leading axes make a batch of clouds.
 
     - `points`: positions, in scene units unless stated otherwise.
     - `normals`: unit outward normals.
@@ -45,7 +45,7 @@ class PointCloud(eqx.Module):
     - `missed`: for a sensor's scan, which has one row per pixel, whether each ray met nothing and so crossed only empty
       space. A row that is neither filled nor missed is invalid. None for a cloud that is not a sensor's image.
     - `sight`: for a sensor's scan, the distance from the camera to the hit of each ray, in units of the points, even if
-      the hit is not a point of the cloud. Infinite if the ray returned nothing. None if unknown.
+      the hit is not a point of the cloud; infinite without a hit. None if unknown.
     """
 
     points: Float[Array, "*batch n 3"] = eqx.field(converter=native)
@@ -138,28 +138,26 @@ class PointCloud(eqx.Module):
 
         Each pixel is a point, missed, or invalid:
 
-        - A pixel of +infinity is missed: its ray met nothing in the whole scene. A pixel with a depth beyond the
-          camera's range is missed too.
-        - A pixel that is zero, negative or NaN, or has a depth below the camera's range, is invalid. It gives no
-          information.
+        - A pixel of +infinity (its ray met nothing in the whole scene) or beyond the camera's range is missed.
+        - A pixel that is zero, negative, NaN or below the camera's range is invalid: it gives no information.
         - A value that stands for "not measured" is invalid. This is the largest value of an integer type, or a value
           that fills far more pixels than any value near it and lies beyond the camera's range or well beyond the box.
           The second kind gives a `UserWarning`.
 
         Distortion is undone first (`Camera.from_intrinsics`). Then a plane is fitted to the pixels around each pixel
-        that lie on the same surface. The window of these pixels grows with the noise (`geometry/plane_fit.py`). The
-        plane gives the point and its normal, which points towards the camera. A pixel is invalid if its neighbours do
-        not define a plane. It is also invalid if six of its eight neighbours disagree with it, since sensors mix the
-        depths of two surfaces at edges. If an image has gaps between its valid pixels, such as a lidar's, planes are
-        fitted to one pixel per block of the gap's size. Each point still lies on the ray of its own pixel.
+        that lie on the same surface. Their window grows with the noise (`geometry/plane_fit.py`). The plane gives the
+        point and its normal, which points towards the camera. A pixel is invalid if its neighbours do not define a
+        plane, or if six of its eight neighbours disagree with it, since sensors mix the depths of two surfaces at
+        edges. If an image has gaps between its valid pixels, such as a lidar's, planes are fitted to one pixel per
+        block of the gap's size. Each point still lies on the ray of its own pixel.
 
         - `depth`: depths along the camera's forward axis. The noise of integer depths is at least their rounding.
-        - `depth_scale`: units of the pose per unit of depth, such as 0.001 for an image in millimetres and a pose in
-          metres. The camera's range and the box are in units of the pose.
-        - `stride`: keep every `stride`-th row and column. The cloud is then an image of `camera.strided(stride)`.
-          Planes are still fitted to all pixels.
-        - `box`: keep only points inside the box. A ray that hits behind the box has crossed the box, so it is missed. A
-          ray that hits in front of the box is invalid.
+        - `depth_scale`: units of the pose (also of the camera's range and the box) per unit of depth, such as 0.001 for
+          an image in millimetres and a pose in metres.
+        - `stride`: keep every `stride`-th row and column of planes that are fitted to all pixels. The cloud is then an
+          image of `camera.strided(stride)`.
+        - `box`: keep only points inside the box. A ray that hits behind the box is missed, and one that hits in front
+          of it is invalid.
 
         **Raises:** `ValueError` if the image's shape differs from the camera's, all depths are outside the camera's
         range, the box is behind the camera, or depths and the distance of the box differ by orders of magnitude.
@@ -173,7 +171,7 @@ class PointCloud(eqx.Module):
     @property
     @own_settings()
     def count(self) -> Int[Array, "*batch"]:
-        """The number of filled rows, which is the number of points."""
+        """The number of points, that is, of filled rows."""
         return jnp.sum(self.mask, axis=-1)
 
     @own_settings()
@@ -188,7 +186,7 @@ class PointCloud(eqx.Module):
 
     @own_settings()
     def only(self, mask: Bool[Array, "*batch n"]) -> "PointCloud":
-        """Return the cloud with only those points where `mask` is True. `missed` and `sight` do not change."""
+        """Return the cloud with only the points where `mask` is True. `missed` and `sight` do not change."""
         mask = self.mask & mask
         points, normals = (jnp.where(mask[..., None], rows, 0.0) for rows in (self.points, self.normals))
         return PointCloud(points, normals, mask, self.missed, self.sight)
@@ -209,29 +207,23 @@ class PointCloud(eqx.Module):
 
 
 def some_rows(cloud: PointCloud, count: int) -> Int[Array, " count"]:
-    """Return the indices of `count` rows of a single cloud, evenly spaced among its filled rows (`mask`).
+    """Return the indices of `count` rows, evenly spaced among a cloud's filled rows.
 
-    Indices repeat if fewer than `count` rows are filled. All indices are 0 if the cloud is empty.
+    Indices repeat if fewer than `count` rows are filled, and are 0 if the cloud is empty.
     """
     order = jnp.argsort(~cloud.mask, stable=True)
     return order[(jnp.arange(count) * cloud.count) // count]
 
 
 def check_single(cloud: PointCloud, name: str = "the cloud") -> None:
-    """Check that a cloud is not a batch.
-
-    **Raises:** `ValueError` for a batch of clouds.
-    """
+    """Raise `ValueError` for a batch of clouds."""
     batch = cloud.mask.shape[:-1]
     require(not batch, f"{name} is a batch {batch} of clouds: give one, or use jax.vmap")
 
 
 def check_oriented(cloud: PointCloud, name: str, limit: float, unit: bool = True) -> None:
-    """Check that a cloud has points within the scene, and that their normals have valid lengths.
+    """Check that a concrete cloud has points within the scene and normals of valid lengths.
 
-    JAX must not be tracing the cloud.
-
-    - `name`: name of the cloud in error messages.
     - `limit`: largest magnitude of a coordinate, in scene units.
     - `unit`: whether normals must have unit length (to 1 %). If not, lengths up to 10 are allowed, since a model may be
       conditioned on prior samples, whose normals do not have unit length.
@@ -266,18 +258,15 @@ def check_oriented(cloud: PointCloud, name: str, limit: float, unit: bool = True
 def concatenate(first: PointCloud, second: PointCloud) -> PointCloud:
     """Return one cloud with the points of two clouds (the paper's union of D and D').
 
-    The rows of `first`, including empty rows, come before those of `second`, so the result's capacity is the sum of
-    both. `missed` and `sight` are None, since the result is not a sensor's image.
+    All rows of `first`, even empty ones, come before those of `second`. `missed` and `sight` are None, since the result
+    is not a sensor's image.
 
     **Raises:** `ValueError` for a batch of clouds.
     """
     for cloud in (first, second):
         check_single(cloud)
-    return jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=0), _without_rays(first), _without_rays(second))
-
-
-def _without_rays(cloud: PointCloud) -> PointCloud:
-    return PointCloud(cloud.points, cloud.normals, cloud.mask)
+    rows = ((cloud.points, cloud.normals, cloud.mask) for cloud in (first, second))
+    return PointCloud(*map(jnp.concatenate, zip(*rows, strict=True)))
 
 
 @checked
@@ -285,24 +274,20 @@ def _without_rays(cloud: PointCloud) -> PointCloud:
 def farthest_point_subsample(cloud: PointCloud, count: int) -> PointCloud:
     """Return a cloud of `count` points, chosen by farthest point sampling (Eldar et al. 1997).
 
-    Sampling starts at the first filled row, and the points are returned in the order in which they are chosen. If
-    the cloud has fewer points than `count`, all its points come first and the remaining rows are empty.
+    Sampling starts at the first filled row, and the points are in the order in which they are chosen. If the cloud has
+    fewer points than `count`, the remaining rows are empty.
 
     **Raises:** `ValueError` if `count` < 1.
     """
     check_single(cloud)
     require(1 <= count <= _MAX_ROWS, f"asked for {count} points; ask for at least one and at most {_MAX_ROWS}")
-    rows = farthest_point_indices(cloud.points, cloud.mask, count)
-    is_filled = jnp.arange(count) < cloud.count
-    return _take(cloud, rows, is_filled)
+    return _take(cloud, farthest_point_indices(cloud.points, cloud.mask, count))
 
 
 @own_settings()
 @functools.partial(jax.jit, static_argnames="capacity")
 def limit_capacity(cloud: PointCloud, capacity: int) -> PointCloud:
-    """Return the cloud with `capacity` rows, filled rows first.
-
-    If the cloud has more points than `capacity`, they are thinned by farthest point sampling.
+    """Return the cloud with `capacity` rows, filled rows first. Farthest point sampling thins it.
 
     **Raises:** `ValueError` if `capacity` < 1.
     """
@@ -310,8 +295,7 @@ def limit_capacity(cloud: PointCloud, capacity: int) -> PointCloud:
 
     def compact(cloud):
         order = jnp.argsort(~cloud.mask, stable=True)[:capacity]
-        order = jnp.pad(order, (0, max(0, capacity - cloud.capacity)))
-        return _take(cloud, order, jnp.arange(capacity) < cloud.count)
+        return _take(cloud, jnp.pad(order, (0, max(0, capacity - cloud.capacity))))
 
     if cloud.capacity <= capacity:
         return compact(cloud)
@@ -320,6 +304,8 @@ def limit_capacity(cloud: PointCloud, capacity: int) -> PointCloud:
     )
 
 
-def _take(cloud: PointCloud, rows: Int[Array, " m"], is_filled: Bool[Array, " m"]) -> PointCloud:
-    points = jnp.where(is_filled[:, None], cloud.points[rows], 0.0)
-    return PointCloud(points, jnp.where(is_filled[:, None], cloud.normals[rows], 0.0), is_filled)
+def _take(cloud: PointCloud, rows: Int[Array, " m"]) -> PointCloud:
+    """Return a cloud of these rows. Rows beyond the number of the cloud's points are empty."""
+    is_filled = jnp.arange(len(rows)) < cloud.count
+    points, normals = (jnp.where(is_filled[:, None], array[rows], 0.0) for array in (cloud.points, cloud.normals))
+    return PointCloud(points, normals, is_filled)

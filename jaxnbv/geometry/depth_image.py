@@ -19,14 +19,12 @@ from jaxnbv.geometry.volume import Box, ray_interval
 from jaxnbv.programs import program
 
 Rows = tuple[Float[Array, "n 3"], Float[Array, "n 3"], Bool[Array, " n"], Bool[Array, " n"], Float[Array, " n"]]
-# Depths that differ from the depths of the box by more than this factor are probably in different units.
-_MAX_DEPTH_RATIO = 20.0
+# The units are right if at least the fraction `_MIN_FRACTION` of the depths is within a factor of `_MAX_DEPTH_RATIO` of
+# the box's depths.
+_MAX_DEPTH_RATIO, _MIN_FRACTION = 20.0, 1e-3
 # A value beyond the box's greatest depth times this factor may be a sentinel ("not measured"). The surface that the
 # object stands on is nearer than that.
 _SENTINEL_DEPTH_RATIO = 1.1
-# If at least this fraction of the depths is within the factor `_MAX_DEPTH_RATIO` of the box's depths, the units are
-# right.
-_MIN_FRACTION = 1e-3
 
 
 class NothingInside(UserWarning):
@@ -37,8 +35,6 @@ def points_of_depth(
     depth: Real[AnyArray, "height width"], camera: Camera, pose: Pose, scale: float, stride: int, box: Box | None
 ) -> Rows:
     """Compute the fields points, normals, mask, missed and sight of the cloud of `PointCloud.from_depth`.
-
-    - `scale`: units of the pose per unit of depth.
 
     **Raises:** `ValueError` for a scale that is not positive, a batch of poses, a stride that is below one or leaves no
     pixel, or for the same reasons as `from_depth`.
@@ -103,8 +99,7 @@ def _points_and_normals(
     3. inside: whether the point lies in the box.
     4. sight: the distance from the camera to the hit; infinite without a hit.
 
-    - `missed`: whether the ray of each pixel met nothing.
-    - `rounding`: standard deviation of the rounding of depths. `block_side`: see `find_block_side`.
+    - `rounding`: standard deviation of the rounding of depths.
     """
     rows, strided_camera = slice(stride // 2, None, stride), camera.strided(stride)
     samples = _strided_samples(depth, jnp.isfinite(depth) & (depth > 0), stride, block_side)[0]
@@ -133,10 +128,7 @@ def _points_and_normals(
 def _strided_samples(
     depth: Float[Array, "h w"], valid: Bool[Array, "h w"], stride: int, block_side: int
 ) -> tuple[Float[Array, "k l"], Bool[Array, "k l"], Float[Array, "k l"]]:
-    """Return three arrays with an entry for every `stride`-th row and column of a depth image.
-
-    The image is divided into square blocks with side `block_side`. The sample of a block is its valid pixel nearest to
-    the middle. An entry describes the block that contains the pixel:
+    """Return three arrays about the block of `block_samples` that holds each `stride`-th pixel.
 
     1. depth of the block's sample.
     2. whether the block has a sample.
@@ -162,9 +154,7 @@ def _depth_behind(box: Box, camera: Camera, pose: Pose) -> Float[Array, " n"]:
 def without_sentinels(
     depth: Real[np.ndarray, "height width"], camera: Camera, pose: Pose, scale: float, box: Box
 ) -> Real[np.ndarray, "height width"]:
-    """Return the depth image with zeros in place of sentinels, values that mean "not measured".
-
-    The sentinels are those that `points_of_depth` finds with the same arguments.
+    """Return the depth image with zeros in place of the sentinels that `points_of_depth` finds.
 
     **Raises:** `ValueError` if the box lies behind the camera.
     """
@@ -180,9 +170,7 @@ def _is_sentinel(
 
 
 def _depth_range(box: Box, pose: Pose) -> tuple[float, float]:
-    """Return the least and greatest depth of a box's corners along the viewing direction of a pose.
-
-    If the least depth is below a thousandth of the greatest depth, it is raised to this value.
+    """Return the least and greatest depth of a box's corners. Their ratio is limited to 1,000.
 
     **Raises:** `ValueError` if the box lies behind the camera.
     """
@@ -200,12 +188,8 @@ def _depth_range(box: Box, pose: Pose) -> tuple[float, float]:
 def _check_units(depth: Float[np.ndarray, " valid"], camera: Camera, depth_range: tuple[float, float] | None) -> None:
     """Check that the measured depths can be in the units of the camera's range and of the box.
 
-    The depths must not all be nearer or all be farther than the camera's range. At least 0.1 % of the depths in the
-    range must be within a factor of 20 of the box's depths. The other depths may come from a far background or glare.
-
-    - `depth_range`: least and greatest depth of the box; None if there is no box.
-
-    **Raises:** `ValueError` if the units must be wrong.
+    **Raises:** `ValueError` if all depths are nearer or all are farther than the camera's range, or if fewer than 0.1 %
+    of those in the range are within a factor of 20 of the box's depths. The others may be background or glare.
     """
     if not len(depth):
         return
@@ -228,7 +212,7 @@ def _check_units(depth: Float[np.ndarray, " valid"], camera: Camera, depth_range
 
 
 def _warn_of_nothing_inside(points: Float[np.ndarray, "valid 3"], inside: Bool[np.ndarray, " n"], box: Box) -> None:
-    """Warn if no point lies in the box. Most often the pose is wrong, but the object may also be out of view."""
+    """Warn if no point lies in the box. Most often the pose is wrong, or the object is out of view."""
     if len(points) and not inside.any():
         low, high = points.min(axis=0), points.max(axis=0)
         warnings.warn(

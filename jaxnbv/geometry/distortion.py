@@ -38,10 +38,7 @@ def distort_points(
 def undistort_points(
     x: Float[np.ndarray, "*n"], y: Float[np.ndarray, "*n"], coefficients: tuple[float, ...]
 ) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
-    """Return the undistorted coordinates of distorted points (x, y) in the plane Z = 1.
-
-    This inverts `distort_points` by fixed-point iteration, as in OpenCV.
-    """
+    """Invert `distort_points` by fixed-point iteration, as in OpenCV."""
     x_true, y_true = x, y
     for _ in range(_ITERATIONS):
         x_distorted, y_distorted = distort_points(x_true, y_true, coefficients)
@@ -58,12 +55,10 @@ def pixels_of(
 
 
 def check_distortion(coefficients: tuple[float, ...], radius: float) -> None:
-    """Check that the coefficients of a lens are valid for an image.
-
-    - `radius`: largest distance from the axis to a point of the image, in the plane Z = 1.
+    """Check that the coefficients of a lens are valid up to a `radius` about the axis, in the plane Z = 1.
 
     **Raises:** `ValueError` for a number of coefficients other than four, five and eight, a coefficient that is not
-    finite, or if the distorted distance from the axis does not grow with the true distance, up to `radius`.
+    finite, or if the distorted distance from the axis does not grow with the true distance.
     """
     array = as_numbers(coefficients, "the distortion", np.float64)
     require(
@@ -93,8 +88,7 @@ def undistort_image(
     inverse depth. If these pixels do not belong to one surface, the depth of the nearest pixel is used. The depth is 0
     outside the distorted image.
 
-    - `depth`: the distorted image, in which valid depths are positive and finite.
-    - `missed`: whether each ray of the distorted image met nothing.
+    - `depth`, `missed`: the distorted image, in which valid depths are positive and finite.
     - `plane_points`: positions of the new image's pixels in the plane Z = 1.
     - `matrix`: intrinsic matrix of both images.
     """

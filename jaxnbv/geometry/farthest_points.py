@@ -16,7 +16,7 @@ def farthest_point_indices(points: Float[Array, "n d"], mask: Bool[Array, " n"],
 
     The first filled row (`mask` is True) is chosen first. Ties go to the first row. No row is chosen twice while an
     unchosen filled row is left, even if points coincide. If there are fewer points than `count`, the first filled row
-    repeats at the end. The indices have no derivative, but `points[indices]` can be differentiated in the points.
+    repeats at the end.
 
     **Raises:** `ValueError` if `count` < 1.
     """
@@ -50,8 +50,6 @@ def _first_of_largest(distance: Float[Array, " n"], rows: Int[Array, " n"]) -> I
 
     For floats that are not negative, the order of the bits is the order of the floats. On a CPU, a maximum of integers
     followed by a minimum of row indices is several times as fast as `jnp.argmax`.
-
-    - `rows`: the indices 0, 1, 2, ... of the rows.
     """
     bits = jax.lax.bitcast_convert_type(distance, jnp.dtype(f"int{8 * distance.dtype.itemsize}"))
     largest = jnp.max(_reduce_parts(jnp.maximum, bits))

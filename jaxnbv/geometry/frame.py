@@ -50,9 +50,8 @@ class Frame(eqx.Module):
     @classmethod
     @checked
     def fit(cls, points: Float[AnyArray, "n 3"], longest_side: float = 2.5, up: str = "y") -> "Frame":
-        """Return the frame that centres the points' bounding box and scales its longest side.
+        """Return the frame that centres the bounding box of points (world) and scales its longest side.
 
-        - `points`: world coordinates, (n, 3).
         - `longest_side`: length that the longest side of the bounding box gets, in scene units.
 
         **Raises:** `ValueError` if there are no points, if all points coincide, or if a point is not finite.
@@ -124,11 +123,7 @@ class Frame(eqx.Module):
 
 
 def _apply(value, map_points, map_directions, scale: float):
-    """Convert a cloud, pose, box, camera or points by functions for points and for directions.
-
-    - `map_points`, `map_directions`: function that converts points, and function that converts directions.
-    - `scale`: factor for lengths.
-    """
+    """Convert a value by functions for points and directions, and a factor (`scale`) for lengths."""
     if isinstance(value, PointCloud):
         points = jnp.where(value.mask[..., None], map_points(value.points), 0.0).astype(value.points.dtype)
         sight = None if value.sight is None else scale * value.sight

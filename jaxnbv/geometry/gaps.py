@@ -1,7 +1,4 @@
-"""Sampling of depth images that have gaps between valid pixels.
-
-Such images come from lidars, or are depth images that were aligned to a camera of higher resolution.
-"""
+"""Sampling of depth images with gaps between valid pixels, from lidars or aligned to a camera of more pixels."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,9 +16,8 @@ _MIN_PLANE_FRACTION, _MIN_PLANE_PIXELS = 0.8, 4
 def find_block_side(valid: Bool[np.ndarray, "h w"]) -> int:
     """Return the smallest side for which square blocks of a depth image rarely lack a valid pixel.
 
-    The side is 1 if most valid pixels have enough neighbours for a plane, even if the image has holes. Otherwise it is
-    the smallest side for which blocks contain a valid pixel about as often as blocks of four times the side. For
-    example, the side is 8 if every eighth row is valid.
+    The side is 1 if most valid pixels have enough neighbours for a plane, even if the image has holes. Otherwise blocks
+    contain a valid pixel about as often as blocks of four times the side. It is 8 if every eighth row is valid.
     """
     num_valid = correlate(valid.astype(np.uint8), np.ones((3, 3), np.uint8), mode="constant")
     if not valid.any() or np.mean(num_valid[valid] >= _MIN_PLANE_PIXELS) >= _MIN_PLANE_FRACTION:
@@ -42,10 +38,7 @@ def block_samples(
 ) -> tuple[Float[Array, "k l"], Bool[Array, "k l"], Int[Array, "k l 2"]]:
     """Return the sample of each square block of an image: the valid pixel nearest to its middle.
 
-    For each block, the results are the depth of the sample, whether there is a sample, and the sample's column and row
-    within the block.
-
-    - `side`: side of the blocks in pixels.
+    The results are the sample's depth, whether there is a sample, and the sample's column and row within the block.
     """
     if side == 1:
         return depth, valid, jnp.zeros((*depth.shape, 2), int)

@@ -16,8 +16,8 @@ _NUM_QUERIES = 256
 def nearest_squared_distance(x: Float[Array, "n 3"], cloud: PointCloud) -> Float[Array, " n"]:
     """Return min_j |x - y_j|^2 over the filled rows y_j of a cloud; infinite if the cloud is empty.
 
-    A loop runs over the rows of the cloud up to the last filled row. So memory is linear in the number of points x, and
-    empty rows at the end cost no time. The result can be differentiated repeatedly in x and in the cloud's points.
+    A loop runs over the rows of the cloud up to the last filled row, so memory is linear in the number of points x, and
+    empty rows at the end cost no time. Repeatedly differentiable in x and in the cloud's points.
     """
     return _nearest_squared_distance(x, cloud.points, cloud.mask)
 
@@ -32,12 +32,7 @@ def spacing(cloud: PointCloud) -> Float[Array, ""]:
 
 
 def distance_to_others(cloud: PointCloud, rows: Int[Array, " r"]) -> Float[Array, " r"]:
-    """Return the distance from the point in each row to its nearest neighbour in a cloud.
-
-    The distance is infinite if the cloud has no other point.
-
-    - `rows`: indices of rows of the cloud.
-    """
+    """Return the distance from the point in each of these rows to its nearest neighbour, or inf."""
     offsets = cloud.points[rows, None] - cloud.points
     is_other = cloud.mask & (jnp.arange(cloud.capacity) != rows[:, None])
     return jnp.sqrt(jnp.min(jnp.where(is_other, jnp.sum(offsets**2, axis=-1), jnp.inf), axis=1))
@@ -46,9 +41,7 @@ def distance_to_others(cloud: PointCloud, rows: Int[Array, " r"]) -> Float[Array
 class DistanceField(eqx.Module):
     """Distances to a cloud, interpolated linearly between the nodes of a cubic grid. Fast for many points.
 
-    - `values`: distance at each node.
-    - `low`: position of the first node.
-    - `spacing`: distance between neighbouring nodes.
+    - `low`, `spacing`: position of the first node, and distance between neighbouring nodes.
     """
 
     values: Float[Array, "n n n"]
@@ -59,8 +52,7 @@ class DistanceField(eqx.Module):
     def of(cls, cloud: PointCloud, margin: Float[Array, ""] | float, resolution: int = 64) -> "DistanceField":
         """Compute the distance field of a cloud, which must not be empty.
 
-        - `margin`: least distance between the cloud and the sides of the cube. Any point outside the cube is at least
-          this far from the cloud.
+        - `margin`: least distance between the cloud and the sides of the grid's cube, and so any point outside.
         - `resolution`: number of nodes along each side of the cube.
         """
         rows = cloud.mask[:, None]
@@ -75,7 +67,7 @@ class DistanceField(eqx.Module):
     def __call__(self, x: Float[Array, "n 3"]) -> Float[Array, " n"]:
         """Return the interpolated distance from each point x to the cloud. Differentiable in x.
 
-        For a point outside the cube of the grid, return the value at the nearest point of the cube.
+        A point outside the cube of the grid has the value of the nearest point of the cube.
         """
         coordinates = jnp.moveaxis((x - self.low) / self.spacing, -1, 0)
         return jax.scipy.ndimage.map_coordinates(self.values, list(coordinates), order=1, mode="nearest")

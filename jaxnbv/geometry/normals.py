@@ -18,10 +18,8 @@ def estimate_normals(
     The normal of a point is that of the least-squares plane through its nearest neighbours. For a depth image, use
     `PointCloud.from_depth`, which takes the noise of the image into account.
 
-    - `points`: the points.
     - `viewpoint`: position of the sensor, either one for all points or one per point, in the coordinates of the points.
-    - `neighbours`: number of points that define a plane, the point itself included. A larger number smooths noise more,
-      but also smooths edges.
+    - `neighbours`: number of points that define a plane, the point included. More smooth noise better, but also edges.
 
     **Raises:** `ValueError` for wrong shapes, fewer points than `neighbours`, fewer than three neighbours, a point or
     viewpoint that is not finite, or a point at the viewpoint.

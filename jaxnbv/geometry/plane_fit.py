@@ -51,8 +51,7 @@ def fit_planes(
     - `depth`: depths, positive and finite where `valid`.
     - `camera`: the camera of the whole image.
     - `min_noise`: lower bound on the standard deviation of the noise, such as that of rounding.
-    - `block_side`: side of the blocks of pixels that give one sample each, see `gaps`. With gaps, the sizes of windows
-      are counted in blocks.
+    - `block_side`: side of the blocks of pixels that give one sample each. Windows are counted in blocks.
     """
     focal = jnp.asarray(camera.focal_lengths, depth.dtype)
     strided = slice(stride // 2, None, stride)
@@ -111,9 +110,7 @@ def fit_planes(
 
 
 def _radius(spacing: Float[Array, "k l"], sigma: Float[Array, "k l"]) -> Int[Array, "k l"]:
-    """Return the radius in pixels of the smallest window whose slope has an error below `_MAX_SLOPE_ERROR`.
-
-    The radius is at most `_MAX_RADIUS`.
+    """Return the radius, up to `_MAX_RADIUS`, of the smallest window whose slope is accurate enough.
 
     - `spacing`, `sigma`: distance between neighbouring pixels on the surface, and standard deviation of their depth.
     """

@@ -1,8 +1,4 @@
-"""Poses, `look_at`, and points on a sphere.
-
-A pose maps the camera's frame to the scene. The camera's frame follows OpenCV: x points right, y down, and z forward
-along the viewing direction. Angles are in radians, lengths in scene units.
-"""
+"""Poses, `look_at`, and points on a sphere. Angles are in radians, lengths in scene units."""
 
 import math
 from collections.abc import Iterator
@@ -129,8 +125,7 @@ def rigid_matrices(
 ) -> tuple[Float[np.ndarray, "n 4 4"], Bool[np.ndarray, " n"]]:
     """Return matrices [[R, t], [0, 1]] with R made orthonormal, and whether each is a rigid motion.
 
-    A matrix whose R is rounded to three digits still counts as a rigid motion. Matrices that are not rigid motions are
-    returned unchanged.
+    R may be rounded to three digits. Other matrices are returned unchanged.
     """
     is_rigid = np.isfinite(matrices).all(axis=(1, 2)) & (_rotation_error(matrices[:, :3, :3]) <= _MAX_ROUNDING)
     is_rigid &= (np.abs(matrices[:, 3] - [0.0, 0.0, 0.0, 1.0]) < 1e-6).all(axis=1)
@@ -164,17 +159,10 @@ def _check_rigid(rotation: np.ndarray, position: np.ndarray) -> None:
 
 
 @own_settings()
-def look_at(
-    position,
-    target=(0.0, 0.0, 0.0),
-    up=(0.0, 1.0, 0.0),
-) -> Pose:
-    """Return the pose at `position` whose forward axis points to `target`.
+def look_at(position, target=(0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0)) -> Pose:
+    """Return the pose at `position` whose forward axis points to `target`, in scene coordinates.
 
-    All arguments are in scene coordinates and can be anything that `jnp.asarray` accepts.
-
-    - `position`: position of the camera, (*batch, 3).
-    - `target`: the point that the camera looks at, (3,). The default is the origin.
+    - `position`, `target`: (*batch, 3) and (3,).
     - `up`: the direction that is up in the image, (3,). If the camera looks along `up`, the coordinate axis in which
       `up` has its smallest component is used instead.
 
@@ -226,12 +214,9 @@ def _look_rotation(
 
 @checked
 def fibonacci_sphere(count: int, radius: float = 1.0, min_elevation: float = -0.5 * math.pi) -> Float[Array, "count 3"]:
-    """Return `count` almost evenly spaced points on a sphere about the origin.
+    """Return `count` points of the spherical Fibonacci lattice (Gonzalez 2010), almost evenly spaced.
 
-    The points are those of the spherical Fibonacci lattice (Gonzalez 2010).
-
-    - `min_elevation`: least elevation of the points above the plane y = 0, in radians. The default gives the whole
-      sphere.
+    - `min_elevation`: least elevation of the points above the plane y = 0, in radians, by default of the whole sphere.
 
     **Raises:** `ValueError` if `count` < 1, `radius` <= 0 or the elevation is not within [-pi/2, pi/2).
     """

@@ -18,7 +18,6 @@ class PoseList(eqx.Module):
     """A list of poses in scene coordinates, with fixed capacity.
 
     - `rows`: a batch of poses. The first `count` poses are the list. The remaining rows are the identity.
-    - `count`: number of poses in the list.
     """
 
     rows: Pose
@@ -26,7 +25,6 @@ class PoseList(eqx.Module):
 
     @classmethod
     def empty(cls, capacity: int) -> "PoseList":
-        """Return an empty list with this capacity."""
         dtype = jnp.result_type(float)
         rows = Pose(np.tile(np.eye(3, dtype=dtype), (capacity, 1, 1)), np.zeros((capacity, 3), dtype))
         return cls(rows, jnp.asarray(0, jnp.int32))
@@ -51,10 +49,7 @@ class PoseList(eqx.Module):
         return jnp.any(is_same_view(poses[:, None], self.rows[None]) & self.is_filled, axis=1)
 
     def distance(self, poses: Pose) -> Float[Array, " poses"]:
-        """Return the distance from the position of each pose of a batch to the nearest position in the list.
-
-        The distance is in scene units, and infinite if the list is empty.
-        """
+        """Return the distance from each pose of a batch to the nearest in the list; infinite without one."""
         distance = jnp.linalg.norm(poses.position[:, None] - self.rows.position[None], axis=-1)
         return jnp.min(jnp.where(self.is_filled, distance, jnp.inf), axis=1)
 
@@ -67,7 +62,7 @@ class PoseList(eqx.Module):
 def is_same_view(poses: Pose, others: Pose) -> Bool[Array, "*batch"]:
     """Return whether two poses agree to 1e-3 in position (scene units) and in viewing direction.
 
-    A rotation about the viewing direction is ignored. Leading axes of the two arguments are broadcast.
+    Leading axes are broadcast.
     """
     is_near = jnp.linalg.norm(poses.position - others.position, axis=-1) < _MAX_DIFFERENCE
     return is_near & (jnp.linalg.norm(poses.forward - others.forward, axis=-1) < _MAX_DIFFERENCE)

@@ -9,10 +9,7 @@ from jaxnbv.checks import AnyArray
 
 @jax.custom_jvp
 def safe_norm(*components: Float[AnyArray, "*#n"]) -> Float[Array, "*n"]:
-    """Return the Euclidean length of the vectors with these components.
-
-    Its derivative at the zero vector is zero.
-    """
+    """Return the length of the vectors with these components. Its derivative at the zero vector is zero."""
     return jnp.sqrt(sum(c * c for c in components))
 
 
@@ -35,12 +32,10 @@ def rotation_about(axis: Float[Array, "3"], angle: Float[Array, ""]) -> Float[Ar
 
 
 def rotation_from_vector(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """Convert a rotation vector to a matrix.
+    """Convert a rotation vector w, with the angle a = |w| in radians, to a matrix (Rodrigues' formula).
 
-    The vector's direction is the axis, and its length the angle in radians.
-
-    For the vector w and its length a, Rodrigues' formula is I + sin(a) / a [w]_x + (1 - cos(a)) / a^2 [w]_x^2. Near
-    zero, both fractions are replaced by their Taylor series, so the result is differentiable at w = 0 too.
+    The matrix is I + sin(a) / a [w]_x + (1 - cos(a)) / a^2 [w]_x^2. Near zero, both fractions are replaced by their
+    Taylor series, so the result is differentiable at w = 0 too.
     """
     square = jnp.sum(vector**2)
     is_small = square < 1e-12
@@ -86,10 +81,7 @@ def rotation_from_6d(columns: Float[AnyArray, "*batch 6"]) -> Float[Array, "*bat
 def rotation_between(
     start: Float[AnyArray, "*batch 3"], end: Float[AnyArray, "*batch 3"]
 ) -> Float[Array, "*batch 3 3"]:
-    """Return the smallest rotation that maps `start` to `end`, which are unit vectors.
-
-    If the vectors are opposite, the smallest rotation is not unique, and any of them is returned.
-    """
+    """Return the smallest rotation that maps one unit vector to another, any of them for opposite ones."""
     start, end = jnp.asarray(start), jnp.asarray(end)
     halfway = normalise(start + end, _any_orthogonal(start), _rounding(start))
     # The sum of nearly opposite vectors has lost digits, but their difference has not. The exact sum is orthogonal to
@@ -121,7 +113,7 @@ def normalise(
 
 
 def _rounding(unit: Float[Array, "*batch n"]) -> float:
-    """Return a length well above the rounding of sums of unit vectors. A shorter sum has no reliable direction."""
+    """Return a length well above the rounding of sums of unit vectors, whose direction is then reliable."""
     return 16.0 * float(jnp.finfo(unit.dtype).eps)
 
 
@@ -131,6 +123,5 @@ def _reject(vector: Float[Array, "*batch 3"], unit: Float[Array, "*batch 3"]) ->
 
 
 def _any_orthogonal(unit: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
-    """Return a unit vector that is orthogonal to a given unit vector."""
     axis = jnp.eye(3, dtype=unit.dtype)[jnp.argmin(jnp.abs(unit), axis=-1)]
     return normalise(_reject(axis, unit), axis)

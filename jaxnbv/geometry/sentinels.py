@@ -16,13 +16,12 @@ _MIN_VALUE_RATIO = 2.0
 def sentinel_pixels(image: Real[np.ndarray, "h w"], max_depth: float) -> Bool[np.ndarray, "h w"]:
     """Return, for each pixel, whether it holds a sentinel: a value that means "not measured".
 
-    Two kinds of values are sentinels. The first is the largest value of an integer type. The second is a value beyond
-    `max_depth` that fills far more pixels than any similar value. It gives a `UserWarning`. If all measured pixels hold
-    the same value, this value is not a sentinel, since the image may show a wall.
+    Sentinels are the largest value of an integer type and, with a `UserWarning`, a value beyond `max_depth` that fills
+    far more pixels than any similar value. A value of all measured pixels is no sentinel: the image may show a wall.
 
     - `image`: depths in any units.
-    - `max_depth`: the largest relevant depth, in the image's units. If it is infinite (unknown), a sentinel of the
-      second kind must be more than twice any other value.
+    - `max_depth`: the largest relevant depth, in the image's units. If it is infinite (unknown), the second sentinel
+      must be more than twice any other value.
     """
     is_integer = np.issubdtype(image.dtype, np.integer)
     is_largest = image == np.iinfo(image.dtype).max if is_integer else np.zeros(image.shape, bool)

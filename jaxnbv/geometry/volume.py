@@ -16,10 +16,9 @@ from jaxnbv.geometry.pose import fibonacci_sphere
 from jaxnbv.programs import program
 
 Volume = Callable[[Float[Array, "n 3"]], Float[Array, " n"]]
-"""Signed distance of a volume, as a function of points in scene coordinates.
+"""Signed distance of a volume, as a function of points in scene coordinates: a `Box` or a solid of `jaxnbv.sdf`.
 
-It is negative inside the volume and positive outside, and its magnitude is at most the distance to the boundary. `Box`
-and the solids of `jaxnbv.scanning.sdf` are volumes.
+It is negative inside the volume and positive outside, and its magnitude is at most the distance to the boundary.
 """
 
 _BISECTIONS = 40
@@ -61,17 +60,14 @@ class Box(eqx.Module):
         return f"from {low} to {high}"
 
     def widened(self, margin: float) -> "Box":
-        """Return the box with all faces but the lower one (y is up) moved outward by the length `margin`.
+        """Return the box with its faces moved outward by a length, except the lower face (y is up).
 
-        The lower face stays, since the surface that the object stands on is below it.
+        The surface that the object stands on is below the lower face.
         """
         return Box(self.low - np.array([margin, 0.0, margin]), self.high + margin)
 
     def shares_beyond(self, points: Float[np.ndarray, "n 3"], margin: float) -> dict[str, float]:
-        """Return, for each face, the fraction of points that are farther than `margin` beyond the face.
-
-        The keys are the names of the faces, such as "+x". The dictionary is empty if there are no points.
-        """
+        """Return the fraction of points that are more than `margin` beyond each face, such as "+x"."""
         if len(points) == 0:
             return {}
         is_beyond = {"-": points < self.low - margin, "+": points > self.high + margin}
@@ -104,9 +100,6 @@ def ray_interval(
     """Return the t at which rays origin + t direction enter and leave a box (Kay and Kajiya 1986).
 
     A ray misses the box if its entering t is larger than its leaving t.
-
-    - `origin`, `direction`: x, y and z components of the rays, each an array.
-    - `low`, `high`: two opposite corners of the box.
     """
     safe = [jnp.where(jnp.abs(d) < 1e-9, 1e-9, d) for d in direction]
     sides = [((a - x) / d, (b - x) / d) for x, d, a, b in zip(origin, safe, low, high, strict=True)]
@@ -119,11 +112,10 @@ def ray_interval(
 def boundary_points(volume: Volume, count: int, level: float = 0.0) -> Float[Array, "count 3"]:
     """Return points where `count` evenly spread rays from the origin cross the boundary of a volume.
 
-    The points are found by bisection between the origin and a sphere beyond the scene. If the volume is not star-shaped
-    about the origin, a ray may have several crossings, and any one of the crossings is returned.
+    The points are found by bisection between the origin and a sphere beyond the scene. If a ray has several crossings,
+    any of them is returned.
 
-    - `level`: value of the volume's function at the returned points, in scene units. The default gives points on the
-      boundary. A positive value gives points outside the volume.
+    - `level`: value of the volume's function at the returned points, in scene units; positive for points outside.
     """
     directions = fibonacci_sphere(count)
 
