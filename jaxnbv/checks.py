@@ -26,7 +26,6 @@ AnyArray = Array | np.ndarray
 _F = TypeVar("_F", bound=Callable[..., Any])
 _MAX_TEXT_LENGTH = 60
 _hints_of = functools.cache(get_type_hints)
-# Folders of code that does not belong to the user.
 _LIBRARY_FOLDERS = tuple(
     f"{Path(str(file)).parent}{os.sep}" for file in (jax.__file__, equinox.__file__, jaxtyping.__file__, __file__)
 )
@@ -76,9 +75,7 @@ def is_traced(*trees) -> bool:
 
 
 def check_fields(module: Any) -> None:
-    """Check the fields of a module that are annotated with plain types, see `check_type`.
-
-    Call this first in `__check_init__`, so that later checks can rely on the types.
+    """Check the fields of a module by `check_type`. Call this first in `__check_init__`.
 
     **Raises:** `ValueError` that names the first field whose value contradicts its annotation.
     """
@@ -143,10 +140,7 @@ def check_type(value: Any, hint: Any, name: str) -> None:
 
 
 def check_index(index: Any, batch: tuple[int, ...], name: str) -> None:
-    """Check an index of an array with batch axes of shape `batch`. JAX would clamp an index out of range.
-
-    **Raises:** `ValueError` for an integer that is out of range, or if there are no batch axes.
-    """
+    """Raise `ValueError` for an integer out of the first axis, which JAX would clamp, or without axes."""
     if isinstance(index, int | np.integer):
         check_batch(batch, name)
         require(-batch[0] <= index < batch[0], f"{name} has {batch[0]} along its first axis: there is no index {index}")
@@ -164,10 +158,9 @@ def check_key(key: Any) -> None:
 
 
 def native(value: Any) -> Any:
-    """Convert a NumPy array to native byte order and at most double precision.
+    """Convert a NumPy array to native byte order and at most double precision; return others unchanged.
 
-    Any other value is returned unchanged. The conversion is necessary because under `jit` JAX reads an array of
-    non-native byte order without swapping the bytes.
+    JAX's `jit` reads an array of non-native byte order without swapping the bytes.
     """
     if isinstance(value, np.ndarray) and (value.dtype.char == "g" or not value.dtype.isnative):
         return value.astype(np.float64 if value.dtype.char == "g" else value.dtype.newbyteorder("="))
@@ -186,9 +179,7 @@ def takes_native(function: _F) -> _F:
 
 @own_settings()
 def as_floats(value: Any, name: str) -> Array:
-    """Return the value as an array of JAX's default floating-point type.
-
-    - `name`: name of the value, for the error message.
+    """Return the value, called `name` in errors, as an array of JAX's default floating-point type.
 
     **Raises:** `ValueError` if the value is not an array of real numbers.
     """
@@ -198,9 +189,8 @@ def as_floats(value: Any, name: str) -> Array:
 
 
 def as_numbers(value: Any, name: str, dtype: Any = float) -> np.ndarray:
-    """Return the value as a NumPy array.
+    """Return the value, called `name` in errors, as a NumPy array.
 
-    - `name`: name of the value, for the error message.
     - `dtype`: type of the result. `float` means JAX's default floating-point type. None keeps the type of the value.
 
     **Raises:** `ValueError` if the value is not an array of real numbers, or is a masked array with masked entries.
@@ -249,10 +239,9 @@ def functions_of_users() -> Iterator[None]:
 def checked_result(value: Any, name: str, axes: int, requirement: str) -> Any:
     """Check a value that a user's function returned, and return it unchanged.
 
-    - `axes`: the required number of axes. If it is 0, a plain number is valid too.
     - `name`, `requirement`: the name of the value, and a description of valid values, for the error message.
 
-    **Raises:** `ValueError` unless the value is an array of real numbers with this number of axes.
+    **Raises:** `ValueError` unless it is an array of real numbers with this number of axes (0 also for plain numbers).
     """
     dtype = getattr(value, "dtype", None)
     is_real = isinstance(value, numbers.Real) if dtype is None else any(jnp.issubdtype(dtype, kind) for kind in _REAL)

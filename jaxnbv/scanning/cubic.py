@@ -20,7 +20,6 @@ def cubic(corners: list, a: list, b: list) -> list[Float[Array, " n"]]:
     along z, y and x in turn, and each of these steps raises the degree by one.
 
     - `corners`: values of the functions at the corners of their cells, in the order of `CORNERS`.
-    - `a`, `b`: start and direction of the rays, in coordinates in which the cell is [0, 1]^3.
     """
     polynomials = [[corner] for corner in corners]
     for x, dx in ((a[2], b[2]), (a[1], b[1]), (a[0], b[0])):
@@ -40,8 +39,6 @@ def first_bracket(c: list) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
     If a cubic is positive at 0 but not at its local minimum, there is exactly one root before the minimum, and s is the
     position of the minimum. Otherwise s is 1: a cubic that is positive at 0 then has one root in [0, 1] if it is not
     positive at 1, else none. A cubic that is not positive at 0 counts as having its first root there.
-
-    - `c`: the coefficients, constant first.
     """
     discriminant = c[2] * c[2] - 3.0 * c[3] * c[1]
     root = jnp.sqrt(jnp.maximum(discriminant, 0.0))
@@ -58,12 +55,10 @@ def first_bracket(c: list) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
 def first_root(c: list) -> Float[Array, " n"]:
     """Return the first root in [0, 1] of each cubic, which must have one.
 
-    The root is 0 for a cubic that is not positive at 0. `first_bracket` returns an interval that holds only the first
-    root, and Newton's method finds the root in it. A step that leaves the interval by more than the rounding error is
-    replaced by bisection. This tolerance is needed because compiled code may compute the same value twice with
-    different rounding, and then the interval may end just beside the root.
-
-    - `c`: the coefficients, constant first.
+    The root is 0 for a cubic that is not positive at 0. Newton's method finds the root in the interval of
+    `first_bracket`. A step that leaves the interval by more than the rounding error is replaced by bisection. This
+    tolerance is needed because compiled code may compute the same value twice with different rounding, and then the
+    interval may end just beside the root.
     """
     high, _ = first_bracket(c)
     drop = c[0] - _polynomial(c, high)

@@ -1,7 +1,7 @@
 """Space that a sensor has seen to be empty, and carving: removal of sampled surface from this space.
 
-A ray that hits shows that space is empty up to its hit. A ray that misses shows that space is empty along all of its
-length. An invalid ray shows nothing. A node of the grid is *seen empty* if all rays near the node went past the node.
+Space is empty up to the hit of a ray, or along all of a ray that misses. An invalid ray shows nothing. A node of the
+grid is *seen empty* if all rays near the node went past the node.
 """
 
 import functools
@@ -29,8 +29,7 @@ _MAX_STRAY_FRACTION = 0.01
 class Carving(eqx.Module):
     """Removal of sampled surface in space that was seen to be empty, and outside the object's volume.
 
-    - `volume`: the region that can hold the object, see `jaxnbv.geometry.volume`. The default is the box that
-      `Frame.fit` scales scenes to.
+    - `volume`: the region that can hold the object, see `jaxnbv.geometry.volume`; by default that of `Frame.fit`.
     - `margin_voxels`: the margin, in spacings of the grid. A node is seen empty if every ray that passes the node
       within the margin, and every neighbour of such a ray in the image, stayed empty to at least the margin beyond the
       node. A node counts as outside if it lies more than two margins outside the volume.
@@ -70,8 +69,7 @@ class Carving(eqx.Module):
 
         All nodes are False if the scan is a cloud that is not a sensor's image (`missed` is None).
 
-        - `barrier`: distance along each ray to the first obstacle, see `Obstacles.barrier`. A ray that hits no surface
-          shows that space is empty only up to the obstacle.
+        - `barrier`: distance along each ray to the first obstacle, which ends the empty space of a ray without a hit.
         """
         if scan.missed is None:
             return jnp.zeros((grid.resolution,) * 3, bool)
@@ -88,15 +86,13 @@ class Carving(eqx.Module):
     @program
     def outside(self, grid: Grid) -> Bool[Array, "g g g"]:
         """Return, for each node, whether it is more than two margins (`margin_voxels`) outside the volume."""
-        axis = jnp.asarray(grid.axis, jnp.result_type(float))
-        return on_tensor_grid(self.volume, axis) > self._beyond_volume(grid)
+        return on_tensor_grid(self.volume, grid.axis) > self._beyond_volume(grid)
 
     def with_room(self, box: Box, grid: Grid, frame: Frame) -> Box:
-        """Return a larger box: all faces but the lower one are moved outward by two margins / sqrt(3).
+        """Return a box (world) with all faces but the lower one moved outward by two margins / sqrt(3).
 
-        Both boxes are in world coordinates. The margin is `margin_voxels` spacings of the grid. The corners of the
-        larger box are at most two margins from the original box, so points in the larger box still count as inside the
-        volume. A scan cropped to the larger box shows that the surface goes on where the original box cuts it.
+        Its corners are at most two margins from the given box, so points in it still count as inside the volume. A scan
+        cropped to it shows that the surface goes on where the given box cuts it.
         """
         return frame.to_world(frame.to_scene(box).widened(self._beyond_volume(grid) / math.sqrt(3.0)))
 
@@ -106,14 +102,12 @@ class Carving(eqx.Module):
     @program
     def inside(self, grid: Grid) -> Bool[Array, "g g g"]:
         """Return, for each node, whether it lies inside the volume."""
-        return on_tensor_grid(self.volume, jnp.asarray(grid.axis, jnp.result_type(float))) < 0
+        return on_tensor_grid(self.volume, grid.axis) < 0
 
     def check_inside(self, cloud: PointCloud, grid: Grid) -> None:
         """Check that the volume, widened by two margins (`margin_voxels`), holds the cloud.
 
-        Carving would cut the object otherwise. Because of noise, up to 1 % of the points may lie outside.
-
-        **Raises:** `ValueError` if more points lie outside.
+        **Raises:** `ValueError` if more than 1 % of the points lie outside, where carving would cut the object.
         """
         limit = self._beyond_volume(grid)
         num_outside, farthest = _count_outside(self.volume, cloud, limit)
@@ -128,13 +122,10 @@ class Carving(eqx.Module):
 
 @jax.jit
 def carve(values: Float[Array, "*s g g g"], empty: Bool[Array, "g g g"]) -> Float[Array, "*s g g g"]:
-    """Return node values in which all empty nodes are positive, that is, outside the surface.
+    """Return node values (minus the level) in which all empty nodes are positive: outside the surface.
 
     The new value of an empty node is twice the largest magnitude among the node and its neighbours. So on the edge from
     an inside node to an empty node, the surface lies in the third of the edge next to the inside node.
-
-    - `values`: values of a function at the nodes, minus the level that the function has on the surface.
-    - `empty`: whether each node was seen to be empty.
     """
     magnitude = jnp.maximum(jnp.abs(values), jnp.finfo(values.dtype).tiny)
     for axis in (-3, -2, -1):
@@ -146,7 +137,6 @@ def carve(values: Float[Array, "*s g g g"], empty: Bool[Array, "g g g"]) -> Floa
 
 @program
 def _count_outside(volume: Volume, cloud: PointCloud, limit: float) -> tuple[Int[Array, ""], Float[Array, ""]]:
-    """Return the number of points more than `limit` outside the volume, and the largest signed distance."""
     # Evaluate all rows, so that clouds with different counts share a compilation.
     distances = jnp.where(cloud.mask, volume(cloud.points), -jnp.inf)
     # The comparison is negated so that NaN counts as outside.
@@ -201,10 +191,7 @@ def _is_crossed(
 
 
 def _least_within(image: Float[Array, "h w"], pixels: int) -> Float[Array, "h w"]:
-    """Return, for each pixel, the minimum of nine pixels: a 3 x 3 pattern with a spacing of `pixels`.
-
-    The pattern is centred on the pixel. Pixels beyond the border count as infinite.
-    """
+    """Return the minimum of nine pixels about each pixel, a 3 x 3 pattern with a spacing of `pixels`."""
     for axis in (0, 1):
         pad = [(0, 0), (0, 0)]
         pad[axis] = (pixels, pixels)

@@ -29,7 +29,7 @@ class Grid(eqx.Module):
     """A regular grid of `resolution`^3 nodes that spans [-half_extent, half_extent]^3 of the scene.
 
     The defaults are the paper's: 100^3 nodes on [-1.75, 1.75]^3. Samples may miss a part of the object that is thinner
-    than a cell (`spacing`), since the part may lie between nodes. Use a finer grid for thin parts.
+    than a cell (`spacing`) and lies between nodes. Use a finer grid for thin parts.
     """
 
     resolution: int = eqx.field(static=True, default=100)
@@ -49,17 +49,13 @@ class Grid(eqx.Module):
         """Return the index of the cell that holds each point (scene coordinates).
 
         Along each axis, cell i lies between the nodes i and i + 1, for i from 0 to `resolution - 2`. For a point
-        outside the grid, at least one index is above `resolution - 2`. No index is negative, since JAX would count it
-        from the other end.
+        outside the grid, at least one index is above that. None is negative, since JAX would count it from the end.
         """
         cell = jnp.floor((points + self.half_extent) / self.spacing).astype(jnp.int32)
         return jnp.where(cell < 0, self.resolution, cell)
 
     def check(self, cloud: PointCloud) -> None:
-        """Warn if many points lie on parts thinner than a cell.
-
-        A point lies on a thin part if a point with the opposite normal is less than a cell's width away.
-        """
+        """Warn if many points are less than a cell's width away from a point with the opposite normal."""
         points, normals = cloud.to_numpy()
         pairs = cKDTree(points).query_pairs(self.spacing, output_type="ndarray")
         is_opposite = np.sum(normals[pairs[:, 0]] * normals[pairs[:, 1]], axis=1) < _MAX_OPPOSITE_COSINE
@@ -80,14 +76,12 @@ class Grid(eqx.Module):
 class GridSurface(Surface):
     """The zero set of a trilinear interpolant of node values, or a batch of zero sets along leading axes.
 
-    Rays are traced exactly. They hit nothing outside the grid's box. A ray that starts outside the box is traced from
-    the point where it enters the box.
+    Rays are traced exactly, and hit nothing outside the grid's box.
 
     - `values`: values of a function f at the nodes, minus the level of f on the surface; positive outside the solid.
-    - `distance`: lower bound, in cells, on the distance from each cell to the nearest cell in which the values change
-      sign; negative inside the solid (`tracing.free_distance`).
-    - `is_void`: whether a sensor cannot see the surface in each cell. A ray whose first zero is in such a cell misses.
-      None if there are no such cells.
+    - `distance`: `tracing.free_distance` of the values.
+    - `is_void`: whether a ray misses if its first zero is in a cell, since a sensor cannot see the surface there. None
+      if there are no such cells.
     """
 
     in_jit: ClassVar[bool] = True
@@ -119,7 +113,7 @@ class GridSurface(Surface):
         return cls(relative, distances, grid)
 
     def without_cells(self, cells: Bool[Array, "*s m m m"]) -> "GridSurface":
-        """Return the surface without its parts in these cells. Rays that would hit these parts miss."""
+        """Return the surface without its parts in these cells, which rays that would hit them miss."""
         return dataclasses.replace(self, is_void=cells if self.is_void is None else self.is_void | cells)
 
     @program
@@ -163,18 +157,14 @@ class GridSurface(Surface):
 def scan_samples(
     surfaces: GridSurface, camera: Camera, poses: Pose, barrier: Float[Array, "poses rays"] | None = None
 ) -> PointCloud:
-    """Scan each surface of a batch from each pose of a batch. Leading axes are (surfaces, poses).
-
-    - `barrier`: distance along each ray to the first obstacle, see `Obstacles.barrier`.
-    """
+    """Scan each surface of a batch from each pose of a batch. Leading axes are (surfaces, poses)."""
     return shared_map(scan, surfaces, camera, poses, barrier, at_once=samples_at_once(camera, poses))
 
 
 def samples_at_once(camera: Camera, poses: Pose) -> int:
     """Return the number of sampled surfaces to scan together from a batch of poses.
 
-    On a CPU this is one, so that the scans of a sample stay in the cache. On a GPU it is the number that gives about
-    eight million rays, and at least one.
+    On a CPU this is one, so that the scans of a sample stay in the cache. On a GPU it gives up to eight million rays.
     """
     return 1 if on_cpu() else max(1, 2**23 // (poses.position.shape[0] * camera.num_rays))
 
@@ -182,9 +172,7 @@ def samples_at_once(camera: Camera, poses: Pose) -> int:
 @jax.debug_nans(False)
 @program
 def mean_depth(scans: PointCloud, pose: Pose) -> Float[Array, " rays"]:
-    """Return each ray's mean depth over the samples that it hits; NaN if it misses most samples.
-
-    The depth is measured along the camera's axis, in scene units.
+    """Return the mean depth of each ray over the samples that it hits, or NaN if it misses most.
 
     - `scans`: scans of all samples from the pose, along a leading axis.
     """
@@ -198,7 +186,6 @@ def mean_depth(scans: PointCloud, pose: Pose) -> Float[Array, " rays"]:
 def _prepare(
     values: Float[Array, "*s g g g"], level: Float[Array, ""]
 ) -> tuple[Float[Array, "*s g g g"], Bool[Array, ""], Int8[Array, "*s m m m"]]:
-    """Return the values minus the level, whether all are finite, and each cell's `tracing.free_distance`."""
     values = values - level
     distances = shared_map(tracing.free_distance, values.reshape(-1, *values.shape[-3:]))
     return values, jnp.isfinite(values).all(), distances.reshape(*values.shape[:-3], *distances.shape[1:])

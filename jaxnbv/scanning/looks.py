@@ -1,9 +1,8 @@
 """The surface that earlier views have measured, and how far each view saw.
 
 The observed cloud is thinned, so surface between its points may have been measured too. This module stores the hits of
-all rays instead, which show the measured surface at the resolution of the sensor. If a view should have seen a sampled
-surface but did not measure it, later views will not measure it either: the surface does not exist, or it is too dark or
-too shiny for the sensor.
+all rays instead. If a view should have seen a sampled surface but did not measure it, later views will not measure it
+either: the surface does not exist, or it is too dark or too shiny for the sensor.
 """
 
 import dataclasses
@@ -52,7 +51,7 @@ class Looks(eqx.Module):
 
     @classmethod
     def empty(cls, grid: Grid, camera: Camera, max_views: int) -> "Looks":
-        """Return a `Looks` without views that has room for `max_views` views of the sensor's camera."""
+        """Return a `Looks` with room for `max_views` views of the sensor's camera."""
         camera = camera.strided(math.ceil(math.sqrt(camera.num_rays / _MAX_RAYS)))
         far = jnp.full((grid.resolution,) * 3, _MAX_DISTANCE * grid.spacing, jnp.result_type(float))
         return cls(far, jnp.zeros((max_views, camera.num_rays), far.dtype), camera, grid)
@@ -66,8 +65,7 @@ class Looks(eqx.Module):
     def with_points(self, cloud: PointCloud, radii: Float[Array, " n"] | float = 0.0) -> "Looks":
         """Return a copy with the points of a cloud added to the measured surface.
 
-        - `radii`: radius of the surface that was measured around each point, in scene units. Radii above a spacing of
-          the grid are reduced to it.
+        - `radii`: radius of the surface that was measured around each point, in scene units, at most a spacing.
         """
         radii = jnp.minimum(radii, self.grid.spacing)
         position = (cloud.points + self.grid.half_extent) / self.grid.spacing
@@ -95,9 +93,7 @@ class Looks(eqx.Module):
         """Return a copy with one more view.
 
         - `index`: index of the view, from 0.
-        - `pose`, `scan`, `camera`: the view's pose, its scan, and the camera that took the scan.
-        - `barrier`: distance along each ray of the camera to the first obstacle. The view saw nothing behind the
-          obstacle.
+        - `barrier`: distance along each ray of the camera to the first obstacle, behind which the view saw nothing.
         """
         # The radius is half the diagonal of a pixel on the surface, so that surface between the rays of a coarse image
         # counts as measured.
@@ -113,22 +109,15 @@ class Looks(eqx.Module):
     def __call__(self, x: Float[Array, "*n 3"]) -> Float[Array, "*n"]:
         """Return the distance from each point x to the nearest measured surface, in scene units.
 
-        Distances of `reach` or more are returned as `reach`. The distances are stored at the nodes of a grid and
-        interpolated linearly, so on a measured surface the result is not zero, but up to half the spacing of the nodes.
-        The result is differentiable in x (scene coordinates).
+        Distances are at most `reach`, and interpolated linearly between the nodes. So on a measured surface the result
+        is not zero, but up to half the spacing of the nodes. Differentiable in x (scene coordinates).
         """
         positions = list(jnp.moveaxis((x + self.grid.half_extent) / self.grid.spacing, -1, 0))
         return jax.scipy.ndimage.map_coordinates(self.distance, positions, order=1, mode="nearest")
 
     @program
     def without_unmeasured(self, surfaces: GridSurface, poses: PoseList) -> GridSurface:
-        """Return the sampled surfaces without the cells that a view should have measured but did not.
-
-        The removed cells are those of `unmeasured_cells` for all views, and the cells next to them.
-
-        - `surfaces`: the sampled surfaces, a batch along a leading axis.
-        - `poses`: the poses of the views.
-        """
+        """Return a batch of surfaces without the `unmeasured_cells` of all views and the cells next to them."""
         return surfaces.without_cells(shared_map(_unmeasured_by_any, surfaces, self, poses))
 
     def unmeasured_cells(self, surface: Surface, index: Int[Array, ""] | int, pose: Pose) -> Int[Array, "rays 3"]:
@@ -139,9 +128,7 @@ class Looks(eqx.Module):
         hit, or if the view's ray passed the hit and went on to something deeper. All other rays get an index beyond the
         grid's cells.
 
-        - `surface`: the sampled surface.
-        - `index`: index of the view, from 0.
-        - `pose`: the view's pose.
+        - `index`, `pose`: index of the view, from 0, and its pose.
         """
         spacing = self.grid.spacing
         hits = scan(surface, self.camera, pose)

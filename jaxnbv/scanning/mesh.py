@@ -32,8 +32,8 @@ _MIN_POINTS = 4
 class _Tree:
     """Cache of the ray tracer for the triangles of the last call.
 
-    The cache is a static field of `TriangleMesh`, since it is not an array. It has no dataclass fields, since its
-    content follows from the triangles. So all instances are equal and have the same repr. A copy starts empty.
+    As a static field of `TriangleMesh`, all instances are equal: their content follows from the triangles. A copy
+    starts empty.
     """
 
     _cache = None
@@ -102,7 +102,7 @@ class TriangleMesh(Surface):
         return cls(frame.to_scene(vertices[rows]), faces.reshape(-1, 3), frame)
 
     def trace(self, origins: Float[AnyArray, "rays 3"], directions: Float[AnyArray, "rays 3"]) -> Hits:
-        """Return the first hits of the rays (see `Surface.trace`), which lie exactly in the triangles' planes.
+        """Return the first hits of the rays (see `Surface.trace`), which lie in the triangles' planes.
 
         **Raises:** `ValueError` under `jit`, `vmap` or `grad`.
         """
@@ -156,8 +156,7 @@ class TriangleMesh(Surface):
     def contains(self, points: Float[AnyArray, "n 3"]) -> Bool[np.ndarray, " n"]:
         """Return, for each point (scene coordinates), whether its winding number has a magnitude above 1/2.
 
-        A mesh that is wound inside out encloses the same points as a mesh that is wound outward. An open sheet encloses
-        nothing.
+        So a mesh that is wound inside out also encloses points, and an open sheet none.
         """
         points = np.asarray(points, dtype=np.float64)
         return np.abs(winding_number(points, self.vertices, self.faces)) > 0.5
@@ -170,10 +169,9 @@ class TriangleMesh(Surface):
 def level_triangles(
     values: Float[np.ndarray, "g g g"], grid: Grid
 ) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"], Float[np.ndarray, "v 3"]] | None:
-    """Return vertices, faces and vertex normals of the zero set of `values`; None if the set is empty.
+    """Return vertices, faces and unit vertex normals of the zero set of `values`; None for an empty set.
 
-    The triangles come from marching cubes, in scene coordinates. Faces are wound outward, and normals have unit length
-    and point outward.
+    They come from marching cubes, in scene coordinates, and faces and normals point outward.
 
     - `values`: one value per node of the grid, positive outside the solid.
     """
@@ -193,9 +191,8 @@ def supported_pieces(
 ) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "k 3"], int]:
     """Return the connected components of a mesh that have at least four points nearby.
 
-    A point belongs to the component of its nearest vertex, if that vertex is within `max_distance` of the point. If no
-    component has four points, the components with the largest number of points are kept. Returns the vertices and faces
-    of the kept components, and the number of dropped components.
+    A point belongs to the component of its nearest vertex, if that vertex is within `max_distance`. If no component has
+    four points, those with the most points are kept. Also returns the number of dropped components.
     """
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
     graph = coo_array((np.ones(len(edges), bool), edges.T), (len(vertices), len(vertices)))
@@ -213,7 +210,7 @@ def mesh_from_sdf(sdf: SignedDistance, grid: Grid) -> TriangleMesh:
 
     **Raises:** `ValueError` if no surface lies within the grid.
     """
-    values = np.array(on_tensor_grid(sdf, jnp.asarray(grid.axis, jnp.result_type(float))))
+    values = np.array(on_tensor_grid(sdf, grid.axis))
     triangles = level_triangles(values, grid)
     if triangles is None:
         raise InputError(

@@ -39,8 +39,7 @@ def load_mesh(path: str | Path | trimesh.Trimesh | trimesh.Scene, up: str = "y")
 def as_surface(scene: Surface | SignedDistance | trimesh.Trimesh | trimesh.Scene) -> Surface:
     """Convert a scene of any accepted type to a surface.
 
-    A `Surface` is returned unchanged. A solid gives the `SDFSurface` of its boundary. A trimesh object is converted by
-    `load_mesh` with the y axis up.
+    A solid gives the `SDFSurface` of its boundary. A trimesh object is converted by `load_mesh` with the y axis up.
 
     **Raises:** `ValueError` for the same reasons as `load_mesh`.
     """
@@ -52,7 +51,6 @@ def as_surface(scene: Surface | SignedDistance | trimesh.Trimesh | trimesh.Scene
 class MeshParts(eqx.Module):
     """A mesh and its parts, from a file that has a node for each part.
 
-    - `mesh`: the whole mesh.
     - `parts`: each part as a mesh, in the scene coordinates of the whole mesh.
     - `names`: name of each part's node in the file.
     """
@@ -80,19 +78,17 @@ def load_parts(path: str | Path | trimesh.Scene, up: str = "y") -> MeshParts:
     """
     nodes = read_nodes(path)
     mesh = joined_nodes(path, [node for _, node in nodes], up)
-    candidates = [
-        (name, node, node.faces[node.area_faces > 0]) for name, node in sorted(nodes, key=lambda node: node[0])
+    parts = [
+        (name, TriangleMesh(mesh.frame.to_scene(node.vertices), node.faces[node.area_faces > 0], mesh.frame))
+        for name, node in sorted(nodes, key=lambda node: node[0])
+        if (node.area_faces > 0).any()
     ]
-    parts_faces = [(name, node, faces) for name, node, faces in candidates if len(faces)]
-    require(len(parts_faces) > 1, f"{path} has one node, and so no parts: save each part as a node of its own")
-    parts = tuple(TriangleMesh(mesh.frame.to_scene(node.vertices), faces, mesh.frame) for _, node, faces in parts_faces)
-    return MeshParts(mesh, parts, tuple(name for name, *_ in parts_faces))
+    require(len(parts) > 1, f"{path} has one node, and so no parts: save each part as a node of its own")
+    return MeshParts(mesh, tuple(part for _, part in parts), tuple(name for name, _ in parts))
 
 
 def joined_nodes(path: str | Path | trimesh.Geometry, meshes: list[trimesh.Trimesh], up: str) -> TriangleMesh:
     """Join the meshes of all nodes of a file into one.
-
-    - `path`: the file or trimesh object that the meshes come from, for error messages.
 
     **Raises:** `ValueError` for the same reasons as `TriangleMesh.from_arrays`, with the path in the message.
     """
@@ -143,10 +139,7 @@ def _read(path: Path) -> list[tuple[str, trimesh.Trimesh]]:
 
 
 def _named_meshes(geometry: trimesh.Geometry) -> list[tuple[str, trimesh.Trimesh]]:
-    """Return a node name and a mesh in scene coordinates for each mesh of a trimesh scene.
-
-    A single mesh gives one entry. A mesh without a node has its index as the name.
-    """
+    """Return the node's name (or an index) and the mesh in scene coordinates of each mesh of a scene."""
     parts = geometry.dump() if isinstance(geometry, trimesh.Scene) else [geometry]
     meshes = [part for part in parts if isinstance(part, trimesh.Trimesh)]
     return [(str(mesh.metadata.get("node", index)), mesh) for index, mesh in enumerate(meshes)]

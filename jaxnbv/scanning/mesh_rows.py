@@ -51,8 +51,7 @@ def read_obj(content: bytes) -> dict[str, Triangles]:
                 corners = [int(value.partition("/")[0]) for value in values]
             except ValueError as error:
                 raise InputError(f"has a face {line.strip()!r}, whose corners are not vertex numbers") from error
-            # Negative numbers count back from the latest vertex. Zero is invalid and becomes -1, which is rejected
-            # later.
+            # Negative numbers count back from the latest vertex. Zero is invalid: it becomes -1, which is rejected.
             rows = [corner - 1 if corner > 0 else len(vertices) + corner if corner else -1 for corner in corners]
             polygons.setdefault(material, []).append(rows)
     points = as_array(vertices)
@@ -90,10 +89,7 @@ def read_off(content: bytes) -> Triangles:
 
 
 def triangles_of(polygons: Sequence[Sequence[int]] | Sequence[np.ndarray] | np.ndarray) -> Int[np.ndarray, "f 3"]:
-    """Cut polygons into fans of triangles about their first corners.
-
-    A polygon with fewer than three corners gives no triangle.
-    """
+    """Cut polygons into fans of triangles about their first corners; none for fewer than three corners."""
     if isinstance(polygons, np.ndarray):
         groups = [polygons]
     else:
@@ -127,9 +123,5 @@ def as_array(rows: list[list[str]]) -> Float[np.ndarray, "n k"]:
 
 
 def cut_short(count: int, declared: int, what: str) -> str:
-    """Return the error message for a file that ends before all declared rows.
-
-    - `count`, `declared`: number of rows in the file, and in its header.
-    - `what`: name of the rows, such as "vertices".
-    """
+    """Return the error message for a file that ends before all declared rows, such as "vertices"."""
     return f"has {count} of the {declared} {what} that its header declares: fetch it again"

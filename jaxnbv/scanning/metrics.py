@@ -17,9 +17,9 @@ from jaxnbv.scanning.mesh import TriangleMesh, mesh_from_sdf
 from jaxnbv.scanning.scanner import Surface
 from jaxnbv.scanning.sphere_tracing import SDFSurface
 
-# Number of points that the paper's authors sample on each of two surfaces to compare the surfaces.
+# Number of points that the paper's authors sample on each of two surfaces to compare them.
 SURFACE_POINTS = 20_000
-# Least cosine of incidence. A pixel whose cosine is smaller is treated as if its cosine had this value.
+# Least cosine of incidence. A smaller one counts as this value.
 GRAZING = 0.2
 
 
@@ -53,8 +53,8 @@ def is_shown(
 ) -> Bool[np.ndarray, " n"]:
     """Return, for each point of the true surface, whether a scan shows the point.
 
-    The scan shows a point if the point and the hit of its pixel are at the same distance from the camera, up to `size`
-    plus a tolerance. The tolerance is the change of distance within half a pixel on the plane of the hit.
+    The point and the hit of its pixel must be at the same distance from the camera, up to `size` plus the change of
+    distance within half a pixel on the plane of the hit.
 
     **Raises:** `ValueError` if the scan does not have one row per ray of the camera.
     """
@@ -80,19 +80,13 @@ def is_shown(
 
 
 def truth_points(scene: Surface, key: PRNGKeyArray, count: int = SURFACE_POINTS) -> Float[np.ndarray, "count 3"] | None:
-    """Draw `count` points on `true_mesh(scene)`, uniform by area; None if the scene has no such mesh.
-
-    Points are in scene coordinates.
-    """
+    """Draw `count` points (scene coordinates) on `true_mesh(scene)`, uniform by area; None without a mesh."""
     mesh = true_mesh(scene)
     return None if mesh is None else mesh.sample_points(key, count)
 
 
 def true_mesh(scene: Surface) -> TriangleMesh | None:
-    """Convert a mesh or a solid to triangles in scene coordinates; None for any other surface.
-
-    A `TriangleMesh` is returned unchanged. An `SDFSurface` is meshed by marching cubes on the default grid.
-    """
+    """Return a `TriangleMesh` unchanged, an `SDFSurface` as a mesh (on the default grid), or else None."""
     if isinstance(scene, SDFSurface):
         return mesh_from_sdf(scene.sdf, Grid())
     return scene if isinstance(scene, TriangleMesh) else None

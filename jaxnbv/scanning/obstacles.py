@@ -35,9 +35,9 @@ class Obstacles(eqx.Module):
       mesh.
     - `margin`: a scanned point nearer than this to a solid counts as a point of the solid.
     - `clearance`: least distance of a camera from an obstacle and from a scanned point.
-    - `clutter`: a solid for other things nearby whose shape is known only roughly. Clutter hides what is behind it and
-      keeps cameras away, as solids do. But points near clutter are not removed, and samples may have surface inside
-      it. A session computes the clutter from its images.
+    - `clutter`: a solid for other things nearby whose shape is known only roughly. It hides what is behind it and keeps
+      cameras away, but points near it are not removed, and samples may have surface inside it. A session computes it
+      from its images.
 
     **Raises:** `ValueError` if `solids` is not a tuple of solids, or for a negative length.
     """
@@ -77,9 +77,9 @@ class Obstacles(eqx.Module):
         return _distance(self.solids, x)
 
     def barrier(self, camera: Camera, poses: Pose) -> Float[Array, "*batch rays"] | None:
-        """Return the distance along each ray of a camera to the first obstacle, clutter included.
+        """Return the distance (scene units) along each ray to the first obstacle or clutter; else infinity.
 
-        The distance (scene units) is infinite for a ray that meets no obstacle. Returns None if there are no obstacles.
+        Returns None if there are neither obstacles nor clutter.
         """
         if not self._all:
             return None
@@ -99,8 +99,7 @@ class Obstacles(eqx.Module):
     @program
     def within(self, grid: Grid) -> Bool[Array, "g g g"]:
         """Return, for each node of a grid, whether it lies inside a solid."""
-        axis = jnp.asarray(grid.axis, jnp.result_type(float))
-        return on_tensor_grid(lambda x: self.distance(x) < 0, axis)
+        return on_tensor_grid(lambda x: self.distance(x) < 0, grid.axis)
 
     def violation(self, poses: Pose, cloud: PointCloud) -> Float[Array, " poses"]:
         """Return by how much each camera is closer than `clearance` to an obstacle or a point of the cloud.

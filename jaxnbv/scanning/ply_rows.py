@@ -69,8 +69,6 @@ def _element(
     """Return the columns of one element, keyed by property name, and the byte at which the element ends.
 
     - `start`: the byte of the file's body at which the element starts.
-    - `element`: name of the element.
-    - `count`: number of rows.
 
     A column of lists is an array if all lists have the same length, else a list with one array per row.
     """
@@ -113,10 +111,9 @@ def _row(body: bytes, start: int, properties: list[_Property], message: str) -> 
 
 
 def _strip_triangles(strips: Iterable[np.ndarray]) -> Int[np.ndarray, "f 3"]:
-    """Convert triangle strips to triangles.
+    """Convert triangle strips, rows of vertex indices with -1 between strips, to triangles.
 
-    An array of `strips` has the vertex indices of one strip, or of several strips separated by -1. Every second
-    triangle of a strip is reversed, so that all triangles have the same winding.
+    Every second triangle of a strip is reversed, so that all triangles have the same winding.
     """
     faces = [np.zeros((0, 3), np.int64)]
     for strip in strips:

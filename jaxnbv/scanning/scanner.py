@@ -43,7 +43,7 @@ class Hits(eqx.Module):
 class Surface(eqx.Module):
     """Base class of everything that rays can hit.
 
-    `in_jit` is True if `trace` runs under JAX transformations, and False for a surface that is traced by host code.
+    - `in_jit`: whether `trace` runs under JAX transformations, and not by host code.
     """
 
     in_jit: eqx.AbstractClassVar[bool]
@@ -57,15 +57,11 @@ class Surface(eqx.Module):
     def trace(self, origins: Float[AnyArray, "rays 3"], directions: Float[AnyArray, "rays 3"]) -> Hits:
         """Return the first hits of the rays origin + t direction, t >= 0, with unit directions.
 
-        A ray can hit a surface from both sides, so a ray that starts inside a solid hits its boundary from within. The
-        normal then points inward, to the side of the ray's origin.
+        A ray can hit a surface from both sides, so a ray that starts inside a solid hits its boundary from within.
         """
 
     def contains(self, points: Float[AnyArray, "n 3"]) -> Bool[AnyArray, " n"]:
-        """Return, for each point (scene coordinates), whether the surface encloses it.
-
-        The default returns False for all points, which is right for a surface that encloses nothing.
-        """
+        """Return, for each point (scene coordinates), whether the surface encloses it, by default False."""
         return np.zeros(len(points), bool)
 
     @property
@@ -84,15 +80,12 @@ class Surface(eqx.Module):
 
 
 class SensorNoise(eqx.Module):
-    """Independent Gaussian noise on the points and normals of a scan.
+    """Independent Gaussian noise on the points and normals of a scan. The defaults are the authors'.
 
     A point x becomes x + eps with eps ~ N(0, points^2 I). A normal n becomes n + eta with eta ~ N(0, normals^2 I), and
     is then normalised.
 
-    - `points`: standard deviation of each coordinate, in scene units.
-    - `normals`: standard deviation of each component of the unit normals.
-
-    The defaults are those of the paper's authors.
+    - `points`, `normals`: standard deviations of a coordinate, in scene units, and of a component of a unit normal.
     """
 
     points: float = eqx.field(static=True, default=0.01)
@@ -111,8 +104,7 @@ class SensorNoise(eqx.Module):
     ) -> PointCloud:
         """Return the cloud with noise on its filled rows. `camera` is ignored.
 
-        The field `sight` of the cloud would reveal the exact distances to the hits. So if the camera's `pose` is given,
-        `sight` becomes the distance from the pose to the noisy points.
+        With the camera's `pose`, `sight` becomes the distance from the pose to the noisy points instead of the hits.
         """
         point_key, normal_key = jax.random.split(key)
         points = cloud.points + self.points * jax.random.normal(point_key, cloud.points.shape, cloud.points.dtype)
@@ -135,8 +127,7 @@ class DepthNoise(eqx.Module):
 
         1/z' = step round((1/z + deviation eps) / step),   eps ~ N(0, 1).
 
-    `PointCloud.from_depth` then computes points and normals from the noisy image, as for any depth image. `scan` has
-    already removed hits outside the camera's range or beyond its `max_incidence`.
+    `PointCloud.from_depth` then computes points and normals from the noisy image.
 
     - `deviation`, `step`: standard deviation and step of 1/z, in 1 / metre; a step of 0 does not round.
     - `scale`: scene units per metre; `frame.scale` if the world is in metres.
@@ -163,8 +154,7 @@ class DepthNoise(eqx.Module):
     def realsense_d435(cls, scale: float = 1.0) -> "DepthNoise":
         """Return noise of 3.8 mm at 1 m, in steps of 1.5 mm (Intel's papers on tuning and subpixel linearity).
 
-        Disparities have an error of 0.08 pixels and steps of 1/32 pixel. The baseline is 50 mm, and 848 pixels span 90
-        degrees.
+        Disparities have errors of 0.08 and steps of 1/32 pixel. The baseline is 50 mm, and 848 pixels span 90 degrees.
         """
         pixels_times_metres = 848 / 2 / math.tan(math.radians(45.0)) * 0.05
         return cls(0.08 / pixels_times_metres, 1 / 32 / pixels_times_metres, scale)
@@ -182,7 +172,7 @@ class DepthNoise(eqx.Module):
 
     @checked
     def __call__(self, scan: PointCloud, key: PRNGKeyArray, camera: Camera, pose: Pose) -> PointCloud:
-        """Add noise to a scan, which has one row per pixel before and after.
+        """Add noise to a scan.
 
         A pixel becomes invalid if its noisy inverse depth is zero or negative, or if no plane fits its neighbours.
 
@@ -205,10 +195,7 @@ Noise: TypeAlias = SensorNoise | DepthNoise
 
 
 def distance_problem(pose: Pose) -> str | None:
-    """Return a message if a pose is so far from the scene that its unit must be wrong, else None.
-
-    Accepts a pose or a batch of poses, but not under JAX transformations.
-    """
+    """Return a message if a concrete pose, or a batch, is so far away that its unit must be wrong."""
     distance = float(np.linalg.norm(np.asarray(pose.position), axis=-1).max(initial=0.0))
     if distance <= _MAX_CAMERA_DISTANCE:
         return None
@@ -226,14 +213,13 @@ def scan(
 
     A row is missed if its ray hits nothing within the camera's range. A row is invalid if the hit is too near for the
     camera, or if its angle of incidence is too large. Points are in scene coordinates. Normals have unit length and
-    point towards the sensor. Poses with leading axes give clouds with the same leading axes. To add noise, apply a
-    `SensorNoise` or `DepthNoise` to the result.
+    point towards the sensor. A batch of poses gives a batch of clouds. To add noise, apply a `SensorNoise` or
+    `DepthNoise` to the result.
 
     - `barrier`: distance along each ray to the first obstacle (`Obstacles.barrier`). A ray that reaches the obstacle
       before the surface counts as missed.
 
-    Runs under `jit` if `surface.in_jit`. Warns if the scan is empty and the camera is so far away that the unit of its
-    pose must be wrong.
+    Runs under `jit` if `surface.in_jit`. Warns of an empty scan from so far away that the pose's unit must be wrong.
     """
     origins, directions = camera.rays(pose)
     hits = surface.trace(origins.reshape(-1, 3), directions.reshape(-1, 3))
@@ -252,29 +238,22 @@ def _measurable_hits(
     pose: Pose,
     barrier: Float[Array, "*batch rays"] | None,
 ) -> PointCloud:
-    """Return the scan that consists of the hits that the sensor can measure."""
     shape = origins.shape[:-1]
     mask = hits.mask.reshape(shape)
     points, normals = hits.points.reshape(*shape, 3), hits.normals.reshape(*shape, 3)
     if barrier is not None:
         mask = mask & (jnp.linalg.norm(points - origins, axis=-1) < barrier)
         points, normals = (jnp.where(mask[..., None], rows, 0.0) for rows in (points, normals))
-    if not camera.limited:
-        return PointCloud(points, normals, mask, ~mask, _sight(points, origins, mask))
-    depth = jnp.einsum("...rd,...d->...r", points - origins, pose.forward, precision="highest")
-    is_beyond = jnp.zeros_like(mask) if camera.farthest is None else depth > camera.farthest
-    cosine = -jnp.sum(normals * directions, axis=-1)
-    is_measured = mask & ~is_beyond & (depth >= camera.nearest) & (cosine >= math.cos(camera.max_incidence))
-    points, normals = (jnp.where(is_measured[..., None], rows, 0.0) for rows in (points, normals))
-    return PointCloud(points, normals, is_measured, ~mask | is_beyond, _sight(points, origins, is_measured))
-
-
-def _sight(
-    points: Float[Array, "*batch rays 3"],
-    origins: Float[Array, "*batch rays 3"],
-    mask: Bool[Array, "*batch rays"],
-) -> Float[Array, "*batch rays"]:
-    return jnp.where(mask, jnp.linalg.norm(points - origins, axis=-1), jnp.inf)
+    missed = ~mask
+    if camera.limited:
+        depth = jnp.einsum("...rd,...d->...r", points - origins, pose.forward, precision="highest")
+        is_beyond = jnp.zeros_like(mask) if camera.farthest is None else depth > camera.farthest
+        cosine = -jnp.sum(normals * directions, axis=-1)
+        mask = mask & ~is_beyond & (depth >= camera.nearest) & (cosine >= math.cos(camera.max_incidence))
+        missed = missed | is_beyond
+        points, normals = (jnp.where(mask[..., None], rows, 0.0) for rows in (points, normals))
+    sight = jnp.where(mask, jnp.linalg.norm(points - origins, axis=-1), jnp.inf)
+    return PointCloud(points, normals, mask, missed, sight)
 
 
 @eqx.filter_custom_jvp
@@ -284,14 +263,12 @@ def implicit_depth(
     mask: Bool[Array, " n"],
     least_slope: Float[Array, " n"],
 ) -> Float[Array, " n"]:
-    """Return `depth` unchanged, but with derivatives from the implicit function theorem.
+    """Return `depth` unchanged, but with derivatives (of any order) from the implicit function theorem.
 
     A ray meets the surface at a depth t where a function f is zero. f and t depend on parameters theta of the ray and
-    of the surface: f(theta, t(theta)) = 0. So dt = -(df/dtheta dtheta) / (df/dt). This rule can itself be
-    differentiated, so derivatives of higher order are right too.
+    of the surface: f(theta, t(theta)) = 0. So dt = -(df/dtheta dtheta) / (df/dt).
 
-    - `field_along_ray`: a module that returns f at a given depth along each of n rays. Its arrays are the parameters
-      theta.
+    - `field_along_ray`: a module that returns f at a given depth along each ray. Its arrays are the parameters theta.
     - `depth`: depth t of a root of f on each ray, computed by any method.
     - `mask`: whether each ray hits the surface. The derivative is zero for rays that miss.
     - `least_slope`: least slope |df/dt| for each ray. A smaller slope is replaced by this value with the slope's sign,
@@ -311,13 +288,12 @@ def _implicit_depth_jvp(primals, tangents):
 
 
 def pixel_area(scan: PointCloud, camera: Camera, pose: Pose, least_cosine: float) -> Float[Array, " rays"]:
-    """Return the surface area that each pixel shows, in squared scene units.
+    """Return the surface area that each pixel shows, in squared scene units; zero without a point.
 
-    It is zero for pixels without a point. Otherwise the area is r^2 omega / cos = z^3 / (r fx fy cos), with focal
-    lengths fx and fy, depth z, distance r, the pixel's solid angle omega and the cosine of incidence cos.
+    The area is r^2 omega / cos = z^3 / (r fx fy cos), with focal lengths fx and fy, depth z, distance r, the pixel's
+    solid angle omega and the cosine of incidence cos.
 
-    - `scan`: the scan that this camera took from this pose.
-    - `least_cosine`: least cosine of incidence. A smaller cosine is replaced by this value.
+    - `least_cosine`: a smaller cosine of incidence is replaced by this value.
     """
     offset = jnp.where(scan.mask[:, None], scan.points - pose.position, pose.forward)
     depth = jnp.matmul(offset, pose.forward, precision="highest")

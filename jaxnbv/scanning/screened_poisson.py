@@ -22,9 +22,9 @@ def has_poisson() -> bool:
 def screened_poisson(cloud: PointCloud, depth: int = 8) -> TriangleMesh:
     """Reconstruct a surface from an oriented cloud by the screened Poisson method.
 
-    MeshLab computes the surface by the method of Kazhdan and Hoppe (2013). The mesh is in scene coordinates (its frame
-    is the identity), and its faces are wound outward. Every run gives the same mesh. The mesh bridges gaps in the scan.
-    It ends where the surface leaves a cube of 1.1 times the cloud's size, and is open there.
+    MeshLab computes the surface by the method of Kazhdan and Hoppe (2013). The mesh is in scene coordinates, its faces
+    are wound outward, and every run gives the same mesh. It bridges gaps in the scan, and is open where the surface
+    leaves a cube of 1.1 times the cloud's size.
 
     - `depth`: depth of the octree. The smallest details have 1 / 2^depth of the cloud's size, if points are that dense.
 

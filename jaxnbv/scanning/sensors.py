@@ -23,12 +23,9 @@ SENSOR_RADIUS = USUAL_SETTING.radius
 
 
 def fit_distance(setting: Setting, bounding_radius: float) -> Setting:
-    """Return the setting with a distance from which an image shows the whole object, from any side.
+    """Return the setting with a distance from which a square image shows the whole object, from any side.
 
-    The camera must have a square image. With its field of view fov and 5 % of room around the object, the distance is
-    the `radius` in
-
-        sin(fov / 2) = 1.05 bounding_radius / radius
+    With 5 % of room around the object, sin(fov / 2) = 1.05 bounding_radius / radius.
 
     - `bounding_radius`: radius of a ball about the scene's origin that holds the object, in scene units.
     """

@@ -13,8 +13,7 @@ from jaxnbv.programs import program
 from jaxnbv.scanning.scanner import Hits, Surface, implicit_depth
 from jaxnbv.scanning.sdf import SignedDistance
 
-# The shortest stride, in scene units, is far above the rounding of float32 distances in the scene (4e-7) and far below
-# the size of relevant detail.
+# Far above the rounding of float32 distances in the scene (4e-7) and far below the size of relevant detail.
 _SHORTEST_STRIDE = 1e-3
 _MAX_STRIDES = 512
 # Once at most this fraction of the rays is unfinished, the unfinished rays continue in a smaller batch.
@@ -35,8 +34,8 @@ class SDFSurface(Surface):
       holds the whole scene, [-pi/2, pi/2]^3.
 
     A ray advances by |sdf|, but by at least 0.001, until the sign changes. The root is then located within the last
-    stride. A ray may miss a part that is thinner than 0.001 along the ray. A ray at an angle of less than a degree to a
-    flat face may use up its 512 strides and miss the face.
+    stride. A ray may miss a part that is thinner than 0.001, or a flat face at an angle of less than a degree, to which
+    it may take more than the 512 strides.
 
     Hits are differentiable in the rays and in the solid's parameters, see `implicit_depth`. For grazing rays, the
     derivative is bounded: it uses a slope of at least 0.05.
@@ -84,8 +83,6 @@ class SDFSurface(Surface):
 
 
 class _DistanceAlongRay(eqx.Module):
-    """The signed distance of a solid as a function of depth along rays."""
-
     sdf: SignedDistance
     origins: Float[Array, "n 3"]
     directions: Float[Array, "n 3"]
@@ -97,7 +94,7 @@ class _DistanceAlongRay(eqx.Module):
         return self.sdf(self.points(depth))
 
     def newton(self, depth: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Return depths after one Newton step towards the root, exact to rounding except for grazing rays."""
+        """Return depths after one Newton step, exact to rounding except for grazing rays."""
         value, slope = jax.jvp(self, (depth,), (jnp.ones_like(depth),))
         return depth - value / (jnp.where(slope < 0, -1.0, 1.0) * jnp.maximum(jnp.abs(slope), _MIN_SLOPE))
 
@@ -105,10 +102,7 @@ class _DistanceAlongRay(eqx.Module):
 def _first_root(
     sdf: SignedDistance, origins: Float[Array, "n 3"], directions: Float[Array, "n 3"], radius: float
 ) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
-    """Return the depth at which each ray first crosses the solid's boundary, and whether it does.
-
-    At the crossing, the sign of the distance changes. Only the ball of `radius` about the scene's origin is searched.
-    """
+    """Return the depth of each ray's first crossing in a ball of this radius, and whether there is one."""
     middle = -jnp.sum(origins * directions, axis=-1)
     squared = middle**2 - jnp.sum(origins**2, axis=-1) + radius**2
     half_chord = jnp.sqrt(jnp.maximum(squared, 0.0))
@@ -136,8 +130,7 @@ class _March(eqx.Module):
 
     - `start_sign`: sign of the signed distance at the start of each ray.
     - `max_depth`: depth at which the ray leaves the ball in which surfaces are searched.
-    - `depth`, `value`: current depth, and the signed distance at this depth.
-    - `previous_depth`, `previous_value`: depth one stride earlier, and the signed distance at that depth.
+    - `depth`, `value`: current depth, and the signed distance there. `previous_...`: those one stride earlier.
     - `is_unfinished`: whether the ray has neither crossed the boundary nor left the ball.
     """
 
@@ -153,10 +146,7 @@ class _March(eqx.Module):
 
 
 def _advance(sdf: SignedDistance, march: _March, count, max_unfinished: int):
-    """Advance the rays until at most `max_unfinished` are unfinished or `_MAX_STRIDES` strides are used up.
-
-    Returns the rays and the total number of strides, which starts at `count`.
-    """
+    """Advance the rays until at most `max_unfinished` are left or `count` has grown to `_MAX_STRIDES`."""
     distance = _DistanceAlongRay(sdf, march.origins, march.directions)
 
     def body(carry):
@@ -175,10 +165,7 @@ def _advance(sdf: SignedDistance, march: _March, count, max_unfinished: int):
 
 
 def _refine(sdf: SignedDistance, march: _March) -> Float[Array, " n"]:
-    """Return the depth of the root within each ray's last stride, by regula falsi.
-
-    The interval is short, so a few chords are enough to reach the rounding error.
-    """
+    """Return the depth of the root within each ray's last stride, by regula falsi, exact to rounding."""
     distance = _DistanceAlongRay(sdf, march.origins, march.directions)
 
     def chord(_, bracket):

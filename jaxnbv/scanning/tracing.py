@@ -35,10 +35,10 @@ Triple = list[Float[Array, " n"]]
 class March(NamedTuple):
     """State of a march along rays entry + t direction.
 
-    - `entry`, `direction`: point at which each ray enters the grid's box, and its direction.
+    - `entry`: point at which each ray enters the grid's box.
     - `t`: the ray's current position.
-    - `t_end`: t at which the ray leaves the box. Once the ray has reached a cell with a zero, `t_end` is the t at which
-      it leaves this cell. So if t < t_end after the march, there is a zero between t and t_end.
+    - `t_end`: t at which the ray leaves the box or, once it has reached a cell with a zero, this cell. So if t < t_end
+      after the march, there is a zero between t and t_end.
     - `sign`: sign of f at the start; zero until it has been computed.
     - `is_unfinished`: whether the ray has neither reached the cell of its first zero nor left the box.
     """
@@ -68,8 +68,8 @@ class GridField(eqx.Module):
         """Distance, in cells along every axis, by which a position moves forward before its cell is computed.
 
         The offset exceeds the rounding of coordinates, so a ray on the border of two cells is always assigned to the
-        cell that it enters, and the march cannot stall. A ray skips at most a sliver of this width. A zero in the
-        sliver is still detected, because the sign in the next cell then differs from the sign at the start.
+        cell that it enters, and the march cannot stall. A zero in the skipped sliver is still detected, because the
+        sign in the next cell then differs from the sign at the start.
         """
         return 16 * float(jnp.finfo(self.values.dtype).eps) * self.resolution
 
@@ -78,10 +78,7 @@ def free_distance(values: Float[Array, "g g g"]) -> Int8[Array, "m m m"]:
     """Return the signed distance, in cells, from each cell of a grid to the nearest change of sign of f.
 
     The distance is 0 for a cell whose own corners differ in sign. Otherwise it has the sign of f in the cell, and its
-    magnitude is a lower bound on the Chebyshev distance to the nearest cell with a change of sign. The magnitude is 1,
-    2, 3, 5, 9 or 17. The value zero counts as negative.
-
-    - `values`: f at the g^3 nodes. There are m^3 = (g - 1)^3 cells.
+    magnitude (1, 2, 3, 5, 9 or 17) is a lower bound on the Chebyshev distance to the nearest change of sign.
     """
     maximum = functools.partial(
         jax.lax.reduce_window, init_value=jnp.int8(-1), computation=jax.lax.max, window_strides=(1, 1, 1)
@@ -116,7 +113,8 @@ class _InCell(eqx.Module):
     @property
     def least_slope(self) -> Float[Array, " n"]:
         corners = corner_values(self.cell, self.field)
-        return _MIN_SLOPE_RATIO * (_largest(corners) - _smallest(corners)) * jnp.sqrt(sum(d * d for d in self.du))
+        spread = functools.reduce(jnp.maximum, corners) - functools.reduce(jnp.minimum, corners)
+        return _MIN_SLOPE_RATIO * spread * jnp.sqrt(sum(d * d for d in self.du))
 
 
 def first_zero(field: GridField, u: Triple, du: Triple) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
@@ -125,8 +123,6 @@ def first_zero(field: GridField, u: Triple, du: Triple) -> tuple[Float[Array, " 
     A ray starts at its origin u or, if u is outside the grid's box, where it enters the box. t is differentiable in the
     values of the field and in the rays. If a ray grazes the surface, its derivative uses a larger slope of f, see
     `implicit_depth`. If there is no zero, t and its derivatives are zero.
-
-    - `u`, `du`: origins and directions of the rays in grid coordinates.
     """
     t, mask, cell = _traced_zero(*jax.lax.stop_gradient((field, u, du)))
     field_along_ray = _InCell(field, u, du, cell)
@@ -151,13 +147,7 @@ _traced_zero = jax.custom_batching.custom_vmap(_first_zero)
 
 @_traced_zero.def_vmap
 def _traced_zero_batched(size: int, batched, field: GridField, u: list[Array], du: list[Array]):
-    """Rule for `vmap` of `_traced_zero`.
-
-    If all entries share one field, their rays are traced as one batch, which is faster. Otherwise `_first_zero` is
-    mapped over the entries as usual.
-
-    - `size`, `batched`: number of entries, and a tree of bools that says which arguments have an axis of entries.
-    """
+    """Rule for `vmap` of `_traced_zero`: trace all rays as one batch if they share one field."""
     u, du = jax.tree.map(
         lambda x, is_batched: x if is_batched else jnp.broadcast_to(x, (size, *x.shape)), (u, du), tuple(batched[1:])
     )
@@ -198,10 +188,7 @@ def smooth_gradient(field: GridField, x: Triple) -> Triple:
 
 
 def enter(u: Triple, du: Triple, field: GridField) -> tuple[March, Float[Array, " n"]]:
-    """Return a march from where the rays u + t du enter the grid's box, and the t of these points.
-
-    The march's own `t` is zero at these points.
-    """
+    """Return a march whose `t` is 0 where the rays u + t du enter the grid's box, and the rays. t there."""
     # The box is smaller than the grid by a sliver, so that no position lies outside the grid after it is rounded and
     # moved forward.
     low, high = 2 * field.offset, field.resolution - 1 - 2 * field.offset
@@ -227,7 +214,10 @@ def march(rays: March, field: GridField) -> March:
     index = jnp.nonzero(rays.is_unfinished, size=remainder, fill_value=count)[0]
     rest = jax.tree.map(lambda leaf: jnp.take(leaf, index, mode="clip"), rays)
     rest = march(rest._replace(is_unfinished=index < count), field)
-    merge = functools.partial(_put, index)
+
+    def merge(array: Array, part: Array) -> Array:
+        return array.at[index].set(part, mode="drop", unique_indices=True)
+
     return rays._replace(t=merge(rays.t, rest.t), t_end=merge(rays.t_end, rest.t_end), sign=merge(rays.sign, rest.sign))
 
 
@@ -252,10 +242,7 @@ def _stride(rays: March, field: GridField) -> March:
 
 
 def _search_cell(rays: March, field: GridField) -> March:
-    """Search the current cell of each ray for a zero.
-
-    A ray in a cell with a change of sign stops if the cell holds its first zero. Otherwise it leaves the cell.
-    """
+    """Stop each ray whose cell holds its first zero. Others leave their cell if it has a change of sign."""
     local, cell = cell_at(rays, field)
     distance = _take(field.cell_distance, _flat(cell, field.resolution - 1))
     has_sign_change = rays.is_unfinished & (distance * rays.sign <= 0)
@@ -275,10 +262,7 @@ def _search_cell(rays: March, field: GridField) -> March:
 
 
 def cell_at(rays: March, field: GridField) -> tuple[Triple, list[Int[Array, " n"]]]:
-    """Return each ray's position within its cell, in [0, 1], and the index of this cell.
-
-    A ray on the border of two cells is assigned to the cell that it is about to enter.
-    """
+    """Return each ray's position, in [0, 1], within its cell or the one that it enters, and this cell."""
     position = [x + rays.t * d for x, d in zip(rays.entry, rays.direction, strict=True)]
     cell = [
         jnp.floor(x + jnp.where(d > 0, field.offset, -field.offset)).astype(jnp.int32)
@@ -290,7 +274,8 @@ def cell_at(rays: March, field: GridField) -> tuple[Triple, list[Int[Array, " n"
 def _t_leave(rays: March, cell: list[Int[Array, " n"]], cells) -> Float[Array, " n"]:
     """Return the t at which each ray leaves the cube of cells that are within `cells` cells of its own."""
     sides = [c + jnp.where(d > 0, cells + 1, -cells) for c, d in zip(cell, rays.direction, strict=True)]
-    return _smallest([(side - x) / d for side, x, d in zip(sides, rays.entry, rays.direction, strict=True)])
+    ends = [(side - x) / d for side, x, d in zip(sides, rays.entry, rays.direction, strict=True)]
+    return functools.reduce(jnp.minimum, ends)
 
 
 def _flat(index: list[Int[Array, " n"]], side: int) -> Int[Array, " n"]:
@@ -305,15 +290,3 @@ def corner_values(cell: list[Int[Array, " n"]], field: GridField) -> list[Float[
 
 def _take(array: Array, index: Int[Array, " n"]) -> Array:
     return array.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
-
-
-def _put(index: Int[Array, " m"], array: Array, part: Array) -> Array:
-    return array.at[index].set(part, mode="drop", unique_indices=True)
-
-
-def _smallest(arrays: list[Float[Array, " n"]]) -> Float[Array, " n"]:
-    return functools.reduce(jnp.minimum, arrays)
-
-
-def _largest(arrays: list[Float[Array, " n"]]) -> Float[Array, " n"]:
-    return functools.reduce(jnp.maximum, arrays)

@@ -27,8 +27,6 @@ FirstFaces: TypeAlias = Callable[
 def first_faces(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> FirstFaces:
     """Return a function that finds the first triangle on each ray, and its distance, see `FirstFaces`.
 
-    - `vertices`, `faces`: the triangles, in scene coordinates.
-
     **Raises:** `ValueError` if neither Embree nor libigl is installed.
     """
     return (_by_embree if tracer() == "embreex" else _by_libigl)(vertices, faces)

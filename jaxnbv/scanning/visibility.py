@@ -22,7 +22,7 @@ _POSES = 32
 class SurfacePoints(NamedTuple):
     """Points of a surface with their normals and areas, in scene units.
 
-    - `points`, `normals`: positions, and unit normals that point outward.
+    - `normals`: unit normals that point outward.
     - `areas`: area of the surface that each point represents, in squared scene units; zero if the surface is empty.
     """
 
@@ -38,7 +38,7 @@ def spread_points(surface: GridSurface, count: int) -> SurfacePoints:
     A plane with unit normal n crosses |n_x| + |n_y| + |n_z| edges per squared grid spacing of its area. So each crossed
     edge represents an area of 1 / (|n_x| + |n_y| + |n_z|) squared spacings (Cauchy-Crofton formula).
 
-    - `count`: number of points. Points repeat if the surface crosses fewer edges.
+    Points repeat if the surface crosses fewer than `count` edges.
     """
     values, grid = surface.values, surface.grid
     is_inside = values <= 0
@@ -80,8 +80,7 @@ def is_visible(
 
     A camera sees a point if the point lies in its image and range, is not at a grazing angle, and nothing hides it.
 
-    - `tolerance`: the surface hides a point if the ray to the point hits the surface more than this length before the
-      point, in scene units.
+    - `tolerance`: the surface hides a point if it is hit more than this length before the point, in scene units.
     - `barrier`: distance along each ray of the camera to an obstacle, see `Obstacles.barrier`.
     """
 

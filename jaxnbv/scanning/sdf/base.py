@@ -1,10 +1,9 @@
 """The base class of solids, rigid motions, scaling, and set operations (constructive solid geometry).
 
 A solid is defined by a signed distance function, which is negative inside. All functions here have slopes of at most
-one, so their magnitude never exceeds the distance to the surface, and a ray may advance by this magnitude (Hart 1996).
-A class is *exact* if the magnitude equals the distance to the surface, and a *lower bound* if the magnitude may be
-smaller. The docstring of each class says which holds, provided that the solids it combines are exact. Parameters are
-arrays, so `jax.vmap` can build a batch of solids that one compiled program scans.
+one, so their magnitude never exceeds the distance to the surface, and a ray may advance by it (Hart 1996). A class is
+*exact* if the magnitude equals this distance, and a *lower bound* if it may be smaller, provided that the solids that
+it combines are exact. Parameters are arrays, so `jax.vmap` can build a batch of solids that one compiled program scans.
 """
 
 import functools
@@ -66,8 +65,8 @@ def greatest(a, b):
 def least_of_last(values):
     """Return the minimum along the last axis. Its derivative is that of the first least entry.
 
-    The derivative here finds this entry by its index. The derivative of `jnp.min` would compare the values with their
-    minimum. If both are compiled separately, they can differ in the last bit, and that derivative is then 0 / 0.
+    The derivative of `jnp.min` would compare the values with their minimum, which can differ in the last bit if both
+    are compiled separately. The derivative is then 0 / 0.
     """
     return jnp.min(values, axis=-1)
 
@@ -80,10 +79,7 @@ def _least_of_last_jvp(values, tangents):
 
 
 def corner_distance(*q):
-    """Return the signed distance to a corner, the solid where all q <= 0.
-
-    - `q`: signed distances to planes that are orthogonal to each other.
-    """
+    """Return the signed distance to a corner, where the distances q to orthogonal planes are all negative."""
     outside = safe_norm(*(greatest(c, 0.0) for c in q))
     return outside + least(functools.reduce(greatest, q), 0.0)
 
@@ -182,8 +178,7 @@ class Union(SignedDistance):
 class SmoothUnion(SignedDistance):
     """The union of two solids with a fillet where their distances a and b differ by less than `width`.
 
-    The distance is min(a, b) - h^2 / (4 width), with h = max(width - |a - b|, 0). It is a lower bound. Its gradient is
-    a weighted mean of the gradients of a and b.
+    The distance is min(a, b) - h^2 / (4 width), with h = max(width - |a - b|, 0), a lower bound.
     """
 
     first: SignedDistance

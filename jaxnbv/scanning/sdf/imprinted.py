@@ -40,10 +40,7 @@ class ImprintedPyramid(SignedDistance):
         return self.scale * jnp.maximum(jnp.maximum(sides, -w), -self._imprint(u, v, w))
 
     def imprint(self, x: Float[AnyArray, "*n 3"]) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
-        """Return the signed distance to the prism pressed into the base, and the height above the base.
-
-        Both are given for each point x, in scene units.
-        """
+        """Return the signed distance to the prism pressed into the base, and the height above the base."""
         u, v, w = self._local(x)
         return self.scale * self._imprint(u, v, w), self.scale * w
 
@@ -54,10 +51,7 @@ class ImprintedPyramid(SignedDistance):
         return local[..., 0], local[..., 1], local[..., 2]
 
     def _imprint(self, u, v, w):
-        """Return the signed distance to the prism that is pressed into the base, in the pyramid's frame.
-
-        The prism ends at `depth` above the base and extends without end below the base.
-        """
+        """Return the signed distance to the prism, endless below the base, in the pyramid's frame."""
         c, s = jnp.cos(self.turn) / self.size, jnp.sin(self.turn) / self.size
         u, v = u - self.place[0], v - self.place[1]
         flat = self.size * pattern_distance(self.pattern, c * u + s * v, c * v - s * u)
@@ -65,12 +59,9 @@ class ImprintedPyramid(SignedDistance):
 
 
 def pattern_distance(pattern: Int[Array, ""], x: Float[Array, "*n"], y: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Return the signed distance (negative inside) from points (x, y) to a pattern in the unit circle.
+    """Return the signed distance, a lower bound, from points (x, y) to a pattern in the unit circle.
 
-    The distance is a lower bound: its magnitude may be smaller than the distance to the pattern's edge.
-
-    - `pattern`: index in `PATTERNS`. All five patterns are evaluated, so that scenes of all classes share one compiled
-      program.
+    - `pattern`: index in `PATTERNS`. All patterns are evaluated, so that scenes of all classes share one program.
     """
     shapes: tuple[Callable[..., Float[Array, "*n"]], ...] = (_cross, _ring, _star, _triangle, _square)
     return jnp.select([pattern == index for index in range(len(PATTERNS))], [shape(x, y) for shape in shapes])
@@ -86,14 +77,11 @@ def _ring(x, y, middle=0.74, half_width=0.24):
 
 
 def _star(x, y, inner=0.48):
-    """Return the signed distance to a star with five tips at radius 1 and notches at radius `inner`.
-
-    The star consists of ten congruent wedges between a tip and a notch. The point is mirrored into one of the wedges.
-    """
+    """Return the signed distance to a star with five tips at radius 1 and notches at radius `inner`."""
     x = jnp.abs(x)
     half_turn = math.pi / 5
-    # Two mirrors, at angles of 3 and 1 times pi / 5 from the tip on the y axis, map all directions to the wedge beside
-    # this tip.
+    # The star has ten congruent wedges between a tip and a notch. Two mirrors, at angles of 3 and 1 times pi / 5 from
+    # the tip on the y axis, map all directions to the wedge beside this tip.
     for angle in (3 * half_turn, half_turn):
         c, s = math.cos(angle), math.sin(angle)
         beyond = jnp.maximum(x * c - y * s, 0.0)

@@ -23,11 +23,9 @@ class LabelledSolid(SignedDistance):
     distance from the axis u2. The result is divided by (|slant| + sqrt(slant^2 + 4)) / 2, the largest singular value of
     this shear.
 
-    - `labels`: label of each primitive; -1 for a slot that is not used.
-    - `revolved`: whether each primitive is a solid of revolution.
+    - `labels`, `revolved`: label of each primitive (-1 for an unused slot), and whether it is a solid of revolution.
     - `centre`, `rotation`, `half_size`, `rounding`: the quantities of the formula, in scene units. For a solid of
-      revolution, the first half size is the half width of the profile. The second and third must both be its half
-      height.
+      revolution, the half sizes are the half width, half height and again half height of the profile.
     - `radius`, `slant`: for a solid of revolution, the radius of the ring (0 for a full solid) and the growth of the
       radius with height.
     """

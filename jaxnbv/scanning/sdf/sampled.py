@@ -21,7 +21,6 @@ class Sampled(SignedDistance):
 
     The distance is accurate to about a cell inside the grid, and a lower bound outside the grid.
 
-    - `values`: signed distance at each node.
     - `low`, `spacing`: position of the first node, and the distance between neighbouring nodes.
     - `padding`: width of the empty space between the solid and the sides of the grid.
     """
@@ -144,7 +143,6 @@ def winding_number(
 ) -> Float[np.ndarray, " n"]:
     """Return the winding number of the triangles around each point (Barill et al. 2018).
 
-    The winding number is 0 outside a closed mesh. It is 1 inside the mesh, or -1 if the mesh is wound inside out. Near
-    a hole it lies between these values.
+    It is 0 outside a closed mesh, 1 inside (-1 if wound inside out), and in between near a hole.
     """
     return np.asarray(optional("igl").fast_winding_number(vertices, faces, points))

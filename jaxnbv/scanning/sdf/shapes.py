@@ -50,10 +50,7 @@ class Cuboid(SignedDistance):
 
 
 class Cylinder(SignedDistance):
-    """The solid cylinder about the y axis. The distance is exact.
-
-    - `half_height`: the flat caps are at y = -half_height and y = half_height.
-    """
+    """The solid cylinder about the y axis, with flat caps at |y| = half_height. The distance is exact."""
 
     radius: Scalar = nonnegative()
     half_height: Scalar = nonnegative()
@@ -64,10 +61,9 @@ class Cylinder(SignedDistance):
 
 
 class Cone(SignedDistance):
-    """The solid truncated cone about the y axis. The distance is exact.
+    """The solid truncated cone about the y axis, with caps at |y| = half_height. The distance is exact.
 
     - `bottom_radius`, `top_radius`: radii of the lower and the upper cap; zero gives a tip.
-    - `half_height`: the flat caps are at y = -half_height and y = half_height.
     """
 
     bottom_radius: Scalar = nonnegative()
@@ -92,10 +88,7 @@ class Cone(SignedDistance):
 
 
 class Torus(SignedDistance):
-    """The torus about the y axis: a tube of `minor_radius` around a circle of `major_radius`.
-
-    The distance is exact.
-    """
+    """The torus about the y axis with a circle of `major_radius` in its tube. The distance is exact."""
 
     major_radius: Scalar = nonnegative()
     minor_radius: Scalar = nonnegative()
