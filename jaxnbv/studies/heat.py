@@ -1,7 +1,6 @@
 """Study of heat: how near the coldest point of the scanned cloud is to the object's coldest points."""
 
-import functools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -33,16 +32,15 @@ from jaxnbv.tasks import ColdestPoint, Coverage, body_temperature
 from jaxnbv.tasks.diffusion import HeatProblem
 from jaxnbv.viz.render import Still
 
-# Methods whose acquisition values the coldest point. All other methods ignore heat.
+# Methods whose acquisition values the coldest point.
 HEAT_METHODS = ("heat", "heat-reached", "heat-halving")
 _OTHERS = ("coverage", *BASELINES)
-# Names of the two estimates of the coldest point, and the points of the cloud from which each takes the coldest.
+# The two estimates of the coldest point, and the points of the cloud from which each takes the coldest.
 ESTIMATES = {"all": "of all points", "reached": "of the warmed points"}
 # Points count as coldest if their temperature exceeds the lowest by at most this fraction of the range from the lowest
 # to the highest. Several points must count, because objects have symmetries and a mug's inner floor is equally cold.
 _MAX_RELATIVE_EXCESS = 0.01
-# Matplotlib's inferno without its palest colours, which would not stand out against grey, the colour of unscanned
-# surface.
+# Matplotlib's inferno without its palest colours, which would not stand out against the grey of unscanned surface.
 _HEAT = LinearSegmentedColormap.from_list("heat", mpl.colormaps["inferno"](np.linspace(0.0, 0.9, 256)))
 _MARKS: dict[str, dict[str, Any]] = {
     "heat source": {"marker": "X", "color": "#d55e00", "ms": 6.0, "mec": "white"},
@@ -52,12 +50,7 @@ _MARKS: dict[str, dict[str, Any]] = {
 
 
 class Truth(NamedTuple):
-    """The temperature of the true object.
-
-    - `mesh`: the surface of the object.
-    - `points`: points on the surface, 1/40 of a scene unit apart.
-    - `temperatures`: temperatures of the points, in degrees.
-    """
+    """The temperature of the true object, in degrees, at points of its surface that are 1/40 of a scene unit apart."""
 
     mesh: TriangleMesh
     points: Float[np.ndarray, "n 3"]
@@ -65,12 +58,12 @@ class Truth(NamedTuple):
 
     @property
     def coldest(self) -> Float[np.ndarray, "3"]:
-        """The coldest of `points`."""
+        """The coldest point."""
         return self.points[np.argmin(self.temperatures)]
 
     @property
     def region(self) -> Float[np.ndarray, "m 3"]:
-        """All points whose temperature exceeds the lowest by at most 1 % of the temperature range."""
+        """All points that count as coldest."""
         low, high = self.temperatures.min(), self.temperatures.max()
         return self.points[self.temperatures <= low + _MAX_RELATIVE_EXCESS * (high - low)]
 
@@ -78,42 +71,35 @@ class Truth(NamedTuple):
 def _saturation(record: Record, method: str) -> dict[int, float]:
     """Return, for each view after the first, 1.0 if the chosen view has value zero, else 0.0.
 
-    A search chooses the highest value, so all candidates then have value zero. The result of a method that is not in
-    `HEAT_METHODS` is {}.
+    A search chooses the highest value, so all candidates then have value zero. Methods that are not in `HEAT_METHODS`
+    give {}.
     """
     steps = record["methods"][method]["steps"] if method in HEAT_METHODS else []
     return {view: float(step["value"] == 0.0) for view, step in enumerate(steps, start=2)}
 
 
 def _measures(estimate: str) -> tuple[Measure, ...]:
-    def measure(name: str, title: str, compute: Callable, unit: str) -> Measure:
-        return Measure(
-            f"{name}, {estimate}", f"{title}: {ESTIMATES[estimate]}", compute, unit=unit, lower_is_better=True
-        )
+    def distances(record: Record, method: str) -> list[float]:
+        return record["methods"][method]["estimates"][estimate]["distances"]
 
-    def estimate_values(quantity: str, record: Record, method: str) -> list[float]:
-        return record["methods"][method]["estimates"][estimate][quantity]
+    def errors(record: Record, method: str) -> Float[np.ndarray, " views"]:
+        temperatures = record["methods"][method]["estimates"][estimate]["temperatures"]
+        return np.abs(np.array(temperatures) - record["truth"]["temperature"])
 
-    def error(record: Record, method: str) -> Float[np.ndarray, " views"]:
-        return np.abs(np.array(estimate_values("temperatures", record, method)) - record["truth"]["temperature"])
-
-    return (
-        measure(
-            "distance", "Distance to the coldest points", functools.partial(estimate_values, "distances"), "scene units"
-        ),
-        measure("error", "Error of the lowest temperature", error, "degrees"),
-    )
+    title = f"Distance to the coldest points: {ESTIMATES[estimate]}"
+    distance = Measure(f"distance, {estimate}", title, distances, unit="scene units", lower_is_better=True)
+    title = f"Error of the lowest temperature: {ESTIMATES[estimate]}"
+    return distance, Measure(f"error, {estimate}", title, errors, unit="degrees", lower_is_better=True)
 
 
 class HeatStudy(Study):
     """Measures how near the coldest point of the cloud is to the object's coldest points.
 
-    Meshes are heated at a random point. Procedural objects and their heat sources come from `heat_scene`.
+    Meshes are heated at a random point. Procedural objects and their heat sources come from `heat_scene`. The study has
+    the settings of `Study`, and:
 
-    It has the settings of `Study`, and:
-
-    - `num_points`: number of points to which the cloud is thinned before an imagined scan is added. The temperature is
-      then simulated on both together.
+    - `num_points`: number of points to which the cloud is thinned before an imagined scan is added and the temperature
+      is simulated on both together.
     - `imagined_rays`: rays along each side of an imagined scan. True scans have 50 x 50 rays.
     - `true_grid`: grid on which a procedural object is meshed. The default resolves the thinnest rods (radius 0.04).
     """
@@ -164,7 +150,7 @@ class HeatStudy(Study):
         return Camera(height=self.imagined_rays, width=self.imagined_rays)
 
     def scene(self, index: int) -> Scene:
-        """Return a scene with an object. The task of the scene is the point where the object is heated."""
+        """Return the scene of an object. Its `task` is the point where the object is heated."""
         file = self.mesh_file(index)
         if file is None:
             scene = heat_scene(index)
@@ -188,16 +174,15 @@ class HeatStudy(Study):
         return bool((np.linalg.norm(points - np.asarray(scene.task), axis=1) <= HeatProblem.radius).any())
 
     def truth(self, scene: Scene) -> Truth:
-        """Compute the temperature of the true surface.
+        """Return the temperature of the true surface.
 
         **Raises:** `ValueError` if the surface is neither a mesh nor a signed distance.
         """
         surface = scene.surface
         mesh = mesh_from_sdf(surface.sdf, self.true_grid) if isinstance(surface, SDFSurface) else surface
         if not isinstance(mesh, TriangleMesh):
-            raise InputError(
-                f"the temperature of a {type(mesh).__name__} cannot be computed: give a mesh or a signed distance"
-            )
+            problem = f"the temperature of a {type(mesh).__name__} cannot be computed"
+            raise InputError(f"{problem}: give a mesh or a signed distance")
         points, temperature = body_temperature(mesh, heat_problem(scene))
         return Truth(mesh, points, temperature.values)
 
@@ -226,17 +211,12 @@ class HeatStudy(Study):
         return {"reached": fractions, "estimates": estimates}
 
     def scene_picture(self, record: Record, methods: Sequence[str], pixels: int) -> ScenePicture:
-        """Return images of the cloud's visible points, coloured by temperature, over the object in grey.
-
-        Markers show the object's coldest point and the coldest point of the cloud.
-        """
+        """Return images of the cloud's visible points, coloured by temperature, over the object in grey."""
         scene, runs = self.scene(record["scene"]), record["methods"]
         truth, heat = self.truth(scene), heat_problem(scene)
         rendering = render_mesh(truth.mesh, opposite_direction(record), pixels)
         colours = ScalarMappable(Normalize(0.0, float(truth.temperatures.max())), _HEAT)
-        clouds = {
-            method: [observations.cloud for _, observations in replay(self, scene, runs[method])] for method in methods
-        }
+        replays = {method: replay(self, scene, runs[method]) for method in methods}
 
         def draw_truth(axes: Axes) -> None:
             draw_on(axes, rendering, truth.points, colours.to_rgba(truth.temperatures))
@@ -244,7 +224,8 @@ class HeatStudy(Study):
             _mark(axes, rendering, truth.coldest, "coldest point of the object")
 
         def tile(axes: Axes, method: str, view: int) -> None:
-            points, temperature = body_temperature(clouds[method][view], heat)
+            _, observations = replays[method][view]
+            points, temperature = body_temperature(observations.cloud, heat)
             draw_on(axes, rendering, points, colours.to_rgba(temperature.values))
             estimate = runs[method]["estimates"]["all"]
             _mark(axes, rendering, truth.coldest, "coldest point of the object")

@@ -1,4 +1,4 @@
-"""Study of identification, which asks which known part the object is and in which pose it lies."""
+"""Study of identification: which known part is the object, and in which pose does it lie?"""
 
 import dataclasses
 import math
@@ -50,7 +50,7 @@ _MIN_ELEVATION = math.radians(10.0)
 _MIN_SHOWN_FRACTION = 0.01
 # Rows and columns of rays of an imagined scan.
 _RAYS = (28, 28)
-# Distances are measured from _POINTS points on the true surface to _DENSE points on the surface of the placed part.
+# Numbers of points on the surfaces of the true part and of the placed part, between which distances are measured.
 _NUM_POINTS, _NUM_DENSE_POINTS = 500, 20_000
 # A pose is right if its error is below this fraction of the part's size.
 _MAX_POSE_ERROR = 0.01
@@ -72,14 +72,12 @@ def _below(fraction: float) -> Any:
 class IdentificationStudy(Study):
     """Measures how well a method's views tell which known part the object is, and in which pose it lies.
 
-    It has the settings of `Study`, and:
+    All methods use the same bank and compute the weights of hypotheses in the same way. They differ only in the views
+    that they choose. The study has the settings of `Study`, and:
 
     - `setup`: where the part lies, and how much of the part a view shows.
     - `meshes`: mesh files of the parts at true size. Without mesh files, the study uses sets of eight parts that look
       alike.
-
-    All methods use the same bank and compute the weights of hypotheses in the same way. They differ only in the views
-    that they choose.
     """
 
     title: ClassVar[str] = "Which part it is, and how it lies"
@@ -136,9 +134,7 @@ class IdentificationStudy(Study):
         setup: Setup | None = None,
         **options: Any,
     ) -> dict[str, Study]:
-        """Return one study for `setup`, or one study for each setup if `setup` is None.
-
-        The keys of the result are the names of the setups.
+        """Return one study for `setup`, or for each setup if it is None, by the names of the setups.
 
         - `parts`: folder of meshes at true size; default: the shipped sets of parts that look alike.
 
@@ -154,7 +150,7 @@ class IdentificationStudy(Study):
 
     @property
     def num_scenes(self) -> int | None:
-        """None, because the number of scenes is unlimited: parts come again in new poses."""
+        """None (unlimited), because parts come again in new poses."""
         return None
 
     @property
@@ -167,7 +163,7 @@ class IdentificationStudy(Study):
         return self.camera.resized(*_RAYS)
 
     def scene(self, index: int) -> Scene:
-        """Return a scene with a part in a random pose. The task of the scene is its `PlacedPart`.
+        """Return the scene of a part in a random pose. Its `task` is the `PlacedPart`.
 
         **Raises:** `ValueError` if the index is negative.
         """
@@ -212,12 +208,8 @@ class IdentificationStudy(Study):
     def truth(self, scene: Scene) -> _Truth:
         """Return the placed part, points on its surface, and its diameter (scene units)."""
         mesh = scene.task.mesh
-        corners = mesh.to_trimesh().convex_hull.vertices
-        return (
-            scene.task,
-            mesh.sample_points(self.key(scene.index, "measure"), _NUM_POINTS),
-            float(pdist(corners).max()),
-        )
+        points = mesh.sample_points(self.key(scene.index, "measure"), _NUM_POINTS)
+        return scene.task, points, float(pdist(mesh.to_trimesh().convex_hull.vertices).max())
 
     def scene_record(self, scene: Scene, truth: _Truth, first: int) -> Record:
         set_name = "" if self.meshes else scene.name.rpartition(" ")[0]
@@ -225,11 +217,11 @@ class IdentificationStudy(Study):
 
     @classmethod
     def group(cls, record: Record) -> str:
-        """Return the name of the scene's set of look-alike parts, or "" for parts from mesh files."""
+        """Return the name of the scene's set of look-alike parts; "" for parts from mesh files."""
         return record["set"]
 
     def follow(self, scene: Scene, truth: _Truth, planner: Planner, episode: Iterator[Step]) -> Record:
-        """Record the most likely name, the true name's probability, and the error of the pose after each view."""
+        """Record, after each view, the most likely name, the true name's probability, and the error of the pose."""
         views = [self._view_record(truth, step.observations.hypotheses) for step in episode]
         return {name: [view[name] for view in views] for name in views[0]}
 
@@ -256,20 +248,15 @@ class IdentificationStudy(Study):
         }
 
     def scene_picture(self, record: Record, methods: Sequence[str], pixels: int) -> ScenePicture:
-        """Return images of the most likely part after each view, in its most likely pose.
-
-        The part is coloured by its distance to the true part.
-        """
+        """Return images of the most likely part after each view, coloured by its distance to the true part."""
         task, runs, eye = self.scene(record["scene"]).task, record["methods"], opposite_direction(record)
         true_mesh = task.mesh
         tree = cKDTree(true_mesh.sample_points(jax.random.key(0), 10 * _NUM_DENSE_POINTS))
 
         def tile(axes: Axes, method: str, view: int) -> None:
             run = runs[method]
-            placement = run["most_likely"][view]
-            mesh = task.placed_mesh(
-                placement["part"], np.asarray(placement["rotation"]), np.asarray(placement["shift"])
-            )
+            part, rotation, shift = (run["most_likely"][view][name] for name in ("part", "rotation", "shift"))
+            mesh = task.placed_mesh(part, np.asarray(rotation), np.asarray(shift))
             axes.imshow(render_mesh(mesh, eye, pixels, lambda points: tree.query(points)[0], _ERRORS).image)
             caption_tile(axes, f"{run['named'][view]}, {run['p_true'][view]:.2f}", is_correct=run["right"][view] == 1)
 

@@ -41,11 +41,8 @@ _NUM_DENSE_POINTS = 200_000
 
 def _distance_measure(name: str, title: str) -> Measure:
     def compute(record: Record, method: str) -> dict[str, float | None]:
-        surfaces = record["methods"][method]["reconstructions"]
-        return {
-            reconstruction: None if distances is None else distances[name]
-            for reconstruction, distances in surfaces.items()
-        }
+        by_reconstruction = record["methods"][method]["reconstructions"].items()
+        return {key: None if distances is None else distances[name] for key, distances in by_reconstruction}
 
     return Measure(name, title, compute, "reconstruction", "scene units", lower_is_better=True)
 
@@ -54,8 +51,8 @@ class ReconstructionStudy(Study):
     """Measures the distance between the surface reconstructed from a method's cloud and the true surface.
 
     The surface is reconstructed by screened Poisson, and as the posterior mean, which is meshed on the grid of the
-    samples and carved as the samples are. Procedural objects come from the test split of `part_scene`. The study has
-    the settings of `Study`.
+    samples and carved like them. Procedural objects come from the test split of `part_scene`. The study has the
+    settings of `Study`.
     """
 
     title: ClassVar[str] = "Distances to the true surface after the last view"
@@ -89,7 +86,6 @@ class ReconstructionStudy(Study):
     quick: ClassVar[Mapping[str, Any]] = {**Study.quick, "num_candidates": 40}
 
     def scene(self, index: int) -> Scene:
-        """Return the scene with this index. Its object is a mesh if the study has `meshes`, else procedural."""
         file = self.mesh_file(index)
         if file is not None:
             return Scene(index, file.name, file.read())
@@ -114,16 +110,11 @@ class ReconstructionStudy(Study):
         return points
 
     def follow(
-        self,
-        scene: Scene,
-        truth: Float[np.ndarray, "n 3"],
-        planner: Planner,
-        episode: Iterator[Step],
+        self, scene: Scene, truth: Float[np.ndarray, "n 3"], planner: Planner, episode: Iterator[Step]
     ) -> Record:
-        """Record the fraction of the surface covered after each view, and the errors of two reconstructions.
+        """Record the surface covered after each view, and the errors of the reconstructions after the last view.
 
-        Both reconstructions are made from the observations after the last view. The errors of the Poisson
-        reconstruction are None if `pymeshlab` is not installed.
+        The errors of the Poisson reconstruction are None if `pymeshlab` is not installed.
         """
         views = [view for view, *_ in episode]
         mesher = self.mesher(scene)
@@ -132,8 +123,8 @@ class ReconstructionStudy(Study):
             name: self._distances(reconstruct(mesher.sampler, observations, name), truth, scene.index)
             for name in RECONSTRUCTIONS
         }
-        fractions = coverage(views, truth)
-        return {"coverage": fractions, "points": int(observations.cloud.count), "reconstructions": distances}
+        count = int(observations.cloud.count)
+        return {"coverage": coverage(views, truth), "points": count, "reconstructions": distances}
 
     def _distances(self, mesh: TriangleMesh | None, truth: Float[np.ndarray, "n 3"], index: int) -> Record | None:
         if mesh is None:
@@ -170,10 +161,7 @@ class ReconstructionStudy(Study):
 
 
 def reconstruct(sampler: SurfaceSampler, observations: Observations, name: str) -> TriangleMesh | None:
-    """Reconstruct the surface from observations by the method `name`, one of `RECONSTRUCTIONS`.
-
-    Return None for the Poisson reconstruction if `pymeshlab` is not installed.
-    """
+    """Return one of `RECONSTRUCTIONS`; None for screened Poisson if `pymeshlab` is not installed."""
     if name == MEAN:
         return sampler.mean_mesh(observations)
     return screened_poisson(observations.cloud) if has_poisson() else None

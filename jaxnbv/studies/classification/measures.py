@@ -21,28 +21,17 @@ _BY_CROSS_ENTROPY = ("cross-entropy", "halving", "gradient-2dof", "gradient-cons
 
 
 def first_hits(correct: Bool[np.ndarray, "runs views"]) -> Bool[np.ndarray, "runs views"]:
-    """Return, for each view, whether any prediction up to this view is correct.
-
-    The first view for which this holds is the paper's T_first.
-    """
+    """Return whether this or an earlier prediction is correct: true from the paper's T_first on."""
     return np.logical_or.accumulate(correct, axis=1)
 
 
 def stable_hits(correct: Bool[np.ndarray, "runs views"]) -> Bool[np.ndarray, "runs views"]:
-    """Return, for each view, whether all predictions from this view to the last view are correct.
-
-    The first view for which this holds is the paper's T_stable.
-    """
+    """Return whether this and all later predictions are correct: true from the paper's T_stable on."""
     return np.logical_and.accumulate(correct[:, ::-1], axis=1)[:, ::-1]
 
 
 def _hit_fraction(hits: Callable) -> Callable[[Record, str], Float[np.ndarray, " views"]]:
-    """Return a function that computes the fraction of a method's runs with a hit at each view.
-
-    Only random search has several runs.
-
-    - `hits`: `first_hits` or `stable_hits`.
-    """
+    """Return the measure of the fraction of a method's runs with a hit. Only random search has several runs."""
 
     def compute(record: Record, method: str) -> Float[np.ndarray, " views"]:
         guesses = np.argmax(record["methods"][method]["log_p"], axis=-1)
@@ -66,10 +55,9 @@ def roughness(sampler: SurfaceSampler, inputs: StepInputs) -> float:
     """Return the roughness of the samples in `inputs`.
 
     It is the average number of grid cells that a sample's surface crosses, divided by the number of cells that the
-    surface of the posterior mean crosses. The posterior mean is carved as the samples are. If it has no closed form,
-    the mean of the samples is used. The roughness is about 1 for samples as smooth as the mean, and it rises if the
-    spacing of the data exceeds the kernel's width. If it is near 5, values of an acquisition say little about which
-    view is best.
+    surface of the posterior mean crosses. The mean is carved like the samples. If it has no closed form, it is the mean
+    of the samples. The roughness is about 1 for samples as smooth as the mean, and rises if the spacing of the data
+    exceeds the kernel's width. If it is near 5, values of an acquisition say little about which view is best.
     """
     posterior, surfaces = inputs.posterior, inputs.surfaces
     assert posterior is not None
@@ -91,10 +79,7 @@ def crossed_cells(values: Float[np.ndarray, "g g g"]) -> int:
 def rank_correlation(
     values: Float[AnyArray, " c"], true_values: Real[AnyArray, " c"], is_compared: Bool[np.ndarray, " c"]
 ) -> float | None:
-    """Return Spearman's rank correlation between expected and true values, or None if either is constant.
-
-    - `is_compared`: True for the candidates to include.
-    """
+    """Return Spearman's rank correlation of the compared candidates' values, or None if either are constant."""
     a, b = np.asarray(values)[is_compared], np.asarray(true_values)[is_compared]
     return None if np.ptp(a) == 0 or np.ptp(b) == 0 else float(spearmanr(a, b).statistic)
 

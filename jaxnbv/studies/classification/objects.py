@@ -40,7 +40,7 @@ _ANGLES = (0, 110, 140)
 class PyramidStudy(ClassificationStudy):
     """Measures how many views a method needs to tell a pyramid's class. The first view hides the pattern.
 
-    It has the settings of `ClassificationStudy`.
+    The settings are those of `ClassificationStudy`.
     """
 
     title: ClassVar[str] = "The class of a pyramid"
@@ -59,10 +59,7 @@ class PyramidStudy(ClassificationStudy):
         return f"first view at {min_angle:03d}° or more from the base's normal"
 
     def scene_record(self, scene: Scene, truth: Truth, first: int) -> Record:
-        """Return the facts about the scene, with the angle between first view and base's normal in degrees.
-
-        The angle is 180 degrees if the camera looks straight at the apex.
-        """
+        """Return the facts about the scene, with the angle between first view and base's normal in degrees."""
         direction = np.asarray(self.candidates.poses().position[first])
         # In the pyramid's own frame, the outward normal of the base is -z.
         assert isinstance(truth.class_object, Pyramid)
@@ -82,11 +79,10 @@ class PyramidStudy(ClassificationStudy):
 
 
 class TruckStudy(ClassificationStudy):
-    """Measures how many views a method needs to tell the class of a truck's cargo.
+    """Measures how many views a method needs to tell the class of a truck's cargo. The first view is random.
 
-    The first view is random. The study has the settings of `ClassificationStudy`, and:
-
-    - `trucks`: mesh files of trucks, which carry the objects of `meshes`.
+    The settings are those of `ClassificationStudy`, and `trucks`: mesh files of trucks, which carry the objects of
+    `meshes`.
     """
 
     title: ClassVar[str] = "The class of a truck's cargo"
@@ -131,7 +127,7 @@ class TruckStudy(ClassificationStudy):
 class HouseholdStudy(ClassificationStudy):
     """Measures how many views a method needs to tell a household object's class. The first view is random.
 
-    The ten classes differ in global shape, which any view shows. It has the settings of `ClassificationStudy`.
+    The ten classes differ in global shape, which any view shows. The settings are those of `ClassificationStudy`.
     """
 
     title: ClassVar[str] = "The class of a household object"
@@ -149,7 +145,7 @@ class HouseholdStudy(ClassificationStudy):
 class OmniObject3DStudy(ClassificationStudy):
     """Measures how many views a method needs to tell a scanned fruit's class. The first view is random.
 
-    The classes differ in small details. The user provides the meshes and the classifier. It has the settings of
+    The classes differ in small details. The user provides the meshes and the classifier. The settings are those of
     `ClassificationStudy`.
     """
 

@@ -7,14 +7,11 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import matplotlib as mpl
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
-from matplotlib.axes import Axes
 
 from jaxnbv.acquisition import Acquisition, inputs_of, scores
 from jaxnbv.checks import require
-from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.networks import CloudClassifier, load_checkpoint, network_scale, pretrained_classifier
@@ -22,21 +19,20 @@ from jaxnbv.planning.loop import Sensor, Step
 from jaxnbv.planning.planner import Planner
 from jaxnbv.programs import program
 from jaxnbv.readers import MeshFile, class_meshes
-from jaxnbv.scanning import Grid, SensorNoise, scan
+from jaxnbv.scanning import Grid, SensorNoise
 from jaxnbv.search import CandidateSearch, Problem, Proposal, Search, TieBreakSearch
 from jaxnbv.search.base import Scores, best_unvisited
 from jaxnbv.studies.classification.measures import CUE_PIXELS, MEASURES, rank_correlation, roughness
-from jaxnbv.studies.engine.episodes import poses_of
+from jaxnbv.studies.classification.pictures import prediction_picture
 from jaxnbv.studies.engine.known import study_sampler
 from jaxnbv.studies.engine.measures import Claim, Measure, Record
 from jaxnbv.studies.engine.searches import BASELINES
 from jaxnbv.studies.engine.study import Scene, Study
-from jaxnbv.studies.engine.tiles import ScenePicture, caption_tile
+from jaxnbv.studies.engine.tiles import ScenePicture
 from jaxnbv.studies.scenes import ClassObject, ClassSet, FirstView, Framing, Split
 from jaxnbv.studies.scenes.class_object import ClassMesh, scan_cue, surface_of
 from jaxnbv.tasks import Coverage, CrossEntropy, EntropyReduction, MixedEntropy
 from jaxnbv.tasks.classification import AnyClassifier, ClassAcquisition, Classifier, as_classifier
-from jaxnbv.viz.style import NEW, draw_border
 
 # Number of runs of random search in each scene.
 _NUM_RANDOM_RUNS = 8
@@ -48,14 +44,11 @@ _ACQUISITIONS: dict[str, type[ClassAcquisition] | None] = {
     "entropy": EntropyReduction,
     "mixed": MixedEntropy,
 }
-_BACKGROUND = np.array(mpl.colors.to_rgb("#f3f5f8"))
-_BASE_COLOUR, _CUE_COLOUR = np.array([0.68, 0.72, 0.78]), np.array(mpl.colors.to_rgb(NEW))
 
 
 class Truth(eqx.Module):
     """The class of a scene's object, and what the candidates show of the object.
 
-    - `label`: index of the class; `class_object`: the object.
     - `scans`: noisy scan of the true object from each candidate.
     - `cue_pixels`: number of rays of each candidate that hit the cue, the part of the object that tells its class.
     """
@@ -76,12 +69,10 @@ class OracleView(CandidateSearch):
     uses_samples: ClassVar[bool] = False
 
     def score(self, problem: Problem, candidates: Pose) -> Float[Array, "1 1 candidates"]:
-        """Return the acquisition scores of the true scans."""
         context = problem.acquisition.context(inputs_of(problem.observations))
         return scores(problem.acquisition, context, self.scans, problem.camera, candidates)[None, None]
 
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
-        """Return the best candidate that is not visited yet. The key is not used."""
         return best_unvisited(problem, candidates, scores[0, 0])
 
 
@@ -96,7 +87,7 @@ class ClassificationStudy(Study):
     - `framing`: size of the object in the image, which decides how much of the object a view shows.
     - `split`: split from which the scenes come. Tune settings on the validation split.
     - `num_points`: number of points to which the cloud is thinned, once per step, before imagined scans are added.
-    - `first`: condition for first views, see `FirstView`.
+    - `first`: condition for first views.
 
     Class attributes:
 
@@ -104,8 +95,8 @@ class ClassificationStudy(Study):
     - `cue`: name of the part of the object that differs by class, such as "cargo"; "" for the whole object.
     - `network`: name of the shipped classifier.
     - `network_points`: numbers of points that `classifier` and `imagined_classifier` get.
-    - `framings`: framings to study. There is one study for each framing.
-    - `solid`: True if the objects have no thin parts, see `SurfaceSampler.preset`.
+    - `framings`: framings of which a command makes one study each.
+    - `solid`: whether the objects have no thin parts, see `SurfaceSampler.preset`.
     """
 
     methods: ClassVar[tuple[str, ...]] = ("cross-entropy", "entropy", "mixed", "tie-break", *OTHERS, "oracle")
@@ -156,9 +147,9 @@ class ClassificationStudy(Study):
 
     @classmethod
     def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
-        """Return one study for the option `framing`; without this option, one study for each of `framings`.
+        """Return one study for the option `framing`, or for each of `framings` without this option.
 
-        The keys of the result are the values of the framings, or "" if the class has only one framing.
+        The keys are the values of the framings, or "" if the class has only one framing.
 
         - `classifier`: option with the file of a network, see `load_checkpoint`; default: the shipped network.
 
@@ -199,29 +190,23 @@ class ClassificationStudy(Study):
 
     @classmethod
     def group(cls, record: Record) -> str:
-        """Return a group name that says whether the first view shows the cue (what tells the class).
-
-        All methods share the first view. The name is "" if the study has no cue.
-        """
+        """Return a group name that says whether the first view shows the cue; "" if the study has none."""
         if not cls.cue:
             return ""
+        # All methods share the first view.
         pixels = next(iter(record["methods"].values()))["pixels"]
         return f"first view {'with' if pixels[0][0] else 'without'} {cls.cue}"
 
     def scene(self, index: int) -> Scene:
-        """Return a scene with an object. The task of the scene is its `Truth`.
+        """Return the scene of an object. Its `task` is a `Truth`.
 
         **Raises:** `ValueError` if there is no mesh with this index, or if the mesh cannot be read.
         """
         keys = jax.random.split(jax.random.fold_in(jax.random.key(3), index), self.num_candidates)
         name, class_object = self.object_of(index)
         cue_pixels, scans = scan_cue(class_object, self.camera, self.candidates.poses())
-        return Scene(
-            index,
-            name,
-            surface_of(class_object),
-            Truth(int(class_object.label), _noisy(scans, keys), class_object, cue_pixels),
-        )
+        truth = Truth(int(class_object.label), _noisy(scans, keys), class_object, cue_pixels)
+        return Scene(index, name, surface_of(class_object), truth)
 
     def object_of(self, index: int) -> tuple[str, ClassObject | ClassMesh]:
         """Return the name and the object of the scene with this index."""
@@ -244,10 +229,7 @@ class ClassificationStudy(Study):
         return Grid(self.grid_resolution, 0.7 * self.framing.longest_side)
 
     def shows_enough(self, scene: Scene, scan: PointCloud) -> bool:
-        """Return whether a scan shows the object and meets the condition for first views, `self.first`.
-
-        With `FirstView.MISCLASSIFIED`, the classifier must be wrong about the scan.
-        """
+        """Return whether a scan shows the object and meets the condition `first`."""
         is_enough = super().shows_enough(scene, scan)
         if self.first is FirstView.ANY or not is_enough:
             return is_enough
@@ -276,7 +258,7 @@ class ClassificationStudy(Study):
         return look
 
     def episode_keys(self, method: str, scene: Scene) -> list[PRNGKeyArray]:
-        """Return the random keys of a method's episodes: several for random search, and one for other methods."""
+        """Return eight random keys for random search, and one for other methods."""
         keys = super().episode_keys(method, scene)
         return [jax.random.fold_in(keys[0], run) for run in range(_NUM_RANDOM_RUNS)] if method == "random" else keys
 
@@ -288,7 +270,7 @@ class ClassificationStudy(Study):
         """Record the classifier's predictions after each view, and measures of each view.
 
         - Each view: the log probabilities of the classes, and the number of the view's rays that hit the cue.
-        - Each proposed view: the `roughness` of the posterior samples that the view was chosen with, and the rank
+        - Each proposed view: the `roughness` of the posterior samples with which the view was chosen, and the rank
           correlation between the candidates' values and the numbers of their rays that hit the cue.
         """
         lists: dict[str, list] = {name: [] for name in ("log_p", "pixels", "rank_correlation", "roughness")}
@@ -296,36 +278,17 @@ class ClassificationStudy(Study):
             lists["log_p"].append(np.asarray(_classify(self.classifier, view.cloud)).tolist())
             pose = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], view.pose)
             lists["pixels"].append(int(scan_cue(truth.class_object, self.camera, pose)[0][0]))
-            rank, rough = None, None
+            rank = None
             if self.cue and view.proposal is not None and len(view.proposal.values) == self.num_candidates:
                 values = np.asarray(view.proposal.values)
                 rank = rank_correlation(values, truth.cue_pixels, np.isfinite(values))
-            if inputs is not None:
-                rough = roughness(planner.sampler, inputs)
             lists["rank_correlation"].append(rank)
-            lists["roughness"].append(rough)
+            lists["roughness"].append(None if inputs is None else roughness(planner.sampler, inputs))
         return lists | {"log_p": [lists["log_p"]], "pixels": [lists["pixels"]] if self.cue else []}
 
     def scene_picture(self, record: Record, methods: Sequence[str], pixels: int) -> ScenePicture:
-        """Return images of the true surface as seen from each view. The cue (what tells the class) is tinted.
-
-        The text below an image gives the class predicted after the view, and the probability of this class.
-        """
-        runs, scene, names = record["methods"], self.scene(record["scene"]), self.objects.classes
-        poses = {method: poses_of(runs[method]) for method in methods}
-        camera = Camera(height=pixels, width=pixels)
-
-        def tile(axes: Axes, method: str, view: int) -> None:
-            axes.imshow(_image(scene, camera, poses[method][view], bool(self.cue)), interpolation="antialiased")
-            if self.cue and runs[method]["pixels"][0][view] >= CUE_PIXELS:
-                draw_border(axes, NEW, 1.6)
-            log_p = runs[method]["log_p"][0][view]
-            guess = int(np.argmax(log_p))
-            caption_tile(axes, f"{names[guess]} {np.exp(log_p[guess]):.0%}", guess == record["label"])
-
-        framing = f"Framed: at least {CUE_PIXELS} {self.cue} pixels. " if self.cue else ""
-        caption = f"{framing}Beneath: prediction; true: {names[record['label']]}. All methods share view 1."
-        return ScenePicture(caption, tile)
+        scene = self.scene(record["scene"])
+        return prediction_picture(scene, record, methods, pixels, self.objects.classes, self.cue)
 
 
 @program
@@ -335,17 +298,4 @@ def _noisy(scans: PointCloud, keys: Key[Array, " candidates"]) -> PointCloud:
 
 @program
 def _classify(classifier: Classifier, cloud: PointCloud) -> Float[Array, " classes"]:
-    """Return the log probabilities of the classes for a cloud, by a compiled program."""
     return classifier(cloud)
-
-
-def _image(scene: Scene, camera: Camera, pose: Pose, is_tinted: bool) -> Float[np.ndarray, "h w 3"]:
-    """Return an image of the scene from a pose, lit from the camera. If `is_tinted`, the cue has its own colour."""
-    cloud = scan(scene.surface, camera, jax.tree.map(jnp.asarray, pose))
-    is_on_cue = np.asarray(scene.task.class_object.on_cue(cloud.points)) & is_tinted
-    points, normals, is_hit = (np.asarray(array) for array in (cloud.points, cloud.normals, cloud.mask))
-    rays = pose.position - points
-    cosines = np.where(is_hit, np.sum(rays * normals, axis=-1) / np.linalg.norm(rays, axis=-1), 0.0)
-    colours = np.where(is_on_cue[:, None], _CUE_COLOUR, _BASE_COLOUR) * (0.4 + 0.65 * cosines)[:, None]
-    image = np.where(is_hit[:, None], np.clip(colours, 0.0, 1.0), _BACKGROUND)
-    return image.reshape(camera.height, camera.width, 3)

@@ -32,16 +32,16 @@ from jaxnbv.tasks import Coverage, Segmenter, SoftPartCount, part_counts
 from jaxnbv.viz.style import GREY, SERIES
 
 # A part is found once the segmenter assigns N_target points to it: values of N_target in the paper's Table 1, the
-# authors' N_target for the utility, and the number of points that the network gets, to which all these values refer.
+# authors' N_target for the utility, and the number of points that the network gets, to which all these refer.
 TARGETS = (20, 40, 60, 80, 100)
 TARGET, NETWORK_POINTS = 60, 2048
 _BY_PARTS = ("discrete", "gradient-2dof", "gradient-6dof")
 _OTHERS = (*BASELINES, "coverage")
 # The width w of `NearestPart`, which is twice the standard deviation of the sensor noise.
 _WIDTH = 0.02
-# Distance that stands for an absent part. At this distance, the part's probability and all derivatives are zero.
+# Distance of an absent part, at which the part's probability and all derivatives are zero.
 _ABSENT_DISTANCE = 100.0
-# Number of points that pictures show on the true surface.
+# Number of points in pictures of the true surface.
 _NUM_DENSE_POINTS = 8000
 
 
@@ -55,8 +55,8 @@ class NearestPart(Segmenter):
     where d_ic is the distance of point i from the true part c. `of` pads the parts of each object to the same number,
     so that all objects share one compilation.
 
-    - `distances`: distance of each node of `grid` from each part. Values between nodes are interpolated linearly.
-    - `num_points`: number of points to segment. They are chosen by farthest point sampling.
+    - `distances`: distance of each node of `grid` from each part, interpolated linearly between nodes.
+    - `num_points`: number of points to segment, which farthest point sampling chooses.
     """
 
     distances: Float[Array, "parts g g g"]
@@ -86,15 +86,13 @@ class NearestPart(Segmenter):
         return jnp.argmin(self.distances_at(points), axis=-1).astype(jnp.int32)
 
     def distances_at(self, points: Float[Array, "n 3"]) -> Float[Array, "n parts"]:
-        """Return the distance of each point from each part.
+        """Return the distance of each point from each part. Outside the grid, it is the value at the border."""
+        coordinates = list((points.T + self.grid.half_extent) / self.grid.spacing)
 
-        A point outside the grid gets the value at the border of the grid.
-        """
-        coordinates = (points.T + self.grid.half_extent) / self.grid.spacing
-        interpolate = jax.vmap(
-            lambda values: map_coordinates(values, list(coordinates), order=1, mode="nearest"), out_axes=-1
-        )
-        return interpolate(self.distances)
+        def interpolate(values):
+            return map_coordinates(values, coordinates, order=1, mode="nearest")
+
+        return jax.vmap(interpolate, out_axes=-1)(self.distances)
 
 
 # A segmenter of parts: a network or the oracle.
@@ -102,9 +100,7 @@ PartSegmenter: TypeAlias = CloudSegmenter | NearestPart
 
 
 def discovery_time(counts: Int[np.ndarray, "views parts"], target: int) -> int | None:
-    """Return the first view (counted from 1) after which every part has `target` points, or None.
-
-    This is the paper's T_discovery.
+    """Return the paper's T_discovery: the first view (from 1) after which every part has `target` points, or None.
 
     - `counts`: number of points that are assigned to each part after each view.
     """
@@ -113,7 +109,7 @@ def discovery_time(counts: Int[np.ndarray, "views parts"], target: int) -> int |
 
 
 def _discovery_times(record: Record, method: str) -> dict[int, float]:
-    """Return `discovery_time` for each of `TARGETS`, or the number of views plus one if it is None."""
+    """Return `discovery_time` for each of `TARGETS`; the number of views plus one if it is None."""
     counts = np.asarray(record["methods"][method]["counts"])
     times = {target: discovery_time(counts, target) for target in TARGETS}
     return {target: float(record["study_views"] + 1 if time is None else time) for target, time in times.items()}
@@ -150,13 +146,7 @@ class PartDiscoveryStudy(Study):
     reference: ClassVar[str] = "discrete"
     measures: ClassVar[tuple[Measure, ...]] = (
         Measure(
-            "time",
-            "Views until all parts are found",
-            _discovery_times,
-            "N_target",
-            "views",
-            digits=2,
-            lower_is_better=True,
+            "time", "Views until all parts are found", _discovery_times, "N_target", "views", 2, lower_is_better=True
         ),
         Measure("found", "Objects whose parts were all found", _all_parts_found, "N_target", "%"),
         Measure("found_by_view", f"All parts found, N_target = {TARGET}", _all_parts_found_by_view, unit="%"),
@@ -178,10 +168,7 @@ class PartDiscoveryStudy(Study):
 
     @abstractmethod
     def segmenter_of(self, scene: Scene, num_points: int | None = None) -> PartSegmenter:
-        """Return the segmenter for a scene.
-
-        - `num_points`: number of points that the segmenter gets; default: the number for an observed cloud.
-        """
+        """Return the segmenter for a scene, which gets `num_points` points; default: as for an observed cloud."""
 
     @abstractmethod
     def true_parts(self, scene: Scene, points: Float[Array, "n 3"]) -> Int[Array, " n"]:
@@ -214,8 +201,7 @@ class PartDiscoveryStudy(Study):
     def scene_picture(self, record: Record, methods: Sequence[str], pixels: int) -> ScenePicture:
         """Return images of the cloud over the true shape. The points are coloured by their predicted part.
 
-        The text below an image gives the number of parts that have at least 60 points. The images of a method end once
-        every part has 100 points, because its episode ends there.
+        The images of a method end once every part has 100 points, because its episode ends there.
         """
         scene, runs = self.scene(record["scene"]), record["methods"]
         parts, segmenter = np.asarray(self.truth(scene)), self.segmenter_of(scene)

@@ -40,13 +40,12 @@ class PartMesh(eqx.Module):
 class MeshPartStudy(PartDiscoveryStudy):
     """Part discovery on mesh files, segmented by the oracle `NearestPart` in place of a network.
 
-    It has the settings of `PartDiscoveryStudy`, and:
+    The utility counts all parts. The measures count only parts that can be found. A part can be found if the oracle
+    assigns at least 100 points (the largest N_target) to it when it segments the scans from all candidates together.
+    The study has the settings of `PartDiscoveryStudy`, and:
 
     - `meshes`: mesh files whose nodes are parts.
     - `room`: largest number of parts of any mesh.
-
-    The utility counts all parts. The measures count only parts that can be found. A part can be found if the oracle
-    assigns at least 100 points (the largest N_target) to it when it segments the scans from all candidates together.
     """
 
     explanation: ClassVar[str] = (
@@ -64,9 +63,9 @@ class MeshPartStudy(PartDiscoveryStudy):
 
     @classmethod
     def files_in(cls, folder: str | Path) -> tuple[MeshFile, ...]:
-        """Return the meshes that have at least two nodes.
+        """Return the meshes that have at least two nodes, one from each subfolder in turn.
 
-        The result takes one mesh from each subfolder in turn. The name of a mesh includes the name of its subfolder.
+        The name of a mesh includes the name of its subfolder.
 
         **Raises:** `ValueError` if there is no such mesh, or if a mesh cannot be read.
         """
@@ -79,7 +78,7 @@ class MeshPartStudy(PartDiscoveryStudy):
         return tuple(interleave(by_class.values()))
 
     def scene(self, index: int) -> Scene:
-        """Return the scene of a mesh file. Its `task` is a `PartMesh`, with the parts and the oracle."""
+        """Return the scene of a mesh file. Its `task` is a `PartMesh`."""
         file = self.mesh_file(index)
         assert file is not None
         parts = load_parts(file.path)
@@ -87,7 +86,6 @@ class MeshPartStudy(PartDiscoveryStudy):
         return Scene(index, file.name, parts.mesh, PartMesh(parts, oracle))
 
     def segmenter_of(self, scene: Scene, num_points: int | None = None) -> NearestPart:
-        """Return the oracle of the scene."""
         oracle = scene.task.oracle
         return NearestPart(oracle.distances, oracle.grid, num_points or oracle.num_points)
 
@@ -136,12 +134,11 @@ class PartStudy(PartDiscoveryStudy):
         return super().configured(model, views, quick, segmenter=part_segmenter(category=0), **options)
 
     def scene(self, index: int) -> Scene:
-        """Return the scene of a procedural object. Its `task` is a `PartScene`, with the solid and its parts."""
+        """Return the scene of a procedural object. Its `task` is a `PartScene`."""
         part = part_scene(self.split, index)
         return Scene(index, CATEGORIES[int(part.category)].name, SDFSurface(part.solid), part)
 
     def segmenter_of(self, scene: Scene, num_points: int | None = None) -> CloudSegmenter:
-        """Return the segmenter for the object's category."""
         base = self.segmenter
         return CloudSegmenter(base.network, scene.task.category, num_points or base.num_points, base.scale)
 

@@ -18,7 +18,7 @@ class BankRecipe(NamedTuple):
 
     - `number`: number of shapes.
     - `kinds`: names of the kinds of shapes. Shape i is of kind `kinds[i % len(kinds)]`.
-    - `shape`: function that returns shape i, given i. Shapes are not rotated at random.
+    - `shape`: function from i to shape i, which is not rotated at random.
     """
 
     number: int
@@ -26,7 +26,7 @@ class BankRecipe(NamedTuple):
     shape: Callable[[int], SignedDistance]
 
     def make(self) -> ShapeBank:
-        """Make the bank. The name of a shape consists of its kind and its index."""
+        """Make the bank. A shape's name is its kind and its index."""
         names = [f"{self.kinds[index % len(self.kinds)]} {index}" for index in range(self.number)]
         return ShapeBank.of([self.shape(index) for index in range(self.number)], names)
 
@@ -43,4 +43,4 @@ RECIPES = {
     "parts": BankRecipe(520, PART_CATEGORIES, lambda i: part_scene(Split.TRAIN, i).solid),
     "heat": BankRecipe(256, HEAT_OBJECTS, _heat_solid),
 }
-"""The recipe of each shipped bank, by the name of the bank."""
+"""Recipes of the shipped banks by name."""

@@ -17,7 +17,7 @@ from jaxnbv.programs import program
 from jaxnbv.scanning import SDFSurface, Surface, TriangleMesh, scan
 from jaxnbv.scanning.sdf import SignedDistance, least_of_last
 from jaxnbv.scanning.sdf.sampled import distance_to_triangles
-from jaxnbv.search.candidates import sphere_candidates
+from jaxnbv.search import SphereCandidates
 from jaxnbv.studies.scenes.labelled import LabelledSolid
 
 
@@ -43,12 +43,9 @@ class ClassObject(SignedDistance):
 
 
 class SolidObject(ClassObject):
-    """A solid made of labelled primitives. The primitives with a label above 0 are the cue.
+    """A solid made of labelled primitives in scene coordinates. The primitives with a label above 0 are the cue.
 
     The solid, called with points, returns bounds of their signed distances, as `LabelledSolid` does.
-
-    - `solid`: the primitives, in scene coordinates.
-    - `label`: index of the class.
     """
 
     solid: LabelledSolid
@@ -58,14 +55,12 @@ class SolidObject(ClassObject):
         return self.solid(x)
 
     def on_cue(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[Array, "*n"]:
-        """Return whether each point lies on a primitive of the cue."""
         return least_of_last(jnp.where(self.solid.labels > 0, self.solid.distances(x), jnp.inf)) <= tolerance
 
 
 class ClassSet(NamedTuple):
     """Names of classes, and a function that makes scenes of these classes.
 
-    - `classes`: names of the classes.
     - `scene`: function that returns the object for a split, an index and a framing; None if all objects are meshes.
     """
 
@@ -85,7 +80,7 @@ class ClassMesh(eqx.Module):
     cue: TriangleMesh | None = None
 
     def on_cue(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[np.ndarray, "*n"]:
-        """Return whether each point lies on the cue, see `ClassObject.on_cue`. Runs on the host."""
+        """Return whether each point lies on the cue, see `ClassObject.on_cue`."""
         if self.cue is None:
             return np.ones(x.shape[:-1], bool)
         points = np.asarray(x, np.float64).reshape(-1, 3)
@@ -102,11 +97,8 @@ def scan_cue(
     class_object: ClassObject | ClassMesh, camera: Camera, poses: Pose
 ) -> tuple[Int[Array, " poses"], PointCloud]:
     """Return how many rays of each pose hit the cue (the part that tells the class), and noiseless scans."""
-    return (
-        _scan_cue(class_object, camera, poses)
-        if isinstance(class_object, ClassMesh)
-        else _scan_cue_compiled(class_object, camera, poses)
-    )
+    run = _scan_cue if isinstance(class_object, ClassMesh) else _scan_cue_compiled
+    return run(class_object, camera, poses)
 
 
 def _scan_cue(
@@ -128,15 +120,14 @@ def hidden_view(
 
     **Raises:** `ValueError` if there is no such pose.
     """
-    poses = sphere_candidates(120) if poses is None else poses
+    poses = SphereCandidates(120).poses() if poses is None else poses
     return poses[choose_hidden(*scan_cue(class_object, camera, poses), key)]
 
 
 def choose_hidden(cue_pixels: Int[AnyArray, " poses"], scans: PointCloud, key: PRNGKeyArray) -> int:
     """Return the index of a random pose whose scan hits the object but not its cue, drawn uniformly.
 
-    - `cue_pixels`: number of rays of each pose that hit the cue, the part of the object that tells its class.
-    - `scans`: scan from each pose.
+    - `cue_pixels`, `scans`: for each pose, the number of rays that hit the cue, and the scan.
 
     **Raises:** `ValueError` if there is no such pose.
     """

@@ -4,7 +4,8 @@ Lengths are in scene units. Along each axis, all parts lie between -1.35 and 1.3
 """
 
 import functools
-from collections.abc import Callable, Sequence
+import operator
+from collections.abc import Callable
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +15,7 @@ from jaxnbv.geometry.frame import Frame
 from jaxnbv.programs import program
 from jaxnbv.scanning import Grid, TriangleMesh
 from jaxnbv.scanning.mesh import level_triangles
-from jaxnbv.scanning.sdf import Cuboid, Cylinder, Difference, Sampled, SignedDistance, Translated, Union
+from jaxnbv.scanning.sdf import Cuboid, Cylinder, Sampled, SignedDistance
 from jaxnbv.surfaces import ShapeBank
 
 PARTS_OF_SET = 8
@@ -22,29 +23,19 @@ PARTS_OF_SET = 8
 _BANK_GRID, _MESH_GRID = Grid(64, 1.5), Grid(100, 1.4)
 # Smallest distance between a part and the faces of the bank's grid.
 _PADDING = 0.15
-# The pocket of the housing: x of its centre, height of its floor, and height of the floor for housings with holes. The
-# second floor is higher, because a deep floor would hide the holes.
+# The pocket of the housing: x of its centre, height of its floor, and height of the floor of housings with holes, which
+# a deep floor would hide.
 _POCKET_X, _POCKET_FLOOR, _SHALLOW_FLOOR = 0.15, 0.05, 0.45
 
 
-def _box(half_size: Sequence[float], center: Sequence[float]) -> SignedDistance:
-    return Translated(Cuboid(np.asarray(half_size)), np.asarray(center))
-
-
-def _pin(radius: float, half_height: float, center: Sequence[float]) -> SignedDistance:
-    return Translated(Cylinder(radius, half_height), np.asarray(center))
-
-
 def _housing(side: float = 1.0, floor: float = _POCKET_FLOOR) -> SignedDistance:
-    """Make a housing: a block with a deep pocket that is open above, and a notch at one corner.
-
-    The notch breaks the block's symmetry.
+    """Make a block with a deep pocket that is open above, and a notch at one corner, which breaks the symmetry.
 
     - `side`: 1, or -1 for the mirror image; `floor`: height of the pocket's floor.
     """
-    block = Cuboid(np.array([0.75, 1.25, 0.55]))
-    pocket = _box([0.42, 0.7, 0.3], [side * _POCKET_X, floor + 0.7, 0.0])
-    return Difference(Difference(block, pocket), _box([0.2, 0.2, 0.2], [side * 0.75, -1.25, 0.55]))
+    pocket = Cuboid([0.42, 0.7, 0.3]).translate([side * _POCKET_X, floor + 0.7, 0.0])
+    notch = Cuboid([0.2, 0.2, 0.2]).translate([side * 0.75, -1.25, 0.55])
+    return Cuboid([0.75, 1.25, 0.55]) - pocket - notch
 
 
 def _bosses() -> list[SignedDistance]:
@@ -59,7 +50,9 @@ def _bosses() -> list[SignedDistance]:
         (0.0, 0.0, 0.22, 0.25),
         (-0.25, 0.15, 0.1, 0.4),
     ]
-    return [Union(_housing(), _pin(r, h, [_POCKET_X + x, _POCKET_FLOOR + h - 0.05, z])) for x, z, r, h in variants]
+    return [
+        _housing() | Cylinder(r, h).translate([_POCKET_X + x, _POCKET_FLOOR + h - 0.05, z]) for x, z, r, h in variants
+    ]
 
 
 def _bores() -> list[SignedDistance]:
@@ -67,7 +60,7 @@ def _bores() -> list[SignedDistance]:
     places = [(-0.25, 0.0), (0.25, 0.0), (0.0, 0.15), (0.0, -0.15), (0.0, 0.0), (0.0, 0.0), (-0.25, 0.15), (0.25, 0.15)]
     radii = [0.12, 0.12, 0.12, 0.12, 0.12, 0.22, 0.12, 0.12]
     return [
-        Difference(_housing(floor=_SHALLOW_FLOOR), _pin(r, 0.35, [_POCKET_X + x, _SHALLOW_FLOOR - 0.25, z]))
+        _housing(floor=_SHALLOW_FLOOR) - Cylinder(r, 0.35).translate([_POCKET_X + x, _SHALLOW_FLOOR - 0.25, z])
         for (x, z), r in zip(places, radii, strict=True)
     ]
 
@@ -77,12 +70,9 @@ def _ribs() -> list[SignedDistance]:
     lengthwise = [(-0.28, 0.0, 90.0), (0.0, 0.0, 90.0), (0.28, 0.0, 90.0)]
     crosswise = [(0.0, -0.2, 0.0), (0.0, 0.0, 0.0), (0.0, 0.2, 0.0)]
     diagonal = [(0.0, 0.0, 45.0), (0.0, 0.0, -45.0)]
-    rib = Cuboid(np.array([0.28, 0.15, 0.06]))
-    up = np.array([0.0, 1.0, 0.0])
+    rib, up = Cuboid([0.28, 0.15, 0.06]), [0.0, 1.0, 0.0]
     return [
-        Union(
-            _housing(), Translated(rib.rotate(up, np.radians(angle)), np.array([_POCKET_X + x, _POCKET_FLOOR + 0.1, z]))
-        )
+        _housing() | rib.rotate(up, np.radians(angle)).translate([_POCKET_X + x, _POCKET_FLOOR + 0.1, z])
         for x, z, angle in (*lengthwise, *crosswise, *diagonal)
     ]
 
@@ -100,7 +90,7 @@ def _connectors() -> list[SignedDistance]:
         (0.16, 0.1, 0.22, -0.15),
     ]
     return [
-        Union(_housing(), _box([half, 0.2, deep], [_POCKET_X + x, _POCKET_FLOOR + 0.15, z]))
+        _housing() | Cuboid([half, 0.2, deep]).translate([_POCKET_X + x, _POCKET_FLOOR + 0.15, z])
         for half, deep, x, z in variants
     ]
 
@@ -113,25 +103,24 @@ def _pins() -> list[SignedDistance]:
     def part(pattern: str) -> SignedDistance:
         # An absent pin is placed inside the block, because all parts of a set need the same structure.
         heights = [_POCKET_FLOOR + (0.2 if digit == "1" else -0.6) for digit in pattern]
-        pins = [_pin(0.1, 0.25, [_POCKET_X + x, y, z]) for (x, z), y in zip(places, heights, strict=True)]
-        return functools.reduce(Union, pins, _housing())
+        pins = [Cylinder(0.1, 0.25).translate([_POCKET_X + x, y, z]) for (x, z), y in zip(places, heights, strict=True)]
+        return functools.reduce(operator.or_, pins, _housing())
 
     return [part(pattern) for pattern in patterns]
 
 
 def _channels() -> list[SignedDistance]:
     """Make blocks with a channel and a boss on one of its walls. The wall and the place along it differ."""
-    block = Difference(Cuboid(np.array([0.7, 0.6, 1.25])), _box([0.28, 0.28, 1.5], [0.0, 0.1, 0.0]))
-    block = Difference(block, _box([0.2, 0.2, 0.2], [0.7, -0.6, 1.25]))
-    places = [(wall, z) for wall in (-0.24, 0.24) for z in (-0.6, -0.2, 0.2, 0.6)]
-    return [Union(block, _box([0.12, 0.12, 0.12], [x, 0.0, z])) for x, z in places]
+    block = Cuboid([0.7, 0.6, 1.25]) - Cuboid([0.28, 0.28, 1.5]).translate([0.0, 0.1, 0.0])
+    block = block - Cuboid([0.2, 0.2, 0.2]).translate([0.7, -0.6, 1.25])
+    boss = Cuboid([0.12, 0.12, 0.12])
+    return [block | boss.translate([x, 0.0, z]) for x in (-0.24, 0.24) for z in (-0.6, -0.2, 0.2, 0.6)]
 
 
 def _cup(floor: float, size: float = 1.0) -> SignedDistance:
-    wall, half_height = 0.12 * size, 1.25 * size
-    top = 1.5
-    inside = _pin(0.7 * size - wall, 0.5 * (top - floor), [0.0, 0.5 * (top + floor), 0.0])
-    return Difference(Cylinder(0.7 * size, half_height), inside)
+    wall, top = 0.12 * size, 1.5
+    inside = Cylinder(0.7 * size - wall, 0.5 * (top - floor)).translate([0.0, 0.5 * (top + floor), 0.0])
+    return Cylinder(0.7 * size, 1.25 * size) - inside
 
 
 def _cups() -> list[SignedDistance]:
@@ -146,22 +135,21 @@ def _sizes() -> list[SignedDistance]:
 
 def _mugs() -> list[SignedDistance]:
     """Make mugs whose handles differ in height and length. The body of a mug hides its handle from behind."""
-    variants = [(y, half) for half in (0.2, 0.4) for y in (-0.6, -0.2, 0.2, 0.6)]
 
     def part(y: float, half: float) -> SignedDistance:
-        grip = Difference(_box([0.22, half, 0.1], [0.86, y, 0.0]), _box([0.12, half - 0.1, 0.2], [0.82, y, 0.0]))
+        hole = Cuboid([0.12, half - 0.1, 0.2]).translate([0.82, y, 0.0])
+        grip = Cuboid([0.22, half, 0.1]).translate([0.86, y, 0.0]) - hole
         # Cut the handle off at the wall. Otherwise it would be visible inside the mug.
-        mug = Union(_cup(-1.1), Difference(grip, Cylinder(0.65, 1.5)))
-        return Translated(mug, np.array([-0.19, 0.0, 0.0]))
+        return (_cup(-1.1) | grip - Cylinder(0.65, 1.5)).translate([-0.19, 0.0, 0.0])
 
-    return [part(*variant) for variant in variants]
+    return [part(y, half) for half in (0.2, 0.4) for y in (-0.6, -0.2, 0.2, 0.6)]
 
 
 def _mirrored() -> list[SignedDistance]:
     """Make four blocks with a boss in a pocket, and the mirror image of each."""
     places = [(-0.25, 0.0), (0.25, 0.0), (0.0, 0.15), (0.0, -0.15)]
     return [
-        Union(_housing(side), _pin(0.12, 0.25, [side * (_POCKET_X + x), _POCKET_FLOOR + 0.2, z]))
+        _housing(side) | Cylinder(0.12, 0.25).translate([side * (_POCKET_X + x), _POCKET_FLOOR + 0.2, z])
         for side in (1.0, -1.0)
         for x, z in places
     ]
@@ -186,7 +174,7 @@ HIDDEN_CUES = ("boss", "bore", "rib", "connector", "pins", "channel", "cup")
 
 
 def confusable_solids(name: str) -> list[SignedDistance]:
-    """Return the parts of a set of `CONFUSABLE_SETS` as solids. All solids have the same pytree structure."""
+    """Return the parts of a set of `CONFUSABLE_SETS` as solids, all with the same pytree structure."""
     return _SETS[name]()
 
 

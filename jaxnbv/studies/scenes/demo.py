@@ -9,9 +9,9 @@ from jaxnbv.scanning.sphere_tracing import SDFSurface
 def demo_object() -> SDFSurface:
     """Return an empty mug on a saucer, with a spoon in the mug and two lumps of sugar beside the mug.
 
-    The y axis is up. The longest side, across the saucer, is 2.5. Four regions are visible from few directions: the
-    inside of the mug, the bowl of the spoon, the underside of the saucer, and the objects behind the mug. Nothing is
-    thinner than 0.06, except the lip of the spoon's bowl.
+    The y axis is up. The longest side, across the saucer, is 2.5. Only few directions show the inside of the mug, the
+    bowl of the spoon, the underside of the saucer, and what is behind the mug. Nothing is thinner than 0.06, except the
+    lip of the spoon's bowl.
     """
     return SDFSurface((_saucer() | _mug() | _spoon() | _sugar()).translate([0.0, -0.87, 0.0]))
 
@@ -34,8 +34,8 @@ def _mug() -> SignedDistance:
 
 
 def _spoon() -> SignedDistance:
-    low, high = [0.24, 0.3, 0.11], [-0.62, 1.7, -0.3]
-    stem = Capsule(low, high, 0.04)
+    high = [-0.62, 1.7, -0.3]
+    stem = Capsule([0.24, 0.3, 0.11], high, 0.04)
     bowl = (Sphere(0.18) - Sphere(0.11).translate([-0.03, 0.11, 0.0])).translate([0.16, 0.36, 0.08])
     return SmoothUnion(stem, Sphere(0.07).translate(high), 0.1) | bowl
 

@@ -22,11 +22,7 @@ class Framing(StrEnum):
 
 
 class FirstView(StrEnum):
-    """Condition for the first view of an object.
-
-    With `ANY`, every view of the object may be the first. With `MISCLASSIFIED`, only a view after which the classifier
-    is wrong may be the first.
-    """
+    """Condition for the first view of an object: `ANY` view, or one after which the classifier is wrong."""
 
     ANY = "any"
     MISCLASSIFIED = "misclassified"
@@ -38,7 +34,7 @@ class Setup(StrEnum):
     - `WHOLE`: a view shows nearly all of the side of the part that faces the camera.
     - `CLOSE_UP`: a view shows a patch of the part.
     - `TABLE`: the part rests on a table.
-    - `HIDDEN`: the part rests on a table beside a box that hides half of one side of the part.
+    - `HIDDEN`: the part rests on a table, beside a box that hides half of one side.
     """
 
     WHOLE = "whole"

@@ -12,11 +12,11 @@ from jaxnbv.checks import require
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.scanning import SDFSurface, Surface, scan
-from jaxnbv.search.candidates import sphere_candidates
+from jaxnbv.search import SphereCandidates
 from jaxnbv.studies.scenes import labelled
 from jaxnbv.studies.scenes.labelled import assemble, generator
 
-# All primitives have the label 0, because labels of heated objects are not used.
+# Labels of heated objects are not used.
 bar, box, ring, rod = (partial(make, 0) for make in (labelled.bar, labelled.box, labelled.ring, labelled.rod))
 path = partial(labelled.path, 0)
 FIRST_TRAINING = 100_000
@@ -25,8 +25,7 @@ FIRST_TRAINING = 100_000
 class HeatScene(eqx.Module):
     """A connected object and its heat source.
 
-    - `surface`: surface of the object, which is centred and has longest side 2.5. Procedural objects stand upright
-      along y.
+    - `surface`: surface of the object, which is centred, upright along y, and has longest side 2.5.
     - `name`: kind of the object, such as one of `HEAT_OBJECTS`.
     - `source`: point of the surface (scene coordinates) around which the object is heated.
     """
@@ -49,9 +48,8 @@ def heat_scene(index: int, is_rotated: bool = True) -> HeatScene:
     rng = generator(jax.random.fold_in(jax.random.key(1), index))
     primitives, position = _BUILDERS[name](rng)
     solid = assemble(primitives, rng.uniform(-np.pi, np.pi) if is_rotated else 0.0)
-    source = solid.centre[0] + jnp.matmul(
-        solid.rotation[0], solid.half_size[0] * jnp.asarray(position), precision="highest"
-    )
+    offset = solid.half_size[0] * jnp.asarray(position)
+    source = solid.centre[0] + jnp.matmul(solid.rotation[0], offset, precision="highest")
     return HeatScene(SDFSurface(solid), name, source)
 
 
@@ -60,7 +58,7 @@ def source_view(scene: HeatScene, key: PRNGKeyArray, num_candidates: int = 100, 
 
     **Raises:** `ValueError` if there is no such candidate.
     """
-    poses = sphere_candidates(num_candidates, radius)
+    poses = SphereCandidates(num_candidates, radius).poses()
     scans = scan(scene.surface, Camera(), poses)
     is_near = jnp.linalg.norm(scans.points - scene.source, axis=-1) < 0.05
     (indices,) = np.nonzero(jnp.any(is_near & scans.mask, axis=-1))
@@ -68,8 +66,8 @@ def source_view(scene: HeatScene, key: PRNGKeyArray, num_candidates: int = 100, 
     return poses[int(jax.random.choice(key, indices))]
 
 
-# Each function below returns the primitives of an object and the position of the heat source. The first primitive is
-# heated. The position is in the frame of this primitive, in units of its half sizes.
+# Each function below returns the primitives of an object, of which the first is heated, and the position of the heat
+# source, in the frame of the first primitive and in units of its half sizes.
 
 
 def _on_top(rng):
@@ -104,9 +102,7 @@ def _chair(rng):
         y = rng.uniform(0.2, 0.5) * height
         parts.append(rod((-x, y, b), (x, y, b), 0.04))
     parts += [bar((-x, height, b), (-x - 0.12, height + rise, b), 0.05, 0.05) for b in (-z, z)]
-    for fraction in (0.45, 0.85):
-        position = -x - 0.12 * fraction, height + rise * fraction
-        parts.append(box((*position, 0), (0.04, 0.1, z)))
+    parts += [box((-x - 0.12 * part, height + rise * part, 0), (0.04, 0.1, z)) for part in (0.45, 0.85)]
     return parts, _on_top(rng)
 
 
@@ -129,14 +125,11 @@ def _fins(rng):
     count, half_depth, half_width = int(rng.integers(6, 10)), rng.uniform(0.6, 0.9), rng.uniform(1.0, 1.2)
     rise, thick = rng.uniform(0.6, 1.0), rng.uniform(0.06, 0.1)
     parts = [box((0, 0, 0), (half_depth, thick, half_width))]
-    positions = np.linspace(-half_width + 0.06, half_width - 0.06, count)
-    for z in positions:
+    for z in np.linspace(-half_width + 0.06, half_width - 0.06, count):
         height = rise * rng.uniform(0.7, 1.0)
         parts.append(box((0, 0.5 * height, z), (half_depth - 0.02, 0.5 * height, 0.035)))
     return parts, (rng.uniform(-0.7, 0.7), -1.0, rng.uniform(-0.7, 0.7))
 
 
 _BUILDERS = {"desk": _desk, "chair": _chair, "mug": _mug, "fins": _fins}
-
-# The kinds of heated objects.
 HEAT_OBJECTS = tuple(_BUILDERS)

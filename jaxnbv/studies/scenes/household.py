@@ -12,7 +12,7 @@ from jaxnbv.studies.scenes.labelled import assemble, generator
 from jaxnbv.studies.scenes.parts import furniture
 from jaxnbv.studies.scenes.splits import Split, scene_key
 
-# Labels above 0 mark what tells an object's class. Here this is the whole object, so all primitives have the label 1.
+# Labels above 0 mark what tells an object's class, which here is the whole object.
 ball, bar, box, ring, rod = (
     partial(make, 1) for make in (labelled.ball, labelled.bar, labelled.box, labelled.ring, labelled.rod)
 )
@@ -57,8 +57,7 @@ def _bathtub(rng):
         yield box((0, -height - 0.05, 0), (x - 0.06, 0.1, z - 0.06))
     if rng.random() < 0.5:
         top = height + rng.uniform(0.2, 0.3)
-        spout = [(0, height - 0.1, z - wall), (0, top, z - wall), (0, top - 0.03, z - 0.32)]
-        yield from path(spout, 0.04)
+        yield from path([(0, height - 0.1, z - wall), (0, top, z - wall), (0, top - 0.03, z - 0.32)], 0.04)
 
 
 def _bed(rng):
@@ -87,8 +86,7 @@ def _desk(rng):
     x, z, height, thick = rng.uniform(0.45, 0.6), rng.uniform(0.95, 1.2), rng.uniform(0.9, 1.1), 0.05
     yield box((0, height, 0), (x, thick, z))
     sides = (-1, 1) if rng.random() < 0.5 else (rng.choice([-1, 1]),)
-    half = rng.uniform(0.22, 0.3)
-    gap = rng.choice([0.05, 0.35])
+    half, gap = rng.uniform(0.22, 0.3), rng.choice([0.05, 0.35])
     for side in sides:
         middle, centre = 0.5 * (gap + height), side * (z - half - 0.04)
         yield box((0, middle, centre), (x - 0.06, 0.5 * (height - gap), half))
@@ -121,8 +119,7 @@ def _dresser(rng):
             yield box((x + 0.01, y, b), (0.035, 0.5 * tall - 0.03, 0.5 * wide - 0.03))
             yield ball((x + 0.07, y, b), 0.045)
     if rng.random() < 0.5:
-        feet = _corners(x - 0.08, z - 0.08)
-        yield from (bar((a, -height - 0.18, b), (a, -height, b), 0.05, 0.05) for a, b in feet)
+        yield from (bar((a, -height - 0.18, b), (a, -height, b), 0.05, 0.05) for a, b in _corners(x - 0.08, z - 0.08))
     else:
         yield box((0, -height - 0.04, 0), (x - 0.04, 0.08, z - 0.04))
 
@@ -131,17 +128,13 @@ def _monitor(rng):
     """Build a monitor: a flat screen with a frame, on a neck with a round or square foot."""
     z, height, thick = rng.uniform(0.85, 1.1), rng.uniform(0.5, 0.7), rng.uniform(0.05, 0.08)
     tilt = rng.uniform(0.0, 0.15)
-    level = height + rng.uniform(0.25, 0.4)
-    lean = ((0.0, 0.0, 1.0), tilt)
+    level, lean, rim = height + rng.uniform(0.25, 0.4), ((0.0, 0.0, 1.0), tilt), 0.05
     yield box((0, level, 0), (thick, height, z), 0.03, lean)
-    rim = 0.05
-    front = thick + 0.02
+    out = np.array([np.cos(tilt), np.sin(tilt), 0.0]) * (thick + 0.02)
     for side in (-1, 1):
         offset = np.array([-np.sin(tilt), np.cos(tilt), 0.0]) * side * (height - rim)
-        out = np.array([np.cos(tilt), np.sin(tilt), 0.0]) * front
         yield box(np.array([0, level, 0]) + out + offset, (0.03, rim, z), 0.02, lean)
-        centre = np.array([0, level, side * (z - rim)]) + out
-        yield box(centre, (0.03, height, rim), 0.02, lean)
+        yield box(np.array([0, level, side * (z - rim)]) + out, (0.03, height, rim), 0.02, lean)
     if rng.random() < 0.5:
         yield box((-thick - 0.04, level, 0), (0.08, 0.5 * height, 0.5 * z), 0.04)
     neck = rng.uniform(0.06, 0.12)
@@ -149,8 +142,8 @@ def _monitor(rng):
     foot = rng.uniform(0.3, 0.45)
     if rng.random() < 0.5:
         yield rod((0, 0, 0), (0, 0.08, 0), foot, 0.85 * foot)
-        return
-    yield box((0, 0.04, 0), (0.75 * foot, 0.04, 1.2 * foot))
+    else:
+        yield box((0, 0.04, 0), (0.75 * foot, 0.04, 1.2 * foot))
 
 
 def _night_stand(rng):
@@ -168,8 +161,7 @@ def _night_stand(rng):
         yield box((0, y, 0), (x + 0.02, 0.5 * tall - 0.03, z - 0.07))
         yield ball((x + 0.07, y, 0), 0.08)
     thick = rng.uniform(0.05, 0.08)
-    feet = _corners(x - thick, z - thick)
-    yield from (bar((a, 0, b), (a, legs, b), thick, thick) for a, b in feet)
+    yield from (bar((a, 0, b), (a, legs, b), thick, thick) for a, b in _corners(x - thick, z - thick))
 
 
 def _sofa(rng):
@@ -212,8 +204,7 @@ def _toilet(rng):
         yield rod(lid - 0.035 * out, lid + 0.035 * out, bowl)
         return
     # Fill the bowl if the lid is shut, because no view can see into it.
-    inside = rod((0.1, level - deep, 0), (0.1, level + 0.07, 0), bowl - 0.1)
-    yield inside
+    yield rod((0.1, level - deep, 0), (0.1, level + 0.07, 0), bowl - 0.1)
     yield rod((0.1, level + 0.05, 0), (0.1, level + 0.12, 0), bowl + 0.02)
 
 

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from jaxnbv.checks import require
 from jaxnbv.scanning.sdf import UNUSED, LabelledSolid
 
-# Number of slots for primitives in a solid. Larger solids use a multiple of this number.
+# Number of slots for primitives in a solid. Larger solids have a multiple of it.
 CAPACITY = 24
 
 _IDENTITY, _NO_OFFSET = np.eye(3), np.zeros(3)
@@ -54,8 +54,7 @@ def box(label: int, centre, half_size, rounding: float = 0.02, axis_angle: tuple
     """Return a box with rounded edges.
 
     - `rounding`: radius of the edges, at most the smallest half size.
-    - `axis_angle`: axis and angle (radians) of a right-handed rotation of the box about its centre; None for no
-      rotation.
+    - `axis_angle`: axis and angle (radians) of a right-handed rotation of the box about its centre.
     """
     half_size = np.asarray(half_size, dtype=float)
     rotation = np.eye(3) if axis_angle is None else rotation_about(*axis_angle)
@@ -97,15 +96,11 @@ def ring(
 
 
 def rod(label: int, start, end, radius: float, end_radius: float | None = None, rounding: float = 0.02) -> Primitive:
-    """Return a solid with circular cross-section and flat ends.
-
-    The radius changes linearly from `radius` at `start` to `end_radius` at `end`; default: constant radius.
-    """
+    """Return a rod or cone with flat ends. Its radius changes linearly to `end_radius`, if given."""
     start, end = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
     length = float(np.linalg.norm(end - start))
     end_radius = radius if end_radius is None else end_radius
-    slant = (end_radius - radius) / length
-    mean = 0.5 * (radius + end_radius)
+    slant, mean = (end_radius - radius) / length, 0.5 * (radius + end_radius)
     return ring(label, 0.5 * (start + end), end - start, 0.0, mean, 0.5 * length, rounding, slant)
 
 
@@ -145,11 +140,9 @@ def _upright(axis):
 
 
 def assemble(primitives: list[Primitive], rotation_angle: float = 0.0, longest_side: float = 2.5) -> LabelledSolid:
-    """Return the union of primitives, rotated about the y axis, then moved and scaled.
+    """Return the union of primitives, rotated about the y axis by an angle in radians, then moved and scaled.
 
-    The bounding box of the result is centred in the scene, and its longest side is `longest_side`.
-
-    - `rotation_angle`: angle of the rotation, in radians.
+    The bounding box of the result is centred in the scene and has this longest side.
     """
     rotation = rotation_about((0.0, 1.0, 0.0), rotation_angle)
     return union(fit([move(p, rotation=rotation) for p in primitives], longest_side))
@@ -181,9 +174,7 @@ def fit(primitives: list[Primitive], longest_side: float) -> list[Primitive]:
 
 
 def union(primitives: list[Primitive], capacity: int = CAPACITY) -> LabelledSolid:
-    """Return the union of primitives without moving them.
-
-    - `capacity`: number of slots for primitives in the solid. Spare slots stay unused.
+    """Return the union of primitives, with `capacity` slots for primitives.
 
     **Raises:** `ValueError` if there are no primitives, or more primitives than the capacity.
     """

@@ -27,7 +27,7 @@ _BUILDERS = {
     "table": furniture.table,
 }
 
-# The categories that have procedural objects, in the order of `networks.CATEGORIES`.
+# In the order of `networks.CATEGORIES`.
 PART_CATEGORIES = tuple(_BUILDERS)
 
 # All objects face along x, as in ShapeNet, up to this rotation about the y axis.
@@ -38,8 +38,7 @@ class PartScene(eqx.Module):
     """An object, its category, and which of the fifty parts of ShapeNet-part it has.
 
     - `solid`: the object. Its labels are indices of the fifty parts.
-    - `category`: index of the object's category in `networks.CATEGORIES`.
-    - `parts`: True for each of the fifty parts that the object has.
+    - `category`: index in `networks.CATEGORIES`.
     """
 
     solid: LabelledSolid

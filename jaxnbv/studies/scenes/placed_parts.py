@@ -45,8 +45,8 @@ class Parts:
     def choose(self, index: int) -> int:
         """Return the index of the part for the scene with this index.
 
-        One half of the parts is for scenes with even indices, and the other half for odd indices. In each half, every
-        part comes once before any part repeats.
+        One half of the parts is for even indices, the other half for odd ones. In each half, every part comes once
+        before any part repeats.
         """
         half = np.random.default_rng(_ORDER_SEED).permutation(len(self.meshes))[index % 2 :: 2]
         return int(half[index // 2 % len(half)])
@@ -54,9 +54,7 @@ class Parts:
 
 @functools.cache
 def parts_in(files: tuple[MeshFile, ...]) -> Parts:
-    """Read parts from mesh files.
-
-    A file that cannot be used is left out, and a `UserWarning` names it.
+    """Read parts from mesh files. An unusable file is left out, and a `UserWarning` names it.
 
     **Raises:** `ValueError` if there is only one part.
     """
@@ -68,18 +66,12 @@ def parts_in(files: tuple[MeshFile, ...]) -> Parts:
     bank = ShapeBank.from_meshes([file.path for file in files], names=names, scale=1.0, up=files[0].up)
     require(len(bank) > 1, f"there is only one part, {bank.names[0]}: give a folder of at least two parts")
     file_of_name = {name.encode()[:64].decode(errors="ignore"): file for name, file in zip(names, files, strict=True)}
-    return Parts(bank, tuple(_at_true_size(file_of_name[name].read()) for name in bank.names))
-
-
-def _at_true_size(mesh: TriangleMesh) -> TriangleMesh:
-    return TriangleMesh(mesh.vertices / mesh.frame.scale, mesh.faces, Frame())
+    meshes = (file_of_name[name].read() for name in bank.names)
+    return Parts(bank, tuple(TriangleMesh(mesh.vertices / mesh.frame.scale, mesh.faces, Frame()) for mesh in meshes))
 
 
 def confusable_parts(index: int) -> tuple[str, Parts, int]:
-    """Return the name of a set of look-alike parts, its parts, and the index of the part for a scene.
-
-    - `index`: index of the scene. The set is `CONFUSABLE_SETS[index % 10]`.
-    """
+    """Return the name and the parts of the set `CONFUSABLE_SETS[index % 10]`, and the part of the scene `index`."""
     cycle, set_index = divmod(index, len(CONFUSABLE_SETS))
     name = CONFUSABLE_SETS[set_index]
     order = np.random.default_rng(_ORDER_SEED + set_index).permutation(PARTS_OF_SET)
@@ -118,19 +110,13 @@ class PlacedPart(eqx.Module):
         return self.placed_mesh(self.part, self.rotation, self.shift)
 
     def placed_mesh(self, part: int, rotation: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"]) -> TriangleMesh:
-        """Return the mesh of a part with a given placement, in scene coordinates.
-
-        - `part`: index of the part in the bank, which need not be the scene's part.
-        """
+        """Return the mesh of any part of the bank with a given placement, in scene coordinates."""
         mesh = self.parts.meshes[part]
         return TriangleMesh(self.scale * mesh.vertices @ np.asarray(rotation).T + shift, mesh.faces, Frame())
 
 
 def place_part(parts: Parts, part: int, setup: Setup, key: PRNGKeyArray) -> PlacedPart:
-    """Place a part at random in a setup.
-
-    The part gets a random rotation, or rests on a table in a random stable pose if `Setup.is_resting`.
-    """
+    """Place a part in a random rotation, or on a table in a random stable pose if the setup has a table."""
     random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     vertices = parts.meshes[part].vertices
     rotation = _resting(vertices, random) if setup.is_resting else Rotation.random(rng=random).as_matrix()
@@ -142,10 +128,7 @@ def place_part(parts: Parts, part: int, setup: Setup, key: PRNGKeyArray) -> Plac
 
 
 def _resting(vertices: Float[np.ndarray, "v 3"], random: np.random.Generator) -> Float[np.ndarray, "3 3"]:
-    """Return the rotation of a random stable pose on a table. The y axis is up.
-
-    A pose is drawn with the probability that a dropped part comes to rest in this pose.
-    """
+    """Return the rotation of a stable pose on a table (y is up), as likely as a dropped part comes to rest in it."""
     hull = trimesh.Trimesh(vertices, process=False).convex_hull
     matrices, probabilities = trimesh.poses.compute_stable_poses(hull)
     rest_rotation = matrices[random.choice(len(probabilities), p=probabilities / probabilities.sum())][:3, :3]
@@ -155,19 +138,14 @@ def _resting(vertices: Float[np.ndarray, "v 3"], random: np.random.Generator) ->
 
 
 def _obstacles(half: Float[np.ndarray, "3"], has_box: bool, random: np.random.Generator) -> Obstacles:
-    """Return a table below a part whose bounding box is centred and has the half sizes `half`.
-
-    If `has_box`, a box on the table hides half of one side of the part.
-    """
+    """Return a table below a centred part of half sizes `half`, and a box that hides half of one side if `has_box`."""
     table = HalfSpace(np.array([0.0, -half[1], 0.0]), np.array([0.0, 1.0, 0.0]))
     if not has_box:
         return Obstacles((table,))
     normal_axis, side_axis = random.permutation([0, 2])
     size, center = np.zeros(3), np.zeros(3)
-    size[normal_axis], center[normal_axis] = (
-        _HALF_THICKNESS,
-        random.choice([-1.0, 1.0]) * (half[normal_axis] + _GAP + _HALF_THICKNESS),
-    )
+    size[normal_axis] = _HALF_THICKNESS
+    center[normal_axis] = random.choice([-1.0, 1.0]) * (half[normal_axis] + _GAP + _HALF_THICKNESS)
     size[side_axis] = 0.5 * (half[side_axis] + _OVERHANG)
     center[side_axis] = random.choice([-1.0, 1.0]) * size[side_axis]
     size[1] = half[1] + _OVERHANG

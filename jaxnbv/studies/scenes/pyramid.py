@@ -14,11 +14,7 @@ from jaxnbv.studies.scenes.splits import Split, scene_key
 
 
 class Pyramid(ClassObject):
-    """A pyramid. The pattern imprinted on its base tells its class.
-
-    - `solid`: the pyramid in scene coordinates.
-    - `label`: index of the pattern in `PATTERNS`.
-    """
+    """A pyramid in scene coordinates. The pattern imprinted on its base tells its class, an index in `PATTERNS`."""
 
     solid: ImprintedPyramid
     label: Int[Array, ""]
@@ -29,8 +25,7 @@ class Pyramid(ClassObject):
     def on_cue(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[Array, "*n"]:
         """Return whether each point of the surface lies on the floor or the walls of the pattern.
 
-        - `x`: points on the surface without noise, because the floor is only a few hundredths below the base.
-        - `tolerance`: largest distance from the pattern, in scene units.
+        Points must have no noise, because the floor is only a few hundredths below the base.
         """
         distance, height = self.solid.imprint(x)
         return (distance <= tolerance) & (height > tolerance)
@@ -41,9 +36,9 @@ def pyramid_scene(
 ) -> Pyramid:
     """Return the pyramid with this index in a split. Its class is `PATTERNS[index % 5]`.
 
-    The pyramid has a random height. The size, position, rotation and depth of its pattern are random too. The pyramid
-    is centred in the scene. It has a random rotation if `is_rotated`, else it is upright along z. The two framings give
-    the same pyramid at different sizes. The function runs under `jit` and `vmap`.
+    The height of the pyramid and the size, position, rotation and depth of its pattern are random. The pyramid is
+    centred in the scene. It has a random rotation if `is_rotated`, else it is upright along z. Both framings give one
+    pyramid in two sizes. The function runs under `jit` and `vmap`.
 
     **Raises:** `ValueError` if the index is negative.
     """

@@ -63,20 +63,17 @@ def _rectangles(flags: Bool[np.ndarray, "m n"]) -> Iterator[tuple[int, slice, sl
 
 
 def loaded_truck(truck: TriangleMesh, cargo: TriangleMesh, label: int, key: PRNGKeyArray) -> ClassMesh:
-    """Return a truck mesh that carries a cargo mesh, placed as in `truck_scene`.
+    """Return a truck mesh that carries a cargo mesh of a class (`label`), placed as in `truck_scene`.
 
     Both meshes must be upright. The cargo is rotated about the vertical by a random angle and scaled to fill the bed.
     The loaded truck has a random rotation.
-
-    - `label`: index of the cargo's class.
 
     **Raises:** `ValueError` if the truck has no bed that `bed_of` finds.
     """
     rng = generator(key)
     rotated_vertices = cargo.vertices @ rotation_about((0.0, 1.0, 0.0), rng.uniform(-np.pi, np.pi)).T
-    scale, offset = placement_on_bed(
-        bed_of(truck), np.stack([rotated_vertices.min(axis=0), rotated_vertices.max(axis=0)]), rng
-    )
+    bounds = np.stack([rotated_vertices.min(axis=0), rotated_vertices.max(axis=0)])
+    scale, offset = placement_on_bed(bed_of(truck), bounds, rng)
     cargo_vertices = scale * rotated_vertices + offset
     rotation = random_rotation(rng)
     vertices = np.concatenate([truck.vertices, cargo_vertices]) @ rotation.T

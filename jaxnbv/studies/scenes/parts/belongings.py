@@ -48,10 +48,8 @@ def guitar(rng: np.random.Generator) -> Iterator[Primitive]:
     yield disc(waist, 0.0, upper)
     yield box(BODY, (0, 0.5 * waist, 0), (depth, 0.3, 0.7 * upper))
     top = waist + upper
-    if rng.random() < 0.4:
-        yield from (
-            bar(BODY, (0, waist, side * 0.2), (0, top + 0.1, side * 0.3), 0.07, depth, 0.05) for side in (-1, 1)
-        )
+    for side in (-1, 1) if rng.random() < 0.4 else ():
+        yield bar(BODY, (0, waist, side * 0.2), (0, top + 0.1, side * 0.3), 0.07, depth, 0.05)
     front = depth + thin - 0.02
     yield box(BODY, (front, -0.1, 0), (thin, 0.045, 0.2))
     yield bar(NECK, (front, 0.5 * waist, 0), (front, top + neck, 0), rng.uniform(0.07, 0.09), thin + 0.01)
@@ -121,6 +119,5 @@ def mug(rng: np.random.Generator) -> Iterator[Primitive]:
     power = rng.choice([1.0, 0.55])
     out = reach * np.cos(angle) ** power
     y = 0.5 * (top + bottom) + 0.5 * (top - bottom) * np.sign(np.sin(angle)) * np.abs(np.sin(angle)) ** power
-    start = radius - wall + slant * y
-    points = np.stack([-start - out, y, np.zeros(6)], axis=-1)
+    points = np.stack([-(radius - wall + slant * y) - out, y, np.zeros(6)], axis=-1)
     yield from path(MUG_HANDLE, points, rng.uniform(0.08, 0.12))

@@ -16,8 +16,7 @@ def chair(rng: np.random.Generator) -> Iterator[Primitive]:
     """Build a chair on legs, a star base or runners, with a panel or slats behind and perhaps armrests."""
     half_width, half_depth = rng.uniform(0.5, 0.65), rng.uniform(0.5, 0.62)
     height, rise = rng.uniform(0.9, 1.15), rng.uniform(1.0, 1.4)
-    thick = rng.uniform(0.05, 0.09)
-    lean = rng.uniform(0.05, 0.3)
+    thick, lean = rng.uniform(0.05, 0.09), rng.uniform(0.05, 0.3)
     yield box(SEAT, (0, height, 0), (half_depth, thick, half_width), rng.uniform(0.02, thick))
     yield from _chair_legs(rng, half_width, half_depth, height - thick)
     yield from _chair_back(rng, half_width, half_depth, height, rise, lean)
@@ -38,28 +37,22 @@ def _chair_legs(rng, half_width, half_depth, height):
         yield rod(LEG, (0, 0.12, 0), (0, height + 0.02, 0), rng.uniform(0.06, 0.1))
         reach, start_angle = rng.uniform(0.5, 0.62), rng.uniform(0, 2 * np.pi)
         for angle in start_angle + 2 * np.pi * np.arange(5) / 5:
-            tip = (reach * np.cos(angle), 0.06, reach * np.sin(angle))
-            yield bar(LEG, (0, 0.14, 0), tip, 0.05, 0.045)
+            yield bar(LEG, (0, 0.14, 0), (reach * np.cos(angle), 0.06, reach * np.sin(angle)), 0.05, 0.045)
         return
     radius = rng.uniform(0.045, 0.07)
     feet = [(a * (x + splay), 0.0, b * (z + splay)) for a, b in corners]
     tops = [(a * x, height + 0.03, b * z) for a, b in corners]
     if kind == "runners":
         yield from (bar(LEG, foot, top, radius, radius) for foot, top in zip(feet, tops, strict=True))
-        yield from (
-            bar(LEG, (-x - splay - radius, 0.03, b), (x + splay + radius, 0.03, b), radius, 0.05)
-            for b in (-z - splay, z + splay)
-        )
+        for b in (-z - splay, z + splay):
+            yield bar(LEG, (-x - splay - radius, 0.03, b), (x + splay + radius, 0.03, b), radius, 0.05)
         return
     taper = rng.uniform(0.7, 1.0)
     yield from (rod(LEG, foot, top, max(0.04, taper * radius), radius) for foot, top in zip(feet, tops, strict=True))
     if rng.random() < 0.4:
         y = rng.uniform(0.25, 0.5) * height
-        half_spans = x + splay * (1 - y / height), z + splay * (1 - y / height)
-        yield from (
-            rod(LEG, (-half_spans[0], y, b * half_spans[1]), (half_spans[0], y, b * half_spans[1]), 0.04)
-            for b in (-1, 1)
-        )
+        half_x, half_z = x + splay * (1 - y / height), z + splay * (1 - y / height)
+        yield from (rod(LEG, (-half_x, y, b * half_z), (half_x, y, b * half_z), 0.04) for b in (-1, 1))
 
 
 def _chair_back(rng, half_width, half_depth, height, rise, lean):
@@ -71,20 +64,15 @@ def _chair_back(rng, half_width, half_depth, height, rise, lean):
     if rng.random() < 0.5:
         gap = rng.choice([0.0, 0.25])
         yield bar(BACK, point_at(gap, 0.0), point_at(1.0, 0.0), half_width - 0.02, thick, 0.03)
-        if gap:
-            yield from (
-                bar(BACK, point_at(0.0, z), point_at(0.4, z), 0.05, thick)
-                for z in (-0.5 * half_width, 0.5 * half_width)
-            )
+        for z in (-0.5 * half_width, 0.5 * half_width) if gap else ():
+            yield bar(BACK, point_at(0.0, z), point_at(0.4, z), 0.05, thick)
         return
     z = half_width - 0.06
     yield from (bar(BACK, point_at(0.0, side * z), point_at(1.0, side * z), 0.06, 0.05) for side in (-1, 1))
     if rng.random() < 0.5:
         yield bar(BACK, point_at(0.85, 0.0), point_at(1.0, 0.0), z, thick)
-        fractions = np.linspace(-1, 1, int(rng.integers(2, 4)) + 2)[1:-1]
-        yield from (
-            bar(BACK, point_at(0.0, fraction * z), point_at(0.9, fraction * z), 0.05, 0.035) for fraction in fractions
-        )
+        for fraction in np.linspace(-1, 1, int(rng.integers(2, 4)) + 2)[1:-1]:
+            yield bar(BACK, point_at(0.0, fraction * z), point_at(0.9, fraction * z), 0.05, 0.035)
         return
     yield from (bar(BACK, point_at(c - 0.08, 0.0), point_at(c + 0.08, 0.0), z, 0.035) for c in (0.4, 0.65, 0.92))
 
@@ -96,8 +84,7 @@ def table(rng: np.random.Generator) -> Iterator[Primitive]:
         radius = rng.uniform(0.95, 1.2)
         yield rod(TOP, (0, height - thick, 0), (0, height + thick, 0), radius, rounding=0.03)
         if rng.random() < 0.6:
-            foot = rng.uniform(0.5, 0.7) * radius
-            column = rng.uniform(0.08, 0.14)
+            foot, column = rng.uniform(0.5, 0.7) * radius, rng.uniform(0.08, 0.14)
             yield rod(TABLE_LEG, (0, 0.05, 0), (0, height, 0), column * rng.uniform(1.0, 1.6), column)
             yield rod(TABLE_LEG, (0, 0.0, 0), (0, 0.12, 0), foot, 0.85 * foot, rounding=0.03)
         else:
@@ -117,8 +104,7 @@ def table(rng: np.random.Generator) -> Iterator[Primitive]:
         yield box(DRAWER, (0, y, 0), (half_depth - 0.12, 0.045, half_width - 0.12))
     elif extra != "none":
         half = np.array([0.7 * half_depth, rng.uniform(0.12, 0.2), rng.uniform(0.25, 0.35)])
-        positions = [0.0] if extra == "drawer" else [-0.5 * half_width, 0.5 * half_width]
-        for z in positions:
+        for z in [0.0] if extra == "drawer" else [-0.5 * half_width, 0.5 * half_width]:
             y = height - thick - half[1] + 0.02
             yield box(DRAWER, (0.15 * half_depth, y, z), half)
             yield box(DRAWER, (0.85 * half_depth + 0.02, y, z), (0.05, 0.035, 0.09))
@@ -136,13 +122,11 @@ def _table_legs(rng, x, z, height):
 
 def lamp(rng: np.random.Generator) -> Iterator[Primitive]:
     """Build a standing lamp, a desk lamp with a bent arm, or a hanging lamp. The shade is open below."""
-    kind = rng.choice(["standing", "desk", "hanging"], p=[0.4, 0.3, 0.3])
-    tube = rng.uniform(0.045, 0.07)
+    kind, tube = rng.choice(["standing", "desk", "hanging"], p=[0.4, 0.3, 0.3]), rng.uniform(0.045, 0.07)
     if kind == "desk":
         yield from _desk_lamp(rng, tube)
         return
-    narrow, wide = rng.uniform(0.3, 0.5), rng.uniform(0.55, 0.85)
-    tall = rng.uniform(0.6, 0.9)
+    narrow, wide, tall = rng.uniform(0.3, 0.5), rng.uniform(0.55, 0.85), rng.uniform(0.6, 0.9)
     if kind == "hanging":
         drop, cap = rng.uniform(0.9, 1.4), rng.uniform(0.22, 0.35)
         yield rod(TUBE, (0, tall - 0.1, 0), (0, tall + drop, 0), tube)

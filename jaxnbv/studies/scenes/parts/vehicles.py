@@ -20,8 +20,7 @@ def airplane(rng: np.random.Generator) -> Iterator[Primitive]:
     yield rod(BODY, (0.83, 0, 0), (1.22, -0.02, 0), radius, 0.35 * radius, rounding=0.03)
     yield rod(BODY, (-1.25, 0.06, 0), (-0.53, 0, 0), 0.4 * radius, radius)
     span, chord, height = rng.uniform(0.95, 1.25), rng.uniform(0.17, 0.24), rng.choice([-0.5, 0.6]) * radius
-    dihedral = rng.uniform(0.0, 0.12)
-    kind = rng.choice(["two", "four", "tail"], p=[0.45, 0.3, 0.25])
+    dihedral, kind = rng.uniform(0.0, 0.12), rng.choice(["two", "four", "tail"], p=[0.45, 0.3, 0.25])
     size = rng.uniform(0.08, 0.1)
     for side in (-1, 1):
         root, tip = np.array([0.15, height, 0.0]), np.array([0.15 - sweep, height + dihedral, side * span])
@@ -37,8 +36,7 @@ def airplane(rng: np.random.Generator) -> Iterator[Primitive]:
             yield rod(ENGINE, (-0.8, 0.05, z), (-0.35, 0.05, z), 0.85 * size, size)
     rise = rng.uniform(0.38, 0.5)
     yield bar(TAIL, (-1.0, 0.05, 0), (-1.2, rise, 0), 0.035, 0.15)
-    level = rise if kind == "tail" else 0.1
-    back = -1.2 if kind == "tail" else -1.08
+    back, level = (-1.2, rise) if kind == "tail" else (-1.08, 0.1)
     reach = rng.uniform(0.36, 0.45)
     for side in (-1, 1):
         yield bar(TAIL, (back, level, 0), (back - 0.15, level, side * reach), 0.12, 0.033)
@@ -46,8 +44,7 @@ def airplane(rng: np.random.Generator) -> Iterator[Primitive]:
 
 def rocket(rng: np.random.Generator) -> Iterator[Primitive]:
     """Build an upright rocket with three or four fins, and with or without boosters between the fins."""
-    radius = rng.uniform(0.2, 0.32)
-    nose = rng.uniform(0.45, 0.7)
+    radius, nose = rng.uniform(0.2, 0.32), rng.uniform(0.45, 0.7)
     yield rod(HULL, (0, 0, 0), (0, 1.75, 0), radius, radius * rng.uniform(0.85, 1.0))
     yield rod(HULL, (0, -0.15, 0), (0, 0.05, 0), 0.75 * radius, 0.5 * radius)
     yield rod(NOSE, (0, 1.72, 0), (0, 1.75 + nose, 0), 0.85 * radius, 0.15 * radius, rounding=0.02)
@@ -56,8 +53,7 @@ def rocket(rng: np.random.Generator) -> Iterator[Primitive]:
     height = rng.uniform(0.2, 0.3)
     for angle in start_angle + 2 * np.pi * np.arange(count) / count:
         rotation = rotation_about((0, 1, 0), angle)
-        root, tip = rotation @ [0.5 * radius, 0.35, 0], rotation @ [reach, 0.05, 0]
-        yield bar(FIN, root, tip, 0.035, height)
+        yield bar(FIN, rotation @ [0.5 * radius, 0.35, 0], rotation @ [reach, 0.05, 0], 0.035, height)
         if boosters:
             x, _, z = rotation_about((0, 1, 0), angle + np.pi / count) @ [radius + 0.09, 0, 0]
             yield rod(HULL, (x, 0.0, z), (x, 0.9, z), 0.12, 0.08)
@@ -81,8 +77,7 @@ def motorbike(rng: np.random.Generator) -> Iterator[Primitive]:
     yield box(FRAME, (0.0, 0.12, 0), (0.3, 0.2, 0.15), 0.08)
     yield box(FRAME, (0.05, 0.36, 0), (0.16, 0.12, 0.11), 0.04, ((0, 0, 1), rng.uniform(-0.3, 0.3)))
     yield bar(FRAME, (-0.5, 0.42, 0), shift(head, y=-0.05), 0.06, 0.06)
-    side = rng.choice([-1, 1])
-    exhaust = rng.uniform(0.05, 0.25)
+    side, exhaust = rng.choice([-1, 1]), rng.uniform(0.05, 0.25)
     yield rod(FRAME, (0.1, 0.0, side * 0.2), (-base - 0.15, exhaust, side * 0.2), 0.05, 0.08)
     yield box(TANK, (0.17, 0.62, 0), (rng.uniform(0.26, 0.32), 0.14, 0.15), 0.12, ((0, 0, 1), 0.15))
     yield box(SEAT, (-0.36, 0.54, 0), (0.28, 0.08, 0.14), 0.06)
