@@ -70,6 +70,7 @@ class Words:
         return f"{capital(' and '.join(self.answer.names[index] for index in self.shown))}?"
 
     def value(self, answer: Answer, index: int) -> str:
+        """Return number `index` of an answer as text."""
         return answer.form.format(answer.values[index])
 
     def said(self, before: Answer | None = None) -> str:
@@ -225,7 +226,7 @@ class _ColdestWords(Words):
 
 
 class CoverageAnswer(Answer):
-    """Amount of surface seen: percent of the true surface, or an area in `unit` if the truth is not known."""
+    """Surface seen: percent of the true surface, or an area in `unit` if that is unknown. `amount` is the text."""
 
     unit: str = "%"
 

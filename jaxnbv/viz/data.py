@@ -37,7 +37,7 @@ class ViewData(eqx.Module):
     - `before`, `new`: points of the cloud before the view, and points that the view added, in scene coordinates.
     - `surface`: the surface after the view: the likeliest known shape, or else the pieces of the posterior mean's
       surface near the cloud. None if the grid holds no surface. Its deviation (world units) grows with the distance
-      from the cloud.
+      from the cloud. `has_shape` says whether it is a known shape.
     - `coverage`: amount of surface seen after the view.
     - `sentences`: see `sentences_about`.
     - `imagined`, `image`: see `render_imagined` and `view_image`.

@@ -1,12 +1,12 @@
 """Pictures of a step's imagined surfaces, as the chosen camera would see them."""
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import equinox as eqx
 import matplotlib as mpl
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, PRNGKeyArray, UInt8
 from scipy.spatial import cKDTree
 
 from jaxnbv.geometry.camera import Camera
@@ -15,13 +15,16 @@ from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.planning.episode import Episode
 from jaxnbv.planning.loop import View, view_keys
-from jaxnbv.sampler import StepInputs
+from jaxnbv.sampler import StepInputs, SurfaceSampler
 from jaxnbv.scanning import TriangleMesh, barrier_of, scan
 from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.surfaces.part_hypotheses import PartHypotheses
 from jaxnbv.viz.placed_shape import placed_parts
 from jaxnbv.viz.sphere import unit
 from jaxnbv.viz.style import BEFORE, NEW
+
+# Vertices and faces.
+Triangles: TypeAlias = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
 
 NUM_SHOWN = 4
 _PIXELS = 96
@@ -35,7 +38,7 @@ class ShadedImage(eqx.Module):
     """A shaded picture of a surface from a camera.
 
     - `mask`: whether each ray hits the surface.
-    - `brightness`: brightness by a lamp beside the camera, in [0, 1].
+    - `brightness`: brightness in [0, 1].
     - `is_seen`: whether an earlier view saw the surface at this pixel.
     """
 
@@ -47,8 +50,7 @@ class ShadedImage(eqx.Module):
 class Imagined(eqx.Module):
     """Imagined surfaces of a step before its view.
 
-    - `samples`: pictures from the chosen pose of some sampled surfaces, or of the likeliest parts.
-    - `names`: name of each sample.
+    - `samples`, `names`: pictures from the chosen pose of some sampled surfaces or of the likeliest parts, and names.
     - `kinds`: kinds of known shapes with their probabilities. Empty without known shapes.
     """
 
@@ -58,14 +60,13 @@ class Imagined(eqx.Module):
 
 
 def render_imagined(episode: Episode, index: int, inputs: StepInputs) -> Imagined | None:
-    """Return pictures of the surfaces imagined before view `index`, or None.
+    """Return pictures of the surfaces imagined before view `index` (from 0).
 
-    The result is None if the planner did not choose this view, or if the search used neither samples nor parts.
+    Return None if the planner did not choose this view, or if the search used neither samples nor parts.
 
-    - `index`: number of the view, from 0. The planner does not choose view 0.
     - `inputs`: inputs of the step that chose the view, with the samples.
     """
-    planner, sampler, view = episode.planner, episode.planner.sampler, episode.views[index]
+    planner, view = episode.planner, episode.views[index]
     parts = inputs.observations.hypotheses if planner.acquisition.needs_hypotheses else None
     if view.proposal is None or (inputs.surfaces is None and parts is None):
         return None
@@ -77,16 +78,10 @@ def render_imagined(episode: Episode, index: int, inputs: StepInputs) -> Imagine
         names, kinds = [part.name for part in likely], parts.names()
         meshes: list[TriangleMesh | None] = [TriangleMesh(part.vertices, part.faces, Frame()) for part in likely]
     else:
-        assert inputs.surfaces is not None
-        assert inputs.posterior is not None
-        all_triangles = [
-            level_triangles(values, sampler.grid) for values in np.array(inputs.surfaces.values[:NUM_SHOWN])
-        ]
-        meshes = [None if triangles is None else TriangleMesh(*triangles[:2], Frame()) for triangles in all_triangles]
         sample_key, *_ = view_keys(episode.key, index)
-        shapes = inputs.posterior.names_of_samples(sample_key, sampler.num_samples)[: len(meshes)]
+        shapes, triangles, kinds = sampled_surfaces(planner.sampler, inputs, sample_key)
         names = [shape or f"imagined {number}" for number, shape in enumerate(shapes, start=1)]
-        kinds = inputs.posterior.kinds()
+        meshes = [None if one is None else TriangleMesh(*one, Frame()) for one in triangles]
     for mesh in meshes:
         if mesh is None:
             empty = np.zeros((camera.height, camera.width))
@@ -96,8 +91,23 @@ def render_imagined(episode: Episode, index: int, inputs: StepInputs) -> Imagine
     return Imagined(tuple(samples), tuple(names), tuple(kinds.items()))
 
 
+def sampled_surfaces(
+    sampler: SurfaceSampler, inputs: StepInputs, key: PRNGKeyArray
+) -> tuple[list[str], list[Triangles | None], dict[str, float]]:
+    """Return names and triangles of at most four samples, and the probabilities of kinds of known shapes.
+
+    - `inputs`: inputs of a step, with a posterior, and with samples drawn with `key`.
+    """
+    assert inputs.surfaces is not None
+    assert inputs.posterior is not None
+    # Marching cubes needs a writable array.
+    meshes = [level_triangles(values, sampler.grid) for values in np.array(inputs.surfaces.values[:NUM_SHOWN])]
+    names = inputs.posterior.names_of_samples(key, sampler.num_samples)[: len(meshes)]
+    return names, [None if mesh is None else mesh[:2] for mesh in meshes], inputs.posterior.kinds()
+
+
 def view_image(view: View, cloud: Float[np.ndarray, "n 3"]) -> ShadedImage | None:
-    """Return the picture of a view's scan; None if the scan is not an image. `cloud`: points seen before."""
+    """Return the picture of a view's scan, see `shaded_image`; None if the scan is not an image."""
     is_image = view.scan.capacity == view.camera.num_rays
     return shaded_image(view.scan, view.camera, view.pose, cloud) if is_image else None
 
@@ -115,7 +125,7 @@ def shaded_image(view_scan: PointCloud, camera: Camera, pose: Pose, cloud: Float
 
 
 def lamp(pose: Pose) -> Float[np.ndarray, "3"]:
-    """Return the unit vector toward the lamp of a picture, which is beside the camera."""
+    """Return the unit vector toward a picture's lamp, which is beside the camera."""
     right, down, forward = np.asarray(pose.rotation, np.float64).T
     return unit(-forward - 0.5 * right - 0.7 * down)
 
@@ -127,10 +137,7 @@ def _fine_camera(camera: Camera) -> Camera:
 
 
 def colour_image(image: ShadedImage, new_colour: str = BEFORE, is_plain: bool = False) -> UInt8[np.ndarray, "h w 3"]:
-    """Colour a picture: grey where seen before, `new_colour` elsewhere on the surface, white beside it.
-
-    - `is_plain`: whether to make the whole surface grey.
-    """
+    """Colour a surface grey where seen before, or everywhere if `is_plain`, and `new_colour` elsewhere."""
     tints = np.array([mpl.colors.to_rgb(colour) for colour in (new_colour, _SEEN_COLOUR)])
     colours = tints[(image.is_seen | is_plain).astype(int)] * (0.25 + 0.75 * image.brightness[..., None])
     return np.round(255.0 * np.where(image.mask[..., None], colours, 1.0)).astype(np.uint8)

@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 import matplotlib as mpl
 import numpy as np
 import trimesh
-from jaxtyping import Float, Int, PRNGKeyArray, UInt8
+from jaxtyping import Float, PRNGKeyArray, UInt8
 from matplotlib.colors import Colormap, LogNorm, Normalize, to_rgb
 from scipy.spatial.transform import Rotation
 
@@ -24,26 +24,36 @@ from jaxnbv.planning.episode import Episode
 from jaxnbv.planning.loop import view_keys
 from jaxnbv.planning.session import Session
 from jaxnbv.sampler import StepInputs, SurfaceSampler
-from jaxnbv.scanning.mesh import level_triangles
 from jaxnbv.search import Proposal
 from jaxnbv.storage.files import write_text
 from jaxnbv.surfaces.part_hypotheses import PartHypotheses
 from jaxnbv.utility import Answer, Quantity
 from jaxnbv.viz.answers import capital, kinds_text, value_text, words_of
 from jaxnbv.viz.choice import colour_range, open_values
+from jaxnbv.viz.imagined import NUM_SHOWN, Triangles, sampled_surfaces
 from jaxnbv.viz.mean_surface import MeanSurface
 from jaxnbv.viz.placed_shape import PlacedShape, placed_parts
 from jaxnbv.viz.scene import Cameras, Points, scene_items
 from jaxnbv.viz.shown_surface import shown_surface
-from jaxnbv.viz.style import BEFORE, DEVIATION, DISPUTED, GREY, IMAGINED, NEW, OPEN, PART, VALUE, gradient, middle_range
+from jaxnbv.viz.style import (
+    BEFORE,
+    DEVIATION,
+    DISPUTED,
+    GREY,
+    IMAGINED,
+    NEW,
+    PART,
+    VALUE,
+    gradient,
+    middle_range,
+    shape_colours,
+)
 from jaxnbv.viz.task import coverage_answers
 from jaxnbv.viz.words import pose_text
 
-# Vertices and faces; kinds of object with their probabilities.
-Triangles: TypeAlias = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
+# Kinds of object with their probabilities.
 Kinds: TypeAlias = tuple[tuple[str, float], ...]
 
-_NUM_SAMPLES = 4
 _NEXT_COLOUR = "#009e73"
 _EYE = (2.6, 1.7, 2.6)
 _POINT_SIZE, _CANDIDATE_SIZE, _FRUSTUM_SIZE = 0.012, 0.05, 0.22
@@ -54,11 +64,12 @@ _PANEL_STYLE = (
 
 
 class LiveView:
-    """A web page that shows an episode or a session. `update` draws it again.
+    """A web page that shows an episode or a session.
 
-    Coordinates are those of the scene, with y up. The page shows points, cameras, candidates coloured by value, and the
-    next view with its expected depth. The surface is the likeliest known shape, or else the posterior mean coloured by
-    its uncertainty. Imagined surfaces can be switched on in the scene tree. A slider goes back to earlier views.
+    It shows points, cameras, candidates coloured by value, and the next view with its expected depth, in scene
+    coordinates. The surface is the likeliest known shape, or else the posterior mean coloured by its uncertainty.
+    Imagined surfaces can be switched on in the scene tree. A slider goes back to earlier views. `stop` stops the server
+    at `address`.
 
     - `port`, `host`: address of the page. By default only this machine can open it.
 
@@ -81,7 +92,6 @@ class LiveView:
 
     @property
     def address(self) -> str:
-        """Address of the page."""
         return f"http://{self._server.get_host()}:{self._server.get_port()}"
 
     def update(self, shown: Episode | Session) -> None:
@@ -103,7 +113,7 @@ class LiveView:
         with self._drawing:
             if self._slider is not None:
                 self._slider.remove()
-                self._slider = None
+            self._slider = None
             if len(views) > 1:
                 self._slider = self._server.gui.add_slider("after view", 1, len(views), 1, len(views))
                 self._slider.on_update(lambda event: show(event.target.value))
@@ -124,12 +134,11 @@ class LiveView:
         scene, picture = self._server.scene, None if expected is None else _depth_picture(expected)
         with self._drawing:
             # Points appear at once; surfaces take longer.
+            items = scene_items(before, new, [view.pose for view in views], episode.sensor)
             with self._server.atomic():
                 for handle in self._handles:
                     handle.remove()
-                self._handles = _draw_items(
-                    scene, scene_items(before, new, [view.pose for view in views], episode.sensor)
-                )
+                self._handles = _draw_items(scene, items)
             observations = episode.observations_after(len(views)) if observations is None else observations
             key, *_ = view_keys(episode.key, len(views))
             answer = views[-1].answer(planner.acquisition)
@@ -140,20 +149,20 @@ class LiveView:
                     self._handles += _draw_choice(scene, planner.camera, proposal, picture)
                 if self._image is not None:
                     self._image.remove()
-                label = "depth expected there"
-                self._image = None if picture is None else self._server.gui.add_image(picture, label=label)
+                self._image = None
+                if picture is not None:
+                    self._image = self._server.gui.add_image(picture, label="depth expected there")
                 self._text.content = _live_text(episode, answer, kinds, proposal)
                 self._legend.content = _legend(surface, proposal, planner.quantity, episode.frame)
 
     def save(self, path: str | Path) -> Path:
-        """Write the present scene with its text and legend to one HTML file, which opens offline."""
+        """Write the present scene with text and legend to one HTML file, which opens offline."""
         page, end, rest = self._server.get_scene_serializer().as_html().rpartition("</body>")
         text = "".join(f"<p>{html.escape(line.replace('**', ''))}</p>" for line in self._text.content.split("\n\n"))
         write_text(Path(path), f'{page}<aside style="{_PANEL_STYLE}">{text}{self._legend.content}</aside>{end}{rest}')
         return Path(path)
 
     def stop(self) -> None:
-        """Stop the server."""
         self._server.stop()
 
 
@@ -165,26 +174,18 @@ def _surfaces(
     With known parts, the imagined surfaces are the likeliest parts. The surface agrees with the `answer`.
     """
     if isinstance(observations.hypotheses, PartHypotheses):
-        parts = placed_parts(observations.hypotheses, _NUM_SAMPLES)
+        parts = placed_parts(observations.hypotheses, NUM_SHOWN)
         surface = shown_surface(sampler, StepInputs(observations))
         return surface, [(part.name, (part.vertices, part.faces)) for part in parts], ()
     inputs = sampler.step_inputs(observations, key)
-    posterior, samples = inputs.posterior, inputs.surfaces
-    assert posterior is not None
-    assert samples is not None
     surface = shown_surface(sampler, inputs, answer)
-    # Marching cubes needs a writable array.
-    meshes = [level_triangles(values, sampler.grid) for values in np.array(samples.values[:_NUM_SAMPLES])]
-    names = posterior.names_of_samples(key, sampler.num_samples)
-    imagined = [(name, triangles[:2]) for name, triangles in zip(names, meshes, strict=False) if triangles is not None]
-    return surface, imagined, tuple(posterior.kinds().items())
+    names, meshes, kinds = sampled_surfaces(sampler, inputs, key)
+    imagined = [(name, triangles) for name, triangles in zip(names, meshes, strict=True) if triangles is not None]
+    return surface, imagined, tuple(kinds.items())
 
 
 def _live_text(episode: Episode, answer: Answer | None, kinds: Kinds, proposal: Proposal | None) -> str:
-    """Return the answer, the next view, the amount seen and the kinds of known shapes, as Markdown.
-
-    - `proposal`: the next view, with values in world units.
-    """
+    """Return the answer, the next view (in world units), the amount seen and the kinds of known shapes, as Markdown."""
     num_views, quantity, frame = len(episode.views), episode.planner.quantity, episode.frame
     lines = list[str]()
     if answer is not None:
@@ -193,10 +194,8 @@ def _live_text(episode: Episode, answer: Answer | None, kinds: Kinds, proposal: 
     if proposal is not None:
         error = proposal.standard_error
         error_text = "" if error is None else f" ± {float(error):.2g}"
-        value = value_text(quantity, float(proposal.value), frame)
-        lines.append(
-            f"**The next view** looks from {pose_text(proposal.pose, frame)}: {quantity.name} {value}{error_text}."
-        )
+        value = f"{value_text(quantity, float(proposal.value), frame)}{error_text}"
+        lines.append(f"**The next view** looks from {pose_text(proposal.pose, frame)}: {quantity.name} {value}.")
     coverage = coverage_answers(episode, None)[-1]
     lines.append(f"**{num_views} view{'s' if num_views > 1 else ''}**, {coverage.amount} of surface seen")
     lines += [kinds_text(kinds)] if kinds else []
@@ -221,18 +220,14 @@ def _draw_surface(scene: Any, surface: MeanSurface | None) -> list[Any]:
     if surface is None:
         return []
     if isinstance(surface, PlacedShape):
-        measured, agreed = surface.measured[:, None], surface.agreed[:, None]
-        scanned, imagined, disputed = (np.array(to_rgb(colour)) for colour in (PART, IMAGINED, OPEN))
-        colours = measured * scanned + (1.0 - measured) * (agreed * imagined + (1.0 - agreed) * disputed)
-        vertex_colors = np.round(255.0 * colours).astype(np.uint8)
+        vertex_colors = np.round(255.0 * shape_colours(surface.measured, surface.agreed)).astype(np.uint8)
         mesh = trimesh.Trimesh(surface.vertices, surface.faces, vertex_colors=vertex_colors, process=False)
         name = f"/likeliest {'part' if surface.is_part else 'shape'}, {surface.caption}"
         handles = [scene.add_mesh_trimesh(name, mesh)]
         if (disputed_space := surface.disputed_space) is not None:
             glass: dict[str, Any] = {"color": to_rgb(DISPUTED), "opacity": 0.25}
-            handles.append(
-                scene.add_mesh_simple("/other shapes", disputed_space.vertices, disputed_space.faces, **glass)
-            )
+            triangles = disputed_space.vertices, disputed_space.faces
+            handles.append(scene.add_mesh_simple("/other shapes", *triangles, **glass))
         return handles
     colours = DEVIATION(LogNorm(*middle_range(surface.deviation))(surface.deviation), bytes=True)
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, vertex_colors=colours, process=False)
@@ -240,7 +235,7 @@ def _draw_surface(scene: Any, surface: MeanSurface | None) -> list[Any]:
 
 
 def _draw_imagined(scene: Any, surfaces: Iterable[tuple[str, Triangles]]) -> list[Any]:
-    """Add imagined surfaces to the scene, hidden at first, and return their handles."""
+    """Add surfaces to the scene, hidden at first, and return their handles."""
     settings: dict[str, Any] = {"color": to_rgb("#8fb8d8"), "opacity": 0.9, "visible": False}
     return [
         scene.add_mesh_simple(f"/imagined/{number} {shape}".rstrip(), *triangles, **settings)
@@ -249,7 +244,7 @@ def _draw_imagined(scene: Any, surfaces: Iterable[tuple[str, Triangles]]) -> lis
 
 
 def _depth_picture(depth: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Colour a depth image: near is bright, far is dark, and NaN (no surface expected) is white."""
+    """Colour a depth image: near is bright, far is dark, NaN (no surface expected) is white."""
     colours = mpl.colormaps["viridis_r"].with_extremes(bad="white")
     return colours(Normalize(*colour_range(depth))(depth), bytes=True)[..., :3]
 

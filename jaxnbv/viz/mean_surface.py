@@ -1,11 +1,13 @@
 """Computes the surface of a posterior's mean as triangles, with a standard deviation at each vertex."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import trimesh
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
@@ -46,14 +48,20 @@ class MeanSurface(eqx.Module):
         """The triangles without normals and deviation."""
         return trimesh.Trimesh(self.vertices, self.faces, process=False)
 
+    def part(self, is_kept: Bool[np.ndarray, " v"]) -> "MeanSurface | None":
+        """Return the part with these vertices, which are those of whole pieces; None for a part without faces."""
+        faces = self.faces[is_kept[self.faces[:, 0]]]
+        if len(faces) == 0:
+            return None
+        rows = self.vertices[is_kept], (np.cumsum(is_kept) - 1)[faces], self.normals[is_kept], self.deviation[is_kept]
+        return MeanSurface(*rows)
+
 
 def mean_surface(sampler: SurfaceSampler, inputs: StepInputs) -> MeanSurface | None:
-    """Return the surface where the posterior mean equals its level; None if there is no such surface.
+    """Return the surface where the posterior mean, carved like samples, equals its level, or None.
 
-    The mean is carved like the samples.
-
-    - `inputs`: inputs of a step, with a posterior. If it has no closed forms, mean and deviation are computed from
-      the samples in `inputs`. If there are none, samples are drawn with a fixed key.
+    If the posterior in `inputs` has no closed forms, mean and deviation are computed from the samples in `inputs`, or
+    else from samples with a fixed key.
     """
     observations, posterior, surfaces = inputs.observations, inputs.posterior, inputs.surfaces
     assert posterior is not None
@@ -95,7 +103,7 @@ def _mean_of_samples(values: Float[np.ndarray, "s g g g"], grid: Grid) -> MeanSu
 def near_points(surface: MeanSurface | None, cloud: PointCloud) -> MeanSurface | None:
     """Return the connected pieces of a surface that are near points of the cloud; None if there are none.
 
-    Other pieces are guesses. The deviation becomes sqrt(sd^2 + (r / 4)^2), where sd is the surface's deviation and r
+    The deviation becomes sqrt(sd^2 + (r / 4)^2), where sd is the surface's deviation and r
     the distance to the nearest point of the cloud. The posterior's own deviation is too small where no ray has hit,
     beside the image's border or behind the object.
     """
@@ -104,12 +112,9 @@ def near_points(surface: MeanSurface | None, cloud: PointCloud) -> MeanSurface |
     distances, _ = cKDTree(cloud.to_numpy()[0]).query(surface.vertices)
     edges = np.concatenate([surface.faces[:, :2], surface.faces[:, 1:]])
     piece = trimesh.graph.connected_component_labels(edges, len(surface.vertices))
+    deviation = np.hypot(surface.deviation, _DEVIATION_PER_DISTANCE * distances)
     is_kept = np.isin(piece, piece[distances < _MAX_DISTANCE])
-    faces = surface.faces[is_kept[surface.faces[:, 0]]]
-    if len(faces) == 0:
-        return None
-    new_index, deviation = np.cumsum(is_kept) - 1, np.hypot(surface.deviation, _DEVIATION_PER_DISTANCE * distances)
-    return MeanSurface(surface.vertices[is_kept], new_index[faces], surface.normals[is_kept], deviation[is_kept])
+    return dataclasses.replace(surface, deviation=deviation).part(is_kept)
 
 
 def padded(rows: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "m d"]:

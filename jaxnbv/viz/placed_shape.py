@@ -49,10 +49,10 @@ _NORMAL_WEIGHT = 0.1
 class PlacedShape(MeanSurface):
     """A known shape at its registered placement, in scene coordinates. Its deviation is zero.
 
-    - `name`, `probability`: name and probability of the part, or of the kind of shape.
-    - `measured`: for each vertex 1 where points were scanned, 0 where the shape is imagined.
-    - `agreed`: for each vertex 1 where most hypotheses have the same surface, 0 where few do.
-    - `disputed_space`: surface of the space that other hypotheses fill; None if there is no such space.
+    - `name`, `probability`: of the part, or of the kind of shape.
+    - `measured`: 1 where points were scanned, 0 where the shape is imagined.
+    - `agreed`: 1 where most hypotheses have the same surface, 0 where few do.
+    - `disputed_space`: surface of the space that other hypotheses fill.
     - `is_part`: whether it is a part at true size.
     """
 
@@ -70,7 +70,7 @@ class PlacedShape(MeanSurface):
 
 
 class _Fits(NamedTuple):
-    """Some registered shapes with their probabilities. The first one is the shape to draw."""
+    """Registered shapes with their probabilities. The first one is the shape to draw."""
 
     bank: ShapeBank
     hypotheses: Hypotheses
@@ -88,7 +88,7 @@ def _select(tree: T, rows: int | list[int]) -> T:
 
 
 def placed_parts(hypotheses: PartHypotheses, count: int) -> list[PlacedShape]:
-    """Return the likeliest parts, `count` at most, each at its likeliest placement."""
+    """Return at most `count` of the likeliest parts, each at its likeliest placement."""
     shapes, weights = np.asarray(hypotheses.placed.shape), np.asarray(hypotheses.shape_weights)
     return [
         _place_shape(hypotheses.bank, hypotheses.placed, int(np.argmax(shapes == part)), float(weights[part]))
@@ -100,8 +100,7 @@ def placed_parts(hypotheses: PartHypotheses, count: int) -> list[PlacedShape]:
 def likeliest_part(hypotheses: PartHypotheses, cloud: PointCloud | None = None) -> PlacedShape | None:
     """Return the likeliest part at its placement; None if "none of these" is more likely.
 
-    - `cloud`: scanned points. Without them, the result counts as measured and agreed everywhere, and its
-      `disputed_space` is None.
+    Without a cloud of scanned points, it counts as measured and agreed everywhere, and has no `disputed_space`.
     """
     if next(iter(hypotheses.names())) == NONE:
         return None
@@ -124,9 +123,7 @@ def likeliest_shape(
 ) -> PlacedShape | None:
     """Return the likeliest shape of the likeliest kind; None if "none of these" is nearly certain.
 
-    - `bank`: examples of categories.
     - `hypotheses`, `weights`: the registered shapes and their weights. The last weight is that of "none of these".
-    - `cloud`: scanned points.
     - `answer`: probabilities of classes. If each kind is one of the classes, they multiply the weights of the kinds, so
       that a picture does not contradict the answer beside it.
     """
@@ -170,7 +167,7 @@ def _place_shape(bank: ShapeBank, hypotheses: Hypotheses, row: int, probability:
 
 
 def _with_hypotheses(shape: PlacedShape, fits: _Fits, cloud: PointCloud) -> PlacedShape:
-    """Return a copy of the shape with `measured`, `agreed` and `disputed_space`, from the scan and the other fits."""
+    """Set `measured`, `agreed` and `disputed_space` of the shape, given the scan and the other fits."""
     half_extent = min(_MARGIN * float(_extent(fits.bank, fits.hypotheses)) + _TOLERANCE, np.pi)
     grid, coarse = Grid(_FINE_NODES, half_extent), Grid(_COARSE_NODES, half_extent)
     # Compute distances on a coarse grid: they are smooth, and each hypothesis costs as much as the whole shape.
@@ -241,11 +238,7 @@ def _pieces(values: Float[np.ndarray, "g g g"], grid: Grid, min_area: float) -> 
     triangles = level_triangles(values, grid)
     if triangles is None:
         return None
-    vertices, faces, normals = triangles
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
-    label = trimesh.graph.connected_component_labels(mesh.edges_unique, len(vertices))
-    area = np.bincount(label[faces[:, 0]], mesh.area_faces, label.max() + 1)
-    vertex_rows, rows = np.unique(faces[area[label[faces[:, 0]]] >= min_area], return_inverse=True)
-    if len(vertex_rows) == 0:
-        return None
-    return MeanSurface(vertices[vertex_rows], rows.reshape(-1, 3), normals[vertex_rows], np.zeros(len(vertex_rows)))
+    surface = MeanSurface(*triangles, np.zeros(len(triangles[0])))
+    label = trimesh.graph.connected_component_labels(surface.mesh.edges_unique, len(surface.vertices))
+    area = np.bincount(label[surface.faces[:, 0]], surface.mesh.area_faces, label.max() + 1)
+    return surface.part(area[label] >= min_area)

@@ -22,7 +22,7 @@ from jaxnbv.viz.mean_surface import MeanSurface
 from jaxnbv.viz.placed_shape import PlacedShape
 from jaxnbv.viz.scene import Cameras, Points, frustum, scene_items
 from jaxnbv.viz.sphere import unit
-from jaxnbv.viz.style import DEVIATION, DISPUTED, IMAGINED, LINE, NEW, OPEN, PART, draw_border
+from jaxnbv.viz.style import DEVIATION, DISPUTED, LINE, NEW, draw_border, shape_colours
 
 _DISTANCE = 11.0
 _DEPTH_TOLERANCE = 0.04  # Noise and the mean's own error must not hide a point behind the surface that it lies on.
@@ -46,11 +46,10 @@ def eye_beside(pose: Pose) -> Float[np.ndarray, "3"]:
 
 
 class Still:
-    """A perspective picture of a surface, with room for all cameras of the scene.
+    """A perspective picture of a surface, transparent where there is no surface.
 
-    The picture is transparent where there is no surface. The light comes from beside the viewer, and hollows are
-    darker. Colours of a known shape say whether it is measured, imagined, or different in other hypotheses. Other
-    surfaces are coloured by their standard deviation.
+    The light comes from beside the viewer, and hollows are darker. Colours of a known shape say whether it is measured,
+    imagined, or different in other hypotheses. Other surfaces are coloured by their standard deviation.
 
     - `eye`: direction from the origin to the viewer.
     - `size`: pixels along each side.
@@ -71,13 +70,10 @@ class Still:
         self.pose = look_at(_DISTANCE * eye / np.linalg.norm(eye))
         self.image, self.depth = np.zeros((size, size, 4)), np.full((size, size), np.inf)
         if surface is not None:
-            self._paint(surface, deviation)
-
-    def _paint(self, surface: MeanSurface, deviation: LogNorm | None) -> None:
-        mask, colours, depth = self._trace(surface, deviation)
-        if isinstance(surface, PlacedShape) and surface.disputed_space is not None:
-            mask, colours, depth = self._blend_disputed(surface.disputed_space, mask, colours, depth)
-        self.show(mask, colours, depth)
+            hits = self._trace(surface, deviation)
+            if isinstance(surface, PlacedShape) and surface.disputed_space is not None:
+                hits = self._blend_disputed(surface.disputed_space, *hits)
+            self.show(*hits)
 
     def _trace(
         self, surface: MeanSurface, deviation: LogNorm | None
@@ -97,11 +93,8 @@ class Still:
         brightness = 0.72 + 0.34 * np.clip(normals @ lamp(self.pose), -0.4, 1.0)
         colours = np.tile(mpl.colors.to_rgba(LINE), (len(points), 1))
         if isinstance(surface, PlacedShape):
-            scanned, imagined, disputed = (np.array(mpl.colors.to_rgb(colour)) for colour in (PART, IMAGINED, OPEN))
-            measured, agreed = (
-                np.sum(weight * values[corners], axis=1)[:, None] for values in (surface.measured, surface.agreed)
-            )
-            colours[:, :3] = measured * scanned + (1.0 - measured) * (agreed * imagined + (1.0 - agreed) * disputed)
+            mixed = (np.sum(weight * values[corners], axis=1) for values in (surface.measured, surface.agreed))
+            colours[:, :3] = shape_colours(*mixed)
         elif deviation is not None:
             colours = DEVIATION(deviation(np.exp(np.sum(weight * np.log(surface.deviation)[corners], axis=1))))
         depth = (points - np.asarray(self.pose.position)) @ np.asarray(self.pose.forward)
@@ -116,15 +109,14 @@ class Still:
         colours: Float[np.ndarray, "hits 4"],
         depth: Float[np.ndarray, " hits"],
     ) -> tuple[Bool[np.ndarray, " rays"], Float[np.ndarray, "all 4"], Float[np.ndarray, " all"]]:
-        """Return results of `_trace` with a translucent surface blended in. This surface hides no points."""
+        """Blend a translucent surface, which hides no points, into results of `_trace`."""
         is_disputed, over, disputed_depth = self._trace(disputed_space, None)
         under, front = np.zeros((len(mask), 4)), np.zeros((len(mask), 4))
         deep, near = np.full(len(mask), np.inf), np.full(len(mask), np.inf)
         under[mask], deep[mask], near[is_disputed] = colours, depth, disputed_depth
         # Brightness of its own shading, relative to a lit face.
-        front[is_disputed, :3] = np.array(mpl.colors.to_rgb(DISPUTED)) * (
-            over[:, :3] / np.array(mpl.colors.to_rgb(LINE))
-        )
+        disputed, lit = (np.array(mpl.colors.to_rgb(colour)) for colour in (DISPUTED, LINE))
+        front[is_disputed, :3] = disputed * (over[:, :3] / lit)
         front[is_disputed, 3] = _DISPUTED_OPACITY
         front[near > deep] = 0.0
         alpha = front[:, 3:] + under[:, 3:] * (1.0 - front[:, 3:])
@@ -141,7 +133,7 @@ class Still:
     def show(
         self, mask: Bool[np.ndarray, " rays"], colours: Float[np.ndarray, "hits 4"], depth: Float[np.ndarray, " hits"]
     ) -> None:
-        """Make the picture, given which rays of `fine_camera` hit, and colours and depths of the hits."""
+        """Make the picture from results of `_trace`."""
         image = np.zeros((len(mask), 4))
         image[mask] = colours
         image[:, :3] *= image[:, 3:]
@@ -161,7 +153,7 @@ class Still:
 
 
 def _barycentric(points: Float[np.ndarray, "n 3"], corners: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3"]:
-    """Return the weights of a triangle's corners at a point in it, for each row."""
+    """Return the weights of a triangle's corners at a point in it."""
     a, b, p = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], points - corners[:, 0]
     aa, ab, bb, pa, pb = (np.einsum("nd,nd->n", *pair) for pair in ((a, a), (a, b), (b, b), (p, a), (p, b)))
     area = np.maximum(aa * bb - ab**2, 1e-30)
@@ -186,7 +178,7 @@ def _occlusion(mask: Bool[np.ndarray, "h w"], depth: Float[np.ndarray, " hits"])
 
 
 def draw_truth(axes: Axes, data: ReportData) -> bool:
-    """Draw the true surface from the viewpoint of the other pictures. Return False if it is not known."""
+    """Draw the true surface from the viewpoint of the other pictures. Returns False if it is not known."""
     mesh = data.true_surface
     if mesh is None:
         return False
@@ -214,9 +206,7 @@ def render_view(data: ReportData, index: int, size: int | None = None) -> Still:
 def draw_scene(
     axes: Axes, data: ReportData, index: int, still: Still, weight: float = 1.0, inset: bool = True, aspect: float = 1.0
 ) -> None:
-    """Draw the scene after view `index` (from 0) into empty axes: surface, points and cameras so far.
-
-    The likeliest part is named at the bottom.
+    """Draw surface, points and cameras after view `index` (from 0) into empty axes. Names the part.
 
     - `still`: picture of the surface, see `render_view`.
     - `weight`: factor for the sizes of lines, dots and letters.

@@ -23,6 +23,13 @@ DEVIATION = LinearSegmentedColormap.from_list("deviation", mpl.colormaps["YlGnBu
 VALUE = LinearSegmentedColormap.from_list("value", mpl.colormaps["BuPu"](np.linspace(0.03, 0.95, 256)))
 
 
+def shape_colours(measured: Float[np.ndarray, " n"], agreed: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+    """Mix the colours of a known shape, see `PlacedShape`."""
+    scanned, imagined, disputed = (np.array(mpl.colors.to_rgb(colour)) for colour in (PART, IMAGINED, OPEN))
+    measured, agreed = measured[:, None], agreed[:, None]
+    return measured * scanned + (1.0 - measured) * (agreed * imagined + (1.0 - agreed) * disputed)
+
+
 def colour_scale(colours: Colormap) -> list[list]:
     """Convert a colour map to plotly's format, a list of pairs: position from 0 to 1, and colour."""
     return [[t, mpl.colors.to_hex(colours(t))] for t in np.linspace(0.0, 1.0, 32).tolist()]
