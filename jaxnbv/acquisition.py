@@ -64,10 +64,7 @@ class Acquisition(eqx.Module):
 
     @abstractmethod
     def score(self, context: Any, view: ImaginedView) -> Float[Array, "*values"]:
-        """Return the score of one view.
-
-        The score must be finite, and no scan may score lower than an empty scan.
-        """
+        """Return the finite score of one view. No scan may score lower than an empty scan."""
 
     def sample_scores(
         self,

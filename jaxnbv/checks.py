@@ -140,7 +140,7 @@ def check_type(value: Any, hint: Any, name: str) -> None:
 
 
 def check_index(index: Any, batch: tuple[int, ...], name: str) -> None:
-    """Raise `ValueError` for an integer out of the first axis, which JAX would clamp, or without axes."""
+    """Raise `ValueError` for an index out of the range of a `batch`'s shape, which JAX would clamp."""
     if isinstance(index, int | np.integer):
         check_batch(batch, name)
         require(-batch[0] <= index < batch[0], f"{name} has {batch[0]} along its first axis: there is no index {index}")

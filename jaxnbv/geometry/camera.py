@@ -133,7 +133,7 @@ class Camera(eqx.Module):
 
     @property
     def intrinsics(self) -> Float[np.ndarray, "3 3"]:
-        """The intrinsic matrix in pixels, in which the centre of the first pixel is at (0, 0)."""
+        """The intrinsic matrix in pixels. The centre of the first pixel is at (0, 0)."""
         (fx, fy), (x, y) = self.focal_lengths, self.center
         return np.array([[fx, 0.0, x * self.width - 0.5], [0.0, fy, y * self.height - 0.5], [0.0, 0.0, 1.0]])
 

@@ -32,7 +32,7 @@ def spacing(cloud: PointCloud) -> Float[Array, ""]:
 
 
 def distance_to_others(cloud: PointCloud, rows: Int[Array, " r"]) -> Float[Array, " r"]:
-    """Return the distance from the point in each of these rows to its nearest neighbour, or inf."""
+    """Return the distance from the point in each of these rows to the nearest other point, or infinity."""
     offsets = cloud.points[rows, None] - cloud.points
     is_other = cloud.mask & (jnp.arange(cloud.capacity) != rows[:, None])
     return jnp.sqrt(jnp.min(jnp.where(is_other, jnp.sum(offsets**2, axis=-1), jnp.inf), axis=1))

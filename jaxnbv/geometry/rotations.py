@@ -81,7 +81,7 @@ def rotation_from_6d(columns: Float[AnyArray, "*batch 6"]) -> Float[Array, "*bat
 def rotation_between(
     start: Float[AnyArray, "*batch 3"], end: Float[AnyArray, "*batch 3"]
 ) -> Float[Array, "*batch 3 3"]:
-    """Return the smallest rotation that maps one unit vector to another, any of them for opposite ones."""
+    """Return the smallest rotation (for opposite vectors, one of them) from one unit vector to another."""
     start, end = jnp.asarray(start), jnp.asarray(end)
     halfway = normalise(start + end, _any_orthogonal(start), _rounding(start))
     # The sum of nearly opposite vectors has lost digits, but their difference has not. The exact sum is orthogonal to
@@ -113,7 +113,7 @@ def normalise(
 
 
 def _rounding(unit: Float[Array, "*batch n"]) -> float:
-    """Return a length well above the rounding of sums of unit vectors, whose direction is then reliable."""
+    """Return the length, well above its rounding, below which a sum of unit vectors has no direction."""
     return 16.0 * float(jnp.finfo(unit.dtype).eps)
 
 

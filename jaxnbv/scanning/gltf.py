@@ -26,11 +26,7 @@ _REMEDY = "export the file again without these, for example from Blender"
 
 
 def read_gltf(content: bytes, kind: str, resolver: Resolver) -> trimesh.Scene:
-    """Read the scene in a glTF file.
-
-    - `content`: the bytes of the file.
-    - `kind`: "gltf" or "glb".
-    - `resolver`: trimesh's resolver of the files that this file refers to.
+    """Read the scene in the bytes of a "gltf" or "glb" file, which may refer to files of the `resolver`.
 
     **Raises:** `ValueError` if the file has features that trimesh does not read, or if the counts or bounds of the
     meshes differ from those in the file's header.

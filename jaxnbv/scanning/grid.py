@@ -95,9 +95,7 @@ class GridSurface(Surface):
     def from_values(
         cls, values: Float[AnyArray, "*s g g g"], level: Float[AnyArray, ""] | float, grid: Grid
     ) -> "GridSurface":
-        """Return the surface where a function with these node values equals `level`.
-
-        - `values`: one value per node. Leading axes give a batch of surfaces.
+        """Return the surface where node values equal `level`, or a batch of surfaces for leading axes.
 
         **Raises:** `ValueError` if the values do not fit the grid, or if a value or the level is not finite.
         """
@@ -113,7 +111,7 @@ class GridSurface(Surface):
         return cls(relative, distances, grid)
 
     def without_cells(self, cells: Bool[Array, "*s m m m"]) -> "GridSurface":
-        """Return the surface without its parts in these cells, which rays that would hit them miss."""
+        """Return the surface without its parts in these cells. Rays that would hit these parts miss."""
         return dataclasses.replace(self, is_void=cells if self.is_void is None else self.is_void | cells)
 
     @program
@@ -172,10 +170,7 @@ def samples_at_once(camera: Camera, poses: Pose) -> int:
 @jax.debug_nans(False)
 @program
 def mean_depth(scans: PointCloud, pose: Pose) -> Float[Array, " rays"]:
-    """Return the mean depth of each ray over the samples that it hits, or NaN if it misses most.
-
-    - `scans`: scans of all samples from the pose, along a leading axis.
-    """
+    """Return each ray's mean depth over the samples (leading axis) that it hits; NaN if it misses most."""
     depth = jnp.einsum("snd,d->sn", scans.points - pose.position, pose.forward, precision="highest")
     count = jnp.sum(scans.mask, axis=0)
     mean = jnp.sum(jnp.where(scans.mask, depth, 0.0), axis=0) / jnp.maximum(count, 1)

@@ -123,5 +123,5 @@ def as_array(rows: list[list[str]]) -> Float[np.ndarray, "n k"]:
 
 
 def cut_short(count: int, declared: int, what: str) -> str:
-    """Return the error message for a file that ends before all declared rows, such as "vertices"."""
+    """Return the error message for a file that ends before all declared rows."""
     return f"has {count} of the {declared} {what} that its header declares: fetch it again"

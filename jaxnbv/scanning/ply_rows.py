@@ -68,8 +68,6 @@ def _element(
 ) -> tuple[dict[str, Any], int]:
     """Return the columns of one element, keyed by property name, and the byte at which the element ends.
 
-    - `start`: the byte of the file's body at which the element starts.
-
     A column of lists is an array if all lists have the same length, else a list with one array per row.
     """
     if count == 0:

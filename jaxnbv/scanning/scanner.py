@@ -43,7 +43,7 @@ class Hits(eqx.Module):
 class Surface(eqx.Module):
     """Base class of everything that rays can hit.
 
-    - `in_jit`: whether `trace` runs under JAX transformations, and not by host code.
+    - `in_jit`: whether `trace` runs under JAX transformations. If not, host code traces the rays.
     """
 
     in_jit: eqx.AbstractClassVar[bool]
@@ -127,7 +127,8 @@ class DepthNoise(eqx.Module):
 
         1/z' = step round((1/z + deviation eps) / step),   eps ~ N(0, 1).
 
-    `PointCloud.from_depth` then computes points and normals from the noisy image.
+    `PointCloud.from_depth` then computes points and normals from the noisy image. `scan` has already removed hits out
+    of the camera's range or beyond its `max_incidence`.
 
     - `deviation`, `step`: standard deviation and step of 1/z, in 1 / metre; a step of 0 does not round.
     - `scale`: scene units per metre; `frame.scale` if the world is in metres.

@@ -55,8 +55,7 @@ class GridField(eqx.Module):
     """A function f on a grid, and the distance from each cell of the grid to a change of sign of f.
 
     - `values`: f at the g^3 nodes, flattened in row-major order.
-    - `cell_distance`: `free_distance` of the (g - 1)^3 cells, in cells, flattened in the same way.
-    - `resolution`: number of nodes along each axis, g.
+    - `cell_distance`: `free_distance` of the (g - 1)^3 cells, flattened in the same way.
     """
 
     values: Float[Array, " nodes"]
@@ -163,8 +162,8 @@ def _traced_zero_batched(size: int, batched, field: GridField, u: list[Array], d
 def smooth_gradient(field: GridField, x: Triple) -> Triple:
     """Return a continuous gradient of f, in change per cell, at points x within the grid.
 
-    The gradient is interpolated linearly from central differences at the nodes (one-sided on the border). The gradient
-    of the trilinear interpolant itself would jump between cells.
+    It is interpolated linearly from central differences at the nodes (one-sided on the border). The gradient of the
+    trilinear interpolant itself would jump between cells.
     """
     last = field.resolution - 1
     cell = [jnp.clip(jnp.floor(jax.lax.stop_gradient(p)).astype(jnp.int32), 0, last - 1) for p in x]
@@ -188,7 +187,7 @@ def smooth_gradient(field: GridField, x: Triple) -> Triple:
 
 
 def enter(u: Triple, du: Triple, field: GridField) -> tuple[March, Float[Array, " n"]]:
-    """Return a march whose `t` is 0 where the rays u + t du enter the grid's box, and the rays. t there."""
+    """Return a march from where the rays u + t du enter the grid's box (its t is 0), and their t there."""
     # The box is smaller than the grid by a sliver, so that no position lies outside the grid after it is rounded and
     # moved forward.
     low, high = 2 * field.offset, field.resolution - 1 - 2 * field.offset

@@ -36,9 +36,8 @@ def spread_points(surface: GridSurface, count: int) -> SurfacePoints:
     """Return points where a surface crosses edges of its grid, chosen evenly among the crossed edges.
 
     A plane with unit normal n crosses |n_x| + |n_y| + |n_z| edges per squared grid spacing of its area. So each crossed
-    edge represents an area of 1 / (|n_x| + |n_y| + |n_z|) squared spacings (Cauchy-Crofton formula).
-
-    Points repeat if the surface crosses fewer than `count` edges.
+    edge represents an area of 1 / (|n_x| + |n_y| + |n_z|) squared spacings (Cauchy-Crofton formula). Points repeat if
+    there are fewer than `count` crossed edges.
     """
     values, grid = surface.values, surface.grid
     is_inside = values <= 0

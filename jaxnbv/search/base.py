@@ -48,10 +48,7 @@ class Search(eqx.Module):
         return acquisition.quantity
 
     def poses_around(self) -> Pose:
-        """Return poses around the object, by default the paper's candidates.
-
-        Surface that at least one of these poses sees counts as visible.
-        """
+        """Return poses around the object. Surface that one of them sees counts as visible."""
         return SphereCandidates().poses()
 
     def upper_half(self) -> "Search":
@@ -107,7 +104,7 @@ class CandidateSearch(Search):
 
     @abstractmethod
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
-        """Propose one of the candidates by the scores that `score` returns, or at random."""
+        """Propose one of the candidates, by their scores from `score` or at random by the key."""
 
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
         candidates = self.candidates.poses()
@@ -171,10 +168,7 @@ def best_or_farthest(problem: Problem, candidates: Pose, scores: Float[Array, "s
 
 
 def preferred(proposal: Proposal, preference: Float[Array, " candidates"]) -> Proposal:
-    """Change a proposal to the candidate of the highest `preference` among its `tied_with_best`.
-
-    Excluded candidates (value -inf) are left out.
-    """
+    """Change a proposal to the tied candidate (not an excluded one) of the highest `preference`."""
     is_tied, errors = proposal.tied_with_best(), proposal.standard_errors
     assert is_tied is not None
     assert errors is not None

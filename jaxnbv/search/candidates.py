@@ -36,9 +36,7 @@ class Candidates(eqx.Module):
         return self
 
     def where(self, allowed: Callable[[Pose], Bool[AnyArray, ""] | bool]) -> "GivenPoses":
-        """Return the candidates that satisfy a predicate, for example that a robot can reach the pose.
-
-        - `allowed`: function of one pose that returns a bool.
+        """Return the candidates for which a function of one pose is True, such as a robot's reach.
 
         **Raises:** `ValueError` if no candidate is allowed, or if the function does not return a single bool.
         """

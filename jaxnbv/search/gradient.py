@@ -116,10 +116,7 @@ class GradientSearch(Search):
         check_traceable(acquisition, capacity, camera, differentiable=True)
 
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
-        """Propose the best pose of all trajectories, or the best candidate if its value is higher.
-
-        The key rotates the space's own candidates.
-        """
+        """Propose the best pose of all trajectories and candidates. The key rotates the space's candidates."""
         if self.candidates is None:
             candidates = self.space.candidates(self.num_candidates, key if self.rotates_candidates else None)
         else:
@@ -151,9 +148,7 @@ class GradientSearch(Search):
     ) -> tuple[Trajectories, Float[Array, " steps"]]:
         """Run the solver from a start, and return the trajectory and the standard errors of its values.
 
-        The trajectory contains every evaluated pose. For a solver with a line search, it contains accepted poses only.
-
-        - `value_range`: range of the candidates' values, by which the solver's objective is divided.
+        The trajectory contains every evaluated pose or, for a solver with a line search, every accepted pose.
         """
         solver = self.minimiser
 

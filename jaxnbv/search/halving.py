@@ -49,10 +49,7 @@ class HalvingSearch(CandidateSearch):
         return self._halve(problem, candidates, score)
 
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
-        """Propose the best candidate of the last round.
-
-        The value and standard error of another candidate are those of its last round.
-        """
+        """Propose the best candidate of the last round. Others have the value and error of their last round."""
         return self._halve(problem, candidates, lambda rows, sample: scores[0, sample][rows])
 
     def _halve(self, problem: Problem, candidates: Pose, score: Callable) -> Proposal:
@@ -60,10 +57,7 @@ class HalvingSearch(CandidateSearch):
         zeros = jnp.zeros(count, candidates.position.dtype)
 
         def rank(state, num_left):
-            """Return the indices of the candidates in a new order, and their mean scores so far.
-
-            The first `num_left` candidates of the current order stay first, and are sorted from the highest mean.
-            """
+            """Return the order with its first `num_left` candidates sorted by their means, and all means so far."""
             order, totals, num_scored = state
             values = jnp.where(is_excluded, -jnp.inf, totals / jnp.maximum(num_scored, 1))
             ranked_values = jnp.where(jnp.arange(count) < num_left, values[order], -jnp.inf)
@@ -93,10 +87,7 @@ class HalvingSearch(CandidateSearch):
         )
 
     def _blocks(self, num_samples: int) -> tuple["_Block", int]:
-        """Return the blocks of all rounds, and the number of candidates in the last round.
-
-        All blocks have the same size, so the program that scores a block is compiled once.
-        """
+        """Return the blocks of all rounds, of one size to compile once, and the last number of candidates."""
         rounds: list[tuple[int, range]] = []
         num_left, num_scored = self.candidates.count, 0
         while num_scored < num_samples:

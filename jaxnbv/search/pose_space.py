@@ -21,10 +21,7 @@ from jaxnbv.scanning.sensors import SENSOR_RADIUS
 
 
 class PoseSpace(eqx.Module):
-    """Base class of pose spaces, the sets of poses that a gradient search can reach.
-
-    - `num_parameters`: number of parameters that move a pose.
-    """
+    """Base class of pose spaces, the sets of poses that a gradient search can reach."""
 
     num_parameters: eqx.AbstractClassVar[int]
 
@@ -42,13 +39,11 @@ class PoseSpace(eqx.Module):
 
 
 class SpherePoses(PoseSpace):
-    """2-DOF poses on a sphere about the origin, all looking at the origin.
+    """2-DOF poses on a sphere of `radius` (scene units) about the origin, all looking at the origin.
 
     The parameters (3,) are added to the unit vector from the origin to the start, and the sum is normalised. The camera
     turns to the origin by the smallest rotation, which has no singularity at the poles. A start at a different radius
     is moved to the sphere.
-
-    - `radius`: radius of the sphere, in scene units.
 
     **Raises:** `ValueError` unless the radius is positive and finite.
     """
@@ -158,10 +153,7 @@ class ConstrainedPoses(PoseSpace):
         return Pose(_product(_product(rotation, rotation_between(target, to_origin)), roll_matrix), position)
 
     def check_camera(self, camera: Camera) -> None:
-        """Raise `ValueError` if an image edge is nearer than `off_axis` to the optical axis.
-
-        The scene's origin could then be outside the image.
-        """
+        """Raise `ValueError` if the origin can leave the image: an edge is nearer than `off_axis` to the axis."""
         left, top, right, bottom = camera.edges
         half = math.atan(min(-left, -top, right, bottom))
         require(

@@ -60,10 +60,7 @@ class Problem(eqx.Module):
     def scores(
         self, poses: Pose, samples: slice | Int[Array, " rows"] = slice(None)
     ) -> Float[Array, "*scores samples poses"]:
-        """Return the acquisition's score for each sample and pose, after the cost of the move is applied.
-
-        For an `AcquisitionList`, the result has a leading axis of acquisitions.
-        """
+        """Return each sample's scores of the poses, after costs. An `AcquisitionList` adds a leading axis."""
         surfaces = jax.tree.map(lambda leaf: leaf[samples], self.surfaces)
         barrier = barrier_of(self.obstacles, self.camera, poses)
         values = self.acquisition.sample_scores(self.context, surfaces, self.camera, poses, barrier)

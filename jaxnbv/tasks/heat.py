@@ -69,9 +69,8 @@ class ColdestPoint(Utility):
     def __call__(self, cloud: PointCloud) -> Float[Array, ""]:
         """Return the negative lowest temperature of one cloud, in degrees.
 
-        Under `vmap`, all clouds are computed in one call on the host. If there is no point over which to take the
-        minimum, the temperature is `HeatProblem.highest`, an upper bound. So any point of a later scan improves the
-        utility.
+        Under `vmap`, all clouds are computed in one call on the host. Without a point, the temperature is
+        `HeatProblem.highest`, an upper bound, so that any point of a later scan improves the utility.
         """
         source = jnp.asarray(self.heat.source, cloud.points.dtype)
         # The source may be traced, so it is passed as an array together with the cloud.
@@ -117,8 +116,7 @@ def body_temperature(
     """Return points of a body, in scene coordinates, and the temperature at these points.
 
     For a mesh, the points are the vertices after refinement, which is fine enough for the default heat problem. Heat
-    does not flow between components of a mesh that touch but share no vertices. If it should, pass a dense cloud of the
-    mesh.
+    does not flow between components of a mesh that touch but share no vertices, but it does in a dense cloud of them.
     """
     if isinstance(body, PointCloud):
         points = np.asarray(body.to_numpy()[0], np.float64)
@@ -150,8 +148,7 @@ class Coldest(Answer):
 def coldest_point(body: PointCloud | TriangleMesh, heat: HeatProblem, reached_only: bool = False) -> Coldest:
     """Return the coldest point of a cloud or a mesh, the first if several are equally cold.
 
-    - `reached_only`: see `ColdestPoint`. If False and some points are not connected to the source, the result is one of
-      these unheated points.
+    - `reached_only`: see `ColdestPoint`.
 
     **Raises:** `ValueError` if there is no point or, with `reached_only`, no point that is connected to the source.
     """

@@ -1,7 +1,4 @@
-"""Functions that run outside JAX on the host, for example a PyTorch model or a solver.
-
-Such functions have no derivative, so gradient searches cannot use them.
-"""
+"""Functions that run outside JAX on the host, such as a PyTorch model or a solver. They have no derivative."""
 
 from collections.abc import Callable
 from typing import ClassVar

@@ -33,11 +33,9 @@ _Image: TypeAlias = tuple[Float[Array, "..."], Float[Array, "..."], Bool[Array, 
 class ImaginedParts(eqx.Module):
     """Context of the acquisition `Identify`: the hypotheses of a step, ready to be scanned.
 
-    - `surfaces`: surfaces of the hypotheses, along a leading axis.
     - `weights`: probabilities of the hypotheses, which sum to one without "none of these".
     - `classes`: for each hypothesis, the name or group of its part as a one-hot row.
     - `tau`: scale of the distance between a measured point and the surface, in scene units, see `part_evidence`.
-    - `pose_weight`: weight of the information about the part's pose, or zero.
     """
 
     surfaces: GridSurface

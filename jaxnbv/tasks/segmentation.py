@@ -28,9 +28,7 @@ _SLACK = 1e-2
 
 
 class Segmenter(eqx.Module):
-    """Base class of segmenters, which return part probabilities for each point of a cloud.
-
-    Subclasses must define only `__call__`.
+    """Base class of segmenters of clouds. Subclasses must define only `__call__`.
 
     - `part_names`: names of the parts to find, keyed by the index of the part; None if parts have no names.
     """

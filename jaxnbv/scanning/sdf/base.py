@@ -79,7 +79,7 @@ def _least_of_last_jvp(values, tangents):
 
 
 def corner_distance(*q):
-    """Return the signed distance to a corner, where the distances q to orthogonal planes are all negative."""
+    """Return the signed distance to the solid where the distances q to orthogonal planes are negative."""
     outside = safe_norm(*(greatest(c, 0.0) for c in q))
     return outside + least(functools.reduce(greatest, q), 0.0)
 

@@ -88,7 +88,7 @@ class Cone(SignedDistance):
 
 
 class Torus(SignedDistance):
-    """The torus about the y axis with a circle of `major_radius` in its tube. The distance is exact."""
+    """The torus about the y axis: a tube of `minor_radius` about a circle of `major_radius`. It is exact."""
 
     major_radius: Scalar = nonnegative()
     minor_radius: Scalar = nonnegative()
