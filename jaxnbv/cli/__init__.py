@@ -57,8 +57,7 @@ def _is_own(point: EntryPoint) -> bool:
 def _add_commands() -> None:
     """Add the commands of this package, then the commands of other packages.
 
-    A command of a different package is skipped if this package has a command of the same name. An entry point names a
-    function, or a `typer.Typer` for a command that has subcommands.
+    A command of a different package is skipped if this package has a command of the same name.
     """
     named = {point.name: point for point in sorted(entry_points(group="jaxnbv.commands"), key=_is_own)}
     for point in sorted(named.values(), key=lambda point: (not _is_own(point), point.name)):
@@ -79,12 +78,7 @@ _add_commands()
 
 
 def run_app() -> None:
-    """Run the command line with the arguments of this process.
-
-    Prints an `InputError` as one line, without a traceback.
-
-    **Raises:** `SystemExit` with the exit code.
-    """
+    """Run the command line and raise `SystemExit`. An `InputError` is printed without a traceback."""
     write_readable()
     try:
         with explained_imports(), each_warning_once():

@@ -140,7 +140,10 @@ def identify(options: IdentifyOptions, box: Any, intrinsics: Any, depth_scale: A
     for name, session in _objects(sessions, names).items():
         answers[name or "object"] = _print_answer(name, session, unit)
         if options.out is not None:
-            _write(options.out / name, name or options.recording.resolve().name, session)
+            from jaxnbv.viz import write_report
+
+            title = name or options.recording.resolve().name
+            typer.echo(f"report      {write_report(session.episode, options.out / name, title=title)}")
     if options.out is not None:
         from jaxnbv.storage.files import write_text
 
@@ -187,18 +190,14 @@ def _print_answer(name: str, session: "Session", unit: str | None) -> dict[str, 
 
 
 def pose_text(pose: "ObjectPose", unit: str) -> str:
-    """Return lines of text with the pose of a part and the standard deviations of the pose.
-
-    - `unit`: unit of the world.
-    """
+    """Return lines of text with the pose of a part and its standard deviations. `unit`: unit of the world."""
     import numpy as np
 
     angle, shift = np.sqrt(np.diag(pose.covariance)).reshape(2, 3).max(axis=1).tolist()
     length = f"{1000.0 * shift:.2g} mm" if unit == "m" else f"{shift:.2g} {unit}"
-    count = len(pose.alternatives)
-    symmetry_text = (
-        f"{count} poses are equally right: the part is symmetric." if count > 1 else "No other pose is as right."
-    )
+    symmetry_text = "No other pose is as right."
+    if (count := len(pose.alternatives)) > 1:
+        symmetry_text = f"{count} poses are equally right: the part is symmetric."
     return "\n".join(
         [
             f"{pose.name}: from its mesh, in the unit of the world, to the world",
@@ -207,9 +206,3 @@ def pose_text(pose: "ObjectPose", unit: str) -> str:
             symmetry_text,
         ]
     )
-
-
-def _write(folder: Path, title: str, session: "Session") -> None:
-    from jaxnbv.viz import write_report
-
-    typer.echo(f"report      {write_report(session.episode, folder, title=title)}")

@@ -43,13 +43,10 @@ from jaxnbv.viz.task import rival_text
 
 
 class Sizes(NamedTuple):
-    """Sizes of a planner.
+    """Sizes of a planner; None for those of the task.
 
-    - `samples`: number of posterior samples.
-    - `candidates`: number of candidates, or None for the number in the task's `Setting`.
     - `capacity`: number of points to keep in the cloud.
-    - `grid`: grid of the samples, or None for the grid of the task.
-    - `rays`: number of rays along each side of an image, or None for the numbers in the task's `Setting`.
+    - `rays`: number of rays along each side of an image.
     """
 
     samples: int
@@ -66,9 +63,7 @@ _MAX_RIVAL_VIEWS = 10
 
 
 def stop_rule_of(texts: Sequence[str]) -> StopRule | None:
-    """Make a stop rule from texts such as "sure=0.95", or None for "never".
-
-    The rule holds when one of the rules in the texts holds.
+    """Make a rule that holds when a rule in the texts, such as "sure=0.95", holds; None for "never".
 
     **Raises:** `ValueError` if a name is unknown, or if a value is not a number or out of range.
     """
@@ -86,11 +81,7 @@ def stop_rule_of(texts: Sequence[str]) -> StopRule | None:
 
 
 def search_of(name: str, radius: float, count: int) -> Search:
-    """Make the search with this name, one of `SEARCHES`.
-
-    - `radius`: distance of the candidates in scene units.
-    - `count`: number of candidates.
-    """
+    """Make the search with this name, one of `SEARCHES`, over `count` candidates at distance `radius`."""
     candidates = SphereCandidates(count, radius)
     if name == "tie-break":
         return TieBreakSearch(candidates, second=Coverage())
@@ -100,7 +91,6 @@ def search_of(name: str, radius: float, count: int) -> Search:
 def sampler_of(model: str, quick: bool, bank: str | ShapeBank | None) -> SurfaceSampler:
     """Make the sampler of imagined surfaces, with a bank of known shapes if given.
 
-    - `model`: name of the model, one of `MODELS`.
     - `bank`: name of a shipped bank, a folder of upright meshes, or a bank of parts in any rotation. None or "none"
       for no bank.
 
@@ -123,7 +113,6 @@ def sampler_of(model: str, quick: bool, bank: str | ShapeBank | None) -> Surface
 def planner_of(
     setting: Setting, acquisition: Acquisition, search: str, sampler: SurfaceSampler, sizes: Sizes
 ) -> Planner:
-    """Make the planner of a task, with the search of this name (one of `SEARCHES`)."""
     grid = sizes.grid or sampler.grid
     sampler = dataclasses.replace(sampler, grid=grid, num_samples=sizes.samples)
     searcher = search_of(search, setting.radius, sizes.candidates or setting.num_candidates)
@@ -132,7 +121,7 @@ def planner_of(
 
 
 def first_pose(place: Position, surface: Surface) -> Pose:
-    """Return the pose of a first view at a position. The camera looks at the origin.
+    """Return the pose of a first view, which looks at the origin.
 
     **Raises:** `ValueError` for a position inside the object.
     """

@@ -40,11 +40,7 @@ SEARCHES = {
 
 
 class Stop(NamedTuple):
-    """A rule of `--until`.
-
-    - `about`: meaning of the rule's number, for the help.
-    - `rule`: function that makes the rule from the number.
-    """
+    """A rule of `--until`: meaning of its number (for the help), and function from number to rule."""
 
     about: str
     rule: "Callable[[float], StopRule]"

@@ -71,10 +71,7 @@ def run(options: RunOptions, **task_options: Any) -> None:
 
 
 def _task(name: str, settings: dict[str, Any]) -> Task:
-    """Make the task with this name, with the values of the task's own options.
-
-    **Raises:** `ValueError` if an option belongs to a different task, or if a required option is missing.
-    """
+    """Make the task with this name and these options, after checking that they are the task's own."""
     declared = {field.name: field for field in fields(TASKS[name])}
     for option in settings.keys() - declared.keys():
         takers = ", ".join(other for other, task in TASKS.items() if option in {field.name for field in fields(task)})

@@ -99,7 +99,7 @@ def _executor(options: StudyOptions) -> AbstractContextManager[Executor | None]:
 
 
 def _sources(folders: Iterable[Path], parts: Iterable[str]) -> dict[str, list[Path]]:
-    """Return the folders from which to copy records, keyed by part of the study, see `run_study`."""
+    """Return the folders from which to copy records, keyed by part of the study."""
     sources = {part: [folder / part for folder in folders if (folder / part / "study.json").exists()] for part in parts}
     for folder in folders:
         require(
@@ -110,10 +110,7 @@ def _sources(folders: Iterable[Path], parts: Iterable[str]) -> dict[str, list[Pa
 
 
 def _overrides(kind: type[Study], options: StudyOptions) -> dict[str, Any]:
-    """Return settings that replace the study's own. Single options take precedence over `--settings`.
-
-    **Raises:** `ValueError` if a quick run has the paper's settings.
-    """
+    """Return settings that replace the study's own. Single options take precedence over `--settings`."""
     is_paper = options.settings == "paper"
     require(not (is_paper and options.quick), "--quick and --settings paper exclude each other: leave one out")
     single = {

@@ -11,30 +11,8 @@ from typing import Any
 
 import typer
 
-_READABLE = str.maketrans(
-    {
-        "²": "2",
-        "³": "3",
-        "±": "+-",
-        "×": "x",
-        "−": "-",
-        "°": " deg",
-        "·": "*",
-        "•": "*",
-        "…": "...",
-        "—": "-",
-        "–": "-",
-        "→": "->",
-        "●": "*",
-        "█": "#",
-        "■": "#",
-        "○": "o",
-        "◯": "o",
-        "★": "*",
-        "✓": "ok",
-        "’": "'",
-    }
-)
+_READABLE = str.maketrans("²³×−—–·•●★█■○◯’", "23x---****##oo'")
+_READABLE |= str.maketrans({"±": "+-", "°": " deg", "…": "...", "→": "->", "✓": "ok"})
 
 
 def _readable(error: UnicodeError) -> tuple[str, int]:
@@ -59,7 +37,7 @@ def write_readable() -> None:
 def each_warning_once() -> Iterator[None]:
     """Context manager: print each warning once, and at its end how often each repeated warning occurred.
 
-    Python's own filter is not enough: whenever a library changes the filters, Python forgets which warnings it printed.
+    Python's own filter prints warnings again whenever a library has changed the filters.
     """
     counts: Counter[str] = Counter()
     show_warning = warnings.showwarning

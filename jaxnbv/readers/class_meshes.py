@@ -27,13 +27,7 @@ _SYNSETS = {category.name: category.synset for category in CATEGORIES}
 
 
 class MeshFile(NamedTuple):
-    """A mesh file with the class, the name and the up axis of its object. `read` loads the file.
-
-    - `label`: index of the object's class.
-    - `name`: name of the object.
-    - `path`: path of the file.
-    - `up`: upward axis in the file, see `Frame`.
-    """
+    """A mesh file with index of the class, name and upward axis (see `Frame`) of its object."""
 
     label: int
     name: str

@@ -17,8 +17,6 @@ _BUNDLE_FUSION = "m_calibrationDepthIntrinsic"
 def intrinsic_matrix(values: Float[AnyArray, "..."] | list | tuple, name: str) -> Float[np.ndarray, "3 3"]:
     """Return the 3 x 3 matrix of intrinsics in pixels, given a 3 x 3 or 4 x 4 matrix, or fx, fy, cx, cy.
 
-    - `name`: name of the values in error messages.
-
     **Raises:** `ValueError` if `values` have none of these shapes.
     """
     array = np.squeeze(as_numbers(values, name, np.float64))

@@ -36,8 +36,7 @@ def own_parts(
     vase in the middle of an orbit also has nearly equal depths in all frames, but all frames see the vase at the same
     place in the world.
 
-    - `image`: returns the depth image of a frame, 0 where nothing was measured.
-    - `matrices`: poses of the frames, camera to world, OpenCV's axes.
+    - `image`, `matrices`: as in `depth_unit`.
     - `scale`: length of a unit of the images in world units.
     """
     indices = np.unique(np.linspace(0, len(matrices) - 1, _NUM_FRAMES).astype(int))
@@ -61,7 +60,7 @@ def own_parts(
 
 
 def _block_minima(image: UInt16[np.ndarray, "h w"], side: int) -> Float[np.ndarray, "k l"]:
-    """Return the least depth in each block of `side` x `side` pixels; zero if nothing was measured in it."""
+    """Return the least depth in each block of `side` x `side` pixels; zero if nothing was measured."""
     image = np.pad(image, [(0, -size % side) for size in image.shape]).astype(float)
     blocks = np.where(image > 0, image, np.inf).reshape(image.shape[0] // side, side, image.shape[1] // side, side)
     least = blocks.min(axis=(1, 3))
@@ -75,12 +74,9 @@ def _is_mount(
     camera: Camera,
     side: int,
 ) -> Bool[np.ndarray, "k l"]:
-    """Return a mask of the connected components of `candidate_depth` that belong to the mount.
+    """Return the connected components of `candidate_depth` through whose place in a frame other frames see.
 
-    A component belongs to the mount if other frames see through the place in the world where it was during one frame.
-
-    - `candidate_depth`: depths of the blocks with the same depth in most frames, in world units; zero in all other
-      blocks.
+    - `candidate_depth`: depths of the blocks with the same depth in most frames, in world units; zero elsewhere.
     - `depths`: depths of the blocks in each frame, in world units.
     - `side`: length of a block's side in pixels.
     """
@@ -120,10 +116,7 @@ def _is_mount(
 
 
 def _components(candidate_depth: Float[np.ndarray, "k l"]) -> tuple[Int[np.ndarray, " blocks"], int]:
-    """Return the component index of each block with positive depth, and the number of components.
-
-    Neighbouring blocks at about the same depth belong to the same connected component.
-    """
+    """Return the component of each block with positive depth (neighbours at about equal depths), and their number."""
     padded = np.pad(candidate_depth, 1)
     number = np.zeros(padded.shape, int)
     number[padded > 0] = np.arange(np.count_nonzero(candidate_depth))

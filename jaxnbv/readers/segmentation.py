@@ -70,11 +70,7 @@ def _stem(file: Path) -> str:
 
 
 def _frame_files(stem: str, files: dict[str, Path]) -> dict[str, Path]:
-    """Return the masks of a frame keyed by object name, or its label image with the key "".
-
-    - `stem`: name of the frame's file without its ending.
-    - `files`: all files in the folder, keyed by their names without endings.
-    """
+    """Return the masks of a frame keyed by object name, or its label image with the key "". `files`: keyed by stem."""
     if stem in files:
         return {"": files[stem]}
     return {

@@ -23,10 +23,7 @@ def read_text(path: Path) -> str:
 
 
 def read_rows(path: Path) -> list[list[str]]:
-    """Read the words of each line of a file, without blank lines and lines that begin with #.
-
-    **Raises:** `OSError` if the file cannot be read.
-    """
+    """Read the words of each line of a file, without blank lines and lines that begin with #."""
     rows = (line.split() for line in read_text(path).splitlines())
     return [row for row in rows if row and not row[0].startswith("#")]
 

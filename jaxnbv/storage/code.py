@@ -101,7 +101,7 @@ def globals_read(code: CodeType, names: dict[str, Any], path: str) -> Iterator[t
     If the code reads an attribute of a user's module, yields this attribute instead of the module.
 
     - `names`: values of the global variables, keyed by name.
-    - `path`: path of the code in the configuration, such as "planner.search", for error messages.
+    - `path`: see `describe`.
 
     **Raises:** `ValueError` if the code imports a user's module.
     """
@@ -140,10 +140,7 @@ def is_user_defined(name: str, member: Any) -> bool:
 def source_of(function: FunctionType, path: str) -> str:
     """Return the source of a function as text, for a lambda only its body.
 
-    A line may have several lambdas. Therefore the body of a lambda is found by the lines and columns that Python stores
-    for its instructions.
-
-    - `path`: path of the function in the configuration, such as "planner.search", for error messages.
+    - `path`: see `describe`.
 
     **Raises:** `ValueError` if the source cannot be read.
     """
@@ -158,7 +155,8 @@ def source_of(function: FunctionType, path: str) -> str:
     if function.__name__ != "<lambda>":
         return text
     lines, _ = inspect.findsource(code)
-    # Skip instructions of zero width, because they belong to no expression.
+    # A line may have several lambdas, so find the body by the places that Python stores for its instructions. Those of
+    # zero width belong to no expression.
     spans = [(a, b, c, d) for a, b, c, d in code.co_positions() if a and b and c is not None and d]
     (first, start), (last, end) = min((a, c) for a, _, c, _ in spans), max((b, d) for _, b, _, d in spans)
     body = [line.encode() for line in lines[first - 1 : last]]

@@ -45,10 +45,7 @@ def versions() -> dict[str, Any]:
 
 
 def differences(stored: Any, current: Any, name: str = "") -> list[str]:
-    """Return a text for each entry that differs between two descriptions. It starts with the path.
-
-    - `name`: path of the two descriptions.
-    """
+    """Return a text for each entry that differs between two descriptions, which starts with its path."""
     if isinstance(stored, dict) and isinstance(current, dict):
         keys = list(dict.fromkeys([*stored, *current]))
         nested = (differences(stored.get(key), current.get(key), f"{name}.{key}".lstrip(".")) for key in keys)
@@ -57,7 +54,7 @@ def differences(stored: Any, current: Any, name: str = "") -> list[str]:
 
 
 def _short(value: Any) -> str:
-    """Return the beginning of the text of a value. The value may be the whole source of a function."""
+    """Return the beginning of a value's text, which may be the source of a function."""
     text = str(value)
     return text if len(text) <= _MAX_TEXT_LENGTH else f"{text[:_MAX_TEXT_LENGTH]}..."
 
@@ -88,9 +85,7 @@ def read_json(file: Path, problem: str, remedy: str) -> dict[str, Any]:
 
 
 def write_arrays(file: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write arrays to a compressed .npz file. If this fails, an existing file stays as it is.
-
-    - `arrays`: the arrays, keyed by the name under which `read_arrays` returns them.
+    """Write arrays, keyed by name, to a compressed .npz file as `write_whole` does.
 
     **Raises:** `ValueError` if the arrays are larger than `read_arrays` accepts, and whenever `write_whole` raises it.
     """
@@ -185,10 +180,7 @@ class ResultFolder:
 
     @contextmanager
     def writing(self) -> Iterator[None]:
-        """Context manager: lock the folder for writing results.
-
-        **Raises:** `ValueError` if another process writes there, or the folder cannot be written.
-        """
+        """Context manager: lock the folder for writing results, as `writing_in` does."""
         with writing_in(self.path):
             # Another process may have written since the last check.
             self._check()

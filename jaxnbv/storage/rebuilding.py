@@ -36,8 +36,8 @@ def rebuild(description: Any, arrays: Mapping[str, np.ndarray], path: str) -> An
     constructor is called.
 
     - `arrays`: contents of the large arrays, keyed by hash, from `describe`.
-    - `path`: path of the configuration for error messages, such as "planner". The first name in this path is the
-      argument of `load` that can replace the configuration.
+    - `path`: path for error messages, such as "planner". Its first name is the argument of `load` that can replace the
+      configuration.
 
     **Raises:** `ValueError` if a part cannot be rebuilt, or has changed since it was described. The error names the
     part's path.
@@ -56,10 +56,8 @@ def rebuild(description: Any, arrays: Mapping[str, np.ndarray], path: str) -> An
 
 
 def read_config(path: str | Path, kind: str, format: int, replacements: Mapping[str, Any]) -> dict[str, Any]:
-    """Rebuild the configuration of an existing folder from the folder's record.
+    """Rebuild the configuration of an existing folder from its record of this kind and format.
 
-    - `kind`: kind of the folder, such as "episode".
-    - `format`: number of the record's format.
     - `replacements`: parts that replace those of the record, keyed by name. When `RunFolder` then opens the folder with
       these parts, it checks that they agree with the record.
 

@@ -29,7 +29,7 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.search import Proposal, Trajectories
 from jaxnbv.storage.description import describe
-from jaxnbv.storage.files import write_whole
+from jaxnbv.storage.files import write_bytes
 from jaxnbv.storage.folders import ResultFolder, read_arrays, versions, write_arrays
 from jaxnbv.storage.rebuilding import read_config
 
@@ -67,10 +67,7 @@ class RunFolder(ResultFolder):
 
     @classmethod
     def config_of(cls, path: str | Path, kind: str, **replacements: Any) -> dict[str, Any]:
-        """Rebuild the configuration of an existing folder, with `replacements` for some parts.
-
-        See `read_config`.
-        """
+        """Rebuild the configuration of an existing folder, see `read_config`."""
         return read_config(path, kind, cls.format, replacements)
 
     def count(self, name: str) -> int:
@@ -128,12 +125,16 @@ class RunFolder(ResultFolder):
         return _parts(arrays)
 
     def write_cloud(self, cloud: PointCloud) -> None:
-        """Write points and normals to cloud.ply, a binary PLY file, in the coordinates of `cloud`."""
-        points, normals = cloud.to_numpy()
-        # Use a mesh without faces, since trimesh's point clouds have no normals.
-        mesh = trimesh.Trimesh(points, vertex_normals=normals, process=False)
-        content = trimesh.exchange.ply.export_ply(mesh, vertex_normal=True)
-        write_whole(self.path / "cloud.ply", lambda file: file.write(content))
+        """Write points and normals to cloud.ply, in the coordinates of `cloud`."""
+        write_bytes(self.path / "cloud.ply", ply_of(cloud))
+
+
+def ply_of(cloud: PointCloud) -> bytes:
+    """Return the content of a binary PLY file with points and normals."""
+    points, normals = cloud.to_numpy()
+    # Use a mesh without faces, since trimesh's point clouds have no normals.
+    mesh = trimesh.Trimesh(points, vertex_normals=normals, process=False)
+    return trimesh.exchange.ply.export_ply(mesh, vertex_normal=True)
 
 
 def _checksum(arrays: dict[str, np.ndarray]) -> str:

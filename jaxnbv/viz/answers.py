@@ -39,10 +39,9 @@ class Chart(NamedTuple):
     """Data of a line chart: named numbers with a value after each view.
 
     - `label`: label of the vertical axis, with the unit.
-    - `true`: values of the numbers if all of the surface had been seen; None if they are not known.
-    - `marks_true_name`: whether `true` is 1 for the true name and 0 for all others. If False, `true` has the values
-      that the numbers should reach.
-    - `goal`: a value that the numbers should reach; None for no such value.
+    - `true`: values of the numbers if all of the surface had been seen.
+    - `marks_true_name`: whether `true` is 1 for the true name and 0 for all others.
+    - `goal`: a value that the numbers should reach.
     """
 
     label: str
@@ -54,7 +53,7 @@ class Chart(NamedTuple):
 
 
 class Words:
-    """Texts and charts about an answer. Subclasses for particular types of answers override some of them."""
+    """Texts and charts about an answer. Subclasses are for particular types of answers."""
 
     def __init__(self, answer: Answer):
         self.answer = answer
@@ -226,7 +225,7 @@ class _ColdestWords(Words):
 
 
 class CoverageAnswer(Answer):
-    """Surface seen: percent of the true surface, or an area in `unit` if that is unknown. `amount` is the text."""
+    """Surface seen: percent of the true surface, or an area in `unit`. `amount` is the text."""
 
     unit: str = "%"
 
@@ -282,10 +281,7 @@ def number_text(value: float) -> str:
 
 
 def kinds_text(kinds: Sequence[tuple[str, float]]) -> str:
-    """Return a sentence with the probabilities of the kinds of known shapes that the samples show.
-
-    - `kinds`: name and probability of each kind, the likeliest first.
-    """
+    """Return a sentence with the probabilities of the kinds of known shapes, the likeliest first."""
     named = [f"{name} {100 * weight:.0f} %" for name, weight in kinds[:_NUM_KINDS_NAMED]]
     rest = sum(weight for _, weight in kinds[_NUM_KINDS_NAMED:])
     return f"Imagined, as known shapes fit: {', '.join(named)}{f', others {100 * rest:.0f} %' if rest else ''}."

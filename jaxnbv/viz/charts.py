@@ -24,10 +24,9 @@ _LEGEND: dict[str, Any] = {"loc": "outside lower center", "frameon": False, "fon
 
 
 def visible_lines(chart: Chart) -> dict[int, int]:
-    """Return the lines to draw, as a dict from a number's index to how many other lines its line hides.
+    """Return the indices of the lines to draw, each with how many nearly coinciding lines it hides.
 
-    A line that nearly coincides with a drawn line is hidden. At most six lines are drawn: those whose largest value, or
-    true value, is highest.
+    At most six lines are drawn: those whose largest value, or true value, is highest.
     """
     largest = chart.values.max(axis=0)
     largest = largest if chart.true is None else np.maximum(largest, chart.true)

@@ -62,8 +62,7 @@ def marks(*proposals: Proposal) -> list[str]:
 def draw_choice(figure: Figure, proposal: Proposal | None, quantity: Quantity, frame: Frame) -> None:
     """Draw a map of the candidates, and below it the candidates by value over a colour bar.
 
-    - `proposal`: None for a given view. Then only the grid of the map is drawn.
-    - `frame`: frame of the world. The values are in its units.
+    The values are in units of `frame`. Without a proposal (for a given view), only the grid of the map is drawn.
     """
     colours = draw_acquisition(figure.add_axes((0.06, 0.4, 0.88, 0.58)), proposal, quantity)
     if proposal is None or colours is None:
@@ -140,7 +139,7 @@ def directions_of(poses: Pose) -> Float[np.ndarray, "*n 3"]:
 
 
 def _draw_ascents(globe: Any, ascents: Float[np.ndarray, "starts steps 3"], weight: float) -> None:
-    """Draw each gradient ascent on the map as a line from a ring (start) to a dot (end)."""
+    """Draw a line from a ring (start) to a dot (end)."""
     for directions in ascents:
         line = sphere.path(directions).T
         globe.plot(*line, color="white", lw=2.2 * weight, zorder=6)

@@ -35,9 +35,7 @@ class ViewData(eqx.Module):
 
     - `view`: the view, with the values of its proposal in world units.
     - `before`, `new`: points of the cloud before the view, and points that the view added, in scene coordinates.
-    - `surface`: the surface after the view: the likeliest known shape, or else the pieces of the posterior mean's
-      surface near the cloud. None if the grid holds no surface. Its deviation (world units) grows with the distance
-      from the cloud. `has_shape` says whether it is a known shape.
+    - `surface`, `has_shape`: see `shown_surface`, but with the deviation in world units; whether it is a known shape.
     - `coverage`: amount of surface seen after the view.
     - `sentences`: see `sentences_about`.
     - `imagined`, `image`: see `render_imagined` and `view_image`.
@@ -69,10 +67,7 @@ class ViewData(eqx.Module):
 
 
 class ReportData(eqx.Module):
-    """Data of a report.
-
-    - `true_surface`: mesh of the true surface; None if it is not known.
-    """
+    """Data of a report."""
 
     episode: Episode
     views: tuple[ViewData, ...]
@@ -119,11 +114,9 @@ def report_data(
 ) -> ReportData:
     """Compute everything that the pictures of an episode show.
 
-    - `truth`: points of the true surface, in scene coordinates. By default they are sampled from the scene if possible.
+    - `truth`, `rival`: see `write_report`.
     - `imagine`: whether to show the surfaces that the steps imagined.
-    - `rival`: an episode of a different search from the same first view.
-    - `sketches`: sketches made while the episode ran. For a step without a sketch, the model is conditioned and sampled
-      again.
+    - `sketches`: sketches made while the episode ran. Steps without a sketch are computed again.
     """
     planner, frame = episode.planner, episode.frame
     true_surface = None if episode.scene is None else true_mesh(episode.scene)

@@ -62,8 +62,7 @@ class Deviation(eqx.Module):
     - `distances`: signed distance from the CAD to each point, positive outside (too much material).
     - `nearest_points`, `normals`: for each point, the nearest point of the CAD and its outward normal.
     - `cad`: the CAD at this pose.
-    - `area`, `missing_area`: area of the CAD that the scan covers, and area that it does not cover. There are no
-      distances for the latter.
+    - `area`, `missing_area`: areas of the CAD that the scan covers and does not cover.
     - `imagined`: fraction of the scanned mesh that no view measured. This part is left out.
     - `radius`: a place on the CAD is covered if at least three of the four nearest rows of `nearest_points` are within
       this distance and on the same side of the wall, as their normals show.
@@ -303,10 +302,7 @@ def _check_units(scan: float, cad: float) -> None:
 
 
 def _rigid_matrix(pose: Float[AnyArray, "4 4"] | list | None) -> Float[np.ndarray, "4 4"]:
-    """Convert a pose to a rigid matrix, and None to the identity.
-
-    **Raises:** `ValueError` unless the pose is a rigid (4, 4) matrix.
-    """
+    """Check that a pose is a rigid (4, 4) matrix, and convert None to the identity."""
     matrix = np.eye(4) if pose is None else as_numbers(pose, "the pose", np.float64)
     require(
         matrix.shape == (4, 4), f"the pose has shape {matrix.shape}: give a matrix (4, 4), from the CAD to the scan"

@@ -78,10 +78,7 @@ def deviation_figure(
 def _two_eyes(
     scene: TriangleMesh, values_at: Values, positions: Float[np.ndarray, "k 3"], outward: Float[np.ndarray, "k 3"]
 ) -> Float[np.ndarray, "2 3"]:
-    """Return two viewing directions that together show most of the scan and of the numbered places.
-
-    - `positions`, `outward`: numbered places and the outward normals there, in scene coordinates.
-    """
+    """Return two directions from which one sees most of the scan and of the places at `positions` (scene)."""
     mesh = scene.to_trimesh()
     samples, rows = trimesh.sample.sample_surface(mesh, _NUM_SAMPLES, seed=0)
     normals = mesh.face_normals[rows]
@@ -123,11 +120,7 @@ def _render(scene: TriangleMesh, eye: Float[np.ndarray, "3"], values_at: Values,
 
 
 def _number(axes: Any, still: Still, positions: Float[np.ndarray, "k 3"], center: Float[np.ndarray, "2"]) -> None:
-    """Write the number of each visible place beside it, on the side away from the centre of the object.
-
-    - `positions`: places in scene coordinates, in the order of their numbers.
-    - `center`: mean pixel of the object's vertices.
-    """
+    """Write the number of each visible place (scene coordinates) beside it, away from the pixel `center`."""
     pixels, in_front = still.project(positions)
     for number, (pixel, is_visible) in enumerate(zip(pixels, in_front, strict=True), start=1):
         if not is_visible:

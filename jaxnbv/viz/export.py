@@ -14,6 +14,7 @@ from jaxnbv.observations import Observations
 from jaxnbv.planning.episode import Episode
 from jaxnbv.sampler import StepInputs, SurfaceSampler
 from jaxnbv.storage.files import write_bytes
+from jaxnbv.storage.run_folder import ply_of
 from jaxnbv.surfaces.part_hypotheses import PartHypotheses
 from jaxnbv.viz.mean_surface import MeanSurface, mean_surface, near_points
 from jaxnbv.viz.placed_shape import likeliest_part
@@ -111,19 +112,13 @@ def _region(mesh: trimesh.Trimesh, faces: Int[np.ndarray, " f"]) -> Region:
 
 @checked
 def save_cloud(episode: Episode, path: str | Path) -> Path:
-    """Write `scanned_cloud` to a PLY, OBJ, GLB or XYZ file, according to the suffix of `path`.
-
-    Only a PLY file holds the normals.
+    """Write `scanned_cloud` to a PLY (with normals), OBJ, GLB or XYZ file, as the suffix of `path` says.
 
     **Raises:** `ValueError` for an episode without views, for a different suffix, or if the file cannot be written.
     """
-    points, normals = scanned_cloud(episode).to_numpy()
-    kind = _kind(path, _CLOUD_FORMATS)
-    if kind == "ply":
-        # Clouds of trimesh have no normals.
-        mesh = trimesh.Trimesh(points, vertex_normals=normals, process=False)
-        return _write(path, trimesh.exchange.ply.export_ply(mesh, vertex_normal=True))
-    return _write(path, trimesh.PointCloud(points).export(file_type=kind))
+    cloud, kind = scanned_cloud(episode), _kind(path, _CLOUD_FORMATS)
+    is_ply = kind == "ply"
+    return _write(path, ply_of(cloud) if is_ply else trimesh.PointCloud(cloud.to_numpy()[0]).export(file_type=kind))
 
 
 @checked
@@ -132,8 +127,7 @@ def save_mesh(episode: Episode, path: str | Path, imagined: bool = True) -> Path
 
     Only a PLY file holds the deviation of each vertex, and whether each face was measured.
 
-    **Raises:** `ValueError` for a different suffix, if the file cannot be written, and whenever `surface_mesh` raises
-    it.
+    **Raises:** `ValueError` as `surface_mesh`, for a different suffix, or if the file cannot be written.
     """
     kind = _kind(path, _MESH_FORMATS)
     return _write(path, surface_mesh(episode, imagined).export(file_type=kind))

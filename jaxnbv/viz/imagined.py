@@ -35,12 +35,7 @@ _MAX_DISTANCE, _MAX_SPACINGS = 0.05, 3.0
 
 
 class ShadedImage(eqx.Module):
-    """A shaded picture of a surface from a camera.
-
-    - `mask`: whether each ray hits the surface.
-    - `brightness`: brightness in [0, 1].
-    - `is_seen`: whether an earlier view saw the surface at this pixel.
-    """
+    """A picture of a surface: where rays hit it, brightness in [0, 1], and where an earlier view saw it."""
 
     mask: Bool[np.ndarray, "h w"]
     brightness: Float[np.ndarray, "h w"]
@@ -131,7 +126,6 @@ def lamp(pose: Pose) -> Float[np.ndarray, "3"]:
 
 
 def _fine_camera(camera: Camera) -> Camera:
-    """Return the camera with a multiple of its pixels: at least `_PIXELS` along the longer side."""
     factor = math.ceil(_PIXELS / max(camera.height, camera.width))
     return camera if factor == 1 else camera.resized(factor * camera.height, factor * camera.width)
 

@@ -103,9 +103,8 @@ def _mean_of_samples(values: Float[np.ndarray, "s g g g"], grid: Grid) -> MeanSu
 def near_points(surface: MeanSurface | None, cloud: PointCloud) -> MeanSurface | None:
     """Return the connected pieces of a surface that are near points of the cloud; None if there are none.
 
-    The deviation becomes sqrt(sd^2 + (r / 4)^2), where sd is the surface's deviation and r
-    the distance to the nearest point of the cloud. The posterior's own deviation is too small where no ray has hit,
-    beside the image's border or behind the object.
+    The deviation becomes sqrt(sd^2 + (r / 4)^2), where sd is the surface's deviation and r the distance to the nearest
+    point of the cloud, because sd is too small where no ray has hit.
     """
     if surface is None:
         return None
@@ -123,10 +122,7 @@ def padded(rows: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "m d"]:
 
 
 def _farthest_rows(features: Float[np.ndarray, "n d"], count: int) -> Int[np.ndarray, " count"]:
-    """Return the indices of `count` rows far from each other, in order of choice.
-
-    If there are fewer rows, the first index is repeated.
-    """
+    """Return indices of rows far from each other, in order of choice. If there are too few, the first is repeated."""
     rows = jnp.asarray(padded(features.astype(np.float32)))
     return np.asarray(farthest_point_indices(rows, jnp.arange(len(rows)) < len(features), count))
 

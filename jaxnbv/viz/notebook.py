@@ -126,7 +126,7 @@ def _(posterior: SurfacePosterior) -> Drawing:
 
 
 def _draw_slice(posterior: SurfacePosterior, axes: Axes) -> None:
-    """Draw P(f < level), the probability of being inside, on the plane z = 0. x is to the right, y is up."""
+    """Draw P(f < level), the probability of being inside, on the plane z = 0, with y up."""
     axis = jnp.linspace(-_HALF_SIDE, _HALF_SIDE, _PIXELS)
     x, y = jnp.meshgrid(axis, axis)
     places = jnp.stack([x.ravel(), y.ravel(), jnp.zeros(_PIXELS**2)], axis=-1)
@@ -159,7 +159,6 @@ def _(episode: Episode) -> Drawing:
 
 
 def _draw_views(episode: Episode, part: PlacedShape | None, axes: Axes) -> None:
-    """Draw the points (those of the last view in a different colour), the likeliest part, and the cameras."""
     poses = [view.pose for view in episode.views]
     extent = max(1.8, *(float(np.linalg.norm(pose.position)) for pose in poses))
     still = Still(eye_beside(poses[-1]), part, 400, extent)

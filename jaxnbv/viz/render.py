@@ -153,7 +153,6 @@ class Still:
 
 
 def _barycentric(points: Float[np.ndarray, "n 3"], corners: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3"]:
-    """Return the weights of a triangle's corners at a point in it."""
     a, b, p = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], points - corners[:, 0]
     aa, ab, bb, pa, pb = (np.einsum("nd,nd->n", *pair) for pair in ((a, a), (a, b), (b, b), (p, a), (p, b)))
     area = np.maximum(aa * bb - ab**2, 1e-30)
@@ -163,10 +162,7 @@ def _barycentric(points: Float[np.ndarray, "n 3"], corners: Float[np.ndarray, "n
 
 
 def _occlusion(mask: Bool[np.ndarray, "h w"], depth: Float[np.ndarray, " hits"]) -> Float[np.ndarray, " hits"]:
-    """Return the fraction by which to darken each hit (Luft, Colditz and Deussen 2006).
-
-    It grows with the depth of the hit relative to the mean depth around it.
-    """
+    """Return by which fraction to darken hits deeper than the mean around them (Luft, Colditz and Deussen 2006)."""
     width, depths = round(_OCCLUSION_WIDTH * len(mask)), np.zeros(mask.shape)
     depths[mask] = depth
     # Two filters in a row, so that a pixel's weight falls off with distance.
@@ -195,10 +191,7 @@ def draw_truth(axes: Axes, data: ReportData) -> bool:
 
 
 def render_view(data: ReportData, index: int, size: int | None = None) -> Still:
-    """Return a picture of the surface after view `index` (from 0), from the report's viewpoint.
-
-    - `size`: pixels along each side; by default those of a report.
-    """
+    """Return a picture of the surface after view `index` (from 0), by default of the size for a report."""
     viewpoint, norm = data.viewpoint, LogNorm(*data.deviations)
     return Still(viewpoint.eye, data.views[index].surface, size or _STILL_SIZE, viewpoint.extent, norm)
 
@@ -208,7 +201,7 @@ def draw_scene(
 ) -> None:
     """Draw surface, points and cameras after view `index` (from 0) into empty axes. Names the part.
 
-    - `still`: picture of the surface, see `render_view`.
+    - `still`: see `render_view`.
     - `weight`: factor for the sizes of lines, dots and letters.
     - `inset`: whether the emptiest corner shows what the last view saw.
     - `aspect`: width divided by height.

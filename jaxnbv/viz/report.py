@@ -55,8 +55,8 @@ def write_report(
 ) -> Path:
     """Write `report.html` into a folder, replacing an earlier report, and return its path.
 
-    - `truth`: points of the true surface in scene coordinates, for the chart of coverage. By default they are sampled
-      from the scene if possible. Without truth the chart shows the area that the scans have seen.
+    - `truth`: points of the true surface in scene coordinates, for the chart of coverage; by default sampled from the
+      scene if possible. Without truth the chart shows the area that the scans have seen.
     - `title`: name of the object.
     - `rival`: an episode of a different search from the same first view, for comparison.
     - `sketches`: sketches of the episode's steps. Missing ones are made again.
@@ -109,23 +109,20 @@ def data_url(picture: UInt8[np.ndarray, "h w _"]) -> str:
 
 
 def _matrix(data: ReportData, index: int) -> str:
-    """Return the pose of a view as JSON text: a matrix from camera (OpenCV's axes) to world."""
+    """Return a view's pose as JSON: a matrix from camera (OpenCV's axes) to world."""
     pose = _world_of(data.episode)[0].to_world(data.views[index].pose)
     return json.dumps(np.asarray(pose.to_matrix(), np.float64).round(6).tolist())
 
 
 def _world_of(episode: Episode) -> tuple[Frame, str]:
-    """Return the frame of the world, and its unit, for the poses that a reader of the report can copy.
-
-    It is the frame of the object's file if there is one, otherwise that of the session or the scene.
-    """
+    """Return frame and unit of poses that a reader copies: those of the object's file, or else of the episode."""
     if episode.scene is not None and (world_frame := episode.scene.world_frame) is not None:
         return world_frame, "the units of the object's file"
     return episode.frame, episode.frame.unit
 
 
 def _deviation_ticks(data: ReportData) -> list[tuple[float, str]]:
-    """Return positions (percent of the width) and labels of the ticks of the colour bar of deviations."""
+    """Return position (percent of the width) and label of each tick of the deviations' colour bar."""
     low, high = data.deviations
     return [(round(100.0 * math.log(tick / low, high / low), 2), f"{tick:g}") for tick in bar_ticks(low, high)]
 
@@ -135,7 +132,6 @@ def _zip(text: str) -> bytes:
 
 
 def _scene_picture(data: ReportData, index: int) -> str:
-    """Draw the scene after a view, and return the picture as a data URL."""
     figure = Figure(figsize=_SCENE, facecolor="none")
     # Leave a margin, so that the frame of the inset is not cut.
     axes = figure.add_axes((0.002, 0.002, 0.996, 0.996))
@@ -144,14 +140,12 @@ def _scene_picture(data: ReportData, index: int) -> str:
 
 
 def _truth_picture(data: ReportData) -> str | None:
-    """Draw the true surface, and return the picture as a data URL; None if the surface is not known."""
     figure = Figure(figsize=_TRUTH, facecolor="none")
     is_known = draw_truth(figure.add_axes((0.0, 0.0, 1.0, 1.0)), data)
     return data_url(_pixels(figure, _TRUTH_DPI)) if is_known else None
 
 
 def _choice_picture(data: ReportData, index: int) -> str:
-    """Draw why a view was chosen (see `draw_choice`), and return the picture as a data URL."""
     figure = Figure(figsize=_CHOICE, facecolor="none")
     draw_choice(figure, data.views[index].proposal, data.quantity, data.episode.frame)
     return data_url(_pixels(figure, _CHOICE_DPI))

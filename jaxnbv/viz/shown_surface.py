@@ -19,8 +19,8 @@ def needs_no_posterior(sampler: SurfaceSampler) -> bool:
 def shown_surface(sampler: SurfaceSampler, inputs: StepInputs, answer: Answer | None = None) -> MeanSurface | None:
     """Return the likeliest known shape at its placement, or else the posterior mean's surface near points.
 
-    Return None if there is no such surface. The mean over several known shapes is the shape of none of them, so it is
-    not shown. If the object fits no known shape, the mean is that of the model without the bank.
+    Return None if there is no such surface. The mean over several known shapes is the shape of none of them, so if the
+    object fits no known shape, the mean is that of the model without the bank.
 
     - `inputs`: inputs of a step, with a posterior unless `needs_no_posterior`.
     - `answer`: the acquisition's answer, whose classes may also be the kinds of the known shapes.

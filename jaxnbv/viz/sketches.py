@@ -18,9 +18,8 @@ from jaxnbv.viz.unmeasured import Patch, unmeasured
 class Sketch(NamedTuple):
     """Costly parts of the pictures of one step, before its view is taken.
 
-    - `surface`: the surface that pictures show, see `shown_surface`.
-    - `imagined`: pictures of the step's samples; None if its view was given or not taken.
-    - `unmeasured`: patches of the surface that views looked at but did not measure.
+    - `surface`, `unmeasured`: see the functions `shown_surface` and `unmeasured`.
+    - `imagined`: see `render_imagined`; None also if the step's view was not taken.
     """
 
     surface: MeanSurface | None

@@ -72,7 +72,6 @@ def _points(item: Points, limit: int) -> list[dict[str, Any]]:
 
 
 def _cameras(item: Cameras) -> list[dict[str, Any]]:
-    """Return plotly traces of the cameras: their edges, separated by gaps, and their numbers."""
     if not item.poses:
         return []
     edges = np.concatenate([frustum(pose, item.camera, item.depth) for pose in item.poses])
@@ -88,9 +87,7 @@ def _cameras(item: Cameras) -> list[dict[str, Any]]:
 
 
 def _mesh(surface: MeanSurface, limit: int, grades: Float[np.ndarray, "2"]) -> dict[str, Any]:
-    """Return a plotly trace of a surface, coarsened to at most `limit` vertices.
-
-    Colours show the logarithm of the deviation or, for a known shape, where it is measured and where hypotheses agree.
+    """Return a plotly trace of a surface, see `_triangles`, in the colours of `Still`.
 
     - `grades`: decimal logarithms of the deviations at the ends of the colours.
     """

@@ -119,11 +119,9 @@ def coverage_answers(
 ) -> list[CoverageAnswer]:
     """Return how much of the surface was seen after each view.
 
-    Given the true surface, this is the percentage of it that was seen. Otherwise it is the sum of the new areas that
-    scans show, in squared world units. `NewSurface` defines what is new, with the acquisition's settings if it is a
-    `NewSurface`. An area measured at a slant counts in full here, but for less in the acquisition.
-
-    - `truth`, `all_observations`: see `task_of`.
+    Given points of the true surface (`truth`), this is the percentage of them that was seen. Otherwise it is the sum of
+    the new areas that scans show, in squared world units. `NewSurface` defines what is new, with the acquisition's
+    settings if it is a `NewSurface`. An area measured at a slant counts in full here, but for less in the acquisition.
     """
     views, acquisition = episode.views, episode.planner.acquisition
     if truth is not None:
@@ -182,10 +180,7 @@ def search_name(episode: Episode) -> str:
 
 
 def rival_text(rival: Episode, episode: Episode) -> str:
-    """Return a sentence about a different search from the same first view: number of views, and answer.
-
-    If a stop rule ended `episode` but not `rival`, the sentence says that `rival` was not done.
-    """
+    """Return a sentence about a different search: number of views, whether it was done, and answer."""
     name, count = search_name(rival).capitalize(), len(rival.views)
     answers = _answers(episode, rival.views[-1:])
     views = f"{count} view{'s' * (count > 1)}"

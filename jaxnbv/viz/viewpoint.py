@@ -25,8 +25,7 @@ class Viewpoint(eqx.Module):
     """One viewpoint for all pictures, near enough for the object to fill them.
 
     - `eye`: unit vector from the origin to the viewer.
-    - `radius`: radius of the object about the origin, in scene units.
-    - `outline`: points on the object.
+    - `radius`, `outline`: radius of the object about the origin, in scene units, and points on the object.
     - `depth`: depth to which fields of view are drawn, in scene units.
     """
 
@@ -67,9 +66,7 @@ def viewpoint_of(episode: Episode, surfaces: list[trimesh.Trimesh]) -> Viewpoint
 def _visible_fraction(
     episode: Episode, surface: trimesh.Trimesh | None, eyes: Float[np.ndarray, "e 3"], clearance: float
 ) -> Float[np.ndarray, " e"]:
-    """Return, for each viewing direction in `eyes`, the fraction of points that it shows.
-
-    The points are those of the chosen views. They must face the viewer and not be hidden by the surface.
+    """Return the fraction of the chosen views' points that face each of `eyes` and are not hidden by the surface.
 
     - `clearance`: distance in front of a point at which the ray to the viewer starts.
     """

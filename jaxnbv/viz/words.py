@@ -25,8 +25,7 @@ def sentences_about(
 
     - `views`: all views up to this one, with the values of their proposals in world units.
     - `amounts`: how much was seen after each view.
-    - `frame`: frame of the world.
-    - `gain`: true gain of the last view, to compare with its expected value, in world units; None if unknown.
+    - `gain`: true gain of the last view, to compare with its expected value, in world units.
     """
     *earlier, view = views
     points, amount = int(view.scan.count), amounts[-1].amount

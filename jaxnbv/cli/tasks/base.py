@@ -24,9 +24,8 @@ class Subject(NamedTuple):
     """The object of an episode, with its acquisition and first pose.
 
     - `bank`: known shapes as in `--known`, or a bank of parts with sizes in scene units.
-    - `grid`: grid of the imagined surfaces, or None for the default grid.
+    - `grid`, `question`: grid of the imagined surfaces and question at the head of the report; None for the defaults.
     - `note`: text to print before the first view.
-    - `question`: question at the head of the report, or None for the default question of the task.
     """
 
     name: str
@@ -41,11 +40,10 @@ class Subject(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Task(ABC):
-    """A task of `jaxnbv run` and `jaxnbv demo`. The fields of a task are options of `run`.
+    """A task of `jaxnbv run` and `jaxnbv demo`.
 
-    Fields without a default are required options.
+    The fields of a task are options of `run`, required if they have no default.
 
-    - `name`: name of the task in `--task`.
     - `about`: the question of the task, as a phrase for the help.
     - `example`: the object of the demo, as a phrase for the help.
     - `until`: default of `--until` in the demo. If it is not empty, the demo also runs farthest view for comparison.
@@ -65,10 +63,7 @@ class Task(ABC):
 
     @abstractmethod
     def acquisition(self, mesh: "TriangleMesh", camera: "Camera", first: "Pose") -> "Acquisition":
-        """Make the acquisition for views of a user's mesh.
-
-        - `first`: pose of the first view.
-        """
+        """Make the acquisition for views of a user's mesh, of which `first` is the first."""
 
     def bank(self, mesh: "TriangleMesh") -> "str | ShapeBank":
         """Return the known shapes for a user's mesh: a name as in `--known`, or parts in scene units."""
@@ -77,11 +72,7 @@ class Task(ABC):
     @classmethod
     @abstractmethod
     def demo(cls, scene: int, seed: int) -> Subject:
-        """Return the object of the demo.
-
-        - `scene`: number that selects the object.
-        - `seed`: seed for the choice of the first view.
-        """
+        """Return the demo's object with the number `scene`. `seed` decides its first view."""
 
 
 def default_first_pose(radius: float | None = None) -> "Pose":

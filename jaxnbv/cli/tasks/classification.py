@@ -20,7 +20,7 @@ _NUM_POINTS = 512
 
 @dataclass(frozen=True, kw_only=True)
 class ClassTask(Task):
-    """Base class of tasks whose acquisition compares a classifier's probabilities before and after a scan."""
+    """Base class of tasks whose acquisition, from `make_acquisition`, uses a classifier."""
 
     example = "a truck, whose cargo the first view does not show"
     until = ("sure=0.95",)
@@ -28,8 +28,7 @@ class ClassTask(Task):
 
     @classmethod
     @abstractmethod
-    def make_acquisition(cls, classifier: "Classifier") -> "Acquisition":
-        """Make the acquisition from a classifier."""
+    def make_acquisition(cls, classifier: "Classifier") -> "Acquisition": ...
 
     def acquisition(self, mesh: "TriangleMesh", camera: "Camera", first: "Pose") -> "Acquisition":
         from jaxnbv.networks import CloudClassifier, load_checkpoint, network_scale
@@ -39,9 +38,9 @@ class ClassTask(Task):
 
     @classmethod
     def demo(cls, scene: int, seed: int) -> Subject:
-        """Return a truck, and a first view from above that does not show the truck's cargo.
+        """Return a truck, the class of whose cargo is asked, and a first view that hides the cargo.
 
-        The class to find is that of the cargo. Surfaces are imagined on the grid that was used to train the classifier.
+        Surfaces are imagined on the grid that was used to train the classifier.
         """
         import jax
         import numpy as np

@@ -87,9 +87,8 @@ class IdentifyTask(Task):
 def bank_of(folder: Path, scale: str, size: float, up: str = "y") -> "ShapeBank":
     """Read the parts of a folder, and convert them to the units of a world.
 
-    - `scale`: unit of the parts, as in `--parts-scale`.
+    - `scale`, `up`: unit and upward axis of the parts, as in `--parts-scale` and `--parts-up`.
     - `size`: approximate size of the object in the world.
-    - `up`: up axis in the files of the parts.
 
     **Raises:** `ValueError` if all parts are far smaller or larger than the object, and whenever
     `ShapeBank.from_meshes` raises it.
