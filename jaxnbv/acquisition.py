@@ -43,13 +43,11 @@ class Acquisition(eqx.Module):
 
     - `needs_posterior`: whether `context` reads the posterior. A planner then puts the posterior into the step inputs.
     - `cloud_only`: whether `context` reads only the cloud D. A planner can then test the acquisition before any view.
-    - `measurable_only`: whether the samples omit surface that an earlier view should have measured but did not, see
-      `Looks`.
+    - `measurable_only`: whether samples omit surface that an earlier view should have measured, but did not (`Looks`).
     - `needs_hypotheses`: whether `context` reads the hypotheses of a model of known parts, and no posterior. The most
       likely part is then the only sample of the step.
-    - `gains_once`: whether a second view from the same pose gains nothing. The true value at the poses of earlier views
-      is then zero, so the estimated value there is an error. `Proposal.tied_with_best` uses this error as a tolerance,
-      and a search over candidates proposes the tied candidate that is farthest from the cameras so far.
+    - `gains_once`: whether a second view from the same pose gains nothing. The value that is estimated at the poses of
+      earlier views is then an error, by which a search over candidates decides what is tied, see `DiscreteSearch`.
     """
 
     needs_posterior: ClassVar[bool] = False
@@ -287,15 +285,13 @@ def expected_value(
 ) -> Float[Array, "poses *scores"]:
     """Return the expected value at each pose: the mean score of imagined scans over the samples.
 
-    Supports `jit`, `grad` and `vmap`, in the poses and in `observations`. An `AcquisitionList` adds an axis for its
-    members.
+    Supports `jit`, `grad` and `vmap`, in poses and observations. An `AcquisitionList` adds an axis for its members.
 
     - `observations`: the observations, or a cloud D. An acquisition that needs the posterior requires `StepInputs`.
     - `surfaces`: the samples along a leading axis.
     - `barrier`: distance along each ray to an obstacle, see `scan`.
 
-    **Raises:** `ValueError` if JAX cannot trace a user's function, and whenever the acquisition's `check` raises it
-    (traced values are not checked).
+    **Raises:** `ValueError` if JAX cannot trace a user's function, and whenever `Acquisition.check` does (for concrete values).
     """
     inputs = _inputs(acquisition, observations)
     # `check` needs concrete results. Under jit, results (and this zero) are traced even if all inputs are concrete.

@@ -215,8 +215,8 @@ def as_numbers(value: Any, name: str, dtype: Any = float) -> np.ndarray:
 def functions_of_users() -> Iterator[None]:
     """Context manager for calls of a user's functions: explain JAX's tracing errors.
 
-    **Raises:** `ValueError` for a function that calls NumPy, selects rows by a mask, or uses a traced value in Python
-    to count, to index or to branch.
+    **Raises:** `ValueError` for a function that calls NumPy, selects rows by a mask, or counts, indexes or branches in
+    Python with a traced value.
     """
     try:
         yield

@@ -24,8 +24,7 @@ _MAX_SKEW = 1e-6
 # Depth cameras have no rays more than 70 degrees off the axis (`_MAX_TANGENT` is the tangent). A principal point may be
 # the centre of an image if it is off by at most `_MAX_CENTER_OFFSET` times half the width and half the height.
 _MAX_TANGENT, _MAX_CENTER_OFFSET = math.tan(math.radians(70.0)), 0.2
-# If the principal point lies at this fraction or more of both the width and the height, the matrix is certainly for a
-# larger image.
+# A principal point at this fraction or more of both the width and the height certainly belongs to a larger image.
 _MAX_CENTER_FRACTION = 0.96
 
 
@@ -48,10 +47,8 @@ class Camera(eqx.Module):
     - `nearest`, `farthest`: the sensor measures depths between these limits, along the viewing direction and in scene
       units. `nearest=0` and `farthest=None` mean no limit. A hit nearer than `nearest` is invalid. A ray without a hit
       up to `farthest` is missed, so it is empty up to `farthest`.
-    - `max_incidence`: largest angle between a ray and the surface normal at which the sensor measures a hit, in radians
-      within (0, pi/2].
-    - `distortion`: coefficients of the lens distortion, see `from_intrinsics`. The rays have no distortion, since
-      `PointCloud.from_depth` undoes it.
+    - `max_incidence`: largest angle between a ray and the normal of a measured hit, in radians within (0, pi/2].
+    - `distortion`: see `from_intrinsics`. The rays have no distortion, since `PointCloud.from_depth` undoes it.
 
     The defaults are the paper's: 30 degrees, 50 x 50 pixels, no limits.
 

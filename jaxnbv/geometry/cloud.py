@@ -154,10 +154,8 @@ class PointCloud(eqx.Module):
         - `depth`: depths along the camera's forward axis. The noise of integer depths is at least their rounding.
         - `depth_scale`: units of the pose (also of the camera's range and the box) per unit of depth, such as 0.001 for
           an image in millimetres and a pose in metres.
-        - `stride`: keep every `stride`-th row and column of planes that are fitted to all pixels. The cloud is then an
-          image of `camera.strided(stride)`.
-        - `box`: keep only points inside the box. A ray that hits behind the box is missed, and one that hits in front
-          of it is invalid.
+        - `stride`: keep every `stride`-th row and column, as `camera.strided` does. Planes are still fitted to all pixels.
+        - `box`: keep only points inside. A ray that hits behind the box is missed, and one that hits before it is invalid.
 
         **Raises:** `ValueError` if the image's shape differs from the camera's, all depths are outside the camera's
         range, the box is behind the camera, or depths and the distance of the box differ by orders of magnitude.
@@ -207,10 +205,7 @@ class PointCloud(eqx.Module):
 
 
 def some_rows(cloud: PointCloud, count: int) -> Int[Array, " count"]:
-    """Return the indices of `count` rows, evenly spaced among a cloud's filled rows.
-
-    Indices repeat if fewer than `count` rows are filled, and are 0 if the cloud is empty.
-    """
+    """Return `count` evenly spaced indices of filled rows, repeated if there are fewer, and 0 if none."""
     order = jnp.argsort(~cloud.mask, stable=True)
     return order[(jnp.arange(count) * cloud.count) // count]
 
@@ -228,8 +223,7 @@ def check_oriented(cloud: PointCloud, name: str, limit: float, unit: bool = True
     - `unit`: whether normals must have unit length (to 1 %). If not, lengths up to 10 are allowed, since a model may be
       conditioned on prior samples, whose normals do not have unit length.
 
-    **Raises:** `ValueError` if the cloud is empty, an entry is not finite, a normal has an invalid length, or a point
-    is beyond the limit.
+    **Raises:** `ValueError` for an empty cloud, an entry that is not finite, or an invalid normal or point.
     """
     points, normals = cloud.to_numpy()
     require(
@@ -258,8 +252,7 @@ def check_oriented(cloud: PointCloud, name: str, limit: float, unit: bool = True
 def concatenate(first: PointCloud, second: PointCloud) -> PointCloud:
     """Return one cloud with the points of two clouds (the paper's union of D and D').
 
-    All rows of `first`, even empty ones, come before those of `second`. `missed` and `sight` are None, since the result
-    is not a sensor's image.
+    All rows of `first`, even empty ones, come before those of `second`. `missed` and `sight` are None.
 
     **Raises:** `ValueError` for a batch of clouds.
     """

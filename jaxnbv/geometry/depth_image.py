@@ -66,7 +66,7 @@ def points_of_depth(
     block_side = 1 if is_traced(depth) else find_block_side(np.isfinite(depth) & (np.asarray(depth) > 0))
     # The rounding is an array, so that a program compiled for one unit of depth runs for any unit.
     image = depth, jnp.asarray(missed), camera, pose, stride, jnp.asarray(rounding, depth.dtype), box, block_side
-    points, normals, mask, missed, inside, sight = _points_and_normals(*image)
+    (points, normals, mask, missed, sight), inside = _points_and_normals(*image)
     if box is not None and not is_traced(points):
         _warn_of_nothing_inside(np.asarray(points)[np.asarray(mask)], np.asarray(inside)[np.asarray(mask)], box)
     mask = mask & inside
@@ -84,20 +84,8 @@ def _points_and_normals(
     rounding: Float[Array, ""],
     box: Box | None,
     block_side: int,
-) -> tuple[
-    Float[Array, "n 3"],
-    Float[Array, "n 3"],
-    Bool[Array, " n"],
-    Bool[Array, " n"],
-    Bool[Array, " n"],
-    Float[Array, " n"],
-]:
-    """Return points, normals, and four arrays with one entry for each ray.
-
-    1. valid: whether the ray measured a point with a normal.
-    2. empty: whether the ray met nothing, or first met something beyond the box.
-    3. inside: whether the point lies in the box.
-    4. sight: the distance from the camera to the hit; infinite without a hit.
+) -> tuple[Rows, Bool[Array, " n"]]:
+    """Return the cloud's rows, even for points outside the box, and whether each point lies in the box.
 
     - `rounding`: standard deviation of the rounding of depths.
     """
@@ -122,7 +110,7 @@ def _points_and_normals(
         crosses_box = valid.reshape(-1) & (nearest.reshape(-1) >= _depth_behind(box, strided_camera, pose))
         inside = box(points) <= 0
         missed = missed | (crosses_box & ~inside)
-    return points, normals, mask, missed, inside, sight
+    return (points, normals, mask, missed, sight), inside
 
 
 def _strided_samples(
@@ -132,8 +120,7 @@ def _strided_samples(
 
     1. depth of the block's sample.
     2. whether the block has a sample.
-    3. lower bound on the depth: the least depth of the samples in this block and, if `block_side` > 1, in the eight
-       blocks around it.
+    3. lower bound on the depth: the least of the samples in this block and, if `block_side` > 1, the eight around it.
     """
     samples, is_sample, _ = block_samples(depth, valid, block_side)
     nearest = jnp.where(is_sample, samples, jnp.inf)
@@ -170,10 +157,7 @@ def _is_sentinel(
 
 
 def _depth_range(box: Box, pose: Pose) -> tuple[float, float]:
-    """Return the least and greatest depth of a box's corners. Their ratio is limited to 1,000.
-
-    **Raises:** `ValueError` if the box lies behind the camera.
-    """
+    """Return the least and greatest depth of a box's corners. Their ratio is limited to 1,000."""
     corners = np.stack(np.meshgrid(*zip(box.low, box.high, strict=True)), axis=-1).reshape(-1, 3)
     depths = (corners - np.asarray(pose.position)) @ np.asarray(pose.forward)
     farthest = float(depths.max())

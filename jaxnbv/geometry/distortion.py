@@ -85,8 +85,7 @@ def undistort_image(
     """Return the depth image without distortion, and whether each ray of the new image met nothing.
 
     Each pixel of the new image is interpolated between the four nearest pixels of the distorted image, linearly in
-    inverse depth. If these pixels do not belong to one surface, the depth of the nearest pixel is used. The depth is 0
-    outside the distorted image.
+    inverse depth, or has the depth of the nearest if they are not on one surface. It is 0 outside the distorted image.
 
     - `depth`, `missed`: the distorted image, in which valid depths are positive and finite.
     - `plane_points`: positions of the new image's pixels in the plane Z = 1.

@@ -15,8 +15,7 @@ def farthest_point_indices(points: Float[Array, "n d"], mask: Bool[Array, " n"],
     """Return the indices of `count` rows, each chosen as far as possible from all earlier chosen rows.
 
     The first filled row (`mask` is True) is chosen first. Ties go to the first row. No row is chosen twice while an
-    unchosen filled row is left, even if points coincide. If there are fewer points than `count`, the first filled row
-    repeats at the end.
+    unchosen filled row is left, even if points coincide. Then the first filled row repeats.
 
     **Raises:** `ValueError` if `count` < 1.
     """

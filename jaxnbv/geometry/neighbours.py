@@ -52,7 +52,7 @@ class DistanceField(eqx.Module):
     def of(cls, cloud: PointCloud, margin: Float[Array, ""] | float, resolution: int = 64) -> "DistanceField":
         """Compute the distance field of a cloud, which must not be empty.
 
-        - `margin`: least distance between the cloud and the sides of the grid's cube, and so any point outside.
+        - `margin`: least distance from the cloud to the sides of the grid's cube, and so to any point outside.
         - `resolution`: number of nodes along each side of the cube.
         """
         rows = cloud.mask[:, None]

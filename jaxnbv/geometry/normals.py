@@ -19,7 +19,7 @@ def estimate_normals(
     `PointCloud.from_depth`, which takes the noise of the image into account.
 
     - `viewpoint`: position of the sensor, either one for all points or one per point, in the coordinates of the points.
-    - `neighbours`: number of points that define a plane, the point included. More smooth noise better, but also edges.
+    - `neighbours`: number of points that define a plane, the point included. More points smooth noise, but also edges.
 
     **Raises:** `ValueError` for wrong shapes, fewer points than `neighbours`, fewer than three neighbours, a point or
     viewpoint that is not finite, or a point at the viewpoint.

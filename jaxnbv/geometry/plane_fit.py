@@ -6,8 +6,7 @@ at (u0, v0), a function with three coefficients a, b and c,
     z0 / z(u, v) = a + b (u - u0) + c (v - v0),     normal along  (b, c, a - b u0 - c v0)
 
 is fitted by least squares to those pixels of a window that can belong to the same surface. If the pixels are a distance
-p apart on the surface and their depth has noise of standard deviation sigma, a slope fitted to (2 r + 1)^2 pixels has
-the error
+p apart on it and their depth has noise of standard deviation sigma, a slope fitted to (2 r + 1)^2 pixels has the error
 
     sqrt(3) sigma / (p r (2 r + 1)).
 

@@ -52,8 +52,7 @@ class Pose(eqx.Module):
         - `convention`: "opencv" for cameras that look along +z with y down, or "opengl" (also used by Blender and NeRF)
           for cameras that look along -z with y up.
 
-        **Raises:** `ValueError` for an unknown convention, a last row other than (0, 0, 0, 1), or for the same reasons
-        as `Pose`.
+        **Raises:** `ValueError` for an unknown convention, a last row other than (0, 0, 0, 1), or as `Pose` does.
         """
         axes = _axes(convention)
         matrices = as_floats(matrix, "the matrix of a pose")
@@ -166,8 +165,7 @@ def look_at(position, target=(0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0)) -> Pose:
     - `up`: the direction that is up in the image, (3,). If the camera looks along `up`, the coordinate axis in which
       `up` has its smallest component is used instead.
 
-    **Raises:** `ValueError` for other shapes, entries that are not finite, if `position` equals `target`, or if `up` is
-    zero.
+    **Raises:** `ValueError` for other shapes, entries that are not finite, equal `position` and `target`, or zero `up`.
     """
     position, target, up = (
         as_floats(value, f"look_at's {name}")
@@ -214,7 +212,7 @@ def _look_rotation(
 
 @checked
 def fibonacci_sphere(count: int, radius: float = 1.0, min_elevation: float = -0.5 * math.pi) -> Float[Array, "count 3"]:
-    """Return `count` points of the spherical Fibonacci lattice (Gonzalez 2010), almost evenly spaced.
+    """Return `count` almost evenly spaced points, the spherical Fibonacci lattice (Gonzalez 2010).
 
     - `min_elevation`: least elevation of the points above the plane y = 0, in radians, by default of the whole sphere.
 

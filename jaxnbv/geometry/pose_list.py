@@ -37,7 +37,7 @@ class PoseList(eqx.Module):
     @property
     def last(self) -> Pose:
         """The last pose; the identity for an empty list."""
-        return jax.tree.map(lambda rows: rows[self.count - 1], self.rows)
+        return self.rows[self.count - 1]
 
     def append(self, pose: Pose) -> "PoseList":
         """Return a list with one more pose. A full list is returned unchanged."""
@@ -60,9 +60,6 @@ class PoseList(eqx.Module):
 
 
 def is_same_view(poses: Pose, others: Pose) -> Bool[Array, "*batch"]:
-    """Return whether two poses agree to 1e-3 in position (scene units) and in viewing direction.
-
-    Leading axes are broadcast.
-    """
+    """Return whether poses (broadcast) agree to 1e-3 in position (scene units) and viewing direction."""
     is_near = jnp.linalg.norm(poses.position - others.position, axis=-1) < _MAX_DIFFERENCE
     return is_near & (jnp.linalg.norm(poses.forward - others.forward, axis=-1) < _MAX_DIFFERENCE)

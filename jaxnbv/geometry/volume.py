@@ -112,8 +112,7 @@ def ray_interval(
 def boundary_points(volume: Volume, count: int, level: float = 0.0) -> Float[Array, "count 3"]:
     """Return points where `count` evenly spread rays from the origin cross the boundary of a volume.
 
-    The points are found by bisection between the origin and a sphere beyond the scene. If a ray has several crossings,
-    any of them is returned.
+    The points (any, if a ray has several) are found by bisection between the origin and a sphere beyond the scene.
 
     - `level`: value of the volume's function at the returned points, in scene units; positive for points outside.
     """

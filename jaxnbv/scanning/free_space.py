@@ -73,7 +73,6 @@ class Carving(eqx.Module):
         """
         if scan.missed is None:
             return jnp.zeros((grid.resolution,) * 3, bool)
-        # `depth` is the depth along the camera's axis up to which each pixel's ray was empty.
         point_depth = jnp.matmul(scan.points - pose.position, pose.forward, precision="highest")
         limit = jnp.asarray(jnp.inf if camera.farthest is None else camera.farthest)
         if barrier is not None:

@@ -37,8 +37,7 @@ _MAX_RAYS = 5_000
 class Looks(eqx.Module):
     """The measured surface and the lines of sight of all views. Immutable, with fixed shapes.
 
-    - `distance`: distance from each node of the grid to the nearest surface that a pixel measured, in scene units, at
-      most `reach`.
+    - `distance`: distance from each node to the nearest measured surface, in scene units, at most `reach`.
     - `sight`: distance from each view's position to what it saw along each ray of `camera`, in scene units; infinite if
       the ray met nothing, and zero for a ray outside the image of the view.
     - `camera`: a copy of the sensor's camera with only every k-th row and column, to limit the number of rays.
@@ -125,8 +124,7 @@ class Looks(eqx.Module):
 
         A hit is unmeasured if the view should have measured it, but no measured surface lies within a spacing of the
         grid. The view should have measured a hit if the surface faces the camera there and the view saw as far as the
-        hit, or if the view's ray passed the hit and went on to something deeper. All other rays get an index beyond the
-        grid's cells.
+        hit, or if the view's ray passed the hit and went on to something deeper. Others get an index beyond the grid.
 
         - `index`, `pose`: index of the view, from 0, and its pose.
         """
@@ -144,7 +142,7 @@ class Looks(eqx.Module):
 
 def _unmeasured_by_any(surface: GridSurface, looks: Looks, poses: PoseList) -> Bool[Array, "m m m"]:
     def mark(index, is_unmeasured):
-        cells = looks.unmeasured_cells(surface, index, jax.tree.map(lambda rows: rows[index], poses.rows))
+        cells = looks.unmeasured_cells(surface, index, poses.rows[index])
         return is_unmeasured.at[tuple(cells.T)].set(True, mode="drop")
 
     is_unmeasured = jax.lax.fori_loop(0, poses.count, mark, jnp.zeros(surface.distance.shape, bool))

@@ -21,7 +21,7 @@ from jaxnbv.geometry.tensor_grid import on_tensor_grid
 from jaxnbv.scanning.grid import Grid
 from jaxnbv.scanning.scanner import Hits, Surface
 from jaxnbv.scanning.sdf import SignedDistance
-from jaxnbv.scanning.sdf.sampled import checked_triangles, winding_number
+from jaxnbv.scanning.sdf.sampled import checked_triangles, is_inside
 from jaxnbv.scanning.triangle_rays import FirstFaces, first_faces
 
 # A connected component of a mesh that is supported by fewer points may come from stray points alone.
@@ -32,8 +32,7 @@ _MIN_POINTS = 4
 class _Tree:
     """Cache of the ray tracer for the triangles of the last call.
 
-    As a static field of `TriangleMesh`, all instances are equal: their content follows from the triangles. A copy
-    starts empty.
+    All instances are equal, as this is a static field and the content follows from the triangles. A copy is empty.
     """
 
     _cache = None
@@ -154,12 +153,8 @@ class TriangleMesh(Surface):
 
     @checked
     def contains(self, points: Float[AnyArray, "n 3"]) -> Bool[np.ndarray, " n"]:
-        """Return, for each point (scene coordinates), whether its winding number has a magnitude above 1/2.
-
-        So a mesh that is wound inside out also encloses points, and an open sheet none.
-        """
-        points = np.asarray(points, dtype=np.float64)
-        return np.abs(winding_number(points, self.vertices, self.faces)) > 0.5
+        """Return, for each point (scene coordinates), whether its winding number has a magnitude above 1/2."""
+        return is_inside(np.asarray(points, dtype=np.float64), self.vertices, self.faces)
 
     def to_trimesh(self) -> trimesh.Trimesh:
         """Return the mesh in scene coordinates as a `trimesh.Trimesh`, to show, measure or export it."""

@@ -104,8 +104,7 @@ def joined_nodes(path: str | Path | trimesh.Geometry, meshes: list[trimesh.Trime
 def read_nodes(path: str | Path | trimesh.Geometry) -> list[tuple[str, trimesh.Trimesh]]:
     """Return the name and the mesh of each node that has faces, in the coordinates of the file or scene.
 
-    **Raises:** `ValueError` if the file is missing, cannot be read, has no faces, or has features that the reader would
-    ignore.
+    **Raises:** `ValueError` for a file that is missing, unreadable, without faces, or with unsupported features.
     """
     meshes = _read_file(Path(path)) if isinstance(path, str | Path) else _named_meshes(path)
     meshes = [(name, mesh) for name, mesh in meshes if len(mesh.faces)]

@@ -26,17 +26,14 @@ GRAZING = 0.2
 def coverage(views: Iterable[Any], truth: Float[AnyArray, "n 3"], size: float = 0.05) -> list[float]:
     """Return, for each view, the fraction of true surface points that this or an earlier view shows.
 
-    If the points are uniform by area, the result is a fraction of the area. Surface that no camera can see, such as the
-    walls of a closed cavity, counts as not covered. A view from either side covers both sides of a sheet thinner than
-    `size`.
+    If the points are uniform by area, the result is a fraction of the area. Surface that no camera can see, such as in
+    a closed cavity, counts as not covered. A view from either side covers both sides of a sheet thinner than `size`.
 
     - `views`: the views of an episode, or other objects with the attributes `scan`, `camera` and `pose`.
     - `truth`: points on the true surface, in scene coordinates.
-    - `size`: largest distance along the ray between a covered point and the hit of its pixel, in scene units. It must
-      be well above the sensor noise.
+    - `size`: largest distance along the ray between a covered point and its pixel's hit (scene units), above the noise.
 
-    **Raises:** `ValueError` if `truth` is empty or not finite, `size` <= 0, or a scan does not have one row per ray of
-    its camera.
+    **Raises:** `ValueError` if `truth` is empty or not finite, `size` <= 0, or a scan does not have one row per ray.
     """
     truth = _points(truth, "true surface")
     require(size > 0, f"the size is {size}; it must be positive, in scene units")
@@ -116,8 +113,7 @@ def surface_distance(reconstruction: Float[AnyArray, "n 3"], truth: Float[AnyArr
     """Compute the Chamfer and Hausdorff distance between two surfaces from points on each surface.
 
     Sample the points with `TriangleMesh.sample_points`. The distance between two samples of the same surface is not
-    zero: if both have n points, uniform on an area A, `accuracy` and `completeness` are about sqrt(A / n) / 2, and the
-    Chamfer distance is twice that.
+    zero: for n points, uniform on an area A, `accuracy` and `completeness` are about sqrt(A / n) / 2.
 
     **Raises:** `ValueError` if `reconstruction` or `truth` has no points or has points that are not finite.
     """

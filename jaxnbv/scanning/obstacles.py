@@ -31,13 +31,11 @@ class Obstacles(eqx.Module):
     Lengths are in scene units within a `Planner`. An obstacle hides everything behind it, both from the sensor and in
     scans of samples. Points of an obstacle are removed from scans, and samples have no surface inside an obstacle.
 
-    - `solids`: a tuple of solids of `jaxnbv.scanning.sdf`, such as a `HalfSpace` for a table, or `solid_of_mesh` for a
-      mesh.
+    - `solids`: a tuple of solids of `jaxnbv.sdf`, such as a `HalfSpace` for a table, or of `solid_of_mesh`.
     - `margin`: a scanned point nearer than this to a solid counts as a point of the solid.
     - `clearance`: least distance of a camera from an obstacle and from a scanned point.
-    - `clutter`: a solid for other things nearby whose shape is known only roughly. It hides what is behind it and keeps
-      cameras away, but points near it are not removed, and samples may have surface inside it. A session computes it
-      from its images.
+    - `clutter`: a solid for other things nearby of which a session knows the rough shape from its images. It hides what
+      is behind it and keeps cameras away, but points near it are not removed, and samples may have surface inside it.
 
     **Raises:** `ValueError` if `solids` is not a tuple of solids, or for a negative length.
     """

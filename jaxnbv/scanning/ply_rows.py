@@ -92,10 +92,7 @@ def _element(
 
 
 def _row(body: bytes, start: int, properties: list[_Property], message: str) -> tuple[list[np.ndarray], int]:
-    """Return the values of a row that begins at the byte `start`, and the byte at which the row ends.
-
-    **Raises:** `ValueError` with `message` if the file ends before the row does.
-    """
+    """Return the values of a row that begins at a byte, and the row's end, or raise with the message."""
     row: list[np.ndarray] = []
     for _, kind, length in properties:
         parts = [(kind, 1)] if length is None else [(length, 1), (kind, -1)]

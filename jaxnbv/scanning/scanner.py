@@ -32,7 +32,6 @@ class Hits(eqx.Module):
 
     - `points`: the hits, in scene coordinates; zero where the ray misses.
     - `normals`: unit normals that point to the side of the ray's origin; zero where the ray misses.
-    - `mask`: whether the ray hits the surface.
     """
 
     points: Float[Array, "rays 3"]
@@ -214,11 +213,9 @@ def scan(
 
     A row is missed if its ray hits nothing within the camera's range. A row is invalid if the hit is too near for the
     camera, or if its angle of incidence is too large. Points are in scene coordinates. Normals have unit length and
-    point towards the sensor. A batch of poses gives a batch of clouds. To add noise, apply a `SensorNoise` or
-    `DepthNoise` to the result.
+    point towards the sensor. A batch of poses gives a batch of clouds. `SensorNoise` or `DepthNoise` adds noise.
 
-    - `barrier`: distance along each ray to the first obstacle (`Obstacles.barrier`). A ray that reaches the obstacle
-      before the surface counts as missed.
+    - `barrier`: distance along each ray to the first obstacle. A ray that reaches it before the surface is missed.
 
     Runs under `jit` if `surface.in_jit`. Warns of an empty scan from so far away that the pose's unit must be wrong.
     """

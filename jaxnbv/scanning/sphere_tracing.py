@@ -16,7 +16,7 @@ from jaxnbv.scanning.sdf import SignedDistance
 # Far above the rounding of float32 distances in the scene (4e-7) and far below the size of relevant detail.
 _SHORTEST_STRIDE = 1e-3
 _MAX_STRIDES = 512
-# Once at most this fraction of the rays is unfinished, the unfinished rays continue in a smaller batch.
+# Nearly all rays finish within a few strides. Once at most this fraction is left, it continues in a smaller batch.
 _MAX_UNFINISHED = 1 / 8
 _NUM_CHORDS = 2
 # Slopes are evaluated this far before a hit along the ray, in units of the machine epsilon. The length is 1e-5 scene
@@ -29,7 +29,6 @@ _MIN_SLOPE = 0.05
 class SDFSurface(Surface):
     """The boundary of a solid, traced by sphere tracing (Hart 1996).
 
-    - `sdf`: the solid.
     - `bounding_radius`: radius of a ball about the scene's origin. Rays hit nothing outside the ball. The default ball
       holds the whole scene, [-pi/2, pi/2]^3.
 
@@ -113,7 +112,6 @@ def _first_root(
     sign = jnp.where(value < 0, -1.0, 1.0)
     march = _March(origins, directions, sign, max_depth, min_depth, value, min_depth, value, meets_ball)
 
-    # Nearly all rays finish within a few strides. The unfinished rays continue in a smaller batch.
     max_unfinished = math.ceil(len(origins) * _MAX_UNFINISHED)
     march, count = _advance(sdf, march, 0, max_unfinished)
     (rows,) = jnp.nonzero(march.is_unfinished, size=max_unfinished, fill_value=len(origins))

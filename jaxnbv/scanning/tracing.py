@@ -18,9 +18,8 @@ from jaxnbv.geometry.volume import ray_interval
 from jaxnbv.scanning.cubic import CORNERS, cubic, first_bracket, first_root
 from jaxnbv.scanning.scanner import implicit_depth
 
-# Once at most a fifth of the rays of a march is unfinished, the march continues with the unfinished rays only. Batches
-# smaller than an image are not reduced. Each batch size is compiled. If batches are reduced at a quarter instead of a
-# fifth, a march is as fast but takes a third longer to compile.
+# Once at most a fifth of the rays of a march is unfinished, the march continues with these only, unless the batch is
+# smaller than an image. With a quarter instead of a fifth, a march is as fast but takes a third longer to compile.
 _SHRINK_FACTOR = 5
 _MIN_BATCH = 2500
 

@@ -15,7 +15,7 @@ from jaxnbv.scanning.grid import GridSurface
 from jaxnbv.scanning.metrics import GRAZING
 from jaxnbv.scanning.scanner import Surface
 
-# Number of poses per batch.
+# Number of poses per batch. The rays through one sample then fit a CPU's cache.
 _POSES = 32
 
 
@@ -104,5 +104,4 @@ def is_visible(
         pixel = jnp.where(is_seen, row * camera.width + column, 0).astype(jnp.int32)
         return is_seen & (distance < barrier[pixel])
 
-    # Poses are processed in batches of `_POSES`, so that the rays through one sample fit a CPU's cache.
     return jax.lax.map(from_pose, (poses, barrier), batch_size=_POSES)

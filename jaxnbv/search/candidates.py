@@ -56,11 +56,10 @@ class SphereCandidates(Candidates):
 
     - `count`: number of cameras. They form a Fibonacci sphere, evenly spaced above `min_elevation`.
     - `radius`: radius in scene units.
-    - `min_elevation`: smallest elevation in radians, above the plane through the origin that is normal to `up`; 0 for a
-      dome over a table.
+    - `min_elevation`: smallest elevation above the origin's horizontal plane, in radians; 0 for a dome over a table.
     - `up`: upward direction in the scene and in the images.
 
-    **Raises:** `ValueError` for no cameras, a radius that is not positive and finite, an elevation that is not within
+    **Raises:** `ValueError` for no cameras, a radius that is not positive and finite, an elevation outside
     [-pi/2, pi/2), or a zero `up`.
     """
 
@@ -89,8 +88,7 @@ class Reach(Candidates):
 
     - `count`: number of cameras. Their directions are a Fibonacci sphere, and they fill the volume evenly.
     - `nearest`, `farthest`: smallest and largest distance from the origin, in scene units.
-    - `min_elevation`, `max_elevation`: limits of the elevation in radians, above the plane through the origin that is
-      normal to `up`.
+    - `min_elevation`, `max_elevation`: limits of the elevation above the origin's horizontal plane, in radians.
     - `up`: upward direction in the scene and in the images.
 
     **Raises:** `ValueError` for no cameras, distances or elevations in the wrong order, or a zero `up`.

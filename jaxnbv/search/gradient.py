@@ -43,8 +43,7 @@ class GradientSearch(Search):
 
     The default numbers of starts and steps and the default learning rate are the paper's. The paper starts from six
     random views without evaluating other candidates first, and returns the best final value. `num_candidates=6` is
-    closest to it. Differentiation stores intermediate results for all starts and samples, which takes several gigabytes
-    with PointNet++.
+    closest to it. Differentiation stores intermediate results for all starts and samples: gigabytes with PointNet++.
 
     **Raises:** `ValueError` for a `dof` other than 2 or 6, for both `dof` and `space`, fewer candidates than starts, no
     starts or iterations, or a learning rate that is not positive. A `Planner` with this search also raises it for an

@@ -25,8 +25,7 @@ class HalvingSearch(CandidateSearch):
 
     All candidates are scored on the first few posterior samples. Each later round keeps the better half of them, and
     doubles the number of samples on which they were scored, until all samples are used. For 16 samples and
-    `num_first_samples=2`, a candidate is scored on 5 samples on average. The proposal may differ from that of
-    `DiscreteSearch`.
+    `num_first_samples=2`, that is 5 samples on average. The proposal may differ from that of `DiscreteSearch`.
 
     - `num_first_samples`: number of posterior samples on which every candidate is scored.
     """
@@ -112,7 +111,6 @@ class _Block(NamedTuple):
 
     - `sorts`: whether to rank the first `num_left` candidates by their mean scores before this block is scored.
     - `num_left`: number of remaining candidates before the ranking.
-    - `sample`: index of the posterior sample.
     - `ranks`: ranks of the candidates to score; `_NO_RANK` for an unused entry.
     """
 

@@ -42,8 +42,7 @@ class SpherePoses(PoseSpace):
     """2-DOF poses on a sphere of `radius` (scene units) about the origin, all looking at the origin.
 
     The parameters (3,) are added to the unit vector from the origin to the start, and the sum is normalised. The camera
-    turns to the origin by the smallest rotation, which has no singularity at the poles. A start at a different radius
-    is moved to the sphere.
+    turns to the origin by the smallest rotation, without a singularity at the poles. Other starts move to the sphere.
 
     **Raises:** `ValueError` unless the radius is positive and finite.
     """
@@ -68,9 +67,7 @@ class FreePoses(PoseSpace):
     """6-DOF poses with any position and rotation.
 
     Six parameters are added to the first two columns of the start's rotation (Zhou et al. 2019), and three parameters
-    to its position. The camera may rotate away from the object, or move into the object.
-
-    - `radius`: radius of the sphere of candidates, in scene units.
+    to its position. The camera may turn away from the object, or move into it. Candidates lie on a sphere of `radius`.
 
     **Raises:** `ValueError` unless the radius is positive and finite.
     """

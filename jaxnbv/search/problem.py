@@ -80,8 +80,7 @@ class Problem(eqx.Module):
         without_cost = dataclasses.replace(self, cost=None)
 
         def add(index, total):
-            pose = jax.tree.map(lambda rows: rows[index][None], visited_poses.rows)
-            return total + without_cost.values(pose)[0]
+            return total + without_cost.values(visited_poses.rows[index][None])[0]
 
         total = jax.lax.fori_loop(0, visited_poses.count, add, jnp.zeros((), visited_poses.rows.position.dtype))
         return jnp.where(visited_poses.count > 1, total / jnp.maximum(visited_poses.count, 1), 0.0)

@@ -32,9 +32,8 @@ class Proposal(eqx.Module):
     - `trajectories`: trajectories of a gradient search from the best candidates; None for other searches.
     - `standard_errors`: standard errors of the values as means over those posterior samples on which a candidate was
       scored; None for a search without scores.
-    - `difference_errors`: standard errors of the differences between the values and the best value. They are smaller
-      than `standard_errors`, because all candidates are scored on the same samples. None for a search that does not
-      score all candidates on all samples.
+    - `difference_errors`: standard errors of the differences between the values and the best value, which are smaller,
+      because the samples are the same. None for a search that does not score all candidates on all samples.
     - `standard_error`: standard error of `value`. NaN for one sample; None for a search without scores.
     - `value_at_visited`: see `Problem.value_at_visited`. None unless the distance from earlier cameras decides ties.
     """
@@ -76,8 +75,7 @@ class Proposal(eqx.Module):
 
         Excluded candidates are left out. The batch is shorter than `count` if there are not enough candidates.
 
-        - `min_angle`: least angle in degrees, at the origin, between two candidates. One that is closer to a better one
-          is left out.
+        - `min_angle`: least angle in degrees, at the origin, between a candidate and all better ones.
 
         **Raises:** `ValueError` for a count below 1, or an angle outside [0, 180].
         """

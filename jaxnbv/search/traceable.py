@@ -17,7 +17,6 @@ def check_traceable(
     """Check that JAX can trace an acquisition. The check uses only shapes and computes nothing.
 
     - `observations`: observations, or the capacity of a cloud D.
-    - `camera`: the camera of the scans to score.
     - `differentiable`: whether to check that scores have derivatives in the points and normals of a scan.
 
     **Raises:** `ValueError` if JAX cannot trace the acquisition (for example a utility in NumPy), or cannot

@@ -91,8 +91,7 @@ class ClassAcquisition(Acquisition):
     """Base class of acquisitions that compare a classifier's results before and after a simulated scan.
 
     - `classifier`: a `Classifier`, or a function from a cloud to log-probabilities.
-    - `num_points`: number of points to which the cloud is thinned by farthest point sampling, once for each proposal,
-      before scans are added.
+    - `num_points`: number of points to which D is thinned by farthest point sampling, once for each proposal.
     """
 
     cloud_only: ClassVar[bool] = True
@@ -157,8 +156,7 @@ class ClassAcquisition(Acquisition):
 class CrossEntropy(ClassAcquisition):
     """Cross-entropy -sum_c p_c^(t) log p_c^(t+1) of the class probabilities before and after a scan.
 
-    This is the paper's alpha^(CE). p^(t) are the probabilities given the cloud D, and p^(t+1) those given D with a
-    simulated scan.
+    This is the paper's alpha^(CE). p^(t) are the probabilities given the cloud D, p^(t+1) those with a simulated scan.
 
     - `classifier`: a `Classifier`, or a function from a cloud to log-probabilities.
     - `num_points`: number of points to which D is thinned by farthest point sampling, once for each proposal.
@@ -194,8 +192,7 @@ class MixedEntropy(ClassAcquisition):
     """Cross-entropy while the class is uncertain, then reduction of entropy, as in the authors' code.
 
     - `classifier`, `num_points`: see `CrossEntropy`.
-    - `threshold`: entropy before the scan, in nats, above which the value is that of `CrossEntropy`, and up to which it
-      is that of `EntropyReduction`.
+    - `threshold`: the value is that of `CrossEntropy` if the entropy before the scan, in nats, is above the threshold.
     """
 
     threshold: float = eqx.field(static=True, default=0.75)

@@ -33,13 +33,10 @@ def _array(source) -> AnyArray:
 class HeatProblem(eqx.Module):
     """A body of uniform temperature, heated near a point: the paper's du/dt = Delta u + f, u(0) = u0.
 
-    - `source`: centre of the heated ball, in scene coordinates. The heating f is `power` within `radius` of the source
-      and zero elsewhere. At the rim it is smoothed according to the area of each point, see `heating`. A body without a
-      point in the ball is not heated.
-    - `radius`: radius of the ball, in scene units.
+    - `source`, `radius`: centre and radius of a ball, in scene coordinates. The heating f is `power` in the ball and
+      zero elsewhere, smoothed at the rim, see `heating`. A body without a point in the ball is not heated.
     - `power`: value of f, in degrees per unit of time, in which the diffusivity is one squared scene unit.
-    - `duration`: time of heating, T.
-    - `steps`: number of steps of implicit Euler, each of length h = T / steps.
+    - `duration`, `steps`: time of heating T, and number of steps of implicit Euler, each of length h = T / steps.
     - `initial`: initial temperature u0, in degrees.
 
     **Raises:** `ValueError` for a source that is not one finite point, a radius or duration that is not positive, less
@@ -103,10 +100,7 @@ class Temperature(NamedTuple):
     reached: Bool[np.ndarray, " n"]
 
     def coldest(self, reached_only: bool) -> int | None:
-        """Return the index of the coldest point, or of the coldest `reached` one; None if there is none.
-
-        If several points are equally cold, it is the first.
-        """
+        """Return the first index of the coldest point, or of the coldest `reached` one; None without one."""
         candidates = np.flatnonzero(self.reached) if reached_only else np.arange(len(self.values))
         return int(candidates[np.argmin(self.values[candidates])]) if len(candidates) else None
 

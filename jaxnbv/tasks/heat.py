@@ -39,11 +39,9 @@ class ColdestPoint(Utility):
 
     - `heat`: a `HeatProblem`, or only the source (3,) in scene coordinates, for the authors' other values. Problems
       that differ only in the source share one compiled program.
-    - `reached_only`: take the minimum only over points that are connected to a heated point. The paper takes the
-      minimum over all points. If D or a simulated scan has points that are not connected to the source, that minimum is
-      the initial temperature, and no view can improve it.
-    - `workers`: number of processes that share the clouds, by default one for each core. With 1, the current process
-      does the work.
+    - `reached_only`: take the minimum only over points that are connected to a heated point. The paper takes it over
+      all points. If any is not connected to the source, that is the initial temperature, and no view can improve it.
+    - `workers`: number of processes that share the clouds, by default one for each core; 1 for this process.
 
     **Raises:** `ValueError` for fewer than one worker, an invalid source, or an attempt to differentiate the utility.
     """

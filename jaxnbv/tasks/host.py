@@ -75,8 +75,7 @@ def call_on_host(
 ) -> Float[Array, "..."]:
     """Call a NumPy function with JAX arrays, also under `jit` and `vmap`, and return the result.
 
-    The function gets the arrays with an additional leading axis, whose length is the number of entries of a `vmap`, or
-    one outside `vmap`.
+    The function gets the arrays with a leading axis for the entries of a `vmap`, of length one outside `vmap`.
 
     - `shape`: shape of the result for one entry. The result has the dtype of the first array.
     - `name`: name of the caller for error messages.

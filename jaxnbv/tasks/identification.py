@@ -132,8 +132,7 @@ def weights_by_name(
 ) -> tuple[list[str], Float[np.ndarray, "*batch n"]]:
     """Return the names of a bank's parts in alphabetical order, and the weights in this order.
 
-    The last weight is that of "none of these", which has no entry in the names. For `Identify(group=...)`, the names
-    are those of the groups.
+    The last weight is that of "none of these", which has no name. `Identify(group=...)` gives the names of the groups.
 
     - `weights`: `PartHypotheses.part_weights`, with any leading axes.
     """

@@ -19,8 +19,7 @@ class ImprintedPyramid(SignedDistance):
     lies at `scale * rotation @ u + offset` in the scene.
 
     - `pattern`: index of the pattern in `PATTERNS`.
-    - `size`, `place`, `turn`, `depth`: radius, centre, rotation angle (radians) and depth of the pattern, in the
-      pyramid's frame.
+    - `size`, `place`, `turn`, `depth`: radius, centre, angle (radians) and depth of the pattern in the pyramid's frame.
     """
 
     pattern: Int[Array, ""]

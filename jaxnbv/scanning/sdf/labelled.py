@@ -26,8 +26,7 @@ class LabelledSolid(SignedDistance):
     - `labels`, `revolved`: label of each primitive (-1 for an unused slot), and whether it is a solid of revolution.
     - `centre`, `rotation`, `half_size`, `rounding`: the quantities of the formula, in scene units. For a solid of
       revolution, the half sizes are the half width, half height and again half height of the profile.
-    - `radius`, `slant`: for a solid of revolution, the radius of the ring (0 for a full solid) and the growth of the
-      radius with height.
+    - `radius`, `slant`: for a solid of revolution, the ring's radius (0 for a full solid) and its growth with height.
     """
 
     labels: Int[Array, " slots"]

@@ -55,8 +55,7 @@ def solid_of_mesh(
     - `sheet`: thickness that is given to faces with the outside on both sides. If it is 0, such faces vanish.
     - `cubic`: use `resolution` nodes along all sides, so that the solids of different meshes can be stacked.
 
-    **Raises:** `ValueError` if the triangles are invalid (see `TriangleMesh.from_arrays`), all vertices coincide, or
-    the resolution is below four.
+    **Raises:** `ValueError` for triangles that `TriangleMesh.from_arrays` rejects or that coincide, or a resolution below four.
     """
     vertices, faces = checked_triangles(vertices, faces)
     require(resolution >= 4, f"the resolution is {resolution}; it must be at least 4")
@@ -80,32 +79,31 @@ def _signed_distance(
     points: Float[np.ndarray, "n 3"], vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], sheet: float
 ) -> Float[np.ndarray, " n"]:
     distance = distance_to_triangles(points, vertices, faces)
-    signed = np.where(_is_inside(points, vertices, faces), -distance, distance)
+    signed = np.where(is_inside(points, vertices, faces), -distance, distance)
     if sheet == 0:
         return signed
     corners = vertices[faces]
     middle, normal = corners.mean(axis=1), np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(float).tiny)
     step = 1e-4 * np.ptp(vertices, axis=0).max() * normal
-    is_thin = ~(_is_inside(middle + step, vertices, faces) | _is_inside(middle - step, vertices, faces))
+    is_thin = ~(is_inside(middle + step, vertices, faces) | is_inside(middle - step, vertices, faces))
     if not is_thin.any():
         return signed
     sheet_distance = distance_to_triangles(points, vertices, faces[is_thin])
     return np.minimum(signed, sheet_distance - 0.5 * sheet)
 
 
-def _is_inside(
+def is_inside(
     points: Float[np.ndarray, "n 3"], vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Bool[np.ndarray, " n"]:
-    # The winding number is negative in a solid whose faces are wound inside out.
+    """Return whether triangles enclose each point, even if wound inside out. Open sheets enclose nothing."""
     return np.abs(winding_number(points, vertices, faces)) > 0.5
 
 
 def checked_triangles(vertices: Any, faces: Any) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
     """Convert vertices and faces to arrays, and check that they are a mesh of triangles.
 
-    **Raises:** `ValueError` if a shape is not (n, 3), there are no faces, an index is not an integer or out of range,
-    or a vertex is not finite.
+    **Raises:** `ValueError` for a shape other than (n, 3), no faces, an invalid index, or a vertex that is not finite.
     """
     vertices = as_numbers(vertices, "the mesh's vertices", np.float64)
     faces = as_numbers(faces, "the mesh's faces", None)

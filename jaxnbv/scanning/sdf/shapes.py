@@ -29,7 +29,6 @@ class Sphere(SignedDistance):
 class Cuboid(SignedDistance):
     """The box [-half_size, half_size] with rounded edges. The distance is exact.
 
-    - `half_size`: half of the length of each side, (3,).
     - `rounding`: radius of the edges. It does not change the outer size.
 
     **Raises:** `ValueError` if the rounding exceeds half of a side, or for the same reasons as `SignedDistance`.
