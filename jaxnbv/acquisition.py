@@ -291,7 +291,7 @@ def expected_value(
     - `surfaces`: the samples along a leading axis.
     - `barrier`: distance along each ray to an obstacle, see `scan`.
 
-    **Raises:** `ValueError` if JAX cannot trace a user's function, and whenever `Acquisition.check` does (for concrete values).
+    **Raises:** `ValueError` if JAX cannot trace a user's function, or if `Acquisition.check` does for concrete values.
     """
     inputs = _inputs(acquisition, observations)
     # `check` needs concrete results. Under jit, results (and this zero) are traced even if all inputs are concrete.

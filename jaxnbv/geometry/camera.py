@@ -48,7 +48,7 @@ class Camera(eqx.Module):
       units. `nearest=0` and `farthest=None` mean no limit. A hit nearer than `nearest` is invalid. A ray without a hit
       up to `farthest` is missed, so it is empty up to `farthest`.
     - `max_incidence`: largest angle between a ray and the normal of a measured hit, in radians within (0, pi/2].
-    - `distortion`: see `from_intrinsics`. The rays have no distortion, since `PointCloud.from_depth` undoes it.
+    - `distortion`: coefficients, see `from_intrinsics`. The rays have none, since `PointCloud.from_depth` undoes it.
 
     The defaults are the paper's: 30 degrees, 50 x 50 pixels, no limits.
 

@@ -154,8 +154,8 @@ class PointCloud(eqx.Module):
         - `depth`: depths along the camera's forward axis. The noise of integer depths is at least their rounding.
         - `depth_scale`: units of the pose (also of the camera's range and the box) per unit of depth, such as 0.001 for
           an image in millimetres and a pose in metres.
-        - `stride`: keep every `stride`-th row and column, as `camera.strided` does. Planes are still fitted to all pixels.
-        - `box`: keep only points inside. A ray that hits behind the box is missed, and one that hits before it is invalid.
+        - `stride`: keep every `stride`-th row and column, as `camera.strided` does. Planes are fitted to all pixels.
+        - `box`: keep only points inside. A ray that hits behind the box is missed, one that hits before it is invalid.
 
         **Raises:** `ValueError` if the image's shape differs from the camera's, all depths are outside the camera's
         range, the box is behind the camera, or depths and the distance of the box differ by orders of magnitude.

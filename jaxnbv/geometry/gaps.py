@@ -1,4 +1,4 @@
-"""Sampling of depth images with gaps between valid pixels, from lidars or aligned to a camera of more pixels."""
+"""Sampling of depth images that have gaps between valid pixels: from lidars, or aligned to a finer camera."""
 
 import jax.numpy as jnp
 import numpy as np

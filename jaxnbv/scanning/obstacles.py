@@ -34,8 +34,8 @@ class Obstacles(eqx.Module):
     - `solids`: a tuple of solids of `jaxnbv.sdf`, such as a `HalfSpace` for a table, or of `solid_of_mesh`.
     - `margin`: a scanned point nearer than this to a solid counts as a point of the solid.
     - `clearance`: least distance of a camera from an obstacle and from a scanned point.
-    - `clutter`: a solid for other things nearby of which a session knows the rough shape from its images. It hides what
-      is behind it and keeps cameras away, but points near it are not removed, and samples may have surface inside it.
+    - `clutter`: a solid for other things nearby, whose rough shape a session computes from its images. It hides what is
+      behind it and keeps cameras away, but points near it are not removed, and samples may have surface inside it.
 
     **Raises:** `ValueError` if `solids` is not a tuple of solids, or for a negative length.
     """

@@ -33,8 +33,8 @@ class SDFSurface(Surface):
       holds the whole scene, [-pi/2, pi/2]^3.
 
     A ray advances by |sdf|, but by at least 0.001, until the sign changes. The root is then located within the last
-    stride. A ray may miss a part that is thinner than 0.001, or a flat face at an angle of less than a degree, to which
-    it may take more than the 512 strides.
+    stride. A ray may miss a part that is thinner than 0.001 along the ray. A ray at an angle of less than a degree to a
+    flat face may use up its 512 strides and miss the face.
 
     Hits are differentiable in the rays and in the solid's parameters, see `implicit_depth`. For grazing rays, the
     derivative is bounded: it uses a slope of at least 0.05.

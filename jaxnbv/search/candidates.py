@@ -56,7 +56,7 @@ class SphereCandidates(Candidates):
 
     - `count`: number of cameras. They form a Fibonacci sphere, evenly spaced above `min_elevation`.
     - `radius`: radius in scene units.
-    - `min_elevation`: smallest elevation above the origin's horizontal plane, in radians; 0 for a dome over a table.
+    - `min_elevation`: smallest elevation over the horizontal plane through the origin, in radians; 0 for a dome.
     - `up`: upward direction in the scene and in the images.
 
     **Raises:** `ValueError` for no cameras, a radius that is not positive and finite, an elevation outside
@@ -88,7 +88,7 @@ class Reach(Candidates):
 
     - `count`: number of cameras. Their directions are a Fibonacci sphere, and they fill the volume evenly.
     - `nearest`, `farthest`: smallest and largest distance from the origin, in scene units.
-    - `min_elevation`, `max_elevation`: limits of the elevation above the origin's horizontal plane, in radians.
+    - `min_elevation`, `max_elevation`: limits of the elevation over the horizontal plane of the origin, in radians.
     - `up`: upward direction in the scene and in the images.
 
     **Raises:** `ValueError` for no cameras, distances or elevations in the wrong order, or a zero `up`.

@@ -17,10 +17,10 @@ from jaxnbv.search.proposal import Proposal
 class DiscreteSearch(CandidateSearch):
     """Search that proposes the candidate of the highest value.
 
-    If a second view from the same pose gains nothing (`Acquisition.gains_once`, such as `NewSurface`), it is the tied
-    candidate that is farthest from the earlier cameras. A candidate is tied if its value differs from the best by at
-    most two standard errors of the difference, plus the mean value expected at visited poses. The true value there is
-    zero, so this mean is an error, and may be as large at other poses.
+    If a second view from the same pose gains nothing (`Acquisition.gains_once`, as for `NewSurface`), it proposes the
+    tied candidate that is farthest from the earlier cameras. A candidate is tied if its value differs from the best by
+    at most two standard errors of the difference, plus the mean value expected at visited poses. The true value there
+    is zero, so this mean is an error, and may be as large at other poses.
     """
 
     uses_samples: ClassVar[bool] = True

@@ -86,7 +86,7 @@ class HalvingSearch(CandidateSearch):
         )
 
     def _blocks(self, num_samples: int) -> tuple["_Block", int]:
-        """Return the blocks of all rounds, of one size to compile once, and the last number of candidates."""
+        """Return the blocks of all rounds, all of one size, and the number of candidates in the last round."""
         rounds: list[tuple[int, range]] = []
         num_left, num_scored = self.candidates.count, 0
         while num_scored < num_samples:

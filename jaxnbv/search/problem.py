@@ -19,7 +19,7 @@ from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning import GridSurface, Obstacles, barrier_of
 
 ApplyCost: TypeAlias = Callable[[Float[Array, "*samples poses"], Observations, Pose], Float[Array, "*samples poses"]]
-"""Function of values, observations and a batch of poses: the values after the cost of moving from the last view."""
+"""Function of values, observations and poses that returns the values after the cost of moving from the last view."""
 
 
 class Problem(eqx.Module):
@@ -60,7 +60,7 @@ class Problem(eqx.Module):
     def scores(
         self, poses: Pose, samples: slice | Int[Array, " rows"] = slice(None)
     ) -> Float[Array, "*scores samples poses"]:
-        """Return each sample's scores of the poses, after costs. An `AcquisitionList` adds a leading axis."""
+        """Return the score of each sample and pose after the cost. An `AcquisitionList` adds a leading axis."""
         surfaces = jax.tree.map(lambda leaf: leaf[samples], self.surfaces)
         barrier = barrier_of(self.obstacles, self.camera, poses)
         values = self.acquisition.sample_scores(self.context, surfaces, self.camera, poses, barrier)

@@ -29,8 +29,9 @@ def check_traceable(
     def cloud(rows: int) -> PointCloud:
         return PointCloud(jnp.zeros((rows, 3)), jnp.ones((rows, 3)), jnp.ones(rows, bool))
 
-    def value(vectors):
-        scan = PointCloud(*vectors, jnp.ones(camera.num_rays, bool))
+    def value(rows):
+        points, normals = rows
+        scan = PointCloud(points, normals, jnp.ones(camera.num_rays, bool))
         step = inputs_of(cloud(observations) if isinstance(observations, int) else observations)
         view = ImaginedView(scan, camera, Pose(jnp.eye(3), jnp.zeros(3)))
         return acquisition.score(acquisition.context(acquisition.inputs(step)), view)

@@ -35,7 +35,7 @@ class HeatProblem(eqx.Module):
 
     - `source`, `radius`: centre and radius of a ball, in scene coordinates. The heating f is `power` in the ball and
       zero elsewhere, smoothed at the rim, see `heating`. A body without a point in the ball is not heated.
-    - `power`: value of f, in degrees per unit of time, in which the diffusivity is one squared scene unit.
+    - `power`: value of f, in degrees per unit of time. The diffusivity is one squared scene unit per unit of time.
     - `duration`, `steps`: time of heating T, and number of steps of implicit Euler, each of length h = T / steps.
     - `initial`: initial temperature u0, in degrees.
 
@@ -100,7 +100,7 @@ class Temperature(NamedTuple):
     reached: Bool[np.ndarray, " n"]
 
     def coldest(self, reached_only: bool) -> int | None:
-        """Return the first index of the coldest point, or of the coldest `reached` one; None without one."""
+        """Return the index of the first of the coldest (`reached`) points; None if there is no point."""
         candidates = np.flatnonzero(self.reached) if reached_only else np.arange(len(self.values))
         return int(candidates[np.argmin(self.values[candidates])]) if len(candidates) else None
 

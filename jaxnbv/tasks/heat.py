@@ -67,7 +67,7 @@ class ColdestPoint(Utility):
     def __call__(self, cloud: PointCloud) -> Float[Array, ""]:
         """Return the negative lowest temperature of one cloud, in degrees.
 
-        Under `vmap`, all clouds are computed in one call on the host. Without a point, the temperature is
+        Under `vmap`, all clouds are computed in one call on the host. Without a point for the minimum, it is
         `HeatProblem.highest`, an upper bound, so that any point of a later scan improves the utility.
         """
         source = jnp.asarray(self.heat.source, cloud.points.dtype)

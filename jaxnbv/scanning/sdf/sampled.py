@@ -55,7 +55,8 @@ def solid_of_mesh(
     - `sheet`: thickness that is given to faces with the outside on both sides. If it is 0, such faces vanish.
     - `cubic`: use `resolution` nodes along all sides, so that the solids of different meshes can be stacked.
 
-    **Raises:** `ValueError` for triangles that `TriangleMesh.from_arrays` rejects or that coincide, or a resolution below four.
+    **Raises:** `ValueError` if `TriangleMesh.from_arrays` refuses the triangles, all vertices coincide, or the
+    resolution is below four.
     """
     vertices, faces = checked_triangles(vertices, faces)
     require(resolution >= 4, f"the resolution is {resolution}; it must be at least 4")
