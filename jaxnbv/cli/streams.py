@@ -11,8 +11,8 @@ from typing import Any
 
 import typer
 
-_READABLE = str.maketrans("²³×−—–·•●★█■○◯’", "23x---****##oo'")
-_READABLE |= str.maketrans({"±": "+-", "°": " deg", "…": "...", "→": "->", "✓": "ok"})
+_LETTERS = dict(zip("²³×−—–·•●★█■○◯’", "23x---****##oo'", strict=True))
+_READABLE = str.maketrans(_LETTERS | {"±": "+-", "°": " deg", "…": "...", "→": "->", "✓": "ok"})
 
 
 def _readable(error: UnicodeError) -> tuple[str, int]:

@@ -5,15 +5,11 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
+import jaxnbv as nbv
 from jaxnbv.cli.options import task_option
 
 if TYPE_CHECKING:
-    from jaxnbv.acquisition import Acquisition
-    from jaxnbv.geometry.camera import Camera
-    from jaxnbv.geometry.pose import Pose
-    from jaxnbv.scanning import Grid, Surface, TriangleMesh
     from jaxnbv.scanning.sensors import Setting
-    from jaxnbv.surfaces import ShapeBank
 
 network_option = task_option(
     metavar="FILE", help="Network, .pth or .safetensors: a classifier for tasks about the class, a segmenter for parts."
@@ -29,11 +25,11 @@ class Subject(NamedTuple):
     """
 
     name: str
-    surface: "Surface"
-    acquisition: "Acquisition"
-    first: "Pose"
-    bank: "str | ShapeBank" = "none"
-    grid: "Grid | None" = None
+    surface: "nbv.scanning.Surface"
+    acquisition: "nbv.Acquisition"
+    first: "nbv.Pose"
+    bank: "str | nbv.ShapeBank" = "none"
+    grid: "nbv.Grid | None" = None
     note: str = ""
     question: str | None = None
 
@@ -62,10 +58,10 @@ class Task(ABC):
         return USUAL_SETTING
 
     @abstractmethod
-    def acquisition(self, mesh: "TriangleMesh", camera: "Camera", first: "Pose") -> "Acquisition":
+    def acquisition(self, mesh: "nbv.TriangleMesh", camera: "nbv.Camera", first: "nbv.Pose") -> "nbv.Acquisition":
         """Make the acquisition for views of a user's mesh, of which `first` is the first."""
 
-    def bank(self, mesh: "TriangleMesh") -> "str | ShapeBank":
+    def bank(self, mesh: "nbv.TriangleMesh") -> "str | nbv.ShapeBank":
         """Return the known shapes for a user's mesh: a name as in `--known`, or parts in scene units."""
         return "none"
 
@@ -75,10 +71,8 @@ class Task(ABC):
         """Return the demo's object with the number `scene`. `seed` decides its first view."""
 
 
-def default_first_pose(radius: float | None = None) -> "Pose":
+def default_first_pose(radius: float | None = None) -> "nbv.Pose":
     """Return the default first pose: at (0.8, 0.9, 2.2), or in this direction at distance `radius`."""
-    from jaxnbv.geometry.pose import look_at
-
     direction = (0.8, 0.9, 2.2)
     scale = 1.0 if radius is None else radius / math.hypot(*direction)
-    return look_at(tuple(scale * x for x in direction))
+    return nbv.look_at(tuple(scale * x for x in direction))

@@ -5,13 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import jaxnbv as nbv
 from jaxnbv.cli.tasks.base import Subject, Task, network_option
 
 if TYPE_CHECKING:
-    from jaxnbv.acquisition import Acquisition
-    from jaxnbv.geometry.camera import Camera
-    from jaxnbv.geometry.pose import Pose
-    from jaxnbv.scanning import TriangleMesh
     from jaxnbv.tasks.classification import Classifier
 
 # Number of input points of the demo's classifier.
@@ -28,9 +25,9 @@ class ClassTask(Task):
 
     @classmethod
     @abstractmethod
-    def make_acquisition(cls, classifier: "Classifier") -> "Acquisition": ...
+    def make_acquisition(cls, classifier: "Classifier") -> "nbv.Acquisition": ...
 
-    def acquisition(self, mesh: "TriangleMesh", camera: "Camera", first: "Pose") -> "Acquisition":
+    def acquisition(self, mesh: "nbv.TriangleMesh", camera: "nbv.Camera", first: "nbv.Pose") -> "nbv.Acquisition":
         from jaxnbv.networks import CloudClassifier, load_checkpoint, network_scale
 
         network = load_checkpoint(self.network)
@@ -46,7 +43,6 @@ class ClassTask(Task):
         import numpy as np
 
         from jaxnbv.networks import pretrained_classifier
-        from jaxnbv.scanning import Grid, SDFSurface
         from jaxnbv.search.candidates import sphere_candidates
         from jaxnbv.studies.scenes import HOUSEHOLD, Framing, Split, hidden_view, truck_scene
 
@@ -56,8 +52,8 @@ class ClassTask(Task):
         side = Framing.CLOSE_UP.longest_side
         acquisition = cls.make_acquisition(pretrained_classifier("truck", side, num_points=_NUM_POINTS))
         note = f"the truck carries a {HOUSEHOLD[int(truck.label)]}, which the first view does not show"
-        grid, question = Grid(64, 0.7 * side), "What does the truck carry?"
-        return Subject("truck", SDFSurface(truck), acquisition, first, "truck", grid, note, question)
+        grid, question = nbv.Grid(64, 0.7 * side), "What does the truck carry?"
+        return Subject("truck", nbv.SDFSurface(truck), acquisition, first, "truck", grid, note, question)
 
 
 class CrossEntropyTask(ClassTask):
@@ -65,10 +61,8 @@ class CrossEntropyTask(ClassTask):
     about = "the object's class"
 
     @classmethod
-    def make_acquisition(cls, classifier: "Classifier") -> "Acquisition":
-        from jaxnbv.tasks import CrossEntropy
-
-        return CrossEntropy(classifier)
+    def make_acquisition(cls, classifier: "Classifier") -> "nbv.Acquisition":
+        return nbv.CrossEntropy(classifier)
 
 
 class EntropyTask(ClassTask):
@@ -76,10 +70,8 @@ class EntropyTask(ClassTask):
     about = "its class, by reduction of entropy"
 
     @classmethod
-    def make_acquisition(cls, classifier: "Classifier") -> "Acquisition":
-        from jaxnbv.tasks import EntropyReduction
-
-        return EntropyReduction(classifier)
+    def make_acquisition(cls, classifier: "Classifier") -> "nbv.Acquisition":
+        return nbv.tasks.EntropyReduction(classifier)
 
 
 class MixedTask(ClassTask):
@@ -87,7 +79,5 @@ class MixedTask(ClassTask):
     about = "its class, first by cross-entropy, then by reduction of entropy"
 
     @classmethod
-    def make_acquisition(cls, classifier: "Classifier") -> "Acquisition":
-        from jaxnbv.tasks import MixedEntropy
-
-        return MixedEntropy(classifier)
+    def make_acquisition(cls, classifier: "Classifier") -> "nbv.Acquisition":
+        return nbv.tasks.MixedEntropy(classifier)

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
+import jaxnbv as nbv
 from jaxnbv.cli.options import Position, task_option
 from jaxnbv.cli.tasks.base import Subject, Task
 
@@ -10,10 +11,6 @@ if TYPE_CHECKING:
     import numpy as np
     from jaxtyping import Float
 
-    from jaxnbv.acquisition import Acquisition
-    from jaxnbv.geometry.camera import Camera
-    from jaxnbv.geometry.pose import Pose
-    from jaxnbv.scanning import TriangleMesh
     from jaxnbv.scanning.sensors import Setting
 
 _NUM_POINTS = 2048
@@ -39,7 +36,7 @@ class HeatTask(Task):
 
         return HEAT_SETTING
 
-    def acquisition(self, mesh: "TriangleMesh", camera: "Camera", first: "Pose") -> "Acquisition":
+    def acquisition(self, mesh: "nbv.TriangleMesh", camera: "nbv.Camera", first: "nbv.Pose") -> "nbv.Acquisition":
         return _coldest_acquisition(_source(self.source, mesh, camera, first))
 
     @classmethod
@@ -51,36 +48,27 @@ class HeatTask(Task):
 
         heat_object = heat_scene(scene)
         first = source_view(heat_object, jax.random.key(seed))
-        return Subject(
-            heat_object.name,
-            heat_object.surface,
-            _coldest_acquisition(np.asarray(heat_object.source)),
-            first,
-            bank="heat",
-        )
+        acquisition = _coldest_acquisition(np.asarray(heat_object.source))
+        return Subject(heat_object.name, heat_object.surface, acquisition, first, bank="heat")
 
 
-def _coldest_acquisition(source: "Float[np.ndarray, '3']") -> "Acquisition":
-    from jaxnbv.acquisition import ExpectedUtilityImprovement
-    from jaxnbv.tasks import ColdestPoint
-
-    return ExpectedUtilityImprovement(ColdestPoint(source), _NUM_POINTS)
+def _coldest_acquisition(source: "Float[np.ndarray, '3']") -> "nbv.Acquisition":
+    return nbv.ExpectedUtilityImprovement(nbv.ColdestPoint(source), _NUM_POINTS)
 
 
 def _source(
-    position: Position | None, mesh: "TriangleMesh", camera: "Camera", first: "Pose"
+    position: Position | None, mesh: "nbv.TriangleMesh", camera: "nbv.Camera", first: "nbv.Pose"
 ) -> "Float[np.ndarray, '3']":
     """Return the object's point nearest to `position`, or else the point in the middle of the first view."""
     import jax
     import numpy as np
 
     from jaxnbv.checks import require
-    from jaxnbv.scanning import scan
 
     if position is not None:
         points = mesh.sample_points(jax.random.key(0), 20_000)
         return points[np.linalg.norm(points - position, axis=1).argmin()]
-    points, _ = scan(mesh, camera, first).to_numpy()
+    points, _ = nbv.scan(mesh, camera, first).to_numpy()
     require(len(points) > 0, "the first view does not see the object: give another --first, or a --source")
     offsets, forward = points - np.asarray(first.position), np.asarray(first.forward)
     distances = np.linalg.norm(offsets - (offsets @ forward)[:, None] * forward, axis=1)

@@ -4,17 +4,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import jaxnbv as nbv
 from jaxnbv.cli.options import task_option
 from jaxnbv.cli.tasks.base import Subject, Task
 
 if TYPE_CHECKING:
-    from jaxnbv.acquisition import Acquisition
-    from jaxnbv.geometry.camera import Camera
-    from jaxnbv.geometry.pose import Pose
-    from jaxnbv.scanning import TriangleMesh
     from jaxnbv.scanning.sdf import SignedDistance
     from jaxnbv.scanning.sensors import Setting
-    from jaxnbv.surfaces import ShapeBank
 
 # If all parts are this many times smaller or larger than the object, their unit must be wrong.
 _OTHER_UNIT = 20.0
@@ -47,12 +43,10 @@ class IdentifyTask(Task):
 
         return USUAL_SETTING._replace(radius=_RADIUS)
 
-    def acquisition(self, mesh: "TriangleMesh", camera: "Camera", first: "Pose") -> "Acquisition":
-        from jaxnbv.tasks import Identify
+    def acquisition(self, mesh: "nbv.TriangleMesh", camera: "nbv.Camera", first: "nbv.Pose") -> "nbv.Acquisition":
+        return nbv.Identify()
 
-        return Identify()
-
-    def bank(self, mesh: "TriangleMesh") -> "ShapeBank":
+    def bank(self, mesh: "nbv.TriangleMesh") -> "nbv.ShapeBank":
         """Return the parts of the folder, in scene units."""
         import numpy as np
 
@@ -65,26 +59,20 @@ class IdentifyTask(Task):
         import numpy as np
         from scipy.spatial.transform import Rotation
 
-        from jaxnbv.geometry.frame import Frame
-        from jaxnbv.geometry.pose import look_at
-        from jaxnbv.scanning import Grid, SDFSurface, mesh_from_sdf
-        from jaxnbv.surfaces import ShapeBank
-        from jaxnbv.tasks import Identify
-
         housings = _housings()
-        meshes = [mesh_from_sdf(solid, Grid(96, 1.4)).to_trimesh() for solid in housings.values()]
-        bank = ShapeBank.from_meshes(meshes, names=tuple(housings), scale=1.0, progress=False)
+        meshes = [nbv.mesh_from_sdf(solid, nbv.Grid(96, 1.4)).to_trimesh() for solid in housings.values()]
+        bank = nbv.ShapeBank.from_meshes(meshes, names=tuple(housings), scale=1.0, progress=False)
         index = scene % len(housings)
         name, solid = list(housings.items())[index]
         rotation = Rotation.random(random_state=scene)
-        frame = Frame(2.5 / float(np.ptp(rotation.apply(bank.extremes[index]), axis=0).max()))
-        surface = SDFSurface(solid.rotate(rotation.as_rotvec(), rotation.magnitude()).scale(frame.scale))
-        first = look_at(_RADIUS * rotation.apply(_FIRST) / np.linalg.norm(_FIRST))
+        frame = nbv.Frame(2.5 / float(np.ptp(rotation.apply(bank.extremes[index]), axis=0).max()))
+        surface = nbv.SDFSurface(solid.rotate(rotation.as_rotvec(), rotation.magnitude()).scale(frame.scale))
+        first = nbv.look_at(_RADIUS * rotation.apply(_FIRST) / np.linalg.norm(_FIRST))
         note = f"the object is the housing with {name}; the first view does not look into its pocket"
-        return Subject("housing", surface, Identify(), first, bank.in_scene(frame), note=note)
+        return Subject("housing", surface, nbv.Identify(), first, bank.in_scene(frame), note=note)
 
 
-def bank_of(folder: Path, scale: str, size: float, up: str = "y") -> "ShapeBank":
+def bank_of(folder: Path, scale: str, size: float, up: str = "y") -> "nbv.ShapeBank":
     """Read the parts of a folder, and convert them to the units of a world.
 
     - `scale`, `up`: unit and upward axis of the parts, as in `--parts-scale` and `--parts-up`.
@@ -96,9 +84,8 @@ def bank_of(folder: Path, scale: str, size: float, up: str = "y") -> "ShapeBank"
     import numpy as np
 
     from jaxnbv.checks import require
-    from jaxnbv.surfaces import ShapeBank
 
-    bank = ShapeBank.from_meshes(folder, scale=as_unit(scale), up=up)
+    bank = nbv.ShapeBank.from_meshes(folder, scale=as_unit(scale), up=up)
     sides = np.ptp(np.asarray(bank.extremes), axis=1).max(axis=1)
     require(
         bool(((sides > size / _OTHER_UNIT) & (sides < size * _OTHER_UNIT)).any()),

@@ -4,15 +4,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import jaxnbv as nbv
 from jaxnbv.cli.options import task_option
 from jaxnbv.cli.tasks.base import Subject, Task, default_first_pose, network_option
 
 if TYPE_CHECKING:
-    from jaxnbv.acquisition import Acquisition
-    from jaxnbv.geometry.camera import Camera
-    from jaxnbv.geometry.pose import Pose
     from jaxnbv.networks import CloudSegmenter
-    from jaxnbv.scanning import TriangleMesh
     from jaxnbv.scanning.sensors import Setting
 
 # Categories that were not in the training set of the shipped segmenter.
@@ -40,7 +37,7 @@ class PartTask(Task):
 
         return PART_SETTING
 
-    def acquisition(self, mesh: "TriangleMesh", camera: "Camera", first: "Pose") -> "Acquisition":
+    def acquisition(self, mesh: "nbv.TriangleMesh", camera: "nbv.Camera", first: "nbv.Pose") -> "nbv.Acquisition":
         from jaxnbv.checks import require
         from jaxnbv.networks import CloudSegmenter, load_checkpoint, network_scale, part_segmenter
 
@@ -56,17 +53,13 @@ class PartTask(Task):
     @classmethod
     def demo(cls, scene: int, seed: int) -> Subject:
         from jaxnbv.networks import CATEGORIES, part_segmenter
-        from jaxnbv.scanning import SDFSurface
         from jaxnbv.studies.scenes import Split, part_scene
 
         part_object = part_scene(Split.TEST, scene)
         category = CATEGORIES[int(part_object.category)].name
         acquisition = _part_acquisition(part_segmenter(category))
-        return Subject(category, SDFSurface(part_object.solid), acquisition, default_first_pose(), bank="parts")
+        return Subject(category, nbv.SDFSurface(part_object.solid), acquisition, default_first_pose(), bank="parts")
 
 
-def _part_acquisition(segmenter: "CloudSegmenter") -> "Acquisition":
-    from jaxnbv.acquisition import ExpectedUtilityImprovement
-    from jaxnbv.tasks import SoftPartCount
-
-    return ExpectedUtilityImprovement(SoftPartCount(segmenter), segmenter.num_points)
+def _part_acquisition(segmenter: "CloudSegmenter") -> "nbv.Acquisition":
+    return nbv.ExpectedUtilityImprovement(nbv.SoftPartCount(segmenter), segmenter.num_points)
