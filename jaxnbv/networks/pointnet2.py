@@ -49,18 +49,19 @@ def _fill_masked(
 
 
 def _encode(
-    levels: tuple[SetAbstraction, ...], whole: PooledMLP, rows: Any, mask: Bool[Array, " n"]
+    levels: tuple[SetAbstraction, ...],
+    whole: PooledMLP,
+    points: Float[Array, "n 3"],
+    features: Float[Array, "n inputs"] | None,
+    mask: Bool[Array, " n"],
 ) -> tuple[list[Any], Float[Array, " outputs"]]:
-    """Return the centres and features of each level, and the features of the whole cloud.
-
-    - `rows`: points and their features, or None for no features.
-    """
+    """Return the centres and features of each level, and the features of the whole cloud."""
     outputs = []
     for level in levels:
-        rows = level(*rows, mask)
-        mask = jnp.ones(len(rows[0]), dtype=bool)
-        outputs.append(rows)
-    return outputs, whole.pool(whole.lift(*rows))
+        points, features = level(points, features, mask)
+        mask = jnp.ones(len(points), dtype=bool)
+        outputs.append((points, features))
+    return outputs, whole.pool(whole.lift(points, features))
 
 
 class PointNet2Classifier(eqx.Module):
@@ -97,7 +98,7 @@ class PointNet2Classifier(eqx.Module):
         **Raises:** `ValueError` if points and normals are not both (n, 3), or there are no rows.
         """
         points, normals, mask = _fill_masked(points, normals, mask)
-        _, x = _encode(self.levels, self.whole, (points, normals if self.uses_normals else None), mask)
+        _, x = _encode(self.levels, self.whole, points, normals if self.uses_normals else None, mask)
         for layer in self.hidden:
             x = jax.nn.relu(layer(x))
         return jax.nn.log_softmax(self.last(x))
@@ -161,7 +162,7 @@ class PointNet2PartSegmenter(eqx.Module):
         # The published network takes coordinates relative to a ball's centre, and absolute coordinates as features.
         features = jnp.concatenate([points, normals], axis=-1) if self.uses_normals else points
         one_hot = jnp.broadcast_to(jax.nn.one_hot(category, count, dtype=points.dtype), (len(points), count))
-        levels, x = _encode(self.levels, self.whole, (points, features), mask)
+        levels, x = _encode(self.levels, self.whole, points, features, mask)
         inputs = [(points, jnp.concatenate([one_hot, points, features], axis=-1)), *levels]
         x, coarse = x[None], jnp.zeros((1, 3), points.dtype)
         for (points, features), propagation in zip(reversed(inputs), self.propagations, strict=True):
@@ -204,14 +205,13 @@ class CompactPartSegmenter(eqx.Module):
     ) -> Float[Array, "n parts"]:
         """Compute the log-probabilities of the fifty parts at each point.
 
-        - `points`: points in units in which the object's longest side is 2.
-        - `normals`: normals of length one.
+        - `points`, `normals`: points in units in which the object's longest side is 2, and unit normals.
         - `category`: index of the object's category in `CATEGORIES`.
         - `mask`: False for rows to ignore. The values of these rows have no meaning.
         """
         points, normals, mask = _fill_masked(points, normals, mask)
         inputs = jnp.concatenate([points, normals], axis=-1)
-        levels, whole = _encode((self.fine, self.coarse), self.whole, (points, inputs), mask)
+        levels, whole = _encode((self.fine, self.coarse), self.whole, points, inputs, mask)
         (centers, fine), (coarse_centers, coarse) = levels
         context = jnp.concatenate([whole, jax.nn.one_hot(category, len(CATEGORIES), dtype=whole.dtype)])
         coarse = self.to_coarse(coarse_centers, jnp.zeros((1, 3), points.dtype), coarse, context[None])

@@ -69,11 +69,7 @@ class Truth(NamedTuple):
 
 
 def _saturation(record: Record, method: str) -> dict[int, float]:
-    """Return, for each view after the first, 1.0 if the chosen view has value zero, else 0.0.
-
-    A search chooses the highest value, so all candidates then have value zero. Methods that are not in `HEAT_METHODS`
-    give {}.
-    """
+    """Return, for each view after the first, whether the chosen view and so every candidate has value zero (1.0)."""
     steps = record["methods"][method]["steps"] if method in HEAT_METHODS else []
     return {view: float(step["value"] == 0.0) for view, step in enumerate(steps, start=2)}
 

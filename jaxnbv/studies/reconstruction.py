@@ -51,8 +51,7 @@ class ReconstructionStudy(Study):
     """Measures the distance between the surface reconstructed from a method's cloud and the true surface.
 
     The surface is reconstructed by screened Poisson, and as the posterior mean, which is meshed on the grid of the
-    samples and carved like them. Procedural objects come from the test split of `part_scene`. The study has the
-    settings of `Study`.
+    samples and carved like them. Procedural objects come from the test split of `part_scene`.
     """
 
     title: ClassVar[str] = "Distances to the true surface after the last view"

@@ -52,10 +52,7 @@ class _UnknownSurface(Surface):
 
 
 class FixedOrder(Baseline):
-    """Baseline that visits candidates in a fixed order.
-
-    - `order`: index of the candidate for each view, including the first view.
-    """
+    """Baseline that visits the candidates with the indices `order`, one per view, including the first view."""
 
     order: Int[Array, " views"] = eqx.field(kw_only=True)
 
@@ -144,13 +141,9 @@ class RecordedStudy(Study):
 
     @classmethod
     def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
-        """Return the study of one recording, under the name "".
+        """Return the study of one recording, under the name "". Voxels have 1/80 of the box's longest side.
 
-        The side of the voxels is 1/80 of the box's longest side. `options`:
-
-        - `folder`, `up`, `intrinsics`, `depth_scale`: settings of `RecordedStudy`.
-        - `box`: two corners of the box as six numbers; default: `bounds_of` the recording.
-        - `num_samples`, `grid_resolution`, `capacity`: settings of `Study`.
+        - `options`: settings of `RecordedStudy`, but `box` is two corners as six numbers; default: `bounds_of`.
 
         **Raises:** `ValueError` if the model has known shapes, or if `options` holds `num_candidates`.
         """
@@ -240,10 +233,7 @@ class RecordedStudy(Study):
         return {"frames": frames, "covered": is_shown.mean(axis=1).tolist()}
 
     def scene_picture(self, record: Record, methods: Sequence[str], pixels: int) -> ScenePicture:
-        """Return images of the box's voxels after each view, projected along the shortest side of the box.
-
-        The line is the path of the recorded camera.
-        """
+        """Return images of the voxels along the box's shortest side, with the path of the recorded camera."""
         recording, runs = self.recording, record["methods"]
         plane_axes = np.sort(np.argsort(self.box.high - self.box.low)[1:])
         voxels, positions = recording.voxels[:, plane_axes], recording.camera_positions[:, plane_axes]

@@ -18,17 +18,8 @@ from jaxnbv.readers.class_meshes import mesh_files
 from jaxnbv.studies.classification.study import OTHERS, ClassificationStudy, Truth
 from jaxnbv.studies.engine.measures import Claim, Record
 from jaxnbv.studies.engine.study import Scene, Study
-from jaxnbv.studies.scenes import (
-    HOUSEHOLD,
-    PATTERNS,
-    ClassSet,
-    Framing,
-    Pyramid,
-    household_scene,
-    pyramid_scene,
-    truck_scene,
-)
-from jaxnbv.studies.scenes.class_object import ClassMesh, choose_hidden
+from jaxnbv.studies.scenes import HOUSEHOLD, PATTERNS, Framing, Pyramid, household_scene, pyramid_scene, truck_scene
+from jaxnbv.studies.scenes.class_object import ClassMesh, ClassSet, choose_hidden
 from jaxnbv.studies.scenes.splits import scene_key
 from jaxnbv.studies.scenes.truck_meshes import loaded_truck
 
@@ -38,10 +29,7 @@ _ANGLES = (0, 110, 140)
 
 
 class PyramidStudy(ClassificationStudy):
-    """Measures how many views a method needs to tell a pyramid's class. The first view hides the pattern.
-
-    The settings are those of `ClassificationStudy`.
-    """
+    """Measures how many views a method needs to tell a pyramid's class. The first view hides the pattern."""
 
     title: ClassVar[str] = "The class of a pyramid"
     objects: ClassVar[ClassSet] = ClassSet(PATTERNS, pyramid_scene)
@@ -81,8 +69,7 @@ class PyramidStudy(ClassificationStudy):
 class TruckStudy(ClassificationStudy):
     """Measures how many views a method needs to tell the class of a truck's cargo. The first view is random.
 
-    The settings are those of `ClassificationStudy`, and `trucks`: mesh files of trucks, which carry the objects of
-    `meshes`.
+    - `trucks`: mesh files of trucks, which carry the objects of `meshes`.
     """
 
     title: ClassVar[str] = "The class of a truck's cargo"
@@ -109,8 +96,8 @@ class TruckStudy(ClassificationStudy):
     def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
         """Return the study, under the name "".
 
-        - `meshes`: option with a folder that holds one subfolder `trucks` of truck meshes and one subfolder per class
-          of cargo, see `class_meshes`.
+        The option `meshes` is a folder with a subfolder `trucks` of truck meshes, and one subfolder per class of cargo,
+        see `class_meshes`.
 
         **Raises:** `ValueError` if there is no truck, and whenever `ClassificationStudy.configured` raises it.
         """
@@ -127,7 +114,7 @@ class TruckStudy(ClassificationStudy):
 class HouseholdStudy(ClassificationStudy):
     """Measures how many views a method needs to tell a household object's class. The first view is random.
 
-    The ten classes differ in global shape, which any view shows. The settings are those of `ClassificationStudy`.
+    The ten classes differ in global shape, which any view shows.
     """
 
     title: ClassVar[str] = "The class of a household object"
@@ -145,8 +132,7 @@ class HouseholdStudy(ClassificationStudy):
 class OmniObject3DStudy(ClassificationStudy):
     """Measures how many views a method needs to tell a scanned fruit's class. The first view is random.
 
-    The classes differ in small details. The user provides the meshes and the classifier. The settings are those of
-    `ClassificationStudy`.
+    The classes differ in small details. The user provides the meshes and the classifier.
     """
 
     title: ClassVar[str] = "The class of a fruit"

@@ -60,10 +60,7 @@ class Truth(eqx.Module):
 
 
 class OracleView(CandidateSearch):
-    """Oracle search that chooses the candidate whose true scan has the highest acquisition score.
-
-    - `scans`: the true scan of each candidate.
-    """
+    """Oracle search that chooses the candidate whose true scan (in `scans`) has the highest acquisition score."""
 
     scans: PointCloud = eqx.field(kw_only=True)
     uses_samples: ClassVar[bool] = False
@@ -203,21 +200,19 @@ class ClassificationStudy(Study):
         **Raises:** `ValueError` if there is no mesh with this index, or if the mesh cannot be read.
         """
         keys = jax.random.split(jax.random.fold_in(jax.random.key(3), index), self.num_candidates)
-        name, class_object = self.object_of(index)
+        file = self.mesh_file(index)
+        class_object: ClassObject | ClassMesh
+        if file is None:
+            assert self.objects.scene is not None
+            name, class_object = f"{self.network} {index}", self.objects.scene(self.split, index, self.framing)
+        else:
+            name, class_object = f"{self.objects.classes[file.label]} {file.name}", self.of_mesh(file, index)
         cue_pixels, scans = scan_cue(class_object, self.camera, self.candidates.poses())
         truth = Truth(int(class_object.label), _noisy(scans, keys), class_object, cue_pixels)
         return Scene(index, name, surface_of(class_object), truth)
 
-    def object_of(self, index: int) -> tuple[str, ClassObject | ClassMesh]:
-        """Return the name and the object of the scene with this index."""
-        file = self.mesh_file(index)
-        if file is None:
-            assert self.objects.scene is not None
-            return f"{self.network} {index}", self.objects.scene(self.split, index, self.framing)
-        return f"{self.objects.classes[file.label]} {file.name}", self.of_mesh(file, index)
-
     def of_mesh(self, file: MeshFile, index: int) -> ClassMesh:
-        """Return the object of a mesh file for the scene with this index."""
+        """Return the object of a mesh file, for the scene with this index."""
         return ClassMesh(file.read(), file.label)
 
     def scene_record(self, scene: Scene, truth: Truth, first: int) -> Record:

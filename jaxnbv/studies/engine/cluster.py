@@ -52,6 +52,8 @@ class Cluster(Executor):
                 f"no Dask scheduler answers at {address} ({error}): start one with `dask scheduler`, and give the "
                 "address that it shows, such as tcp://HOST:8786"
             ) from error
+        lost = f"the Dask scheduler at {address} is gone"
+        self._lost = f"{lost}: start it, then the same command again. Scenes that have a record are kept"
         self._pickled: tuple[Any, Any] = None, None
         self._count = itertools.count()
         self._running: set[Future] = set()
@@ -71,7 +73,7 @@ class Cluster(Executor):
 
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future:
         """Run a call on a worker, and return its future. Consecutive calls of one function send it once."""
-        require(self._client.status == "running", self._lost_message())
+        require(self._client.status == "running", self._lost)
         if function is not self._pickled[0]:
             # Pickle the function here, so that a worker compares versions before it imports the function's modules.
             content = optional("cloudpickle").dumps(function)
@@ -113,7 +115,7 @@ class Cluster(Executor):
         if not answer.set_running_or_notify_cancel():
             return
         if task.status == "cancelled":
-            answer.set_exception(InputError(self._lost_message()))
+            answer.set_exception(InputError(self._lost))
             return
         try:
             answer.set_result(task.result())
@@ -127,12 +129,6 @@ class Cluster(Executor):
             answer.set_exception(error)
         # Release the result. Otherwise Dask would compute it again if the worker that holds it dies.
         task.release()
-
-    def _lost_message(self) -> str:
-        return (
-            f"the Dask scheduler at {self.address} is gone: start it, then the same command again. Scenes that have a "
-            "record are kept"
-        )
 
 
 def _call(

@@ -35,7 +35,6 @@ class Measure(NamedTuple):
 class Claim(NamedTuple):
     """A claim that the study's reference method is better than other methods, or not worse.
 
-    - `text`: the claim in words.
     - `measure`: name of the measure that decides the claim; `at`: the view or other key whose values are compared.
     - `others`: the methods with which the reference is compared.
     - `must_be_better`: False if it is enough that the reference is not worse.
@@ -49,10 +48,7 @@ class Claim(NamedTuple):
 
 
 def _seconds(record: Record, method: str) -> dict[str, float]:
-    """Return the median time of a method's proposals in a scene (seconds), under the key "median".
-
-    The first proposal is left out, because its time may include compilation.
-    """
+    """Return the median time of a method's proposals in seconds, without the first, which may include compilation."""
     seconds = [step["seconds"] for step in record["methods"][method].get("steps", [])][1:]
     return {"median": float(np.median(seconds))} if seconds else {}
 

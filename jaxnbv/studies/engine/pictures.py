@@ -1,11 +1,10 @@
 """Pictures of a study. The picture of a scene has one small image (tile) per method and view."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.lines import Line2D
@@ -67,16 +66,17 @@ def _draw_picture(picture: ScenePicture, record: Record, methods: Sequence[str])
 
 
 def _draw_one_tile_per_method(picture: ScenePicture, title: str, methods: Sequence[str]) -> Figure:
-    cells: list[tuple[str, Callable[[Axes], object]]] = []
-    if picture.truth is not None:
-        cells.append(("truth", picture.truth))
-    cells += [(method, lambda axes, method=method: picture.tile(axes, method, 0)) for method in methods]
-    num_columns = min(len(cells), _MAX_TILES_PER_ROW)
-    figure, grid = _empty_tiles(picture, title, -(-len(cells) // num_columns), num_columns, _MIN_WIDTH)
-    for axes, (name, draw) in zip(grid.ravel(), cells, strict=False):
+    names = methods if picture.truth is None else ("truth", *methods)
+    num_columns = min(len(names), _MAX_TILES_PER_ROW)
+    figure, grid = _empty_tiles(picture, title, -(-len(names) // num_columns), num_columns, _MIN_WIDTH)
+    tiles = grid.ravel()
+    for axes, name in zip(tiles, names, strict=False):
         axes.set_title(name, fontsize=9, loc="center", pad=4)
-        draw(axes)
-    for axes in grid.ravel()[len(cells) :]:
+    if picture.truth is not None:
+        picture.truth(tiles[0])
+    for axes, method in zip(tiles[len(names) - len(methods) :], methods, strict=False):
+        picture.tile(axes, method, 0)
+    for axes in tiles[len(names) :]:
         axes.axis("off")
     return figure
 

@@ -104,10 +104,7 @@ def tables(table: pd.DataFrame, study: type[Study], group: str = _ALL) -> list[t
 
 
 def _means(rows: pd.DataFrame, measure: Measure, best: pd.Series) -> list[str]:
-    """Format means as text, with a star where `best` is True.
-
-    Means in percent are shown with their interval, and all other means with their standard error.
-    """
+    """Format means with their interval if in percent, else with their standard error. A star marks the best."""
     texts = []
     for row, star in zip(rows.itertuples(), best, strict=True):
         if measure.unit == "%":

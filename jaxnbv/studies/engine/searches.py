@@ -2,36 +2,23 @@
 
 from collections.abc import Callable
 
-from jaxnbv.search import (
-    Candidates,
-    ConstrainedPoses,
-    DiscreteSearch,
-    FarthestView,
-    FreePoses,
-    GradientSearch,
-    HalvingSearch,
-    HybridSearch,
-    PoseSpace,
-    RandomView,
-    Search,
-    SpherePoses,
-    UncertaintyView,
-)
+from jaxnbv import search
+from jaxnbv.search import Candidates, PoseSpace, Search
 
 # Baselines of all studies.
 BASELINES = ("farthest", "uncertainty", "random")
 _OVER_CANDIDATES: dict[str, Callable[..., Search]] = {
-    "farthest": FarthestView,
-    "uncertainty": UncertaintyView,
-    "random": RandomView,
-    "halving": HalvingSearch,
+    "farthest": search.FarthestView,
+    "uncertainty": search.UncertaintyView,
+    "random": search.RandomView,
+    "halving": search.HalvingSearch,
 }
 # Gradient search over free poses drifts to views that miss the object, as the paper found. Constrained poses keep the
 # object in view.
 _SPACES: dict[str, Callable[[float], PoseSpace]] = {
-    "gradient-2dof": SpherePoses,
-    "gradient-6dof": FreePoses,
-    "gradient-constrained": lambda radius: ConstrainedPoses(radius - 0.3, radius + 0.3),
+    "gradient-2dof": search.SpherePoses,
+    "gradient-6dof": search.FreePoses,
+    "gradient-constrained": lambda radius: search.ConstrainedPoses(radius - 0.3, radius + 0.3),
 }
 
 
@@ -53,7 +40,7 @@ def search_of(
     """
     if method in _SPACES:
         settings = num_starts, iterations, learning_rate, max(num_candidates // 2, num_starts)
-        return GradientSearch(None, _SPACES[method](radius), *settings)
+        return search.GradientSearch(None, _SPACES[method](radius), *settings)
     if method == "hybrid":
-        return HybridSearch(space=SpherePoses(radius), candidates=candidates)
-    return _OVER_CANDIDATES.get(method, DiscreteSearch)(candidates)
+        return search.HybridSearch(space=search.SpherePoses(radius), candidates=candidates)
+    return _OVER_CANDIDATES.get(method, search.DiscreteSearch)(candidates)

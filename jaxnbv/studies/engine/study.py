@@ -172,10 +172,7 @@ class Study(eqx.Module):
 
     @abstractmethod
     def acquisition(self, method: str, scene: Scene) -> Acquisition:
-        """Return the acquisition of a method.
-
-        It should have the same pytree structure in all scenes, so that they share one compilation.
-        """
+        """Return a method's acquisition. If its pytree structure is one for all scenes, it is compiled once."""
 
     def search(self, method: str, scene: Scene) -> Search:
         """Return the search of a method, see `search_of`."""

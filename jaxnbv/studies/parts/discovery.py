@@ -100,9 +100,9 @@ PartSegmenter: TypeAlias = CloudSegmenter | NearestPart
 
 
 def discovery_time(counts: Int[np.ndarray, "views parts"], target: int) -> int | None:
-    """Return the paper's T_discovery: the first view (from 1) after which every part has `target` points, or None.
+    """Return the paper's T_discovery: the first view after which all parts have `target` points, or None.
 
-    - `counts`: number of points that are assigned to each part after each view.
+    - `counts`: number of points that are assigned to each part after each view. Views are counted from 1.
     """
     is_complete: Bool[np.ndarray, " views"] = np.all(np.asarray(counts) >= target, axis=1)
     return int(np.argmax(is_complete)) + 1 if is_complete.any() else None
@@ -199,10 +199,7 @@ class PartDiscoveryStudy(Study):
         return {"counts": counts}
 
     def scene_picture(self, record: Record, methods: Sequence[str], pixels: int) -> ScenePicture:
-        """Return images of the cloud over the true shape. The points are coloured by their predicted part.
-
-        The images of a method end once every part has 100 points, because its episode ends there.
-        """
+        """Return images of the cloud, coloured by predicted part, over the true shape, until the episode ends."""
         scene, runs = self.scene(record["scene"]), record["methods"]
         parts, segmenter = np.asarray(self.truth(scene)), self.segmenter_of(scene)
         palette, point = [SERIES[part % len(SERIES)] for part in range(len(parts))], jnp.zeros((1, 3))

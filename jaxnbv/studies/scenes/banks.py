@@ -16,7 +16,6 @@ from jaxnbv.surfaces import ShapeBank
 class BankRecipe(NamedTuple):
     """Defines the shapes of a bank of known shapes.
 
-    - `number`: number of shapes.
     - `kinds`: names of the kinds of shapes. Shape i is of kind `kinds[i % len(kinds)]`.
     - `shape`: function from i to shape i, which is not rotated at random.
     """

@@ -22,10 +22,7 @@ from jaxnbv.studies.scenes.labelled import LabelledSolid
 
 
 class ClassObject(SignedDistance):
-    """Base class of solids that belong to one of several classes.
-
-    - `label`: index of the class.
-    """
+    """Base class of solids that belong to one of several classes, which has the index `label`."""
 
     label: eqx.AbstractVar[Int[Array, ""]]
 
@@ -59,19 +56,15 @@ class SolidObject(ClassObject):
 
 
 class ClassSet(NamedTuple):
-    """Names of classes, and a function that makes scenes of these classes.
-
-    - `scene`: function that returns the object for a split, an index and a framing; None if all objects are meshes.
-    """
+    """Names of classes, and a function from split, index and framing to an object; None if all are meshes."""
 
     classes: tuple[str, ...]
     scene: Callable[..., ClassObject] | None = None
 
 
 class ClassMesh(eqx.Module):
-    """A mesh that belongs to one of several classes.
+    """A mesh that belongs to one of several classes, which has the index `label`.
 
-    - `label`: index of the class.
     - `cue`: the triangles of `mesh` that are the cue (they tell the class); default: all triangles.
     """
 

@@ -26,6 +26,8 @@ _PADDING = 0.15
 # The pocket of the housing: x of its centre, height of its floor, and height of the floor of housings with holes, which
 # a deep floor would hide.
 _POCKET_X, _POCKET_FLOOR, _SHALLOW_FLOOR = 0.15, 0.05, 0.45
+# Places in the pocket: x and z relative to its centre.
+_SIDES = [(-0.25, 0.0), (0.25, 0.0), (0.0, 0.15), (0.0, -0.15)]
 
 
 def _housing(side: float = 1.0, floor: float = _POCKET_FLOOR) -> SignedDistance:
@@ -40,16 +42,8 @@ def _housing(side: float = 1.0, floor: float = _POCKET_FLOOR) -> SignedDistance:
 
 def _bosses() -> list[SignedDistance]:
     """Make blocks with a pocket. The position, radius and height of a boss on the pocket's floor differ."""
-    variants = [
-        (-0.25, 0.0, 0.12, 0.25),
-        (0.25, 0.0, 0.12, 0.25),
-        (0.0, 0.15, 0.12, 0.25),
-        (0.0, -0.15, 0.12, 0.25),
-        (0.0, 0.0, 0.12, 0.25),
-        (0.0, 0.0, 0.12, 0.45),
-        (0.0, 0.0, 0.22, 0.25),
-        (-0.25, 0.15, 0.1, 0.4),
-    ]
+    variants = [(x, z, 0.12, 0.25) for x, z in (*_SIDES, (0.0, 0.0))]
+    variants += [(0.0, 0.0, 0.12, 0.45), (0.0, 0.0, 0.22, 0.25), (-0.25, 0.15, 0.1, 0.4)]
     return [
         _housing() | Cylinder(r, h).translate([_POCKET_X + x, _POCKET_FLOOR + h - 0.05, z]) for x, z, r, h in variants
     ]
@@ -57,18 +51,18 @@ def _bosses() -> list[SignedDistance]:
 
 def _bores() -> list[SignedDistance]:
     """Make blocks with a pocket. The position and radius of a blind hole in the pocket's floor differ."""
-    places = [(-0.25, 0.0), (0.25, 0.0), (0.0, 0.15), (0.0, -0.15), (0.0, 0.0), (0.0, 0.0), (-0.25, 0.15), (0.25, 0.15)]
-    radii = [0.12, 0.12, 0.12, 0.12, 0.12, 0.22, 0.12, 0.12]
+    variants = [(x, z, 0.12) for x, z in (*_SIDES, (0.0, 0.0))]
+    variants += [(0.0, 0.0, 0.22), (-0.25, 0.15, 0.12), (0.25, 0.15, 0.12)]
     return [
         _housing(floor=_SHALLOW_FLOOR) - Cylinder(r, 0.35).translate([_POCKET_X + x, _SHALLOW_FLOOR - 0.25, z])
-        for (x, z), r in zip(places, radii, strict=True)
+        for x, z, r in variants
     ]
 
 
 def _ribs() -> list[SignedDistance]:
     """Make blocks with a pocket. The position and direction of a rib on the pocket's floor differ."""
-    lengthwise = [(-0.28, 0.0, 90.0), (0.0, 0.0, 90.0), (0.28, 0.0, 90.0)]
-    crosswise = [(0.0, -0.2, 0.0), (0.0, 0.0, 0.0), (0.0, 0.2, 0.0)]
+    lengthwise = [(x, 0.0, 90.0) for x in (-0.28, 0.0, 0.28)]
+    crosswise = [(0.0, z, 0.0) for z in (-0.2, 0.0, 0.2)]
     diagonal = [(0.0, 0.0, 45.0), (0.0, 0.0, -45.0)]
     rib, up = Cuboid([0.28, 0.15, 0.06]), [0.0, 1.0, 0.0]
     return [
@@ -79,16 +73,8 @@ def _ribs() -> list[SignedDistance]:
 
 def _connectors() -> list[SignedDistance]:
     """Make blocks with a pocket. The size and position of a connector on the pocket's floor differ."""
-    variants = [
-        (0.3, 0.1, 0.0, 0.0),
-        (0.1, 0.22, 0.0, 0.0),
-        (0.2, 0.2, 0.0, 0.0),
-        (0.12, 0.12, 0.0, 0.0),
-        (0.16, 0.1, -0.22, 0.15),
-        (0.16, 0.1, 0.22, 0.15),
-        (0.16, 0.1, -0.22, -0.15),
-        (0.16, 0.1, 0.22, -0.15),
-    ]
+    variants = [(half, deep, 0.0, 0.0) for half, deep in ((0.3, 0.1), (0.1, 0.22), (0.2, 0.2), (0.12, 0.12))]
+    variants += [(0.16, 0.1, x, z) for z in (0.15, -0.15) for x in (-0.22, 0.22)]
     return [
         _housing() | Cuboid([half, 0.2, deep]).translate([_POCKET_X + x, _POCKET_FLOOR + 0.15, z])
         for half, deep, x, z in variants
@@ -147,11 +133,10 @@ def _mugs() -> list[SignedDistance]:
 
 def _mirrored() -> list[SignedDistance]:
     """Make four blocks with a boss in a pocket, and the mirror image of each."""
-    places = [(-0.25, 0.0), (0.25, 0.0), (0.0, 0.15), (0.0, -0.15)]
     return [
         _housing(side) | Cylinder(0.12, 0.25).translate([side * (_POCKET_X + x), _POCKET_FLOOR + 0.2, z])
         for side in (1.0, -1.0)
-        for x, z in places
+        for x, z in _SIDES
     ]
 
 

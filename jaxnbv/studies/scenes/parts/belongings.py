@@ -40,12 +40,8 @@ def guitar(rng: np.random.Generator) -> Iterator[Primitive]:
     lower, upper = rng.uniform(0.42, 0.52), rng.uniform(0.32, 0.4)
     depth, thin = rng.uniform(0.08, 0.16), rng.uniform(0.04, 0.055)
     waist, neck = rng.uniform(0.5, 0.6), rng.uniform(0.95, 1.15)
-
-    def disc(y, z, radius):
-        return rod(BODY, (-depth, y, z), (depth, y, z), radius, rounding=0.04)
-
-    yield disc(0.0, 0.0, lower)
-    yield disc(waist, 0.0, upper)
+    yield rod(BODY, (-depth, 0.0, 0.0), (depth, 0.0, 0.0), lower, rounding=0.04)
+    yield rod(BODY, (-depth, waist, 0.0), (depth, waist, 0.0), upper, rounding=0.04)
     yield box(BODY, (0, 0.5 * waist, 0), (depth, 0.3, 0.7 * upper))
     top = waist + upper
     for side in (-1, 1) if rng.random() < 0.4 else ():
