@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+import jaxnbv as nbv
 from jaxnbv.cli.options import command, run_option, sensor_option, task_option
 from jaxnbv.cli.registry import STOPS
 from jaxnbv.errors import InputError
@@ -15,8 +16,6 @@ from jaxnbv.studies.entries import RECORDING
 if TYPE_CHECKING:
     import numpy as np
 
-    from jaxnbv.planning.session import Session
-    from jaxnbv.readers.recorded import RecordedFrames
     from jaxnbv.surfaces.part_pose import ObjectPose
 
 _NUM_NAMES, _BAR_WIDTH = 4, 24
@@ -95,22 +94,17 @@ def identify(options: IdentifyOptions, box: Any, intrinsics: Any, depth_scale: A
 
     from jaxnbv.cli.play import stop_rule_of
     from jaxnbv.cli.tasks.identification import as_unit, bank_of
-    from jaxnbv.planning.planner import Planner
-    from jaxnbv.planning.session import Session
-    from jaxnbv.planning.sessions import Sessions
-    from jaxnbv.readers.recorded import RecordedFrames
     from jaxnbv.readers.segmentation import Segmentation
     from jaxnbv.studies.shown_voxels import bounds_of
-    from jaxnbv.surfaces import FreeRotation, Upright
 
-    frames = RecordedFrames(options.recording, None, intrinsics, depth_scale)
+    frames = nbv.readers.RecordedFrames(options.recording, None, intrinsics, depth_scale)
     corners = np.array(box or bounds_of(frames), np.float64).reshape(2, 3)
     bank = bank_of(options.parts, options.parts_scale, float(np.ptp(corners, axis=0).max()), options.parts_up)
     indices = np.unique(np.linspace(0, len(frames) - 1, min(options.views, len(frames))).round().astype(int)).tolist()
-    planner = Planner.for_parts(bank, Upright() if options.upright else FreeRotation())
+    planner = nbv.Planner.for_parts(bank, nbv.surfaces.Upright() if options.upright else nbv.surfaces.FreeRotation())
     planner = dataclasses.replace(planner, max_views=len(indices))
     masks = None if options.masks is None else Segmentation(options.masks, frames.files)
-    kind = Session if masks is None and not options.several else Sessions
+    kind = nbv.Session if masks is None and not options.several else nbv.Sessions
     sessions = kind(frames.camera, corners, planner, options.up, until=stop_rule_of(options.until or ()))
     names: dict[int, str] = {} if masks is None else masks.names
     for index in indices:
@@ -119,7 +113,7 @@ def identify(options: IdentifyOptions, box: Any, intrinsics: Any, depth_scale: A
             typer.echo(f"frame {index:<5} shows no object in the box")
             continue
         image = frames.depth(index), frames.matrices[index], frames.depth_scale
-        if isinstance(sessions, Sessions):
+        if isinstance(sessions, nbv.Sessions):
             sessions.add(*image, labels=labels)
         else:
             sessions.add(*image)
@@ -129,7 +123,7 @@ def identify(options: IdentifyOptions, box: Any, intrinsics: Any, depth_scale: A
         if (reason := sessions.done()) is not None:
             typer.echo(f"enough      {reason}")
             break
-    if not _objects(sessions, names) or (isinstance(sessions, Session) and not sessions.views):
+    if not _objects(sessions, names) or (isinstance(sessions, nbv.Session) and not sessions.views):
         raise InputError(
             f"none of the {len(indices)} frames of {options.recording} shows an object in the box: give --box, or more "
             "--views"
@@ -140,30 +134,27 @@ def identify(options: IdentifyOptions, box: Any, intrinsics: Any, depth_scale: A
     for name, session in _objects(sessions, names).items():
         answers[name or "object"] = _print_answer(name, session, unit)
         if options.out is not None:
-            from jaxnbv.viz import write_report
-
             title = name or options.recording.resolve().name
-            typer.echo(f"report      {write_report(session.episode, options.out / name, title=title)}")
+            typer.echo(f"report      {nbv.write_report(session.episode, options.out / name, title=title)}")
     if options.out is not None:
         from jaxnbv.storage.files import write_text
 
         write_text(options.out / "identity.json", json.dumps(answers, indent=1))
 
 
-def _shows(frames: "RecordedFrames", index: int, corners: "np.ndarray") -> bool:
+def _shows(frames: "nbv.readers.RecordedFrames", index: int, corners: "np.ndarray") -> bool:
     """Return whether a frame shows at least `_MIN_POINTS` points in a box."""
     import numpy as np
 
-    from jaxnbv.geometry.pose import Pose
     from jaxnbv.planning.images import Image
 
     image = Image.from_arrays(frames.depth(index), frames.matrices[index], frames.depth_scale, None)
-    points = image.points(frames.camera, Pose.from_matrix(image.matrix))
+    points = image.points(frames.camera, nbv.Pose.from_matrix(image.matrix))
     is_inside = (image.depth > 0) & np.all((points > corners[0]) & (points < corners[1]), axis=-1)
     return int(is_inside.sum()) >= _MIN_POINTS
 
 
-def _objects(sessions: Any, names: dict[int, str]) -> "dict[str, Session]":
+def _objects(sessions: Any, names: dict[int, str]) -> "dict[str, nbv.Session]":
     """Return the session of each object, keyed by the object's name. The name of a single object is ""."""
     objects = getattr(sessions, "objects", None)
     if objects is None:
@@ -171,11 +162,11 @@ def _objects(sessions: Any, names: dict[int, str]) -> "dict[str, Session]":
     return {names.get(number, str(number)): session for number, session in objects.items()}
 
 
-def _likely_names(session: "Session") -> list[tuple[str, float]]:
+def _likely_names(session: "nbv.Session") -> list[tuple[str, float]]:
     return list(session.identity.items())[:_NUM_NAMES]
 
 
-def _print_answer(name: str, session: "Session", unit: str | None) -> dict[str, Any]:
+def _print_answer(name: str, session: "nbv.Session", unit: str | None) -> dict[str, Any]:
     """Print which part an object is and where it lies, and return both for a JSON file."""
     from jaxnbv.surfaces.part_hypotheses import NONE
 

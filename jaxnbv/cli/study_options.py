@@ -1,6 +1,7 @@
 """Options of `jaxnbv study` that all studies take."""
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -8,6 +9,8 @@ import typer
 
 from jaxnbv.cli.options import help_sentence, one_of, planner_option, run_option
 from jaxnbv.cli.registry import STUDY_MODELS, STUDY_SETTINGS
+
+_size_option = partial(planner_option, show_default="that of the settings")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,19 +47,10 @@ class StudyOptions:
             help="Settings of the planner and number of views. " + help_sentence(STUDY_SETTINGS.items()),
         ),
     ] = "usual"
-    candidates: Annotated[
-        int | None, planner_option(min=2, help="Number of candidate poses.", show_default="that of the settings")
-    ] = None
-    samples: Annotated[
-        int | None, planner_option(min=1, help="Number of posterior samples.", show_default="that of the settings")
-    ] = None
-    grid: Annotated[
-        int | None,
-        planner_option(min=2, help="Nodes of the samples' grid along each axis.", show_default="that of the settings"),
-    ] = None
-    capacity: Annotated[
-        int | None, planner_option(min=1, help="Number of points to keep in D.", show_default="that of the settings")
-    ] = None
+    candidates: Annotated[int | None, _size_option(min=2, help="Number of candidate poses.")] = None
+    samples: Annotated[int | None, _size_option(min=1, help="Number of posterior samples.")] = None
+    grid: Annotated[int | None, _size_option(min=2, help="Nodes of the samples' grid along each axis.")] = None
+    capacity: Annotated[int | None, _size_option(min=1, help="Number of points to keep in D.")] = None
     model: Annotated[
         str | None,
         planner_option(

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+import jaxnbv as nbv
 from jaxnbv.cli.options import command
 
 
@@ -25,13 +26,9 @@ def view(options: ViewOptions) -> None:
     from jaxnbv.checks import check_device
 
     check_device()
-    from jaxnbv.planning.episode import Episode
-    from jaxnbv.planning.session import Session
-    from jaxnbv.viz import LiveView
-
     is_session = (options.folder / "session.json").exists()
-    run = Session.load(options.folder) if is_session else Episode.load(options.folder)
-    page = LiveView(options.port)
+    run = nbv.Session.load(options.folder) if is_session else nbv.Episode.load(options.folder)
+    page = nbv.viz.LiveView(options.port)
     try:
         page.update(run)
         if options.html is not None:

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+import jaxnbv as nbv
 from jaxnbv.cli.options import command, sensor_option
 from jaxnbv.compiled import keep_compiled
 
@@ -42,8 +43,6 @@ def warm_up(options: WarmUpOptions) -> None:
     there. If you use a different planner than the default, call session.rehearse() in your program instead of this
     command.
     """
-    import jaxnbv as nbv
-
     (fx, fy, cx, cy), (height, width) = options.intrinsics, options.size
     matrix = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
     camera = nbv.Camera.from_intrinsics(matrix, height, width, options.nearest, options.farthest)

@@ -213,7 +213,21 @@ def deviation(
     _check_units(_diameter(points), _diameter(model.vertices))
     matrix = _rigid_matrix(pose)
     if register:
-        matrix = _register(points, normals, model, is_solid, None if pose is None else matrix)
+        start = None if pose is None else np.linalg.inv(matrix)
+        result = register_scan(points, normals, model, is_solid, start)
+        if result.median_distance > _POOR_MEDIAN * _diameter(model.vertices):
+            warnings.warn(
+                f"the CAD fits the scan poorly: the median distance is {result.median_distance:.4g}. Give pose=, and "
+                "check that it is this part, that the scan shows little else, and that its faces are wound outward",
+                stacklevel=3,
+            )
+        if result.ambiguity > 0:
+            warnings.warn(
+                "the CAD fits the scan nearly as well in another pose, where its surface is off by "
+                f"{result.ambiguity:.4g} on average: scan more of the part, or give pose=",
+                stacklevel=3,
+            )
+        matrix = np.linalg.inv(result.matrix)
     rotation, faces = matrix[:3, :3], np.ascontiguousarray(model.faces, np.int64)
     vertices = np.ascontiguousarray(model.vertices @ rotation.T + matrix[:3, 3])
     # Pseudonormals give a sign on open meshes too, where winding numbers have no inside.
@@ -223,36 +237,11 @@ def deviation(
     gaps, _ = cKDTree(points).query(points, k=5)
     radius, outer_normals = _RADIUS * float(np.quantile(gaps[:, 4], 0.9)), model.face_normals @ rotation.T
     posed_cad, area = TriangleMesh(vertices, faces, Frame()), float(model.area)
-    result = Deviation(
-        matrix, points, distances, nearest_points, outer_normals[rows], posed_cad, area, 0.0, imagined, radius
-    )
+    nearest = nearest_points, outer_normals[rows]
+    all_covered = Deviation(matrix, points, distances, *nearest, posed_cad, area, 0.0, imagined, radius)
     samples, rows = trimesh.sample.sample_surface(posed_cad.to_trimesh(), _SAMPLES, seed=0)
-    missing = area * float(np.mean(np.isnan(result.values_at(np.asarray(samples), outer_normals[rows]))))
-    return dataclasses.replace(result, area=area - missing, missing_area=missing)
-
-
-def _register(
-    points: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
-    model: trimesh.Trimesh,
-    is_solid: bool,
-    pose: Float[np.ndarray, "4 4"] | None,
-) -> Float[np.ndarray, "4 4"]:
-    start = None if pose is None else np.linalg.inv(pose)
-    result = register_scan(points, normals, model, is_solid, start)
-    if result.median_distance > _POOR_MEDIAN * _diameter(model.vertices):
-        warnings.warn(
-            f"the CAD fits the scan poorly: the median distance is {result.median_distance:.4g}. Give pose=, and check "
-            "that it is this part, that the scan shows little else, and that its faces are wound outward",
-            stacklevel=4,
-        )
-    if result.ambiguity > 0:
-        warnings.warn(
-            "the CAD fits the scan nearly as well in another pose, where its surface is off by "
-            f"{result.ambiguity:.4g} on average: scan more of the part, or give pose=",
-            stacklevel=4,
-        )
-    return np.linalg.inv(result.matrix)
+    missing = area * float(np.mean(np.isnan(all_covered.values_at(np.asarray(samples), outer_normals[rows]))))
+    return dataclasses.replace(all_covered, area=area - missing, missing_area=missing)
 
 
 def _mesh_of(source: _Mesh | TriangleMesh) -> trimesh.Trimesh:
