@@ -21,15 +21,8 @@ from jaxnbv.cli.tasks.base import Task
 
 T = TypeVar("T")
 
-TaskOption = Annotated[
-    str,
-    task_option(
-        parser=one_of(TASKS), metavar="TASK", help=help_sentence((name, task.about) for name, task in TASKS.items())
-    ),
-]
-SearchOption = Annotated[
-    str, search_option(parser=one_of(SEARCHES), metavar="SEARCH", help=help_sentence(SEARCHES.items()))
-]
+TaskOption = Annotated[str, task_option(**one_of({name: task.about for name, task in TASKS.items()}, "TASK"))]
+SearchOption = Annotated[str, search_option(**one_of(SEARCHES, "SEARCH"))]
 SeedOption = Annotated[
     int, run_option(metavar="N", min=0, max=2**63 - 1, help="Seed of the sensor's noise and of the samples.")
 ]
@@ -81,9 +74,7 @@ class EpisodeOptions:
         ),
     ] = None
     noise: Annotated[float, sensor_option(metavar="X", help="Standard deviation of points and normals.")] = 0.01
-    model: Annotated[
-        str, sampler_option(parser=one_of(MODELS), metavar="MODEL", help=help_sentence(MODELS.items()))
-    ] = "screened"
+    model: Annotated[str, sampler_option(**one_of(MODELS, "MODEL"))] = "screened"
     known: KnownOption = None
     search: SearchOption
     seed: SeedOption = 0

@@ -23,9 +23,8 @@ class ViewPrinter:
             _print(f"views are chosen by {label_of(self.planner.quantity)}")
         self.count += 1
         position = ", ".join(f"{value:+.2f}" for value in np.asarray(view.pose.position))
-        _print(
-            f"view {self.count:<3} ({position})   {int(view.scan.count):,} points   {_choice_text(self.planner, view)}"
-        )
+        points, choice = f"{int(view.scan.count):,} points", _choice_text(self.planner, view)
+        _print(f"view {self.count:<3} ({position})   {points}   {choice}")
         answer = view.answer(self.planner.acquisition)
         if answer is not None:
             _print(f"         {words_of(answer).said(self.before)}")
@@ -47,9 +46,8 @@ def _choice_text(planner: Planner, view: View) -> str:
         return f"drawn from {len(values)}"
     if view.proposal.trajectories is not None:
         best = float(values.max(initial=-np.inf))
-        return f"{number_text(value)}, " + (
-            "no ascent found more" if value <= best else f"by ascent from {number_text(best)}"
-        )
+        source = "no ascent found more" if value <= best else f"by ascent from {number_text(best)}"
+        return f"{number_text(value)}, {source}"
     rank, tied = 1 + int(np.sum(values > value)), view.proposal.num_tied
     ties = f", tied with {tied}" if tied else ""
     rank_text = "best" if rank == 1 else f"number {rank}"

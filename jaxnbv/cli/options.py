@@ -2,7 +2,7 @@
 
 import dataclasses
 import inspect
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import Any, TypeAlias, TypeVar, get_args, get_type_hints
 
@@ -29,15 +29,19 @@ def help_sentence(choices: Iterable[tuple[str, str]]) -> str:
     return "; ".join(f"{name}: {about}" for name, about in choices) + "."
 
 
-def one_of(names: Collection[str]) -> Callable[[str], str]:
-    """Make the parser of an option that takes one of these names. Its error suggests a similar name."""
+def one_of(choices: Mapping[str, str], metavar: str, about: str = "") -> dict[str, Any]:
+    """Make the settings of an option that takes one of these names. Its error suggests a similar name.
+
+    - `choices`: meanings for the help, keyed by name.
+    - `about`: sentence before these in the help.
+    """
 
     def parse(text: str) -> str:
-        if text not in names:
-            raise typer.BadParameter(f"{text!r} is not one of {', '.join(names)}.{suggestion(text, names)}")
+        if text not in choices:
+            raise typer.BadParameter(f"{text!r} is not one of {', '.join(choices)}.{suggestion(text, choices)}")
         return text
 
-    return parse
+    return {"parser": parse, "metavar": metavar, "help": f"{about} {help_sentence(choices.items())}".lstrip()}
 
 
 def command(options: type[T], more: Mapping[str, Any] = {}) -> Callable[[Callable[..., None]], Callable[..., None]]:

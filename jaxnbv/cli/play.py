@@ -167,16 +167,14 @@ def run_episode(
         typer.echo(subject.note)
     bank = "none" if options.model == "paper" else options.known or subject.bank
     sampler = dataclasses.replace(sampler_of(options.model, options.quick, bank), grid=subject.grid or Grid())
-    planner, rival = (
-        planner_of(setting, subject.acquisition, search, sampler, sizes) for search in (options.search, "farthest")
-    )
+    searches = options.search, "farthest"
+    planner, rival = (planner_of(setting, subject.acquisition, search, sampler, sizes) for search in searches)
     folder = options.out or Path("runs") / _folder_name(options, subject)
     has_rival = has_rival and stop_rule is not None and options.search != "farthest"
     key, noise = jax.random.key(options.seed), SensorNoise(options.noise, options.noise)
     print_view = ViewPrinter(planner)
-    sketches = (
-        viz.Sketches(Episode(planner, subject.surface, noise, subject.first, key, ())) if options.report else None
-    )
+    start = Episode(planner, subject.surface, noise, subject.first, key, ())
+    sketches = viz.Sketches(start) if options.report else None
     rival_run: Future[Episode] | None = None
     sketch_run: Future[None] | None = None
 
@@ -191,11 +189,11 @@ def run_episode(
             sketch_run = in_background(sketches.add, step)
         # Start the baseline only after the first view. Before, both threads would compile the same programs.
         if rival_run is None and has_rival:
-            start = subject.surface, subject.first, _MAX_RIVAL_VIEWS, key, noise, folder / "farthest"
-            rival_run = in_background(simulate, rival, *start, progress=False, until=stop_rule)
+            rival_settings = subject.surface, subject.first, _MAX_RIVAL_VIEWS, key, noise, folder / "farthest"
+            rival_run = in_background(simulate, rival, *rival_settings, progress=False, until=stop_rule)
 
-    start = subject.surface, subject.first, options.views, key, noise, folder
-    episode = simulate(planner, *start, until=stop_rule, each=report_step)
+    settings = subject.surface, subject.first, options.views, key, noise, folder
+    episode = simulate(planner, *settings, until=stop_rule, each=report_step)
     rival_episode = None if rival_run is None else rival_run.result()
     if sketch_run is not None:
         sketch_run.result()
@@ -207,12 +205,7 @@ def run_episode(
         typer.echo(textwrap.fill(text, 100, initial_indent="race     ", subsequent_indent="         "))
     if options.report:
         page = viz.write_report(
-            episode,
-            folder,
-            title=subject.name,
-            rival=rival_episode,
-            sketches=sketches,
-            question=subject.question,
+            episode, folder, title=subject.name, rival=rival_episode, sketches=sketches, question=subject.question
         )
         typer.echo(f"report   {page}")
     typer.echo(f"episode  {folder}   ({time.perf_counter() - start_time:.0f} s)")

@@ -44,9 +44,8 @@ def run_study(name: str, options: StudyOptions, **settings: Any) -> None:
     model = options.model or usual_model
     names = None if options.methods is None else [name.strip() for name in options.methods.split(",")]
     methods, own = methods_of(kind, names, model), {text: _import_method(text) for text in options.own or ()}
-    scenes = _scenes(
-        str(kind.quick_scenes if options.quick else entry.scenes) if options.scenes is None else options.scenes
-    )
+    default_scenes = kind.quick_scenes if options.quick else entry.scenes
+    scenes = _scenes(str(default_scenes) if options.scenes is None else options.scenes)
     changes = f"{'' if model == usual_model else f'-{model}'}{'-paper-settings' if is_paper else ''}"
     folder = options.out or Path("runs") / f"study-{name}{changes}{'-quick' if options.quick else ''}"
     if options.quick:
@@ -68,9 +67,8 @@ def run_study(name: str, options: StudyOptions, **settings: Any) -> None:
             results_folder = RecordFolder(folder / part, config, executor, arrays)
             results_folder.join(sources[part])
             records = results_folder.collect(indices, run)
-            failures |= {
-                f"{part} scene {index}".strip(): error for index, error in results_folder.failures(indices).items()
-            }
+            part_failures = results_folder.failures(indices)
+            failures |= {f"{part} scene {index}".strip(): error for index, error in part_failures.items()}
             count += len(indices)
             if records:
                 table = results(records, type(study))

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from jaxnbv.cli.options import help_sentence, one_of, planner_option, run_option
+from jaxnbv.cli.options import one_of, planner_option, run_option
 from jaxnbv.cli.registry import STUDY_MODELS, STUDY_SETTINGS
 
 _size_option = partial(planner_option, show_default="that of the settings")
@@ -40,12 +40,7 @@ class StudyOptions:
         ),
     ] = None
     settings: Annotated[
-        str,
-        planner_option(
-            parser=one_of(STUDY_SETTINGS),
-            metavar="SETTINGS",
-            help="Settings of the planner and number of views. " + help_sentence(STUDY_SETTINGS.items()),
-        ),
+        str, planner_option(**one_of(STUDY_SETTINGS, "SETTINGS", "Settings of the planner and number of views."))
     ] = "usual"
     candidates: Annotated[int | None, _size_option(min=2, help="Number of candidate poses.")] = None
     samples: Annotated[int | None, _size_option(min=1, help="Number of posterior samples.")] = None
@@ -54,9 +49,7 @@ class StudyOptions:
     model: Annotated[
         str | None,
         planner_option(
-            parser=one_of(STUDY_MODELS),
-            metavar="MODEL",
-            help="Model of the imagined surfaces. " + help_sentence(STUDY_MODELS.items()),
+            **one_of(STUDY_MODELS, "MODEL", "Model of the imagined surfaces."),
             show_default="known if the study has known shapes; with --settings paper: paper",
         ),
     ] = None

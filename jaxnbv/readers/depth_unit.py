@@ -8,14 +8,13 @@ from jaxtyping import Float, UInt16
 
 from jaxnbv.geometry.camera import Camera
 
-UNITS_A_METRE = (1000.0, 5000.0, 10000.0, 4000.0, 6553.5, 1.0)
-"""Common units of depth images, each as the number of units per metre. 1 is for images in the unit of the world."""
+# Common units of depth images, each as the number of units per metre. 1 is for images in the unit of the world.
+_UNITS_PER_METRE = (1000.0, 5000.0, 10000.0, 4000.0, 6553.5, 1.0)
 
 # Number of pairs of frames, cosine of the largest angle between the viewing directions of a pair, number of pixels used
 # of each frame, and relative difference up to which depths count as equal.
 _NUM_PAIRS, _MIN_COSINE, _NUM_PIXELS, _TOLERANCE = 12, math.cos(math.radians(45.0)), 2000, 0.02
-# Least fraction of the points that must agree with the best unit, and least ratio of the number of these points to the
-# number for the second-best unit.
+# Least fraction of the points that must agree with the best unit, and least ratio of their number to the second-best's.
 _MIN_FRACTION, _MIN_RATIO = 0.03, 2.0
 
 
@@ -30,7 +29,7 @@ def depth_unit(
     - `image`: returns the depth image of a frame, 0 where nothing was measured.
     - `matrices`: poses of the frames, camera to world, OpenCV's axes.
     """
-    scales = 1.0 / np.array(UNITS_A_METRE)
+    scales = 1.0 / np.array(_UNITS_PER_METRE)
     counts, total = np.zeros(len(scales)), 0
     positions, forward = matrices[:, :3, 3], matrices[:, :3, 2]
     stride = math.ceil(math.sqrt(camera.num_rays / _NUM_PIXELS))

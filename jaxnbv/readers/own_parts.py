@@ -10,16 +10,13 @@ from scipy.sparse.csgraph import connected_components
 
 from jaxnbv.geometry.camera import Camera
 
-# Number of frames to compare, least number of frames that must show the mount, and number of blocks along the longer
-# side of an image.
+# Numbers of frames to compare, of frames that must show the mount, and of blocks along an image's longer side.
 _NUM_FRAMES, _MIN_FRAMES, _NUM_BLOCKS = 16, 4, 80
-# Relative difference up to which depths count as equal: the depths of a block in different frames, and the depths of a
-# point in two frames.
+# Relative difference up to which depths count as equal: those of a block in all frames, of a point in two frames.
 _BLOCK_TOLERANCE, _POINT_TOLERANCE = 0.02, 0.05
 # Neighbouring blocks belong to the same component if their depths differ by at most this factor.
 _MAX_DEPTH_RATIO = 1.1
-# A component belongs to the mount if other frames look through its position in the world more than this many times as
-# often as they see a surface there.
+# A component belongs to the mount if frames look through its place this many times as often as they see surface there.
 _MIN_DEEPER_RATIO = 4
 
 
@@ -52,9 +49,8 @@ def own_parts(
         low, middle, high = np.nanpercentile(rows, [10, 50, 90], axis=0)
         candidate_depth[is_frequent] = np.where(high - low < _BLOCK_TOLERANCE * middle, middle, 0.0)
     if candidate_depth.any():
-        candidate_depth = np.where(
-            _is_mount(scale * candidate_depth, scale * depths, matrices[frames], camera, side), candidate_depth, 0.0
-        )
+        is_mount = _is_mount(scale * candidate_depth, scale * depths, matrices[frames], camera, side)
+        candidate_depth = np.where(is_mount, candidate_depth, 0.0)
     max_depths = _MAX_DEPTH_RATIO * maximum_filter(candidate_depth, 3)
     return np.kron(max_depths, np.ones((side, side)))[: camera.height, : camera.width]
 
@@ -85,18 +81,15 @@ def _is_mount(
     (fx, skew, cx), (_, fy, cy), _ = np.asarray(camera.intrinsics, float)
     down = (side * (row + 0.5) - cy) / fy
     rays = np.stack([(side * (column + 0.5) - cx - skew * down) / fx, down, np.ones(len(row))], axis=-1)
-    points = candidate_depth[row, column, None] * rays
+    block_depths = candidate_depth[row, column]
+    points = block_depths[:, None] * rays
     num_deeper, num_equal = np.zeros(count), np.zeros(count)
-    # Use bounds of the depths around a block, since the surface may be slanted and the point may be anywhere in the
-    # block.
+    # Use bounds of the depths around a block, since the surface may be slanted and the point anywhere in the block.
     window = (1, 3, 3)
     least = minimum_filter(np.where(depths > 0, depths, np.inf), window)
     greatest = maximum_filter(depths, window)
     for first, matrix in enumerate(matrices):
-        is_shown = (
-            np.abs(depths[first, row, column] - candidate_depth[row, column])
-            < _BLOCK_TOLERANCE * candidate_depth[row, column]
-        )
+        is_shown = np.abs(depths[first, row, column] - block_depths) < _BLOCK_TOLERANCE * block_depths
         for second, other in enumerate(matrices):
             motion = np.linalg.inv(other) @ matrix
             second_points = points @ motion[:3, :3].T + motion[:3, 3]

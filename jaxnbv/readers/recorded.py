@@ -151,12 +151,9 @@ class RecordedFrames:
             pixels = np.asarray(optional("PIL.Image").open(file))
         except OSError as error:
             raise InputError(f"cannot read the depth image {file} ({error}): unpack the data set again") from error
-        is_valid = (
-            pixels.ndim == 2 and pixels.dtype.kind in "iu" and pixels.min() >= 0 and pixels.max() <= _NO_MEASUREMENT
-        )
-        require(
-            is_valid, f"{file} is an image of {pixels.dtype}, {pixels.shape}: depth images have one channel of 16 bit"
-        )
+        kind, is_depth = f"{pixels.dtype}, {pixels.shape}", pixels.ndim == 2 and pixels.dtype.kind in "iu"
+        is_valid = is_depth and 0 <= pixels.min() <= pixels.max() <= _NO_MEASUREMENT
+        require(is_valid, f"{file} is an image of {kind}: depth images have one channel of 16 bit")
         return np.where(pixels == _NO_MEASUREMENT, 0, pixels).astype(np.uint16)
 
 

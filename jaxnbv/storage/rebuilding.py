@@ -96,9 +96,8 @@ class _Rebuilder:
         if kind in _TEXTS:
             return _TEXTS[kind](node["value"])
         if kind in ("list", "set", "frozenset", "dict"):
-            return {"list": list, "set": set, "frozenset": frozenset, "dict": dict}[kind](
-                self.rebuild(node["items"], path)
-            )
+            collection: Callable[[Any], Any] = {"list": list, "set": set, "frozenset": frozenset, "dict": dict}[kind]
+            return collection(self.rebuild(node["items"], path))
         if kind in ("function", "class", "again", "wrapped"):
             obj = self._lookup_code(node["name"], path)
             has_type = kind != "wrapped" or name_of(type(obj)) == node["by"]
@@ -107,9 +106,8 @@ class _Rebuilder:
             )
             return obj
         if kind == "partial":
-            function, arguments, keywords = (
-                self.rebuild(node[part], path) for part in ("function", "arguments", "keywords")
-            )
+            parts = (self.rebuild(node[part], path) for part in ("function", "arguments", "keywords"))
+            function, arguments, keywords = parts
             return functools.partial(function, *arguments, **keywords)
         if kind == "method":
             function, instance = self.rebuild(node["function"], path), self.rebuild(node["self"], path)

@@ -13,6 +13,7 @@ proposal_01.npz   the search's proposal for the image with this number: pose, ca
 refused_00.npz    a proposed pose that cannot be reached, and the reason; refused_01.npz and so on
 """
 
+import functools
 import hashlib
 import os
 import re
@@ -75,8 +76,7 @@ class RunFolder(ResultFolder):
 
         **Raises:** `ValueError` if a file before the last one is missing.
         """
-        # List names and do not check files, so a broken link counts as a file, and reading this file then raises an
-        # error.
+        # A broken link counts as a file, so that reading it raises an error.
         names = {file for file in os.listdir(self.path) if re.fullmatch(rf"{name}_\d{{2,}}\.npz", file)}
         for index in range(len(names)):
             file = self.file(name, index).name
@@ -99,10 +99,8 @@ class RunFolder(ResultFolder):
         **Raises:** `ValueError` whenever `write_whole` raises it.
         """
         self.bind()
-        leaves = jax.tree_util.tree_leaves_with_path(parts)
-        arrays = {
-            jax.tree_util.keystr(key_path, simple=True, separator="."): np.asarray(leaf) for key_path, leaf in leaves
-        }
+        name_of = functools.partial(jax.tree_util.keystr, simple=True, separator=".")
+        arrays = {name_of(key): np.asarray(leaf) for key, leaf in jax.tree_util.tree_leaves_with_path(parts)}
         arrays["index"] = np.asarray(index)
         contents: dict[str, Any] = arrays | {"sha256": np.asarray(_checksum(arrays))}
         write_arrays(self.file(name, index), contents)

@@ -184,9 +184,8 @@ class _PartWords(Words):
         return f"{self.answer.target:g} points or more of every part"
 
     def settled(self, answers: Sequence[Answer], holds: Holds) -> list[bool]:
-        return [
-            all(answer.values[index] >= self.answer.target for index in words_of(answer).shown) for answer in answers
-        ]
+        shown = ((answer, words_of(answer).shown) for answer in answers)
+        return [all(answer.values[index] >= self.answer.target for index in indices) for answer, indices in shown]
 
     def charts(self, answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...]:
         all_answers = answers if truth is None else [*answers, truth]

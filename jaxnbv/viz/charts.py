@@ -33,9 +33,8 @@ def visible_lines(chart: Chart) -> dict[int, int]:
     tolerance = _MIN_DIFFERENCE * max(float(np.ptp(chart.values)), 1e-12)
     num_hidden = dict[int, int]()
     for index in np.argsort(-largest, kind="stable").tolist():
-        coinciding = (
-            other for other in num_hidden if np.abs(chart.values[:, other] - chart.values[:, index]).max() < tolerance
-        )
+        distances = {other: np.abs(chart.values[:, other] - chart.values[:, index]).max() for other in num_hidden}
+        coinciding = (other for other, distance in distances.items() if distance < tolerance)
         # The line of the true name hides no other line. Lines that each have a true value are never hidden.
         front = next(coinciding, None) if chart.true is None or chart.marks_true_name else None
         if front is not None and not (chart.marks_true_name and chart.true is not None and chart.true[front] > 0):
@@ -66,9 +65,8 @@ def draw_chart(axes: Axes, chart: Chart, rival: Chart | None = None, rival_name:
         handles.append(Line2D([], [], color=GREY, lw=1.2, ls="--", label="in truth"))
     if is_one and len(views) <= _MAX_VIEWS:
         for view, value in zip(views.tolist(), chart.values[:, 0].tolist(), strict=True):
-            axes.annotate(
-                number_text(value), (view, value), (0, 6), textcoords="offset points", ha="center", fontsize=8
-            )
+            style = {"textcoords": "offset points", "ha": "center", "fontsize": 8}
+            axes.annotate(number_text(value), (view, value), (0, 6), **style)
     rival_index = 0 if is_one else true_index
     if rival is not None and rival_index is not None:
         style = {"color": GREY, "lw": 1.4, "ls": (0, (4, 2)), "marker": "s", "ms": 3.5}

@@ -27,8 +27,8 @@ from jaxnbv.surfaces.rigid import orient_outward, register_scan
 _POINTS, _MIN_POINTS, _SAMPLES = 50_000, 10, 20_000
 # A scan that is this many times larger or smaller than the CAD must be in different units.
 _LARGE_RATIO, _SMALL_RATIO = 8.0, 50.0
-# Fractions of the CAD's diameter: least distance between worst places, largest distance at which a scanned point covers
-# the CAD, median distance above which a fit is poor.
+# Fractions of the CAD's diameter: least distance of worst places, largest distance of a point that covers the CAD, and
+# median distance of a poor fit.
 _MIN_DISTANCE, _MAX_DISTANCE, _POOR_MEDIAN = 0.05, 0.05, 0.02
 # Number of nearest points over which a median smooths the deviation.
 _NEIGHBOURS = 9
@@ -293,9 +293,8 @@ def _check_units(scan: float, cad: float) -> None:
 def _rigid_matrix(pose: Float[AnyArray, "4 4"] | list | None) -> Float[np.ndarray, "4 4"]:
     """Check that a pose is a rigid (4, 4) matrix, and convert None to the identity."""
     matrix = np.eye(4) if pose is None else as_numbers(pose, "the pose", np.float64)
-    require(
-        matrix.shape == (4, 4), f"the pose has shape {matrix.shape}: give a matrix (4, 4), from the CAD to the scan"
-    )
+    shape = matrix.shape
+    require(shape == (4, 4), f"the pose has shape {shape}: give a matrix (4, 4), from the CAD to the scan")
     (matrix,), (is_rigid,) = rigid_matrices(matrix[None])
     require(is_rigid, f"the pose is no rigid motion: {short_text(pose)}; give a rotation and a shift, [[R, t], [0, 1]]")
     return matrix

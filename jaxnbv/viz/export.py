@@ -31,9 +31,8 @@ def scanned_cloud(episode: Episode) -> PointCloud:
     **Raises:** `ValueError` for an episode without views.
     """
     require(len(episode.views) > 0, "the episode has no view yet: there are no points")
-    points, normals = (
-        np.concatenate(rows) for rows in zip(*(view.scan.to_numpy() for view in episode.views), strict=True)
-    )
+    scans = zip(*(view.scan.to_numpy() for view in episode.views), strict=True)
+    points, normals = map(np.concatenate, scans)
     return episode.frame.to_world(PointCloud.from_arrays(points, normals))
 
 
@@ -142,9 +141,8 @@ def _surface(sampler: SurfaceSampler, observations: Observations) -> MeanSurface
 
 def _kind(path: str | Path, kinds: tuple[str, ...]) -> str:
     kind = Path(path).suffix[1:].lower()
-    require(
-        kind in kinds, f"{path} does not say a format: end it with one of {', '.join('.' + suffix for suffix in kinds)}"
-    )
+    suffixes = ", ".join(f".{suffix}" for suffix in kinds)
+    require(kind in kinds, f"{path} does not say a format: end it with one of {suffixes}")
     return kind
 
 

@@ -59,10 +59,9 @@ def overview_figure(data: ReportData) -> Figure:
     if data.has_deviations:
         _draw_deviations(legend_panel.add_axes((0.15, 1.0 - 0.25 / legend_height, 0.7, 0.13 / legend_height)), data)
     maps = f"Maps: {data.quantity.name}; dark is high"
-    # Ten letters of this size take an inch.
-    legend_panel.text(
-        0.04, 1.0 - 1.0 / legend_height, maps, fontsize=12.0 * min(1.0, 9.0 * width / len(maps)), va="center"
-    )
+    # Ten letters of size 12 take an inch.
+    size = 12.0 * min(1.0, 9.0 * width / len(maps))
+    legend_panel.text(0.04, 1.0 - 1.0 / legend_height, maps, fontsize=size, va="center")
     for number, (mark, colour) in enumerate(legend):
         row, column = divmod(number, legend_columns)
         position = 0.04 + 0.94 * column / legend_columns, 1.0 - (1.28 + _LINE_HEIGHT * row) / legend_height

@@ -93,9 +93,8 @@ def _mean_of_samples(values: Float[np.ndarray, "s g g g"], grid: Grid) -> MeanSu
         return None
     vertices, faces, normals = triangles
     grid_points = (vertices + grid.half_extent).T / grid.spacing
-    slope = np.linalg.norm(
-        [map_coordinates(part, grid_points, order=1) for part in np.gradient(mean, grid.spacing)], axis=0
-    )
+    gradient = [map_coordinates(part, grid_points, order=1) for part in np.gradient(mean, grid.spacing)]
+    slope = np.linalg.norm(gradient, axis=0)
     value_deviation = map_coordinates(values.std(axis=0, ddof=min(1, len(values) - 1)), grid_points, order=1)
     return MeanSurface(vertices, faces, normals, value_deviation / np.maximum(slope, 1e-6))
 

@@ -179,11 +179,9 @@ def _with_hypotheses(shape: PlacedShape, fits: _Fits, cloud: PointCloud) -> Plac
         agreed += weight * _step(2.0 * _TOLERANCE - np.abs(map_coordinates(distance, grid_points, order=1)))
     # Positive outside the disputed space, and near the shape itself.
     outside = np.maximum(4.0 * _SOFTNESS * (_MIN_DISPUTED - occupancy), _TOLERANCE - own_distances)
+    measured, agreed = _measured_weight(shape, cloud), np.clip(4.0 * agreed - 1.5, 0.0, 1.0)
     disputed_space = _pieces(outside, grid, _MIN_PIECE * shape.mesh.area)
-    agreed = np.clip(4.0 * agreed - 1.5, 0.0, 1.0)
-    return dataclasses.replace(
-        shape, measured=_measured_weight(shape, cloud), agreed=agreed, disputed_space=disputed_space
-    )
+    return dataclasses.replace(shape, measured=measured, agreed=agreed, disputed_space=disputed_space)
 
 
 def _step(x: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:

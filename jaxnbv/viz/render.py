@@ -82,9 +82,8 @@ class Still:
         # Do not use the camera's compiled rays: for millions of pixels, XLA takes seconds for the constants.
         directions = unit(np.asarray(self.fine_camera.pixel_directions()) @ np.asarray(self.pose.rotation).T)
         origin, vertices = np.asarray(self.pose.position, np.float64), surface.vertices.astype(np.float64)
-        rows, distances = first_faces(vertices, surface.faces.astype(np.int64))(
-            np.broadcast_to(origin, directions.shape), directions
-        )
+        trace = first_faces(vertices, surface.faces.astype(np.int64))
+        rows, distances = trace(np.broadcast_to(origin, directions.shape), directions)
         mask = rows >= 0
         points = origin + distances[mask, None] * directions[mask]
         corners = surface.faces[rows[mask]]
@@ -166,9 +165,8 @@ def _occlusion(mask: Bool[np.ndarray, "h w"], depth: Float[np.ndarray, " hits"])
     width, depths = round(_OCCLUSION_WIDTH * len(mask)), np.zeros(mask.shape)
     depths[mask] = depth
     # Two filters in a row, so that a pixel's weight falls off with distance.
-    sums, fractions = (
-        uniform_filter(uniform_filter(image, width), width)[mask] for image in (depths, mask.astype(float))
-    )
+    images = depths, mask.astype(float)
+    sums, fractions = (uniform_filter(uniform_filter(image, width), width)[mask] for image in images)
     mean = sums / np.maximum(fractions, 1e-9)
     return _MAX_DARKENING * np.clip((depth - mean) / _FULL_DEPTH, 0.0, 1.0)
 
@@ -181,10 +179,8 @@ def draw_truth(axes: Axes, data: ReportData) -> bool:
     # Shading is interpolated between vertices, so they must be near each other.
     vertices, faces = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, _MAX_EDGE, max_iter=12)
     fine = trimesh.Trimesh(vertices, faces)
-    normals, flat = np.asarray(fine.vertex_normals), np.ones(len(fine.vertices))
-    still = Still(
-        data.viewpoint.eye, MeanSurface(fine.vertices, fine.faces, normals, flat), _TRUTH_SIZE, data.viewpoint.extent
-    )
+    surface = MeanSurface(fine.vertices, fine.faces, np.asarray(fine.vertex_normals), np.ones(len(fine.vertices)))
+    still = Still(data.viewpoint.eye, surface, _TRUTH_SIZE, data.viewpoint.extent)
     axes.imshow(still.image, interpolation="bilinear")
     crop(axes, still, [still.project(np.asarray(fine.vertices))[0]])
     return True

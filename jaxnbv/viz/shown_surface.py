@@ -36,10 +36,8 @@ def shown_surface(sampler: SurfaceSampler, inputs: StepInputs, answer: Answer | 
         if (shape := likeliest_shape(model.bank, fits, weights, observations.cloud, answer)) is not None:
             return shape
         sampler = sampler.without_bank
-        posterior_of_none = (
-            posterior.of_none if isinstance(posterior, KnownShapesPosterior) else sampler.posterior(observations)
-        )
-        inputs = StepInputs(observations, posterior_of_none)
+        of_none = posterior.of_none if isinstance(posterior, KnownShapesPosterior) else sampler.posterior(observations)
+        inputs = StepInputs(observations, of_none)
     return near_points(mean_surface(sampler, inputs), observations.cloud)
 
 

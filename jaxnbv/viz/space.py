@@ -28,10 +28,8 @@ def figures_in_space(data: ReportData) -> list[go.Figure]:
     for index, view in enumerate(data.views):
         poses = [viewpoint.drawn_pose(other.pose) for other in data.views[: index + 1]]
         traces = [] if view.surface is None else [_mesh(view.surface, vertices, grades)]
-        if isinstance(view.surface, PlacedShape) and view.surface.disputed_space is not None:
-            traces.append(
-                _triangles(view.surface.disputed_space, vertices // 2, _legend_entry("other shapes") | _GLASS)
-            )
+        if isinstance(view.surface, PlacedShape) and (disputed_space := view.surface.disputed_space) is not None:
+            traces.append(_triangles(disputed_space, vertices // 2, _legend_entry("other shapes") | _GLASS))
         for item in scene_items(view.before, view.new, poses, data.episode.sensor, viewpoint.depth):
             traces += _points(item, points) if isinstance(item, Points) else _cameras(item)
         figures.append(go.Figure(traces, _layout(viewpoint.eye, viewpoint.extent)))

@@ -15,8 +15,7 @@ from jaxnbv.scanning import Carving, TriangleMesh
 from jaxnbv.viz.answers import number_text, point_text
 from jaxnbv.viz.mean_surface import padded
 
-# Least number of views that looked at a patch, since one may be chance. Least fraction of the surface in a patch.
-# Maximum number of patches.
+# Least number of views that looked at a patch (one may be chance), least fraction of the surface, number of patches.
 _MIN_LOOKS, _MIN_AREA, _MAX_PATCHES = 2, 0.005, 3
 
 
@@ -52,9 +51,8 @@ def unmeasured(surface: trimesh.Trimesh, observations: Observations, carving: Ca
     is_unmeasured = looks_of_face >= _MIN_LOOKS
     if carving is not None:
         is_unmeasured &= np.asarray(carving.volume(centers))[: len(surface.faces)] < -looks.grid.spacing
-    pieces = trimesh.graph.connected_components(
-        surface.face_adjacency[is_unmeasured[surface.face_adjacency].all(axis=1)], nodes=np.nonzero(is_unmeasured)[0]
-    )
+    neighbours = surface.face_adjacency[is_unmeasured[surface.face_adjacency].all(axis=1)]
+    pieces = trimesh.graph.connected_components(neighbours, nodes=np.nonzero(is_unmeasured)[0])
     patches = [_patch(surface, faces, looks_of_face) for faces in pieces]
     patches = [patch for patch in patches if patch.area > _MIN_AREA * surface.area]
     return sorted(patches, key=lambda patch: -patch.area)[:_MAX_PATCHES]

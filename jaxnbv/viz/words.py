@@ -66,9 +66,9 @@ def _reason(quantity: Quantity, proposal: Proposal, frame: Frame) -> dict[str, s
     rest = others if is_ascent or rank > 1 else others[1:]
     if rest:
         visited_value = 0.0 if proposal.value_at_visited is None else float(proposal.value_at_visited)
-        level = "two standard errors" + (
-            f" and {number_text(visited_value)}, expected even at earlier poses" if visited_value > 0 else ""
-        )
+        level = "two standard errors"
+        if visited_value > 0:
+            level += f" and {number_text(visited_value)}, expected even at earlier poses"
         tied_text = "" if num_tied is None else f"; {num_tied or 'no'} other{'s' * (num_tied != 1)} within {level}"
         other, median = "candidate" if is_ascent else "other", number_text(float(np.median(others)))
         sentences["Other candidates"] = f"Best {other} {number_text(rest[0])}, median {median}{tied_text}."
