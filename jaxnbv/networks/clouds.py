@@ -111,7 +111,7 @@ class CloudSegmenter(Segmenter):
         return self._probabilities(farthest_point_subsample(cloud, self.num_points))
 
     def predict(self, cloud: PointCloud) -> tuple[PointCloud, Int[Array, " num_points"]]:
-        """Return the points that the network gets, in scene coordinates, and their likeliest parts; -1 if masked."""
+        """Return the network's input points, in scene coordinates, and their likeliest parts; -1 if masked."""
         inputs = farthest_point_subsample(cloud, self.num_points)
         labels = jnp.argmax(self._probabilities(inputs), axis=-1).astype(jnp.int32)
         return inputs, jnp.where(inputs.mask, labels, -1)

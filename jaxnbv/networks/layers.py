@@ -189,7 +189,7 @@ def interpolate(
 
 
 def _nearest(points: Float[Array, "n 3"], coarse: Float[Array, "m 3"]) -> tuple[Int[Array, "n 3"], Bool[Array, "n 3"]]:
-    """Return the rows of the three nearest coarse points of each point, and whether each of the three exists.
+    """Return the rows of the three nearest coarse points of each point, and whether each row exists.
 
     On a CPU this loop over the coarse points is two to three times as fast as `jax.lax.top_k`.
     """

@@ -68,7 +68,7 @@ def _part_segmenter(state: "_State") -> PointNet2PartSegmenter:
 def _encoder(
     state: "_State", scales: tuple[tuple[Level, ...], tuple[Level, ...]], kinds: dict[int, str]
 ) -> tuple[tuple[SetAbstraction, ...], PooledMLP, list[int]]:
-    """Return the set abstractions, the PointNet over all points, and the widths of the points' and levels' features.
+    """Return set abstractions, the PointNet over all points, and widths of points' and levels' features.
 
     - `scales`: sizes of the levels for networks with one radius per level, and with several.
     - `kinds`: allowed numbers of inputs, and the meaning of each.
@@ -88,7 +88,7 @@ def _encoder(
 
 
 class _State:
-    """Tensors keyed by name, with checks of their shapes. `unused` has the names of the tensors not used so far."""
+    """Tensors keyed by name, with checks of their shapes, and names of the tensors not used so far."""
 
     def __init__(self, tensors: Tensors):
         self.tensors = {name: array for name, array in tensors.items() if not name.endswith("num_batches_tracked")}

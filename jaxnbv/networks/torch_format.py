@@ -170,7 +170,7 @@ class _TensorUnpickler(pickle.Unpickler):
 
 
 class _Dictionary(OrderedDict):
-    """A dictionary that ignores attributes, since a model's state dictionary may have some besides its tensors."""
+    """A dictionary that ignores attributes, which a model's state dictionary may have besides tensors."""
 
     def __setstate__(self, _: Any) -> None:
         pass

@@ -10,7 +10,7 @@ from jaxnbv.studies.scenes.framing import FirstView, Framing, Setup
 
 
 def _option(kind: Any, text: str, default: str, metavar: str | None = None) -> Any:
-    """Return the annotation of an option, with its help text, and with text that stands for its default, None."""
+    """Return the annotation of an option whose default is None. The help shows the text `default`."""
     return Annotated[kind | None, typer.Option(help=text, show_default=default, metavar=metavar)]
 
 

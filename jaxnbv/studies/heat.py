@@ -50,7 +50,7 @@ _MARKS: dict[str, dict[str, Any]] = {
 
 
 class Truth(NamedTuple):
-    """The temperature of the true object, in degrees, at points of its surface that are 1/40 of a scene unit apart."""
+    """The temperature (degrees) of the true object, at points of its surface 1/40 scene unit apart."""
 
     mesh: TriangleMesh
     points: Float[np.ndarray, "n 3"]
@@ -69,7 +69,7 @@ class Truth(NamedTuple):
 
 
 def _saturation(record: Record, method: str) -> dict[int, float]:
-    """Return, for each view after the first, whether the chosen view and so every candidate has value zero (1.0)."""
+    """Return, for each later view, 1.0 if the best candidate, and so every one, has value zero."""
     steps = record["methods"][method]["steps"] if method in HEAT_METHODS else []
     return {view: float(step["value"] == 0.0) for view, step in enumerate(steps, start=2)}
 

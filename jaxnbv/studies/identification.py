@@ -1,4 +1,4 @@
-"""Study of identification: which known part is the object, and in which pose does it lie?"""
+"""Study of identification: which known part the object is, and in which pose it lies."""
 
 import dataclasses
 import math
@@ -221,7 +221,7 @@ class IdentificationStudy(Study):
         return record["set"]
 
     def follow(self, scene: Scene, truth: _Truth, planner: Planner, episode: Iterator[Step]) -> Record:
-        """Record, after each view, the most likely name, the true name's probability, and the error of the pose."""
+        """Record after each view the likeliest name, the true name's probability, and the pose's error."""
         views = [self._view_record(truth, step.observations.hypotheses) for step in episode]
         return {name: [view[name] for view in views] for name in views[0]}
 

@@ -111,7 +111,7 @@ class ReconstructionStudy(Study):
     def follow(
         self, scene: Scene, truth: Float[np.ndarray, "n 3"], planner: Planner, episode: Iterator[Step]
     ) -> Record:
-        """Record the surface covered after each view, and the errors of the reconstructions after the last view.
+        """Record the surface covered after each view, and the final errors of the reconstructions.
 
         The errors of the Poisson reconstruction are None if `pymeshlab` is not installed.
         """

@@ -1,4 +1,4 @@
-"""Study of a recording. A method chooses frames one by one, and the study measures how much of a box they show."""
+"""Study of a recording: how much of a box the frames show that a method chooses one by one."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -52,7 +52,7 @@ class _UnknownSurface(Surface):
 
 
 class FixedOrder(Baseline):
-    """Baseline that visits the candidates with the indices `order`, one per view, including the first view."""
+    """Baseline that visits the candidates with the indices `order`, the first view's included."""
 
     order: Int[Array, " views"] = eqx.field(kw_only=True)
 

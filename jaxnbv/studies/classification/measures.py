@@ -31,7 +31,7 @@ def stable_hits(correct: Bool[np.ndarray, "runs views"]) -> Bool[np.ndarray, "ru
 
 
 def _hit_fraction(hits: Callable) -> Callable[[Record, str], Float[np.ndarray, " views"]]:
-    """Return the measure of the fraction of a method's runs with a hit. Only random search has several runs."""
+    """Return the measure of the fraction of runs with a hit. Only random search has several runs."""
 
     def compute(record: Record, method: str) -> Float[np.ndarray, " views"]:
         guesses = np.argmax(record["methods"][method]["log_p"], axis=-1)
@@ -79,7 +79,7 @@ def crossed_cells(values: Float[np.ndarray, "g g g"]) -> int:
 def rank_correlation(
     values: Float[AnyArray, " c"], true_values: Real[AnyArray, " c"], is_compared: Bool[np.ndarray, " c"]
 ) -> float | None:
-    """Return Spearman's rank correlation of the compared candidates' values, or None if either are constant."""
+    """Return Spearman's rank correlation over the compared candidates; None if one side is constant."""
     a, b = np.asarray(values)[is_compared], np.asarray(true_values)[is_compared]
     return None if np.ptp(a) == 0 or np.ptp(b) == 0 else float(spearmanr(a, b).statistic)
 

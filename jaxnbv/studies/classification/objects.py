@@ -67,7 +67,9 @@ class PyramidStudy(ClassificationStudy):
 
 
 class TruckStudy(ClassificationStudy):
-    """Measures how many views a method needs to tell the class of a truck's cargo. The first view is random.
+    """Measures how many views a method needs to tell the class of a truck's cargo.
+
+    The first view is random.
 
     - `trucks`: mesh files of trucks, which carry the objects of `meshes`.
     """

@@ -60,7 +60,7 @@ class Truth(eqx.Module):
 
 
 class OracleView(CandidateSearch):
-    """Oracle search that chooses the candidate whose true scan (in `scans`) has the highest acquisition score."""
+    """Oracle that chooses the candidate whose true scan (in `scans`) has the highest acquisition score."""
 
     scans: PointCloud = eqx.field(kw_only=True)
     uses_samples: ClassVar[bool] = False

@@ -96,7 +96,7 @@ def _draw(axes: Axes, rows: pd.DataFrame, measure: Measure, methods: list[str]) 
 
 
 def _look(method: str, index: int) -> dict[str, Any]:
-    """Return arguments of `Axes.errorbar` for a method. If it is not in `LOOKS`, its position decides its look."""
+    """Return arguments of `Axes.errorbar` for a method. Its position decides if it is not in `LOOKS`."""
     colour, line, marker = LOOKS.get(method) or _OTHERS[index % len(_OTHERS)]
     width, size = (2.0, 5.5) if (colour, line, marker) == _OURS else (1.2, 4.4)
     bars = {"ecolor": mpl.colors.to_rgba(colour, 0.35), "elinewidth": 2.4}

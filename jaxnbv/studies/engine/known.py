@@ -42,7 +42,7 @@ def study_sampler(
 
 
 def keep_shapes(sampler: SurfaceSampler, is_selected: Callable[[str], bool]) -> SurfaceSampler:
-    """Return the sampler with only those of its known shapes, if it has any, whose names satisfy `is_selected`."""
+    """Return the sampler with only those known shapes, if it has any, whose names are selected."""
     model = sampler.model
     if not isinstance(model, KnownShapes):
         return sampler
@@ -53,7 +53,7 @@ def keep_shapes(sampler: SurfaceSampler, is_selected: Callable[[str], bool]) -> 
 
 
 def without_own_shape(sampler: SurfaceSampler, files: Sequence[MeshFile], index: int) -> SurfaceSampler:
-    """Return the sampler without the known shape, if it has one, that was made from the mesh `files[index]`."""
+    """Return the sampler without the known shape, if it has one, of the mesh `files[index]`."""
     return keep_shapes(sampler, lambda name: name != _name(files, index))
 
 

@@ -48,7 +48,7 @@ class Claim(NamedTuple):
 
 
 def _seconds(record: Record, method: str) -> dict[str, float]:
-    """Return the median time of a method's proposals in seconds, without the first, which may include compilation."""
+    """Return the median time (seconds) of a method's proposals except the first, which may compile."""
     seconds = [step["seconds"] for step in record["methods"][method].get("steps", [])][1:]
     return {"median": float(np.median(seconds))} if seconds else {}
 

@@ -77,7 +77,7 @@ def chapters(folder: str | Path) -> list[Chapter]:
 
 
 def _kinds() -> dict[str, type[Study]]:
-    """Return the classes of studies by name: first those of the registry, then other subclasses of `Study`."""
+    """Return the classes of studies by name: those of the registry, then other subclasses of `Study`."""
     kinds = {kind.__qualname__: kind for kind in (entry.load() for entry in studies().values())}
     todo = [Study]
     while todo:

@@ -79,7 +79,7 @@ def groups_of(table: pd.DataFrame) -> dict[str, int]:
 
 
 def tables(table: pd.DataFrame, study: type[Study], group: str = _ALL) -> list[tuple[str, pd.DataFrame]]:
-    """Return two tables of text per measure, each as a title and a data frame, from the `table` of `results`.
+    """Return two tables of text per measure, each as a title and a data frame, from `results`.
 
     Rows are methods, and columns are views or other keys. The first table has the means of the methods. The second has
     the leads: the reference's mean minus another method's. A table without rows is left out.
@@ -104,7 +104,7 @@ def tables(table: pd.DataFrame, study: type[Study], group: str = _ALL) -> list[t
 
 
 def _means(rows: pd.DataFrame, measure: Measure, best: pd.Series) -> list[str]:
-    """Format means with their interval if in percent, else with their standard error. A star marks the best."""
+    """Format means with their interval (if in percent) or standard error. A star marks the best."""
     texts = []
     for row, star in zip(rows.itertuples(), best, strict=True):
         if measure.unit == "%":

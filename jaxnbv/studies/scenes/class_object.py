@@ -40,7 +40,7 @@ class ClassObject(SignedDistance):
 
 
 class SolidObject(ClassObject):
-    """A solid made of labelled primitives in scene coordinates. The primitives with a label above 0 are the cue.
+    """A solid made of labelled primitives, in scene coordinates. Labels above 0 mark the cue.
 
     The solid, called with points, returns bounds of their signed distances, as `LabelledSolid` does.
     """

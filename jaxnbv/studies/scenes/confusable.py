@@ -31,7 +31,7 @@ _SIDES = [(-0.25, 0.0), (0.25, 0.0), (0.0, 0.15), (0.0, -0.15)]
 
 
 def _housing(side: float = 1.0, floor: float = _POCKET_FLOOR) -> SignedDistance:
-    """Make a block with a deep pocket that is open above, and a notch at one corner, which breaks the symmetry.
+    """Make a block with a deep pocket, open above, and a notch at a corner, which breaks the symmetry.
 
     - `side`: 1, or -1 for the mirror image; `floor`: height of the pocket's floor.
     """

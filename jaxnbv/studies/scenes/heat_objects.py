@@ -1,4 +1,4 @@
-"""Heated objects. Heat flows through their legs, panels, handle or fins, which are visible in few views."""
+"""Heated objects. Heat flows through legs, panels, handles or fins, which few views show."""
 
 from functools import partial
 

@@ -82,7 +82,7 @@ def _bed(rng):
 
 
 def _desk(rng):
-    """Build a desk with a back panel. It stands on two chests of drawers, or on one chest and on legs or a panel."""
+    """Build a desk with a back panel, on two chests of drawers, or on one chest and legs or a panel."""
     x, z, height, thick = rng.uniform(0.45, 0.6), rng.uniform(0.95, 1.2), rng.uniform(0.9, 1.1), 0.05
     yield box((0, height, 0), (x, thick, z))
     sides = (-1, 1) if rng.random() < 0.5 else (rng.choice([-1, 1]),)

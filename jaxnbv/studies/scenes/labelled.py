@@ -140,7 +140,7 @@ def _upright(axis):
 
 
 def assemble(primitives: list[Primitive], rotation_angle: float = 0.0, longest_side: float = 2.5) -> LabelledSolid:
-    """Return the union of primitives, rotated about the y axis by an angle in radians, then moved and scaled.
+    """Return the union of primitives, rotated about the y axis (radians), then moved and scaled.
 
     The bounding box of the result is centred in the scene and has this longest side.
     """

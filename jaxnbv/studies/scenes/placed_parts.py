@@ -71,7 +71,7 @@ def parts_in(files: tuple[MeshFile, ...]) -> Parts:
 
 
 def confusable_parts(index: int) -> tuple[str, Parts, int]:
-    """Return the name and the parts of the set `CONFUSABLE_SETS[index % 10]`, and the part of the scene `index`."""
+    """Return name and parts of the set `CONFUSABLE_SETS[index % 10]`, and the part of scene `index`."""
     cycle, set_index = divmod(index, len(CONFUSABLE_SETS))
     name = CONFUSABLE_SETS[set_index]
     order = np.random.default_rng(_ORDER_SEED + set_index).permutation(PARTS_OF_SET)
@@ -128,7 +128,7 @@ def place_part(parts: Parts, part: int, setup: Setup, key: PRNGKeyArray) -> Plac
 
 
 def _resting(vertices: Float[np.ndarray, "v 3"], random: np.random.Generator) -> Float[np.ndarray, "3 3"]:
-    """Return the rotation of a stable pose on a table (y is up), as likely as a dropped part comes to rest in it."""
+    """Draw a stable pose on a table (y is up), with the probability that a dropped part rests in it."""
     hull = trimesh.Trimesh(vertices, process=False).convex_hull
     matrices, probabilities = trimesh.poses.compute_stable_poses(hull)
     rest_rotation = matrices[random.choice(len(probabilities), p=probabilities / probabilities.sum())][:3, :3]
@@ -138,7 +138,7 @@ def _resting(vertices: Float[np.ndarray, "v 3"], random: np.random.Generator) ->
 
 
 def _obstacles(half: Float[np.ndarray, "3"], has_box: bool, random: np.random.Generator) -> Obstacles:
-    """Return a table below a centred part of half sizes `half`, and a box that hides half of one side if `has_box`."""
+    """Return a table below a part of these half sizes, with or without a box that hides half a side."""
     table = HalfSpace(np.array([0.0, -half[1], 0.0]), np.array([0.0, 1.0, 0.0]))
     if not has_box:
         return Obstacles((table,))

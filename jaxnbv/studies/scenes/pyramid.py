@@ -14,7 +14,7 @@ from jaxnbv.studies.scenes.splits import Split, scene_key
 
 
 class Pyramid(ClassObject):
-    """A pyramid in scene coordinates. The pattern imprinted on its base tells its class, an index in `PATTERNS`."""
+    """A pyramid in scene coordinates. The pattern on its base, of `PATTERNS`, tells its class."""
 
     solid: ImprintedPyramid
     label: Int[Array, ""]

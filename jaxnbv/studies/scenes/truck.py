@@ -61,7 +61,7 @@ def random_rotation(rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:
 
 
 def _truck(rng: np.random.Generator) -> tuple[list[Primitive], Float[np.ndarray, "2 3"]]:
-    """Return the primitives of a truck that faces x, and the lowest and highest corner of the space above its bed."""
+    """Return the primitives of a truck that faces x, and the corners of the space above its bed."""
     wheel, half_width = rng.uniform(0.16, 0.22), rng.uniform(0.52, 0.62)
     bed, cab, rail = rng.uniform(1.05, 1.35), rng.uniform(0.4, 0.6), rng.uniform(0.4, 0.5)
     hood = rng.choice([0.0, rng.uniform(0.3, 0.45)])
