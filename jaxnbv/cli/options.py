@@ -57,14 +57,14 @@ def command(options: type[T], more: Mapping[str, Any] = {}) -> Callable[[Callabl
             further = {name: values.pop(name) for name in more}
             function(options(**values), **further)
 
-        hints, fields = get_type_hints(options, include_extras=True), dataclasses.fields(options)  # type: ignore[arg-type]
+        hints, empty = get_type_hints(options, include_extras=True) | dict(more), inspect.Parameter.empty
+        fields = {one.name: one.default for one in dataclasses.fields(options)}  # type: ignore[arg-type]
+        defaults = {name: empty if default is dataclasses.MISSING else default for name, default in fields.items()}
+        for name, hint in more.items():
+            defaults[name] = empty if isinstance(get_args(hint)[-1], ArgumentInfo) else None
         parameters = [
-            _parameter(one.name, hints[one.name], _EMPTY if one.default is dataclasses.MISSING else one.default)
-            for one in fields
-        ]
-        parameters += [
-            _parameter(name, hint, _EMPTY if isinstance(get_args(hint)[-1], ArgumentInfo) else None)
-            for name, hint in more.items()
+            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=hints[name])
+            for name, default in defaults.items()
         ]
         call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         call.__name__, call.__doc__ = function.__name__, function.__doc__
@@ -91,10 +91,3 @@ class Command(TyperCommand):
                 words.append(flag)
             words.append(word)
         return super().parse_args(ctx, words)
-
-
-_EMPTY = inspect.Parameter.empty
-
-
-def _parameter(name: str, annotation: Any, default: Any) -> inspect.Parameter:
-    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)

@@ -5,7 +5,7 @@ import html
 import threading
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -50,9 +50,6 @@ from jaxnbv.viz.style import (
 )
 from jaxnbv.viz.task import coverage_answers
 from jaxnbv.viz.words import pose_text
-
-# Kinds of object with their probabilities.
-Kinds: TypeAlias = tuple[tuple[str, float], ...]
 
 _NEXT_COLOUR = "#009e73"
 _EYE = (2.6, 1.7, 2.6)
@@ -168,23 +165,25 @@ class LiveView:
 
 def _surfaces(
     sampler: SurfaceSampler, observations: Observations, key: PRNGKeyArray, answer: Answer | None
-) -> tuple[MeanSurface | None, list[tuple[str, Triangles]], Kinds]:
-    """Return the surface to show, some imagined surfaces with names, and the kinds of known shapes.
+) -> tuple[MeanSurface | None, list[tuple[str, Triangles]], list[tuple[str, float]]]:
+    """Return the surface to show, some imagined surfaces with names, and kinds of known shapes with probabilities.
 
     With known parts, the imagined surfaces are the likeliest parts. The surface agrees with the `answer`.
     """
     if isinstance(observations.hypotheses, PartHypotheses):
         parts = placed_parts(observations.hypotheses, NUM_SHOWN)
         surface = shown_surface(sampler, StepInputs(observations))
-        return surface, [(part.name, (part.vertices, part.faces)) for part in parts], ()
+        return surface, [(part.name, (part.vertices, part.faces)) for part in parts], []
     inputs = sampler.step_inputs(observations, key)
     surface = shown_surface(sampler, inputs, answer)
     names, meshes, kinds = sampled_surfaces(sampler, inputs, key)
     imagined = [(name, triangles) for name, triangles in zip(names, meshes, strict=True) if triangles is not None]
-    return surface, imagined, tuple(kinds.items())
+    return surface, imagined, list(kinds.items())
 
 
-def _live_text(episode: Episode, answer: Answer | None, kinds: Kinds, proposal: Proposal | None) -> str:
+def _live_text(
+    episode: Episode, answer: Answer | None, kinds: list[tuple[str, float]], proposal: Proposal | None
+) -> str:
     """Return the answer, the next view (in world units), the amount seen and the kinds of known shapes, as Markdown."""
     num_views, quantity, frame = len(episode.views), episode.planner.quantity, episode.frame
     lines = list[str]()
