@@ -20,8 +20,8 @@ def sentinel_pixels(image: Real[np.ndarray, "h w"], max_depth: float) -> Bool[np
     far more pixels than any similar value. A value of all measured pixels is no sentinel: the image may show a wall.
 
     - `image`: depths in any units.
-    - `max_depth`: the largest relevant depth, in the image's units. If it is infinite (unknown), the latter must be more
-      than twice any other value.
+    - `max_depth`: the largest relevant depth, in the image's units. If it is infinite (unknown), the latter must be
+      more than twice any other value.
     """
     is_integer = np.issubdtype(image.dtype, np.integer)
     is_largest = image == np.iinfo(image.dtype).max if is_integer else np.zeros(image.shape, bool)
