@@ -49,7 +49,8 @@ SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 # A worker takes whole files, so that fixtures of a module run once. The longest files come first.
 LONGEST_FIRST = (
-    "test_cli.py",
+    "test_messages.py",
+    "test_demo_command.py",
     "test_episodes.py",
     "test_depth_image.py",
     "test_pages.py",

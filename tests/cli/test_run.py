@@ -59,3 +59,39 @@ def test_a_view_is_printed_when_it_is_done(ring):
     assert "stopped here" in result.stderr
     assert "view 1   (" in result.stdout
     assert "view 2" not in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("search", "model"),
+    [
+        ("farthest", "screened"),
+        pytest.param("random", "paper", marks=pytest.mark.slow),
+        ("uncertainty", "paper"),
+        pytest.param("gradient-constrained", "screened", marks=pytest.mark.slow),
+    ],
+)
+def test_run_takes_a_mesh_each_search_and_each_model(search, model, ring):
+    named = () if model == "screened" else ("--model", model)
+    arguments = ("run", "ring.ply", "--quick", "--views", "2", "--search", search, "--out", "mine", "--no-report")
+    result = run_command(*arguments, *named, cwd=ring)
+    assert result.returncode == 0, result.stderr
+    config = json.loads((ring / "mine" / "episode.json").read_text())["config"]
+    sampler = config["planner"]["sampler"]
+    assert sampler["model"]["type"].partition(":")[2] == {"screened": "ScreenedSPSR", "paper": "GeometricSPSR"}[model]
+    assert (sampler["carving"] is None) == (model == "paper")
+    with np.load(ring / "mine" / "view_01.npz") as view:
+        positions, values = view["proposal.candidates.position"], view["proposal.values"]
+        if "proposal.trajectories.values" in view:
+            positions = np.concatenate([positions, view["proposal.trajectories.poses.position"].reshape(-1, 3)])
+            values = np.concatenate([values, view["proposal.trajectories.values"].ravel()])
+        chosen = np.flatnonzero((positions == view["pose.position"]).all(axis=1))
+        assert values[chosen].max() == values.max() == view["proposal.value"]
+
+
+@pytest.mark.slow
+def test_a_published_checkpoint_classifies_a_mesh(ring, shared):
+    network = str(shared / "reference" / "pointnet2_cls_ssg.pth")
+    arguments = ("--task", "mixed", "--network", network, "--quick", "--views", "2", "--no-report")
+    result = run_command("run", "ring.ply", *arguments, cwd=ring)
+    assert result.returncode == 0, result.stderr
+    assert "(was " in result.stdout
