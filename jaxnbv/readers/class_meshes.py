@@ -27,7 +27,7 @@ _SYNSETS = {category.name: category.synset for category in CATEGORIES}
 
 
 class MeshFile(NamedTuple):
-    """A mesh file with index of the class, name and upward axis (see `Frame`) of its object."""
+    """A mesh file, with the class index, the name and the upward axis (see `Frame`) of its object."""
 
     label: int
     name: str

@@ -16,7 +16,7 @@ _NUM_FRAMES, _MIN_FRAMES, _NUM_BLOCKS = 16, 4, 80
 _BLOCK_TOLERANCE, _POINT_TOLERANCE = 0.02, 0.05
 # Neighbouring blocks belong to the same component if their depths differ by at most this factor.
 _MAX_DEPTH_RATIO = 1.1
-# A component belongs to the mount if frames look through its place this many times as often as they see surface there.
+# A component of the mount has a higher ratio of frames that see through its place to frames that see surface there.
 _MIN_DEEPER_RATIO = 4
 
 
@@ -70,7 +70,7 @@ def _is_mount(
     camera: Camera,
     side: int,
 ) -> Bool[np.ndarray, "k l"]:
-    """Return the connected components of `candidate_depth` through whose place in a frame other frames see.
+    """Return a mask of the connected components of `candidate_depth` that other frames see through.
 
     - `candidate_depth`: depths of the blocks with the same depth in most frames, in world units; zero elsewhere.
     - `depths`: depths of the blocks in each frame, in world units.

@@ -200,7 +200,7 @@ _READERS: dict[str, Callable[[Path], _StoredRecording]] = {
 
 
 def _with_pose(files: list[Path], has_pose: Bool[np.ndarray, " n"], folder: Path) -> list[Path]:
-    """Return the files with a valid pose. Warns if files without one are left out, and raises if these are most."""
+    """Return the files with a valid pose. Warns if some have none, and raises `ValueError` if most have none."""
     names = [file.name for file, is_posed in zip(files, has_pose, strict=True) if not is_posed]
     problem = f"{len(names)} of the {len(files)} poses in {folder} are no rigid motion, the first that of {names[:1]}"
     require(

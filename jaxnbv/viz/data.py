@@ -35,7 +35,7 @@ class ViewData(eqx.Module):
 
     - `view`: the view, with the values of its proposal in world units.
     - `before`, `new`: points of the cloud before the view, and points that the view added, in scene coordinates.
-    - `surface`, `has_shape`: see `shown_surface`, but with the deviation in world units; whether it is a known shape.
+    - `surface`: see `shown_surface`, but with the deviation in world units. `has_shape`: whether it is a known shape.
     - `coverage`: amount of surface seen after the view.
     - `sentences`: see `sentences_about`.
     - `imagined`, `image`: see `render_imagined` and `view_image`.
@@ -115,7 +115,7 @@ def report_data(
     """Compute everything that the pictures of an episode show.
 
     - `truth`, `rival`: see `write_report`.
-    - `imagine`: whether to show the surfaces that the steps imagined.
+    - `imagine`: whether to show the surfaces that the steps imagined, and surface that no view could measure.
     - `sketches`: sketches made while the episode ran. Steps without a sketch are computed again.
     """
     planner, frame = episode.planner, episode.frame

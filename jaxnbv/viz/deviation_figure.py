@@ -78,7 +78,7 @@ def deviation_figure(
 def _two_eyes(
     scene: TriangleMesh, values_at: Values, positions: Float[np.ndarray, "k 3"], outward: Float[np.ndarray, "k 3"]
 ) -> Float[np.ndarray, "2 3"]:
-    """Return two directions from which one sees most of the scan and of the places at `positions` (scene)."""
+    """Return two viewing directions that together show most of the scan and of the places (scene coordinates)."""
     mesh = scene.to_trimesh()
     samples, rows = trimesh.sample.sample_surface(mesh, _NUM_SAMPLES, seed=0)
     normals = mesh.face_normals[rows]

@@ -45,7 +45,7 @@ class ShadedImage(eqx.Module):
 class Imagined(eqx.Module):
     """Imagined surfaces of a step before its view.
 
-    - `samples`, `names`: pictures from the chosen pose of some sampled surfaces or of the likeliest parts, and names.
+    - `samples`, `names`: pictures from the chosen pose of some sampled surfaces or of the likeliest parts.
     - `kinds`: kinds of known shapes with their probabilities. Empty without known shapes.
     """
 
@@ -131,7 +131,7 @@ def _fine_camera(camera: Camera) -> Camera:
 
 
 def colour_image(image: ShadedImage, new_colour: str = BEFORE, is_plain: bool = False) -> UInt8[np.ndarray, "h w 3"]:
-    """Colour a surface grey where seen before, or everywhere if `is_plain`, and `new_colour` elsewhere."""
+    """Colour a surface grey where seen before (if `is_plain` everywhere), else `new_colour`, on white."""
     tints = np.array([mpl.colors.to_rgb(colour) for colour in (new_colour, _SEEN_COLOUR)])
     colours = tints[(image.is_seen | is_plain).astype(int)] * (0.25 + 0.75 * image.brightness[..., None])
     return np.round(255.0 * np.where(image.mask[..., None], colours, 1.0)).astype(np.uint8)

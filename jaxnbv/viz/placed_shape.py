@@ -49,7 +49,7 @@ _NORMAL_WEIGHT = 0.1
 class PlacedShape(MeanSurface):
     """A known shape at its registered placement, in scene coordinates. Its deviation is zero.
 
-    - `name`, `probability`: of the part, or of the kind of shape.
+    - `name`, `probability`: those of the part, or of the kind of shape.
     - `measured`: 1 where points were scanned, 0 where the shape is imagined.
     - `agreed`: 1 where most hypotheses have the same surface, 0 where few do.
     - `disputed_space`: surface of the space that other hypotheses fill.

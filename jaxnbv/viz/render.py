@@ -161,7 +161,7 @@ def _barycentric(points: Float[np.ndarray, "n 3"], corners: Float[np.ndarray, "n
 
 
 def _occlusion(mask: Bool[np.ndarray, "h w"], depth: Float[np.ndarray, " hits"]) -> Float[np.ndarray, " hits"]:
-    """Return by which fraction to darken hits deeper than the mean around them (Luft, Colditz and Deussen 2006)."""
+    """Return the fraction by which to darken hits in hollows (Luft, Colditz and Deussen 2006)."""
     width, depths = round(_OCCLUSION_WIDTH * len(mask)), np.zeros(mask.shape)
     depths[mask] = depth
     # Two filters in a row, so that a pixel's weight falls off with distance.

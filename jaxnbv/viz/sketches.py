@@ -59,7 +59,7 @@ def sketches_of(
 
     - `all_observations`, `answers`: observations and answer after each view.
     - `by_view`: sketches that exist already, keyed by the index of the step's view.
-    - `imagine`: whether new sketches show what was imagined.
+    - `imagine`: whether new sketches have more than the surface.
     """
     planner, sampler = episode.planner, episode.planner.sampler
     for index, (observations, answer) in enumerate(zip(all_observations, answers, strict=True), start=1):
@@ -74,13 +74,13 @@ def sketches_of(
                 sample_key, *_ = view_keys(episode.key, index)
                 surfaces = sampler.sample(observations, sample_key, posterior)
             inputs = StepInputs(observations, posterior, surfaces)
-        yield _sketch(episode, index, inputs, answer, is_imagined)
+        yield _sketch(episode, index, inputs, answer, imagine)
 
 
-def _sketch(
-    episode: Episode, index: int, inputs: StepInputs, answer: Answer | None, is_imagined: bool = True
-) -> Sketch:
+def _sketch(episode: Episode, index: int, inputs: StepInputs, answer: Answer | None, imagine: bool = True) -> Sketch:
     sampler = episode.planner.sampler
     surface = shown_surface(sampler, inputs, answer)
+    if not imagine:
+        return Sketch(surface, None)
     patches = [] if surface is None else unmeasured(surface.mesh, inputs.observations, sampler.carving)
-    return Sketch(surface, render_imagined(episode, index, inputs) if is_imagined else None, patches)
+    return Sketch(surface, render_imagined(episode, index, inputs) if index < len(episode.views) else None, patches)

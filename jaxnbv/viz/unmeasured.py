@@ -15,7 +15,7 @@ from jaxnbv.scanning import Carving, TriangleMesh
 from jaxnbv.viz.answers import number_text, point_text
 from jaxnbv.viz.mean_surface import padded
 
-# Least number of views that looked at a patch (one may be chance), least fraction of the surface, number of patches.
+# Least number of views that looked at a patch (one may be chance), least fraction of the surface, most patches.
 _MIN_LOOKS, _MIN_AREA, _MAX_PATCHES = 2, 0.005, 3
 
 

@@ -59,7 +59,7 @@ class Task(ABC):
 
     @abstractmethod
     def acquisition(self, mesh: "nbv.TriangleMesh", camera: "nbv.Camera", first: "nbv.Pose") -> "nbv.Acquisition":
-        """Make the acquisition for views of a user's mesh, of which `first` is the first."""
+        """Make the acquisition for views of a user's mesh. `first` is the pose of the first view."""
 
     def bank(self, mesh: "nbv.TriangleMesh") -> "str | nbv.ShapeBank":
         """Return the known shapes for a user's mesh: a name as in `--known`, or parts in scene units."""

@@ -31,7 +31,7 @@ class ClassTask(Task):
 
     @classmethod
     def demo(cls, scene: int, seed: int) -> Subject:
-        """Return a truck, the class of whose cargo is asked, and a first view that hides the cargo.
+        """Return a truck whose cargo is to be classified, and a first view from above that hides it.
 
         Surfaces are imagined on the grid that was used to train the classifier.
         """
