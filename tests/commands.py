@@ -33,3 +33,10 @@ def run_command(*arguments: str, cwd) -> subprocess.CompletedProcess:
         except SystemExit as leaving:
             code = leaving.code or 0
     return subprocess.CompletedProcess(arguments, code, stdout.getvalue(), stderr.getvalue())
+
+
+def run_without_error(*arguments: str, cwd) -> subprocess.CompletedProcess:
+    """The result of `run_command`, without an error."""
+    result = run_command(*arguments, cwd=cwd)
+    assert result.returncode == 0, result.stderr
+    return result

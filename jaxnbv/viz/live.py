@@ -28,6 +28,7 @@ from jaxnbv.search import Proposal
 from jaxnbv.storage.files import write_text
 from jaxnbv.surfaces.part_hypotheses import PartHypotheses
 from jaxnbv.utility import Answer, Quantity
+from jaxnbv.viz import style
 from jaxnbv.viz.answers import capital, kinds_text, value_text, words_of
 from jaxnbv.viz.choice import colour_range, open_values
 from jaxnbv.viz.imagined import NUM_SHOWN, Triangles, sampled_surfaces
@@ -35,19 +36,6 @@ from jaxnbv.viz.mean_surface import MeanSurface
 from jaxnbv.viz.placed_shape import PlacedShape, placed_parts
 from jaxnbv.viz.scene import Cameras, Points, scene_items
 from jaxnbv.viz.shown_surface import shown_surface
-from jaxnbv.viz.style import (
-    BEFORE,
-    DEVIATION,
-    DISPUTED,
-    GREY,
-    IMAGINED,
-    NEW,
-    PART,
-    VALUE,
-    gradient,
-    middle_range,
-    shape_colours,
-)
 from jaxnbv.viz.task import coverage_answers
 from jaxnbv.viz.words import pose_text
 
@@ -219,16 +207,16 @@ def _draw_surface(scene: Any, surface: MeanSurface | None) -> list[Any]:
     if surface is None:
         return []
     if isinstance(surface, PlacedShape):
-        vertex_colors = np.round(255.0 * shape_colours(surface.measured, surface.agreed)).astype(np.uint8)
+        vertex_colors = np.round(255.0 * style.shape_colours(surface.measured, surface.agreed)).astype(np.uint8)
         mesh = trimesh.Trimesh(surface.vertices, surface.faces, vertex_colors=vertex_colors, process=False)
         name = f"/likeliest {'part' if surface.is_part else 'shape'}, {surface.caption}"
         handles = [scene.add_mesh_trimesh(name, mesh)]
         if (disputed_space := surface.disputed_space) is not None:
-            glass: dict[str, Any] = {"color": to_rgb(DISPUTED), "opacity": 0.25}
+            glass: dict[str, Any] = {"color": to_rgb(style.DISPUTED), "opacity": 0.25}
             triangles = disputed_space.vertices, disputed_space.faces
             handles.append(scene.add_mesh_simple("/other shapes", *triangles, **glass))
         return handles
-    colours = DEVIATION(LogNorm(*middle_range(surface.deviation))(surface.deviation), bytes=True)
+    colours = style.DEVIATION(LogNorm(*style.middle_range(surface.deviation))(surface.deviation), bytes=True)
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, vertex_colors=colours, process=False)
     return [scene.add_mesh_trimesh("/surface of the mean", mesh)]
 
@@ -253,7 +241,7 @@ def _draw_choice(scene: Any, camera: Camera, proposal: Proposal, picture: np.nda
     is_open = np.isfinite(values)
     if is_open.any():
         places = np.asarray(proposal.candidates.position)[is_open]
-        colours = VALUE(Normalize(*colour_range(values))(values[is_open]), bytes=True)[:, :3]
+        colours = style.VALUE(Normalize(*colour_range(values))(values[is_open]), bytes=True)[:, :3]
         settings: dict[str, Any] = {"point_size": _CANDIDATE_SIZE, "point_shape": "circle"}
         handles.append(scene.add_point_cloud("/candidates", places, colours, **settings))
     return [*handles, _frustum(scene, "/next view", camera, proposal.pose, _NEXT_COLOUR, picture)]
@@ -261,26 +249,29 @@ def _draw_choice(scene: Any, camera: Camera, proposal: Proposal, picture: np.nda
 
 def _legend(surface: MeanSurface | None, proposal: Proposal | None, quantity: Quantity, frame: Frame) -> str:
     """Return the legend of the colours as HTML."""
-    marks = [("points before", BEFORE), ("new points, last camera", NEW), ("earlier cameras", GREY)]
+    marks = [("points before", style.BEFORE), ("new points, last camera", style.NEW), ("earlier cameras", style.GREY)]
     marks += [] if proposal is None else [("next view", _NEXT_COLOUR)]
     if isinstance(surface, PlacedShape):
         kind = "part" if surface.is_part else "known shape"
-        shapes = [(f"likeliest {kind}: {html.escape(surface.caption)}", PART), ("its imagined parts", IMAGINED)]
-        marks[:0] = [*shapes, ("where other shapes disagree", DISPUTED)]
+        marks[:0] = [
+            (f"likeliest {kind}: {html.escape(surface.caption)}", style.PART),
+            ("its imagined parts", style.IMAGINED),
+            ("where other shapes disagree", style.DISPUTED),
+        ]
     rows = [f'<div><b style="color:{colour}">&#9679;</b> {name}</div>' for name, colour in marks]
     if surface is not None and not isinstance(surface, PlacedShape):
-        low, high = middle_range(frame.length_to_world(surface.deviation))
-        rows.append(_bar(f"the surface is known to, in {frame.unit}", DEVIATION, f"{low:g}", f"{high:g}"))
+        low, high = style.middle_range(frame.length_to_world(surface.deviation))
+        rows.append(_bar(f"the surface is known to, in {frame.unit}", style.DEVIATION, f"{low:g}", f"{high:g}"))
     if proposal is not None and np.isfinite(proposal.values).any():
         ends = (value_text(quantity, value, frame) for value in colour_range(open_values(proposal)))
-        rows.append(_bar(f"candidates: {quantity.name}", VALUE, *ends))
+        rows.append(_bar(f"candidates: {quantity.name}", style.VALUE, *ends))
     return f'<div style="padding:0 1em 1em;font-size:.85em">{"".join(rows)}</div>'
 
 
 def _bar(name: str, colours: Colormap, low: str, high: str) -> str:
     return (
         f'<div style="margin-top:.5em">{name}</div>'
-        f'<div style="height:.7em;background:{gradient(colours)}"></div>'
+        f'<div style="height:.7em;background:{style.gradient(colours)}"></div>'
         f'<div style="display:flex;justify-content:space-between"><span>{low}</span><span>{high}</span></div>'
     )
 

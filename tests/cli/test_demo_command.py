@@ -12,7 +12,7 @@ import weakref
 from unittest import mock
 
 import pytest
-from commands import run_command, run_process
+from commands import run_command, run_process, run_without_error
 
 from jaxnbv.cli import play
 from jaxnbv.cli.tasks import TASKS
@@ -54,8 +54,7 @@ def test_the_demo_runs_in_its_own_process_and_the_same_command_continues_it(tmp_
     name = "truck-cross-entropy-halving-seed2"
     out = check_demo(tmp_path, run_process(*options, "--views", "2", cwd=tmp_path), name)
     before = {path.name: path.read_bytes() for path in out.glob("view_*.npz")}
-    result = run_command(*options, "--views", "3", "--until", "never", "--no-report", cwd=tmp_path)
-    assert result.returncode == 0, result.stderr
+    run_without_error(*options, "--views", "3", "--until", "never", "--no-report", cwd=tmp_path)
     assert (out / "view_02.npz").exists()
     assert all((out / name).read_bytes() == content for name, content in before.items())
 
@@ -64,8 +63,7 @@ def test_a_rule_ends_it_and_says_what_is_saved(tmp_path):
     """No other candidate is within a travel of 0.1."""
     arguments = ("demo", "--task", "coverage", "--quick", "--views", "3", "--search", "farthest", "--no-report")
     rules = ("--until", "travel=0.1", "--until", "seconds=1e6")
-    result = run_command(*arguments, *rules, "--out", "mine", cwd=tmp_path)
-    assert result.returncode == 0, result.stderr
+    result = run_without_error(*arguments, *rules, "--out", "mine", cwd=tmp_path)
     assert "enough   after view 1: the next view would cost" in result.stdout
     assert "Views saved: 2 of 3" in result.stdout
     assert len(list((tmp_path / "mine").glob("view_*.npz"))) == 1
@@ -140,8 +138,7 @@ def test_no_posterior_waits_for_a_rival_or_for_an_earlier_drawing(tmp_path, monk
     monkeypatch.setattr(play.viz, "Sketches", Drawings)
     monkeypatch.setattr(play.viz, "write_report", lambda *arguments, **settings: "report.html")
     with mock.patch.multiple(play, **changes):
-        result = run_command("demo", "--task", "coverage", cwd=tmp_path)
-    assert result.returncode == 0, result.stderr
+        result = run_without_error("demo", "--task", "coverage", cwd=tmp_path)
     assert "a race" in result.stdout
     assert references == [False, False, True]
 
@@ -149,8 +146,7 @@ def test_no_posterior_waits_for_a_rival_or_for_an_earlier_drawing(tmp_path, monk
 @pytest.mark.slow
 def test_the_demo_of_a_task_tells_what_was_found(tmp_path):
     setting = ("--task", "parts", "--known", "parts", "--scene", "7", "--quick", "--views", "2", "--search", "farthest")
-    result = run_command("demo", *setting, cwd=tmp_path)
-    assert result.returncode == 0, result.stderr
+    result = run_without_error("demo", *setting, cwd=tmp_path)
     assert result.stdout.count("wheel") == 2
     (report,) = tmp_path.rglob("report.html")
     assert "Points predicted of each part" in report.read_text()

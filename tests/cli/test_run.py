@@ -6,7 +6,7 @@ from unittest import mock
 import numpy as np
 import pytest
 import trimesh
-from commands import run_command
+from commands import run_command, run_without_error
 
 from jaxnbv.checks import InputError
 from jaxnbv.planning.planner import Planner
@@ -33,8 +33,7 @@ def border_hits(file):
 
 @pytest.mark.parametrize("asked", [(), ("--task", "heat")])
 def test_an_object_fits_the_view(asked, ring):
-    result = run_command(*FARTHEST, *asked, "--out", "mine", cwd=ring)
-    assert result.returncode == 0, result.stderr
+    run_without_error(*FARTHEST, *asked, "--out", "mine", cwd=ring)
     for file in sorted((ring / "mine").glob("view_*.npz")):
         hits, total = border_hits(file)
         assert hits == 0
@@ -42,8 +41,7 @@ def test_an_object_fits_the_view(asked, ring):
 
 
 def test_the_papers_close_up_is_there_when_asked(ring):
-    result = run_command(*FARTHEST, "--paper", cwd=ring)
-    assert result.returncode == 0, result.stderr
+    run_without_error(*FARTHEST, "--paper", cwd=ring)
     out = ring / "runs" / "ring-coverage-farthest-seed0"
     assert border_hits(out / "view_00.npz")[0] > 20
     config = json.loads((out / "episode.json").read_text())["config"]
@@ -73,8 +71,7 @@ def test_a_view_is_printed_when_it_is_done(ring):
 def test_run_takes_a_mesh_each_search_and_each_model(search, model, ring):
     named = () if model == "screened" else ("--model", model)
     arguments = ("run", "ring.ply", "--quick", "--views", "2", "--search", search, "--out", "mine", "--no-report")
-    result = run_command(*arguments, *named, cwd=ring)
-    assert result.returncode == 0, result.stderr
+    run_without_error(*arguments, *named, cwd=ring)
     config = json.loads((ring / "mine" / "episode.json").read_text())["config"]
     sampler = config["planner"]["sampler"]
     assert sampler["model"]["type"].partition(":")[2] == {"screened": "ScreenedSPSR", "paper": "GeometricSPSR"}[model]
@@ -92,6 +89,5 @@ def test_run_takes_a_mesh_each_search_and_each_model(search, model, ring):
 def test_a_published_checkpoint_classifies_a_mesh(ring, shared):
     network = str(shared / "reference" / "pointnet2_cls_ssg.pth")
     arguments = ("--task", "mixed", "--network", network, "--quick", "--views", "2", "--no-report")
-    result = run_command("run", "ring.ply", *arguments, cwd=ring)
-    assert result.returncode == 0, result.stderr
+    result = run_without_error("run", "ring.ply", *arguments, cwd=ring)
     assert "(was " in result.stdout

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 import typer
-from commands import run_command
+from commands import run_command, run_without_error
 
 from jaxnbv.cli import app
 from jaxnbv.studies.registry import studies
@@ -33,14 +33,12 @@ def test_the_help_of_studies_is_an_overview_and_that_of_a_study_has_its_options_
 def test_the_study_writes_tables_and_figures_and_continues(tmp_path):
     arguments = ("study", "pyramid", "--quick", "--views", "2", "--framing", "whole", "--out", "mine")
     some = ("--methods", "farthest,oracle")
-    result = run_command(*arguments, *some, "--scenes", "1", cwd=tmp_path)
-    assert result.returncode == 0, result.stderr
+    result = run_without_error(*arguments, *some, "--scenes", "1", cwd=tmp_path)
     assert "not the full study" in result.stdout
     folder = tmp_path / "mine" / "whole"
     first = (folder / "scene_0000.json").read_bytes()
     assert {"results.csv", "chart.png", "scene_0000.png"} <= {path.name for path in folder.iterdir()}
-    result = run_command(*arguments, *some, "--scenes", "2", cwd=tmp_path)
-    assert result.returncode == 0, result.stderr
+    result = run_without_error(*arguments, *some, "--scenes", "2", cwd=tmp_path)
     assert (folder / "scene_0000.json").read_bytes() == first
     assert (folder / "scene_0001.json").exists()
     result = run_command(*arguments, "--methods", "farthest,best", cwd=tmp_path)
@@ -52,8 +50,7 @@ def test_the_study_writes_tables_and_figures_and_continues(tmp_path):
 @pytest.mark.parametrize("name", ["heat", "reconstruction"])
 def test_each_study_writes_tables_figures_and_pictures(name, tmp_path):
     sizes = ("--quick", "--scenes", "1", "--views", "2", "--methods", "farthest,random")
-    result = run_command("study", name, *sizes, "--out", "it", cwd=tmp_path)
-    assert result.returncode == 0, result.stderr
+    result = run_without_error("study", name, *sizes, "--out", "it", cwd=tmp_path)
     assert "not the full study" in result.stdout
     written = {path.name for path in (tmp_path / "it").iterdir()}
     assert {"study.json", "scene_0000.json", "results.csv", "chart.png", "scene_0000.png"} <= written
