@@ -13,7 +13,7 @@ and the bias b of a layer: W' = W g / sqrt(v + eps), b' = (b - m) g / sqrt(v + e
 the running mean m and the running variance v of the normalisation, and eps = 1e-5.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import jax.numpy as jnp
 import numpy as np
@@ -44,22 +44,22 @@ def published_network(tensors: Tensors) -> PointNet2Classifier | PointNet2PartSe
 
 def _classifier(state: "_State") -> PointNet2Classifier:
     levels, whole, _ = _encoder(state, SCALES, {3: "points", 6: "with normals"})
-    first = state.linear("fc1", _width(whole.layers), "bn1")
-    second = state.linear("fc2", _width((first,)), "bn2")
-    return PointNet2Classifier(levels, whole, (first, second), state.linear("fc3", _width((second,))))
+    first = state.linear("fc1", _width(whole.layers[-1]), "bn1")
+    second = state.linear("fc2", _width(first), "bn2")
+    return PointNet2Classifier(levels, whole, (first, second), state.linear("fc3", _width(second)))
 
 
 def _part_segmenter(state: "_State") -> PointNet2PartSegmenter:
     levels, whole, widths = _encoder(state, PARTS_SCALES, {6: "points", 9: "with normals"})
-    width = _width(whole.layers)
+    width = _width(whole.layers[-1])
     propagations = []
     # The last propagation takes, beside the interpolated features, the category, coordinates and features of the point.
     for number, own in ((3, widths[2]), (2, widths[1]), (1, None)):
         layers = state.layers(f"fp{number}.mlp_convs", None if own is None else own + width)
         propagations.append(FeaturePropagation(layers))
-        width = _width(layers)
+        width = _width(layers[-1])
     hidden = state.linear("conv1", width, "bn1")
-    last = state.linear("conv2", _width((hidden,)))
+    last = state.linear("conv2", _width(hidden))
     network = PointNet2PartSegmenter(levels, whole, tuple(propagations), hidden, last)
     require(network.num_categories > 0, "the tensor fp1.mlp_convs.0.weight has no inputs for categories")
     return network
@@ -83,7 +83,7 @@ def _encoder(
         blocks = [f"conv_blocks.{index}" for index in range(len(level.radii))] if is_multi_scale else ["mlp_convs"]
         branches = tuple(state.pooled(f"sa{number}.{block}", 3 + widths[-1], roll=is_multi_scale) for block in blocks)
         levels.append(SetAbstraction(branches, level.radii, level.members, level.centers))
-        widths.append(sum(_width(branch.layers) for branch in branches))
+        widths.append(sum(_width(branch.layers[-1]) for branch in branches))
     return tuple(levels), state.pooled("sa3.mlp_convs", 3 + widths[-1]), widths
 
 
@@ -137,7 +137,7 @@ class _State:
         while not layers or f"{name}.{len(layers)}.weight" in self.tensors:
             number = len(layers)
             layers.append(self.linear(f"{name}.{number}", inputs, f"{norm}.{number}", roll and number == 0))
-            inputs = _width(layers)
+            inputs = _width(layers[-1])
         return tuple(layers)
 
     def pooled(self, name: str, inputs: int, roll: bool = False) -> PooledMLP:
@@ -146,5 +146,5 @@ class _State:
         return PooledMLP(layers)
 
 
-def _width(layers: Sequence[Linear]) -> int:
-    return layers[-1].bias.shape[0]
+def _width(layer: Linear) -> int:
+    return layer.bias.shape[0]

@@ -1,7 +1,4 @@
-"""Settings of the paper's experiments on parts and on heat, which differ from `USUAL_SETTING`.
-
-Each `Setting` holds the camera, the radius of the sphere of candidates and the number of candidates.
-"""
+"""Settings of the paper's experiments on parts and on heat, which differ from `USUAL_SETTING`."""
 
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.scanning.sensors import Setting

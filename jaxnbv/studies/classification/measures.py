@@ -1,7 +1,6 @@
 """Measures of classification studies: hits, visible cues, and the quality of samples and values.
 
-A view is a first hit if at least one prediction up to this view is the right class. A view is a stable hit if all
-predictions from this view to the last view are the right class. The cue is the part of an object that tells its class.
+The cue is the part of an object that tells its class.
 """
 
 from collections.abc import Callable

@@ -1,7 +1,4 @@
-"""Functions that run the trials of a study, one after the other in this process or with an executor.
-
-A trial runs all methods on one scene.
-"""
+"""Functions that run trials (all methods on one scene), in this process or with an executor."""
 
 import functools
 import traceback
@@ -19,7 +16,7 @@ class Failure(NamedTuple):
     traceback: str
 
 
-# Function that runs all methods on the scene with an index.
+# Function from the index of a scene to the record of all methods.
 Trial: TypeAlias = Callable[[int], Record]
 Outcome: TypeAlias = Record | Failure
 Outcomes: TypeAlias = Generator[tuple[int, Outcome], None, None]

@@ -95,7 +95,6 @@ class NearestPart(Segmenter):
         return jax.vmap(interpolate, out_axes=-1)(self.distances)
 
 
-# A segmenter of parts: a network or the oracle.
 PartSegmenter: TypeAlias = CloudSegmenter | NearestPart
 
 

@@ -20,7 +20,7 @@ from jaxnbv.scanning.sdf import UNUSED, LabelledSolid
 # Number of slots for primitives in a solid. Larger solids have a multiple of it.
 CAPACITY = 24
 
-_IDENTITY, _NO_OFFSET = np.eye(3), np.zeros(3)
+_IDENTITY = np.eye(3)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -148,7 +148,7 @@ def assemble(primitives: list[Primitive], rotation_angle: float = 0.0, longest_s
     return union(fit([move(p, rotation=rotation) for p in primitives], longest_side))
 
 
-def move(p: Primitive, scale: float = 1.0, rotation=_IDENTITY, offset=_NO_OFFSET) -> Primitive:
+def move(p: Primitive, scale: float = 1.0, rotation=_IDENTITY, offset=0.0) -> Primitive:
     """Return a primitive moved by x -> scale rotation x + offset."""
     return dataclasses.replace(
         p,
