@@ -157,6 +157,14 @@ def check_key(key: Any) -> None:
     require(is_key, f"the key is {short_text(key)}: make one with jax.random.key(seed)")
 
 
+def on_host(tree: Any) -> Any:
+    """Return a tree with NumPy arrays; unchanged if it is traced.
+
+    NumPy compiles nothing, whereas JAX compiles a program for each operation outside `jit`.
+    """
+    return tree if is_traced(tree) else jax.tree.map(np.asarray, tree)
+
+
 def native(value: Any) -> Any:
     """Convert a NumPy array to native byte order and at most double precision; return others unchanged.
 

@@ -7,7 +7,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnbv.checks import AnyArray, as_numbers, check_fields, checked, is_traced, own_settings, require, short_text
+from jaxnbv.checks import (
+    AnyArray,
+    as_numbers,
+    check_fields,
+    checked,
+    is_traced,
+    on_host,
+    own_settings,
+    require,
+    short_text,
+)
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
@@ -124,13 +134,16 @@ class Frame(eqx.Module):
 
 def _apply(value, map_points, map_directions, scale: float):
     """Convert a value by functions for points and directions, and a factor (`scale`) for lengths."""
+    if isinstance(value, PointCloud | Pose):
+        xp, arrays = (jnp, value) if is_traced(value) else (np, on_host(value))
     if isinstance(value, PointCloud):
-        points = jnp.where(value.mask[..., None], map_points(value.points), 0.0).astype(value.points.dtype)
-        sight = None if value.sight is None else scale * value.sight
-        return dataclasses.replace(value, points=points, normals=map_directions(value.normals), sight=sight)
+        points = xp.where(arrays.mask[..., None], map_points(arrays.points), 0.0).astype(arrays.points.dtype)
+        sight = None if arrays.sight is None else jnp.asarray(scale * arrays.sight)
+        normals = jnp.asarray(map_directions(arrays.normals))
+        return dataclasses.replace(value, points=jnp.asarray(points), normals=normals, sight=sight)
     if isinstance(value, Pose):
-        rotation = jnp.swapaxes(map_directions(jnp.swapaxes(value.rotation, -1, -2)), -1, -2)
-        return Pose(rotation, map_points(value.position).astype(value.position.dtype))
+        rotation = xp.swapaxes(map_directions(xp.swapaxes(arrays.rotation, -1, -2)), -1, -2)
+        return Pose(rotation, map_points(arrays.position).astype(arrays.position.dtype))
     if isinstance(value, Box):
         corners = map_points(np.array([value.low, value.high]))
         return Box(corners.min(axis=0), corners.max(axis=0))

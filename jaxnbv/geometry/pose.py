@@ -9,7 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxnbv.checks import AnyArray, as_floats, check_batch, check_index, checked, is_traced, own_settings, require
+from jaxnbv.checks import (
+    AnyArray,
+    as_floats,
+    check_batch,
+    check_index,
+    checked,
+    is_traced,
+    on_host,
+    own_settings,
+    require,
+)
 
 # A matrix counts as a rotation if no entry of |R R^T - I| exceeds `_MAX_ERROR`. Up to `_MAX_ROUNDING`, it counts as a
 # rotation that was written to three digits, and is corrected.
@@ -84,9 +94,12 @@ class Pose(eqx.Module):
 
         **Raises:** `ValueError` for an unknown convention.
         """
-        rotation = self.rotation * _axes(convention).astype(self.rotation.dtype)
-        last = jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 1.0], self.position.dtype), (*self.position.shape[:-1], 1, 4))
-        return jnp.concatenate([jnp.concatenate([rotation, self.position[..., None]], axis=-1), last], axis=-2)
+        pose = on_host(self)
+        xp = jnp if is_traced(self) else np
+        rotation = pose.rotation * _axes(convention).astype(pose.rotation.dtype)
+        last = xp.broadcast_to(np.array([0.0, 0.0, 0.0, 1.0], rotation.dtype), (*pose.position.shape[:-1], 1, 4))
+        rows = xp.concatenate([rotation, pose.position[..., None]], axis=-1)
+        return jnp.asarray(xp.concatenate([rows, last], axis=-2))
 
     @property
     @own_settings()

@@ -70,12 +70,12 @@ class Solver(eqx.Module):
         """Return how much the data reduce Var f(x), at points in scene coordinates."""
 
     def whiten(self, matrices: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
-        """Apply C^-1 to the columns of each matrix, where C is the Cholesky factor of the covariance."""
-        return _apply_to_columns(self.factor.whiten, matrices)
+        """Apply C^-1 to the columns of matrices that are zero in unfilled rows, with C the Cholesky factor of A."""
+        return _apply_to_leading_rows(CholeskyFactor.whiten, self.factor, self.cloud, matrices)
 
     def unwhiten(self, matrices: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
-        """Apply C^-T to the columns of each matrix, where C is the Cholesky factor of the covariance."""
-        return _apply_to_columns(self.factor.unwhiten, matrices)
+        """Apply C^-T to the columns of matrices that are zero in unfilled rows, with C the Cholesky factor of A."""
+        return _apply_to_leading_rows(CholeskyFactor.unwhiten, self.factor, self.cloud, matrices)
 
     def whitened_cross(self, x: Float[Array, "n 3"]) -> Float[Array, "3 capacity n"]:
         """Return C^-1 cov(v_d(X), f(x)) for each component d of the normal field v at the cloud's points X.
@@ -83,13 +83,12 @@ class Solver(eqx.Module):
         C is the Cholesky factor of the covariance of the normals. The sum of squares over d and the data is the part of
         Var f(x) that the data explain.
         """
-        capacity, factor = self.cloud.capacity, self.factor
+        factor = self.factor
 
         def whiten_rows(size: int):
             cross = function_normal_covariance(x, self.cloud.points[:size], self.spectrum)
             cross = jnp.where(self.cloud.mask[:size], cross, 0.0)
-            whitened = _apply_to_columns(factor.leading(size).whiten, jnp.swapaxes(cross, 1, 2))
-            return jnp.pad(whitened, ((0, 0), (0, capacity - size), (0, 0)))
+            return _pad_rows(_apply_to_columns(factor.leading(size).whiten, jnp.swapaxes(cross, 1, 2)), self.cloud)
 
         return _call_on_leading_rows(self.cloud, whiten_rows)
 
@@ -121,7 +120,7 @@ class DenseSolver(Solver):
         return self.cholesky
 
     def solve(self, matrices: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
-        return _apply_to_columns(self.cholesky.solve, matrices)
+        return _apply_to_leading_rows(CholeskyFactor.solve, self.cholesky, self.cloud, matrices)
 
     def explained_variance(self, x: Float[Array, "n 3"]) -> Float[Array, " n"]:
         """Return how much the data reduce Var f(x). The cost grows with (number of points) x (capacity)^2."""
@@ -204,6 +203,25 @@ def _call_on_leading_rows(cloud: PointCloud, compute: Callable[[int], Float[Arra
     return jax.lax.switch(
         jnp.searchsorted(jnp.asarray(sizes), filled), [functools.partial(compute, size) for size in sizes]
     )
+
+
+def _apply_to_leading_rows(
+    function: Callable[[CholeskyFactor, Array], Array],
+    factor: CholeskyFactor,
+    cloud: PointCloud,
+    matrices: Float[Array, "s n k"],
+) -> Float[Array, "s n k"]:
+    """Apply a function of a factor and columns to the columns of matrices that are zero in unfilled rows."""
+
+    def apply(size: int):
+        columns = functools.partial(function, factor.leading(size))
+        return _pad_rows(_apply_to_columns(columns, matrices[:, :size]), cloud)
+
+    return _call_on_leading_rows(cloud, apply)
+
+
+def _pad_rows(matrices: Float[Array, "s size k"], cloud: PointCloud) -> Float[Array, "s n k"]:
+    return jnp.pad(matrices, ((0, 0), (0, cloud.capacity - matrices.shape[1]), (0, 0)))
 
 
 def _apply_to_columns(function: Callable[[Array], Array], matrices: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
