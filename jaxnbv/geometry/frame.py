@@ -135,7 +135,7 @@ class Frame(eqx.Module):
 def _apply(value, map_points, map_directions, scale: float):
     """Convert a value by functions for points and directions, and a factor (`scale`) for lengths."""
     if isinstance(value, PointCloud | Pose):
-        xp, arrays = (jnp, value) if is_traced(value) else (np, on_host(value))
+        xp, arrays = jnp if is_traced(value) else np, on_host(value)
     if isinstance(value, PointCloud):
         points = xp.where(arrays.mask[..., None], map_points(arrays.points), 0.0).astype(arrays.points.dtype)
         sight = None if arrays.sight is None else jnp.asarray(scale * arrays.sight)
