@@ -34,6 +34,8 @@ from jaxnbv.search.candidates import sphere_candidates
 from jaxnbv.storage.folders import versions
 from jaxnbv.studies.scenes import Framing, Split, demo_object, hidden_view, pyramid_scene
 
+_NUM_PARTS = 200
+
 
 class Bench:
     """Inputs that all stages share, and the results: seconds by stage, with ratios."""
@@ -167,6 +169,22 @@ def gradient(bench: Bench) -> None:
         bench.take(f"search: {name}", lambda other=other: other.choose(inputs, bench.key), discrete=discrete)
 
 
+def parts(bench: Bench) -> None:
+    """Identification among 200 parts at true size, cuboids whose sides are random."""
+    sides = np.random.default_rng(0).uniform(0.4, 1.6, (_NUM_PARTS, 3))
+    bank = nbv.ShapeBank.from_meshes([trimesh.creation.box(extents=row) for row in sides], scale=1.0, progress=False)
+    planner, part = nbv.Planner.for_parts(bank), nbv.SDFSurface(nbv.sdf.Cuboid(0.5 * sides[0]))
+    cloud = observe_scene(part, planner.camera, bench.first, nbv.SensorNoise(), bench.key)
+    name = f"identification: a view is registered to {_NUM_PARTS} parts"
+    registration = bench.take(name, lambda: planner.init(bench.first, cloud))
+    observations = planner.init(bench.first, cloud)
+    bench.take(
+        f"identification: a step with {_NUM_PARTS} parts",
+        lambda: planner.propose(observations, bench.key),
+        registration=registration,
+    )
+
+
 def networks(bench: Bench) -> None:
     """PointNet++ at its published sizes on one cloud of 1,024 points, against its multiply-adds."""
     from networks import NETWORKS, multiply_adds, random_network, timings
@@ -220,7 +238,7 @@ def yardstick() -> float:
     return least_time(lambda: product(matrix), repeats=10)
 
 
-STAGES = (coverage, sessions, cross_entropy, gradient, networks, devices, episodes)
+STAGES = (coverage, sessions, cross_entropy, gradient, parts, networks, devices, episodes)
 
 
 def page(record: dict) -> str:

@@ -13,6 +13,8 @@ from jaxnbv.surfaces.mesh_shapes import MeshShape
 
 # Number of random points, and the distance from the surface (in grid cells) within which points are compared.
 _NUM_PROBES, _MAX_DISTANCE = 8192, 3.0
+# Number of pairs that a warning names.
+_NUM_NAMED = 5
 # The rotations of a cube onto itself are tested, because files often store equal parts along different axes.
 _ROTATIONS = Rotation.create_group("O").as_matrix()
 
@@ -20,19 +22,22 @@ _ROTATIONS = Rotation.create_group("O").as_matrix()
 def warn_of_look_alikes(
     shapes: Sequence[MeshShape], names: Sequence[str], sizes: Float[np.ndarray, " k"], stacklevel: int
 ) -> None:
-    """Warn of each pair of parts that are equal to within a grid cell, up to rotations by right angles.
+    """Warn of all pairs of parts that are equal to within a grid cell, up to rotations by right angles.
 
     - `sizes`: world units per unit of each shape.
     """
-    grids = [_Grid(shape) for shape in shapes]
+    grids, pairs = [_Grid(shape) for shape in shapes], []
     for one, other in itertools.combinations(range(len(shapes)), 2):
         gap = _difference(grids[one], grids[other], float(sizes[other] / sizes[one]))
         if gap < grids[one].spacing:
-            warnings.warn(
-                f"{names[one]} and {names[other]} are the same up to {gap * sizes[one]:.2g}: no view will tell them "
-                "apart. Leave one out, or raise the resolution if they differ by a detail that is smaller than a cell",
-                stacklevel=stacklevel + 1,
-            )
+            pairs.append(f"{names[one]} and {names[other]} (up to {gap * sizes[one]:.2g})")
+    if pairs:
+        others = f" and {len(pairs) - _NUM_NAMED} other pairs" if len(pairs) > _NUM_NAMED else ""
+        warnings.warn(
+            f"these parts are the same: {', '.join(pairs[:_NUM_NAMED])}{others}. No view will tell them apart. Leave "
+            "one of each pair out, or raise the resolution if they differ by a detail that is smaller than a cell",
+            stacklevel=stacklevel + 1,
+        )
 
 
 class _Grid:
