@@ -132,9 +132,8 @@ class _Describer:
             parts = {"members": {key: value for key, value in vars(obj).items() if is_user_defined(key, value)}}
             return {"type": "class", "name": name, **self._without_arrays({**parts, "bases": obj.__bases__}, path)}
         if isinstance(obj, functools.partial):
-            return {"type": "partial", **self._describe_values({"function": obj.func, "arguments": obj.args}, path)} | {
-                "keywords": self.describe(obj.keywords, path)
-            }
+            parts = self._describe_values({"function": obj.func, "arguments": obj.args}, path)
+            return {"type": "partial", **parts, "keywords": self.describe(obj.keywords, path)}
         instance = getattr(obj, "__self__", None)
         if instance is not None and not isinstance(instance, ModuleType):
             function = getattr(obj, "__func__", None) or getattr(type(instance), obj.__name__)

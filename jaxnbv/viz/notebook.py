@@ -170,11 +170,8 @@ def _draw_views(episode: Episode, part: PlacedShape | None, axes: Axes) -> None:
 @drawing_of.register
 def _(observations: Observations) -> Drawing:
     views, cloud = int(observations.num_views), drawing_of(observations.cloud)
-    empty = (
-        ""
-        if observations.empty_nodes is None
-        else f", {float(np.mean(observations.empty_nodes)):.0%} of the grid seen empty"
-    )
+    nodes = observations.empty_nodes
+    empty = "" if nodes is None else f", {float(np.mean(nodes)):.0%} of the grid seen empty"
     return Drawing(cloud.draw, f"{views} view{'s' * (views != 1)}{empty}; {cloud.facts}")
 
 

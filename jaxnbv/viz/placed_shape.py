@@ -1,7 +1,7 @@
 """The likeliest known shape at its placement, and where the other hypotheses differ from it."""
 
 import dataclasses
-from typing import NamedTuple, TypeAlias, TypeVar
+from typing import TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -69,19 +69,6 @@ class PlacedShape(MeanSurface):
         return f"{self.name}  {100 * self.probability:.0f} %"
 
 
-class _Fits(NamedTuple):
-    """Registered shapes with their probabilities. The first one is the shape to draw."""
-
-    bank: ShapeBank
-    hypotheses: Hypotheses
-    weights: Float[np.ndarray, " h"]
-
-    @classmethod
-    def of(cls, bank: ShapeBank, hypotheses: Hypotheses, weights: Float[np.ndarray, " h"], rows: list[int]) -> "_Fits":
-        """Select these rows of `hypotheses`, and normalise their `weights`, one for each of `rows`."""
-        return cls(bank, _select(hypotheses, rows), weights / max(weights.sum(), 1e-30))
-
-
 def _select(tree: T, rows: int | list[int]) -> T:
     """Return rows of all leaves. Indexing JAX's arrays would compile a program for each shape of a leaf."""
     return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[rows]), tree)
@@ -111,7 +98,7 @@ def likeliest_part(hypotheses: PartHypotheses, cloud: PointCloud | None = None) 
     first = int(np.argmax(shapes == hypotheses.most_likely[0]))
     likely = np.argsort(-weights, kind="stable")[:_MAX_HYPOTHESES].tolist()
     rows = [first, *(row for row in likely if row != first and weights[row] > 0)]
-    return _with_hypotheses(part, _Fits.of(hypotheses.bank, hypotheses.placed, weights[rows], rows), cloud)
+    return _with_hypotheses(part, hypotheses.bank, _select(hypotheses.placed, rows), weights[rows], cloud)
 
 
 def likeliest_shape(
@@ -143,7 +130,7 @@ def likeliest_shape(
     first = _place_shape(bank, hypotheses, rows[likely[0]], kinds[likely[0]])
     shape = dataclasses.replace(first, name=likely[0], is_part=False)
     kind_weights = np.array([kinds[kind] for kind in likely])
-    return _with_hypotheses(shape, _Fits.of(bank, hypotheses, kind_weights, [rows[kind] for kind in likely]), cloud)
+    return _with_hypotheses(shape, bank, _select(hypotheses, [rows[kind] for kind in likely]), kind_weights, cloud)
 
 
 def _place_shape(bank: ShapeBank, hypotheses: Hypotheses, row: int, probability: float) -> PlacedShape:
@@ -166,15 +153,18 @@ def _place_shape(bank: ShapeBank, hypotheses: Hypotheses, row: int, probability:
     )
 
 
-def _with_hypotheses(shape: PlacedShape, fits: _Fits, cloud: PointCloud) -> PlacedShape:
-    """Set `measured`, `agreed` and `disputed_space` of the shape, given the scan and the other fits."""
-    half_extent = min(_MARGIN * float(_extent(fits.bank, fits.hypotheses)) + _TOLERANCE, np.pi)
+def _with_hypotheses(
+    shape: PlacedShape, bank: ShapeBank, hypotheses: Hypotheses, weights: Float[np.ndarray, " h"], cloud: PointCloud
+) -> PlacedShape:
+    """Set `measured`, `agreed` and `disputed_space` of a shape, the first of `hypotheses` with these weights."""
+    half_extent = min(_MARGIN * float(_extent(bank, hypotheses)) + _TOLERANCE, np.pi)
     grid, coarse = Grid(_FINE_NODES, half_extent), Grid(_COARSE_NODES, half_extent)
     # Compute distances on a coarse grid: they are smooth, and each hypothesis costs as much as the whole shape.
-    others = np.array(_distances(fits.bank, fits.hypotheses, jnp.asarray(coarse.axis, jnp.float32)))
+    others = np.array(_distances(bank, hypotheses, jnp.asarray(coarse.axis, jnp.float32)))
     occupancy, own_distances = np.zeros((_FINE_NODES,) * 3, others.dtype), _resample(others[0], coarse, grid)
     grid_points, agreed = (shape.vertices + half_extent).T / coarse.spacing, np.zeros(len(shape.vertices))
-    for weight, distance in zip(fits.weights.tolist(), others, strict=True):
+    weights = weights / max(weights.sum(), 1e-30)
+    for weight, distance in zip(weights.tolist(), others, strict=True):
         occupancy += weight * _step(-_resample(distance, coarse, grid))
         agreed += weight * _step(2.0 * _TOLERANCE - np.abs(map_coordinates(distance, grid_points, order=1)))
     # Positive outside the disputed space, and near the shape itself.
