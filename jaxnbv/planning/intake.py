@@ -48,12 +48,12 @@ class Intake:
         intake.images, intake.clutter = (), self._no_clutter()
         return intake
 
-    def add(self, loop: Loop, image: Image, accepted: Callable[[], None] = lambda: None) -> Loop | None:
+    def add(self, loop: Loop, image: Image, on_accept: Callable[[], None] = lambda: None) -> Loop | None:
         """Add an image to the loop as a view, and return the loop.
 
         Return None, and change nothing, if the image is blank and is not the first image.
 
-        - `accepted`: function that is called after all checks and before the view is added.
+        - `on_accept`: function that is called after all checks and before the view is added.
 
         **Raises:** `ValueError` in the cases that `Session.add` lists. Nothing changes then.
         """
@@ -77,7 +77,7 @@ class Intake:
             shows_any = index > 0 or bool(cloud.mask.any())
             require(shows_any, "the first image shows nothing of the box at the pixels of the mask, or all is ignored")
         obstacles, scan = loop.planner.obstacles, self.frame.to_scene(cloud)
-        loop.add(self.frame.to_scene(pose), scan if obstacles is None else obstacles.remove_points(scan), accepted)
+        loop.add(self.frame.to_scene(pose), scan if obstacles is None else obstacles.remove_points(scan), on_accept)
         if self.clutter is not None and obstacles is not None:
             self.clutter = self.clutter.with_image(clean, self.camera, pose, self.frame, obstacles)
             loop = loop.with_clutter(self.clutter.solid())

@@ -171,11 +171,11 @@ class Loop:
         return self._observations
 
     @own_settings()
-    def add(self, pose: Pose, scan: PointCloud, accepted: Callable[[], None] = lambda: None) -> View:
+    def add(self, pose: Pose, scan: PointCloud, on_accept: Callable[[], None] = lambda: None) -> View:
         """Add a view. If `propose` was called since the last view, the view records that proposal.
 
         - `pose`: actual pose of the sensor, which may differ from the proposed pose.
-        - `accepted`: function that is called after all checks and before the view is added, for example to store it.
+        - `on_accept`: function that is called after all checks and before the view is added, for example to store it.
 
         **Raises:** `ValueError` whenever `Planner.init` or `Planner.observe` raises it. The loop does not change then.
         """
@@ -183,7 +183,7 @@ class Loop:
             observations = self.planner.init(pose, scan, self.camera)
         else:
             observations = self.planner.observe(self._observations, pose, scan, self.camera)
-        accepted()
+        on_accept()
         proposal = self._next.proposal if self._next.is_proposed else None
         if self._first_view_time is None:
             self._first_view_time = time.monotonic()

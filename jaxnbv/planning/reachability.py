@@ -1,31 +1,29 @@
-"""Chooses the best pose that an arm can reach. A function of the user checks poses, best first."""
+"""The best pose that an arm can reach. A function of the user checks poses, best first."""
 
 import dataclasses
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxnbv.checks import InputError, require, short_text
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.pose_list import is_same_view
 from jaxnbv.geometry.rotations import rotation_about
+from jaxnbv.planning.loop import Loop
 from jaxnbv.search import Proposal
 
 Reachable: TypeAlias = Callable[[Float[np.ndarray, "n 4 4"]], Any]
 """Function of camera-to-world matrices (n, 4, 4) that returns, for each matrix, whether the arm can reach the pose.
 
-The function may return one of three kinds of answers:
-
-- a bool,
-- None if the pose can be reached, otherwise the reason as a text such as "joint limit",
-- a score from 0 (not reachable) to 1, which multiplies the value of the pose.
+An answer is a bool; None if the pose can be reached, otherwise the reason as a text such as "joint limit"; or a score
+from 0 (not reachable) to 1, which multiplies the value of the pose.
 """
 
 # Number of poses in one call of the function.
@@ -35,121 +33,68 @@ _ROLLS = (45.0, -45.0, 90.0, -90.0, 135.0, -135.0, 180.0)
 _NO_REASON = "not reachable"
 
 
-class Choice(NamedTuple):
-    """The best pose that can be reached.
-
-    - `proposal`: the search's proposal with this pose and its value.
-    - `refusals`: for each reason, the number of poses that cannot be reached.
-    """
-
-    proposal: Proposal
-    refusals: Mapping[str, int]
-
-
 class RefusedPose(NamedTuple):
-    """A pose that the user refused, in scene coordinates, and the reason."""
+    """A scene pose that the user refused, and the reason."""
 
     pose: Pose
     reason: str
 
 
 class _Option(NamedTuple):
-    """A pose that can be reached, the pose's value, and the value times the score of the user's function."""
+    """A pose that can be reached, its value, and the score from the user's function."""
 
     pose: Pose
     value: float
-    weighted: float
-
-
-@dataclasses.dataclass
-class _Checks:
-    """Iterable that checks poses in order, and yields for each the options that the arm can reach.
-
-    - `poses`, `values`: poses to check and their values, in order.
-    - `answers`: function of a batch of poses. It returns the score of each pose, or the reason why the arm cannot reach
-      the pose.
-    - `refused`, `values_at`: as in `best_reachable`.
-    - `refusals`: for each reason, the number of poses so far that cannot be reached.
-    """
-
-    poses: Pose
-    values: Float[np.ndarray, " n"]
-    answers: Callable[[Pose], list[float | str]]
-    refused: Sequence[RefusedPose]
-    values_at: Callable[[Pose], Float[Array, " n"]] | None
-    refusals: Counter[str] = dataclasses.field(default_factory=Counter)
-
-    def __iter__(self) -> Iterator[list[_Option]]:
-        """Yield, for each pose, the list of its options.
-
-        The only option is the pose itself if the arm can reach it. Otherwise the options are the rotations of the pose
-        about the optical axis that the arm can reach.
-        """
-        for start in range(0, len(self.values), _BATCH_SIZE):
-            rows = range(start, min(start + _BATCH_SIZE, len(self.values)))
-            for row, answer in zip(rows, self.answers(self.poses[jnp.asarray(rows)]), strict=True):
-                yield self._options(row, answer)
-
-    def _options(self, row: int, answer: float | str) -> list[_Option]:
-        pose, value = self.poses[row], float(self.values[row])
-        if (reason := _reason_if_refused(pose, self.refused)) is not None:
-            self.refusals[reason] += 1
-            return []
-        if not isinstance(answer, str):
-            return [self._option(pose, value, answer)]
-        rolls = _rotations_about_axis(pose)
-        scores = {index: score for index, score in enumerate(self.answers(rolls)) if not isinstance(score, str)}
-        if not scores:
-            self.refusals[answer] += 1
-            return []
-        values = np.full(len(_ROLLS), value) if self.values_at is None else np.asarray(self.values_at(rolls), float)
-        return [self._option(rolls[index], float(values[index]), score) for index, score in scores.items()]
-
-    def _option(self, pose: Pose, value: float, score: float) -> _Option:
-        # The search may have proposed a tied pose whose value is not the highest. Therefore values are capped at the
-        # value of the proposed pose.
-        max_value = min(value, float(self.values[0]))
-        return _Option(pose, value, max_value * score if max_value > 0 else max_value)
+    score: float
 
 
 def best_reachable(
-    proposal: Proposal,
+    loop: Loop,
     reachable: Reachable | None,
     to_matrices: Callable[[Pose], Float[np.ndarray, "n 4 4"]],
-    refused: Sequence[RefusedPose] = (),
-    values_at: Callable[[Pose], Float[Array, " n"]] | None = None,
-    seconds: float = math.inf,
-) -> Choice:
-    """Among the poses that the arm can reach, find the pose with the highest product of value and score.
+    refused_poses: Sequence[RefusedPose],
+    seconds: float,
+) -> tuple[Proposal, dict[str, int]]:
+    """Propose the pose with the highest product of value and score, among poses that the arm can reach.
 
-    All poses that the search evaluated are considered. They are checked in batches, highest value first, until no
-    unchecked pose can be better. If a pose cannot be reached, the same pose with the camera rotated about its optical
-    axis is tried.
+    The loop's proposal becomes this pose and its value. Return it and, for each reason, the number of poses that cannot
+    be reached. The poses that the search evaluated are checked in batches, highest value first, until no unchecked pose
+    can be better. If a pose cannot be reached, the pose is tried with the camera rotated about its optical axis.
 
     - `reachable`: the user's function, which returns the scores; None if all poses can be reached.
     - `to_matrices`: function that converts scene poses to the matrices for `reachable`.
-    - `refused`: poses that are excluded, also with the camera rotated about its optical axis.
-    - `values_at`: function that returns the values of rotated poses; None if such a rotation does not change the value,
-      as for square images.
+    - `refused_poses`: poses that are excluded, also with the camera rotated about its optical axis.
     - `seconds`: time limit. After this time, the best pose so far is used.
 
-    **Raises:** `ValueError` if no pose can be reached, or if `reachable` returns an invalid answer.
+    **Raises:** `ValueError` if no pose can be reached, if `reachable` returns an invalid answer, and whenever
+    `Loop.propose` raises it.
     """
+    proposal = loop.propose()
+    if reachable is None and not refused_poses:
+        return proposal, {}
 
     def answers(batch: Pose) -> list[float | str]:
         return [1.0 for _ in batch.position] if reachable is None else _answers(reachable, to_matrices(batch))
 
     poses, values = _evaluated_poses(proposal)
-    checks, best, count, start = _Checks(poses, values, answers, refused, values_at), None, 0, time.monotonic()
-    for count, options in enumerate(checks, start=1):
+    refusals: Counter[str] = Counter()
+    best, best_value, count, start = None, -math.inf, 0, time.monotonic()
+    for count, options in enumerate(_options(loop, poses, values, answers, refused_poses, refusals), start=1):
         for option in options:
-            best = option if best is None or option.weighted > best.weighted else best
-        is_best = best is not None and best.weighted >= min(values[count : count + 1], default=-math.inf)
+            # The search may have proposed a tied pose whose value is not the highest. Therefore values are capped at
+            # the value of the proposed pose.
+            value = min(option.value, float(values[0]))
+            value = value * option.score if value > 0 else value
+            if best is None or value > best_value:
+                best, best_value = option, value
+        is_best = best is not None and best_value >= min(values[count : count + 1], default=-math.inf)
         if is_best or time.monotonic() - start > seconds:
             break
     if best is not None:
-        return Choice(_with_pose(proposal, best.pose, best.value), dict(checks.refusals))
-    reasons = ", ".join(f"{number} {reason}" for reason, number in checks.refusals.most_common())
+        proposal = _with_pose(proposal, best.pose, best.value)
+        loop.replace_proposal(proposal)
+        return proposal, dict(refusals)
+    reasons = ", ".join(f"{number} {reason}" for reason, number in refusals.most_common())
     subject = f"{count} of the {len(values)} poses" if count < len(values) else f"{count} poses"
     raise InputError(
         f"none of the {subject} that the search looked at can be reached ({reasons}): give other candidates, "
@@ -157,11 +102,50 @@ def best_reachable(
     )
 
 
-def _evaluated_poses(proposal: Proposal) -> tuple[Pose, Float[np.ndarray, " poses"]]:
-    """Return all poses that a search evaluated, and their values.
+def _options(
+    loop: Loop,
+    poses: Pose,
+    values: Float[np.ndarray, " poses"],
+    answers: Callable[[Pose], list[float | str]],
+    refused_poses: Sequence[RefusedPose],
+    refusals: Counter[str],
+) -> Iterator[list[_Option]]:
+    """Check poses in order, and yield for each the list of its options, which the arm can reach.
 
-    The proposed pose comes first. The others follow in descending order of value.
+    The only option is the pose itself if the arm can reach it. Otherwise the options are the rotations of the pose
+    about the optical axis that the arm can reach. If there is no option, count the reason in `refusals`.
+
+    - `answers`: function of a batch of poses. It returns the score of each pose, or the reason why the arm cannot reach
+      the pose.
     """
+    for start in range(0, len(values), _BATCH_SIZE):
+        rows = range(start, min(start + _BATCH_SIZE, len(values)))
+        for row, answer in zip(rows, answers(poses[jnp.asarray(rows)]), strict=True):
+            pose, value = poses[row], float(values[row])
+            reason, options = _reason_if_refused(pose, refused_poses), []
+            if reason is None and isinstance(answer, str):
+                reason, options = answer, _rolled_options(loop, pose, value, answers)
+            elif reason is None:
+                options = [_Option(pose, value, answer)]
+            if not options:
+                refusals[str(reason)] += 1
+            yield options
+
+
+def _rolled_options(
+    loop: Loop, pose: Pose, value: float, answers: Callable[[Pose], list[float | str]]
+) -> list[_Option]:
+    rolls = _rotations_about_axis(pose)
+    scores = {index: score for index, score in enumerate(answers(rolls)) if not isinstance(score, str)}
+    values, camera = np.full(len(_ROLLS), value), loop.planner.camera
+    # The rotation does not change the value if images are square, or if the search does not simulate them.
+    if scores and loop.planner.search.uses_samples and camera.height != camera.width:
+        values = np.asarray(loop.planner.values_at(loop.inputs(), rolls), float)
+    return [_Option(rolls[index], float(values[index]), score) for index, score in scores.items()]
+
+
+def _evaluated_poses(proposal: Proposal) -> tuple[Pose, Float[np.ndarray, " poses"]]:
+    """Return the poses that a search evaluated, and their values: the proposed pose, then the best first."""
     parts = [(proposal.candidates, proposal.values)]
     if proposal.trajectories is not None:
         parts.append(proposal.trajectories.flat)
@@ -193,9 +177,9 @@ def _rotations_about_axis(pose: Pose) -> Pose:
     return Pose(rotations, jnp.broadcast_to(pose.position, (len(_ROLLS), 3)))
 
 
-def _reason_if_refused(pose: Pose, refused: Sequence[RefusedPose]) -> str | None:
+def _reason_if_refused(pose: Pose, refused_poses: Sequence[RefusedPose]) -> str | None:
     """Return why the user refused a pose or a rotation of it about the optical axis; None if neither."""
-    return next((refused_pose.reason for refused_pose in refused if is_same_view(pose, refused_pose.pose)), None)
+    return next((refused.reason for refused in refused_poses if is_same_view(pose, refused.pose)), None)
 
 
 def _answers(reachable: Reachable, matrices: Float[np.ndarray, "n 4 4"]) -> list[float | str]:

@@ -2,16 +2,15 @@
 
 import math
 import threading
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray, Real
+from jaxtyping import Float, PRNGKeyArray, Real
 from tqdm import tqdm
 
 from jaxnbv.checks import AnyArray, InputError, as_numbers, check_key, checked, own_settings, require
@@ -29,7 +28,7 @@ from jaxnbv.planning.loop import STAGES, Loop, View
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.reachability import Reachable, RefusedPose, best_reachable
 from jaxnbv.planning.rehearsal import Rehearsal, rehearse
-from jaxnbv.planning.session_folder import SessionFolder
+from jaxnbv.planning.session_folder import KIND, SessionFolder
 from jaxnbv.planning.session_scene import box_of, in_scene, usual_planner
 from jaxnbv.planning.session_warnings import (
     warn_of_blank,
@@ -43,6 +42,7 @@ from jaxnbv.planning.stopping import StopRule
 from jaxnbv.progress import progress_bar
 from jaxnbv.scanning import Obstacles
 from jaxnbv.search import Proposal
+from jaxnbv.storage import RunFolder
 from jaxnbv.surfaces.part_hypotheses import hypotheses_of
 from jaxnbv.surfaces.part_pose import ObjectPose, object_pose
 
@@ -57,7 +57,7 @@ class NextView(eqx.Module):
       matrix compensates for the error of the camera's mount.
     - `value`: value that the search gave the pose, with lengths or areas in world units.
     - `standard_error`: standard error of the value as a mean over posterior samples; None with fewer than two samples.
-    - `proposal`: full result of the search, in scene coordinates.
+    - `proposal`: result of the search, in scene coordinates.
     - `refusals`: for each reason, the number of poses that were tried but cannot be reached.
     """
 
@@ -71,8 +71,8 @@ class NextView(eqx.Module):
 class Session:
     """The planning loop at a real sensor.
 
-    Matrices are 4 x 4, camera to world. Matrices, the box, stop rules, costs and values are in world units. Planning
-    uses evenly spaced rows and columns of each image, at most 20,000 rays. The folder stores whole images.
+    Matrices (4 x 4, camera to world), the box, stop rules, costs and values are in world units. Planning uses evenly
+    spaced rows and columns of each image, at most 20,000 rays. The folder stores whole images.
 
     - `camera`: the sensor, with its range in world units.
     - `box`: two corners of a box around the object. The box should not contain the table.
@@ -81,29 +81,26 @@ class Session:
       carving. The default planner uses `NewSurface`, `DiscreteSearch`, eight samples, 24 x 32 rays and 2,000 points.
     - `up`: the world's upward axis, for example "z". Required, because no default is right for all robots.
     - `obstacles`: solids around the object, in world units, for example `Obstacles((table,), margin=0.005)`. Pass
-      `Obstacles()` if there are no obstacles. By default the session detects obstacles:
+      `Obstacles()` if there are none. By default the session detects obstacles:
 
-      - A plane under the object in the first image counts as a table. Its points are removed, and cameras keep clear of
-        it. A warning names the plane. If there is no such plane, the warning names other values of `up` with which a
-        plane would be detected.
+      - A plane under the object in the first image counts as a table, which a warning names. Its points are removed,
+        and cameras keep clear of it. Without such a plane, a warning names values of `up` that would give one.
       - Surfaces outside the box become coarse obstacles. They may hide the object, and cameras keep clear of them.
 
     - `poses`: (n, 4, 4), poses at which the sensor can be held. The default is the candidates of the planner's search,
-      in scene units around the centre of the box. If the candidates are a whole sphere, only the upper half is used,
-      because a table may be below. Give poses to scan a room from inside, because the default poses are outside the
-      box.
-    - `folder`: folder in which images and proposals are stored before they are used. If the process is killed, the
-      session continues from this folder.
+      in scene units around the centre of the box. If they are a whole sphere, only the upper half is used, because a
+      table may be below. Give poses to scan a room from inside, because the default poses are outside the box.
+    - `folder`: folder in which images and proposals are stored before they are used. A session whose process was killed
+      continues from this folder.
     - `convention`: axes of the matrices, see `Pose.from_matrix`.
     - `key`: random key of the posterior samples.
     - `until`: stop rule, for example `Sure(0.95) | Budget(seconds=600)`; see `jaxnbv.planning.stopping`.
     - `correct_mount`: True corrects the poses from the third image on, by the errors that `alignment` estimates. False
       warns once if the poses seem wrong. None skips the check.
-    - `reachable`: function of matrices (n, 4, 4) in the session's convention, see
-      `jaxnbv.planning.reachability.Reachable`. For each matrix it returns whether the arm can go there. A score from 0
-      to 1 multiplies the value of the pose, for example 1 / (1 + seconds of motion). The function is called with
-      batches of poses in the order of their value. If a pose cannot be reached, the session tries the same pose with
-      the camera rotated about its optical axis.
+    - `reachable`: function of matrices (n, 4, 4) in the session's convention that returns, for each matrix, whether the
+      arm can go there, see `jaxnbv.planning.reachability.Reachable`. A score from 0 to 1 multiplies the value of the
+      pose, for example 1 / (1 + seconds of motion). The function is called with batches of poses in the order of their
+      value. If a pose cannot be reached, the session tries it with the camera rotated about its optical axis.
     - `ignore`: function of world points (n, 3) that returns, for each point, whether it belongs to the robot. Points of
       the robot are not part of the object, but hide the space behind them. The function is called once for each image,
       with all measured points.
@@ -174,13 +171,13 @@ class Session:
     ) -> "Session":
         """Load a session from its folder, to continue after its last image.
 
-        - `planner`: planner to use in place of the stored planner. Pass a planner if the stored planner contains a
-          function or network that cannot be restored. Both planners must have the same description.
-        - `until`, `progress`, `reachable`, `ignore`: as for a new session. A session's folder does not store them.
+        - `planner`: replaces the stored planner, if that contains a function or network that cannot be restored. Both
+          planners must have the same description.
+        - `until`, `progress`, `reachable`, `ignore`: as for a new session. The folder does not store them.
 
         **Raises:** `ValueError` if the folder holds no session, or if the stored planner cannot be restored.
         """
-        config = SessionFolder.config_of(path, **({} if planner is None else {"planner": planner}))
+        config = RunFolder.config_of(path, KIND, **({} if planner is None else {"planner": planner}))
         return cls(**config, folder=path, until=until, progress=progress, reachable=reachable, ignore=ignore)
 
     def __repr__(self) -> str:
@@ -192,8 +189,8 @@ class Session:
     def rehearse(self) -> Rehearsal:
         """Compile the programs of the first views, by planning with simulated images of a ball on a table.
 
-        The rehearsal takes half a minute to a minute, or a few seconds if compiled programs are cached (see
-        `keep_compiled`). The session does not change. To rehearse while the camera moves to its first pose, call
+        This takes half a minute to a minute, or a few seconds if compiled programs are cached (see `keep_compiled`).
+        The session does not change. To rehearse while the camera moves to its first pose, call
         `threading.Thread(target=session.rehearse).start()`. `add` waits until the rehearsal has ended.
         """
         with self._rehearsal_lock:
@@ -208,7 +205,7 @@ class Session:
 
     @property
     def views(self) -> tuple[View, ...]:
-        """The session's images so far, as views of an episode in scene coordinates."""
+        """The images so far, as views of an episode in scene coordinates."""
         return self._loop.views
 
     @property
@@ -258,9 +255,7 @@ class Session:
 
     @property
     def episode(self) -> Episode:
-        """The session so far as an episode in scene coordinates.
-
-        The episode's `frame` maps the scene to the world.
+        """The session so far as an episode in scene coordinates, whose `frame` maps the world to the scene.
 
         **Raises:** `ValueError` before the first image.
         """
@@ -272,8 +267,8 @@ class Session:
     def done(self) -> str | None:
         """Return the stop rule's reason to stop; None to continue.
 
-        The rule is evaluated once for each image. If the rule needs posterior samples or a proposal, `next` reuses
-        these. Nothing is stored in the folder.
+        The rule is evaluated once for each image. `next` reuses samples and proposals that the rule needs. Nothing is
+        stored in the folder.
 
         **Raises:** `ValueError` if the rule needs the next proposal and `next` raises it.
         """
@@ -338,8 +333,7 @@ class Session:
         if its image was taken elsewhere. Warns if the value is at most three standard errors above the mean value that
         is expected at visited poses, where nothing new is left to see.
 
-        - `seconds`: time limit for calls of `reachable`, which may be slow. After this time, the best reachable pose so
-          far is used.
+        - `seconds`: time limit for calls of `reachable`. After this time, the best reachable pose so far is used.
 
         **Raises:** `ValueError` before the first image, if no pose can be reached, if a different process has added
         images to the folder, and whenever `Planner.propose` raises it.
@@ -347,15 +341,12 @@ class Session:
         if self._next is None:
             with self._lock_folder() as folder, self._planning():
                 require(len(self.views) > 0, _NO_IMAGE)
-                proposal = self._loop.propose()
-                refusals: Mapping[str, int] = {}
-                if self.reachable is not None or self._refused_poses:
-                    values_at = self._values_at if self._roll_changes_value else None
-                    arguments = self.reachable, self._matrices, self._refused_poses, values_at, seconds
-                    proposal, refusals = best_reachable(proposal, *arguments)
-                    self._loop.replace_proposal(proposal)
+                arguments = self.reachable, self._matrices, self._refused_poses, seconds
+                proposal, refusals = best_reachable(self._loop, *arguments)
                 next_view = self._to_next_view(proposal, refusals)
-                warn_of_little(next_view.value, next_view.standard_error, self._value_at_visited(proposal))
+                at_visited = proposal.value_at_visited
+                value_at_visited = 0.0 if at_visited is None else self._loop.in_world(at_visited)
+                warn_of_little(next_view.value, next_view.standard_error, value_at_visited)
                 if folder is not None:
                     folder.store_proposal(len(self.views), proposal)
                 self._next = next_view
@@ -390,18 +381,18 @@ class Session:
         refused = RefusedPose(self._next.proposal.pose, reason)
         with self._lock_folder() as folder:
             if folder is not None:
-                folder.store_refused(len(self.views), refused)
+                folder.store_refused_pose(len(self.views), refused)
             self._refused_poses.append(refused)
             self._next = None
 
     @property
     def next_view(self) -> NextView | None:
-        """Result of `next` since the last image; None if `next` was not called since then."""
+        """Result of `next` since the last image; None if `next` was not called."""
         return self._next
 
-    def _add(self, image: Image, accepted: Callable[[], None] = lambda: None) -> None:
+    def _add(self, image: Image, on_accept: Callable[[], None] = lambda: None) -> None:
         """Add a view, unless the image is blank."""
-        if (loop := self._intake.add(self._loop, image, accepted)) is not None:
+        if (loop := self._intake.add(self._loop, image, on_accept)) is not None:
             self._loop, self._next = loop, None
 
     def _correct(self) -> None:
@@ -417,39 +408,26 @@ class Session:
 
     def _read(self, folder: SessionFolder) -> None:
         """Add the images of the folder to the session, with their proposals and the latest proposal."""
-        self._refused_poses, count = folder.refused(), folder.num_images
+        self._refused_poses, count = folder.refused_poses(), folder.num_images
         for index in range(count + 1):
             if index and (proposal := folder.proposal(index)) is not None:
                 self._loop.set_stored_proposal(proposal)
-                self._next = self._to_next_view(proposal)
+                self._next = self._to_next_view(proposal, {})
             if index < count:
                 self._add(folder.image(index))
                 if self.correct_mount:
                     self._correct()
 
-    def _to_next_view(self, proposal: Proposal, refusals: Mapping[str, int] = MappingProxyType({})) -> NextView:
-        """Convert a proposal to the result of `next`, in world coordinates."""
+    def _to_next_view(self, proposal: Proposal, refusals: dict[str, int]) -> NextView:
         error = None if proposal.standard_error is None else self._loop.in_world(proposal.standard_error)
         error = error if error is not None and math.isfinite(error) else None
         (matrix,), value = self._matrices(proposal.pose[None]), self._loop.in_world(proposal.value)
-        return NextView(matrix, value, error, proposal, dict(refusals))
+        return NextView(matrix, value, error, proposal, refusals)
 
     def _matrices(self, poses: Pose) -> Float[np.ndarray, "n 4 4"]:
         """Return the world matrices to command so that the camera arrives at scene poses (n,)."""
         commanded_poses = self._intake.mount_error.command_poses(self.frame.to_world(poses))
         return np.asarray(commanded_poses.to_matrix(self.convention), np.float64)
-
-    @property
-    def _roll_changes_value(self) -> bool:
-        """Whether a rotation of the camera about its optical axis changes the value of a pose."""
-        camera = self.planner.camera
-        return self.planner.search.uses_samples and camera.height != camera.width
-
-    def _values_at(self, poses: Pose) -> Float[Array, " n"]:
-        return self.planner.values_at(self._loop.inputs(), poses)
-
-    def _value_at_visited(self, proposal: Proposal) -> float:
-        return 0.0 if proposal.value_at_visited is None else self._loop.in_world(proposal.value_at_visited)
 
     def _show_stage(self, stage: str) -> None:
         """Show a stage of planning on the progress bar. The first call creates the bar."""
@@ -468,14 +446,6 @@ class Session:
                 self._bar.close()
             self._bar = None
 
-    @contextmanager
-    def _lock_folder(self) -> Iterator[SessionFolder | None]:
-        """Context manager: lock the folder for writing, and yield it; None if the session has no folder.
-
-        **Raises:** `ValueError` if a different process writes to the folder or has added images.
-        """
-        if self._folder is None:
-            yield None
-            return
-        with self._folder.writing(len(self.views)):
-            yield self._folder
+    def _lock_folder(self) -> AbstractContextManager[SessionFolder | None]:
+        """Context manager: lock the folder for writing, and yield it; None if the session has no folder."""
+        return nullcontext() if self._folder is None else self._folder.writing(len(self.views))

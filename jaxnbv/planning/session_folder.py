@@ -13,7 +13,7 @@ from jaxnbv.planning.reachability import RefusedPose
 from jaxnbv.search import Proposal
 from jaxnbv.storage import RunFolder
 
-_KIND = "session"
+KIND = "session"
 
 
 class SessionFolder:
@@ -26,21 +26,11 @@ class SessionFolder:
     """
 
     def __init__(self, path: str | Path, config: dict[str, Any]):
-        self._folder = RunFolder(path, _KIND, config)
-
-    @staticmethod
-    def config_of(path: str | Path, **replacements: Any) -> dict[str, Any]:
-        """Return the arguments of the session in a folder.
-
-        - `replacements`: arguments to use in place of stored ones, for example if these cannot be restored.
-
-        **Raises:** `ValueError` if the folder holds no session.
-        """
-        return RunFolder.config_of(path, _KIND, **replacements)
+        self._folder = RunFolder(path, KIND, config)
 
     @contextmanager
-    def writing(self, num_images: int) -> Iterator[None]:
-        """Context manager: lock the folder for writing.
+    def writing(self, num_images: int) -> "Iterator[SessionFolder]":
+        """Context manager: lock the folder for writing, and yield it.
 
         - `num_images`: number of images in the session.
 
@@ -52,7 +42,7 @@ class SessionFolder:
                 f"{self._folder.path} holds {self.num_images} images, but this session knows {num_images}: another "
                 "process has added some; make the session again, which reads them",
             )
-            yield
+            yield self
 
     @property
     def num_images(self) -> int:
@@ -66,9 +56,9 @@ class SessionFolder:
         return image._replace(robot=entry.get("robot"))
 
     def store_image(self, index: int, image: Image) -> None:
-        """Store an image, and delete the stored proposal for the image after it.
+        """Store an image, and delete a stored proposal for the image after it.
 
-        If there is such a proposal, it is outdated: it was computed from images that the user has deleted since.
+        Such a proposal was computed from images that the user has deleted since.
         """
         self._folder.file("proposal", index + 1).unlink(missing_ok=True)
         pixels = {"mask": image.mask, "robot": image.robot}
@@ -85,12 +75,12 @@ class SessionFolder:
         """Store the proposal that was made after `num_images` images."""
         self._folder.write("proposal", num_images, proposal=proposal)
 
-    def refused(self) -> list[RefusedPose]:
+    def refused_poses(self) -> list[RefusedPose]:
         """Read all refused poses."""
         entries = [self._folder.read("refused", index) for index in range(self._folder.count("refused"))]
         return [RefusedPose(entry["pose"], str(entry["reason"])) for entry in entries]
 
-    def store_refused(self, num_images: int, refused: RefusedPose) -> None:
+    def store_refused_pose(self, num_images: int, refused: RefusedPose) -> None:
         """Store a refused pose, and remove the proposal that was made after `num_images` images."""
         index = self._folder.count("refused")
         self._folder.write("refused", index, pose=refused.pose, reason=np.asarray(refused.reason))
