@@ -19,29 +19,26 @@ class CholeskyFactor(eqx.Module):
 
     @classmethod
     def of(cls, matrix: Float[Array, "n n"]) -> "CholeskyFactor":
-        """Factorise a symmetric matrix A. Only one triangle of A is read.
-
-        The factor is not finite if A is not positive definite.
-        """
+        """Factorise A, of which one triangle is read. The factor is not finite unless A is positive definite."""
         return cls(jnp.linalg.cholesky(matrix.T, symmetrize_input=False).T)
 
     def leading(self, size: int) -> "CholeskyFactor":
-        """Return the factor of the first `size` rows and columns of the factorised matrix A."""
+        """Return the factor of the first `size` rows and columns of A."""
         return CholeskyFactor(self.upper[:size, :size])
 
     def whiten(self, rows: Rows) -> Rows:
-        """Apply C^-1 to each column of `rows`, where C is the lower triangular factor."""
+        """Apply C^-1 to each column of `rows`."""
         return solve_triangular(self.upper.T, rows, lower=True)
 
     def unwhiten(self, rows: Rows) -> Rows:
-        """Apply C^-T, the inverse of the transpose of the factor C, to each column of `rows`."""
+        """Apply C^-T, the inverse of the transpose of C, to each column of `rows`."""
         return solve_triangular(self.upper.T, rows, lower=True, trans="T")
 
     def solve(self, rows: Rows) -> Rows:
-        """Apply A^-1, the inverse of the factorised matrix, to each column of `rows`."""
+        """Apply A^-1 to each column of `rows`."""
         return self.unwhiten(self.whiten(rows))
 
     @property
     def log_determinant(self) -> Float[Array, ""]:
-        """Logarithm of the determinant of the factorised matrix A."""
+        """Logarithm of the determinant of A."""
         return 2.0 * jnp.sum(jnp.log(jnp.diag(self.upper)))

@@ -56,32 +56,28 @@ class Solver(eqx.Module):
     @property
     @abstractmethod
     def factor(self) -> CholeskyFactor:
-        """The Cholesky factor of the covariance A of the normals.
-
-        **Raises:** `ValueError` if A is not factorised.
-        """
+        """The Cholesky factor of A. **Raises:** `ValueError` if A is not factorised."""
 
     @abstractmethod
     def solve(self, matrices: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
-        """Apply the inverse covariance A^-1 to the columns of matrices that are zero in unfilled rows."""
+        """Apply A^-1 to the columns of matrices that are zero in unfilled rows."""
 
     @abstractmethod
     def explained_variance(self, x: Float[Array, "n 3"]) -> Float[Array, " n"]:
         """Return how much the data reduce Var f(x), at points in scene coordinates."""
 
     def whiten(self, matrices: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
-        """Apply C^-1 to the columns of matrices that are zero in unfilled rows, with C the Cholesky factor of A."""
+        """Apply C^-1 to columns that are zero in unfilled rows, with C the Cholesky factor of A."""
         return _apply_to_leading_rows(CholeskyFactor.whiten, self.factor, self.cloud, matrices)
 
     def unwhiten(self, matrices: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
-        """Apply C^-T to the columns of matrices that are zero in unfilled rows, with C the Cholesky factor of A."""
+        """Apply C^-T to columns that are zero in unfilled rows, with C the Cholesky factor of A."""
         return _apply_to_leading_rows(CholeskyFactor.unwhiten, self.factor, self.cloud, matrices)
 
     def whitened_cross(self, x: Float[Array, "n 3"]) -> Float[Array, "3 capacity n"]:
         """Return C^-1 cov(v_d(X), f(x)) for each component d of the normal field v at the cloud's points X.
 
-        C is the Cholesky factor of the covariance of the normals. The sum of squares over d and the data is the part of
-        Var f(x) that the data explain.
+        The sum of squares over d and the data is the part of Var f(x) that the data explain.
         """
         factor = self.factor
 
@@ -94,7 +90,7 @@ class Solver(eqx.Module):
 
 
 class DenseSolver(Solver):
-    """A solver that factorises the covariance A, with one row for each row of the cloud. See `Solver`."""
+    """A solver that factorises A. See `Solver`."""
 
     cloud: PointCloud
     spectrum: Spectra
@@ -103,7 +99,7 @@ class DenseSolver(Solver):
 
     @classmethod
     def of(cls, cloud: PointCloud, spectrum: Spectra, noise: Scalar) -> "DenseSolver":
-        """Factorise the covariance of the normals of a cloud. See `Solver` for the arguments."""
+        """Factorise A. See `Solver` for the arguments."""
         capacity = cloud.capacity
 
         def factorise(size: int):
@@ -123,7 +119,7 @@ class DenseSolver(Solver):
         return _apply_to_leading_rows(CholeskyFactor.solve, self.cholesky, self.cloud, matrices)
 
     def explained_variance(self, x: Float[Array, "n 3"]) -> Float[Array, " n"]:
-        """Return how much the data reduce Var f(x). The cost grows with (number of points) x (capacity)^2."""
+        """Return how much the data reduce Var f(x), at a cost of (number of points) x (capacity)^2."""
         return jax.lax.map(
             lambda point: jnp.sum(self.whitened_cross(point[None]) ** 2),
             x,
@@ -132,7 +128,7 @@ class DenseSolver(Solver):
 
 
 class ConjugateGradientSolver(Solver):
-    """A solver by conjugate gradients, for a covariance A that is too large to factorise. See `Solver`.
+    """A solver by conjugate gradients, for A that is too large to factorise. See `Solver`.
 
     A solve takes about 200 products with A for 50,000 points and a truncation of 50. In float32 the error of the result
     is at most 1e-4 of the largest value. The result is NaN if the solve did not converge.
@@ -144,7 +140,7 @@ class ConjugateGradientSolver(Solver):
 
     @property
     def factor(self) -> CholeskyFactor:
-        """Not available. **Raises:** `ValueError`, because this solver does not factorise A."""
+        """**Raises:** `ValueError`, because this solver does not factorise A."""
         raise InputError(
             f"covariances and likelihoods need a factorisation, which is done for at most {MAX_DENSE_CAPACITY} points: "
             "keep fewer points"
