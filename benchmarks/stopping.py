@@ -25,7 +25,8 @@ from jaxnbv.networks import part_segmenter, pretrained_classifier
 from jaxnbv.networks.categories import CATEGORIES
 from jaxnbv.planning.episode import Episode
 from jaxnbv.planning.loop import view_keys
-from jaxnbv.planning.stopping import Covered, PartsFound, StopContext, Sure
+from jaxnbv.planning.part_rules import PartsFound
+from jaxnbv.planning.stopping import Covered, StopContext, Sure
 from jaxnbv.scanning import GridSurface
 from jaxnbv.scanning.visibility import is_visible, spread_points
 from jaxnbv.storage.files import write_text

@@ -26,6 +26,9 @@ from .planning.episode import Episode as Episode
 from .planning.episodes import Episodes as Episodes
 from .planning.episodes import episodes as episodes
 from .planning.loop import View as View
+from .planning.part_rules import Identified as Identified
+from .planning.part_rules import PartsFound as PartsFound
+from .planning.part_rules import Placed as Placed
 from .planning.planner import Planner as Planner
 from .planning.session import NextView as NextView
 from .planning.session import Session as Session
@@ -33,9 +36,6 @@ from .planning.sessions import Sessions as Sessions
 from .planning.simulate import simulate as simulate
 from .planning.stopping import Budget as Budget
 from .planning.stopping import Covered as Covered
-from .planning.stopping import Identified as Identified
-from .planning.stopping import PartsFound as PartsFound
-from .planning.stopping import Placed as Placed
 from .planning.stopping import StopRule as StopRule
 from .planning.stopping import Sure as Sure
 from .planning.stopping import ValueBelow as ValueBelow

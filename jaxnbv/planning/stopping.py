@@ -20,7 +20,7 @@ import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from jaxnbv.acquisition import Acquisition, ExpectedUtilityImprovement, context_of
+from jaxnbv.acquisition import Acquisition, context_of
 from jaxnbv.checks import InputError, check_fields, check_type, require, short_text
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
@@ -29,11 +29,8 @@ from jaxnbv.observations import Observations
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.travel import CostFunction, WorldCost, arc_length, total_cost
 from jaxnbv.scanning import GridSurface, barrier_of
-from jaxnbv.surfaces.part_hypotheses import hypotheses_of
-from jaxnbv.surfaces.part_pose import surface_error
 from jaxnbv.tasks.classification import ClassAcquisition
 from jaxnbv.tasks.coverage import NewSurface, new_surface_of, seen_share
-from jaxnbv.tasks.segmentation import PartAnswer, SoftPartCount
 
 
 @dataclasses.dataclass(frozen=True)
@@ -188,52 +185,6 @@ def half_of(cloud: PointCloud, key: PRNGKeyArray) -> PointCloud:
     return cloud.only(jax.random.bernoulli(key, 0.5, cloud.mask.shape))
 
 
-class PartsFound(StopRule):
-    """Stop once the segmenter predicts enough points for every part.
-
-    - `points`: smallest number of predicted points for each part.
-    - `parts`: names of the parts to find, by default all parts of the segmenter. Give names if the object may lack some
-      of the segmenter's parts.
-
-    **Raises:** `ValueError` for a number of points below one, an acquisition without a segmenter, or a name that is not
-    a part of the segmenter.
-    """
-
-    points: int = eqx.field(static=True, default=60)
-    parts: tuple[str, ...] | None = eqx.field(static=True, default=None)
-
-    def __check_init__(self):
-        check_fields(self)
-        require(self.points >= 1, f"a part is found by {self.points} points; give at least 1")
-        are_names = isinstance(self.parts, tuple) and all(isinstance(name, str) for name in self.parts)
-        require(self.parts is None or are_names, f"the parts are {short_text(self.parts)}; give a tuple of their names")
-
-    def check(self, acquisition: Acquisition) -> None:
-        utility = acquisition.utility if isinstance(acquisition, ExpectedUtilityImprovement) else None
-        if not isinstance(utility, SoftPartCount):
-            raise InputError(
-                f"PartsFound is about parts, but {type(acquisition).__name__} has no segmenter: use the utility "
-                "SoftPartCount, or another rule"
-            )
-        names = tuple((utility.segmenter.part_names or {}).values())
-        require(
-            bool(self.parts or names),
-            "the segmenter has no names for its parts: give the parts to find as PartsFound(parts=('part 0', ...))",
-        )
-        unknown_names = [name for name in self.parts or () if names and name not in names]
-        require(not unknown_names, f"the segmenter knows no part {unknown_names[:1]}: give some of {', '.join(names)}")
-
-    def after(self, context: StopContext) -> str | None:
-        answer = context.planner.acquisition.answer(context.observations.cloud)
-        if not isinstance(answer, PartAnswer):
-            raise InputError("the acquisition's answer has no parts: PartsFound needs that of SoftPartCount")
-        counts = dict(zip(answer.names, answer.values.tolist(), strict=True))
-        names = self.parts or tuple(answer.names[index] for index in answer.parts)
-        if any(counts.get(name, 0) < self.points for name in names):
-            return None
-        return f"all {len(names)} parts are found, each by {self.points} points or more"
-
-
 class Covered(StopRule):
     """Stop once `expected_coverage`, the fraction of the visible area seen so far, is large enough.
 
@@ -276,48 +227,6 @@ def expected_coverage(context: StopContext, new: NewSurface) -> float:
     barrier = barrier_of(planner.obstacles, planner.camera, poses)
     newness = context_of(new, observations)
     return float(seen_share(newness, surfaces, planner.camera, poses, observations.poses, barrier))
-
-
-class Identified(StopRule):
-    """Stop once one of the known parts, or "none of these", has at least a given probability.
-
-    - `probability`: smallest probability at which to stop, within (0, 1).
-
-    **Raises:** `ValueError` for a probability outside (0, 1), or a planner without known parts.
-    """
-
-    probability: float = eqx.field(static=True, default=0.95)
-
-    def __check_init__(self):
-        check_fields(self)
-        require(0 < self.probability < 1, f"the probability is {self.probability}; it must lie within (0, 1)")
-
-    def after(self, context: StopContext) -> str | None:
-        name, probability = next(iter(hypotheses_of(context.observations).names().items()))
-        return f"it is {name} ({100 * probability:.0f} %)" if probability >= self.probability else None
-
-
-class Placed(StopRule):
-    """Stop once the expected error of the most probable part's surface is at most a given length.
-
-    The error is `surface_error`, a root mean square over the surface and over the hypotheses.
-
-    - `length`: largest error at which to stop, in world units in a session, and in scene units in a simulation.
-
-    **Raises:** `ValueError` for a length that is not positive, or a planner without known parts.
-    """
-
-    length: float = eqx.field(static=True)
-
-    def __check_init__(self):
-        check_fields(self)
-        require(self.length > 0, f"the length is {self.length}; it must be positive")
-
-    def after(self, context: StopContext) -> str | None:
-        error = float(
-            context.frame.length_to_world(surface_error(hypotheses_of(context.observations), context.observations))
-        )
-        return f"its surface is known to {error:.2g}" if error <= self.length else None
 
 
 class ValueBelow(StopRule):

@@ -17,7 +17,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxnbv.geometry.frame import Frame
-from jaxnbv.planning.stopping import Identified, Sure
+from jaxnbv.planning.part_rules import Identified
+from jaxnbv.planning.stopping import Sure
 from jaxnbv.tasks.classification import ClassAnswer
 from jaxnbv.tasks.heat import Coldest
 from jaxnbv.tasks.identification import IdentityAnswer

@@ -17,9 +17,10 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
 from jaxnbv.observations import Observations
+from jaxnbv.planning.part_rules import PartsFound
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.simulate import simulate
-from jaxnbv.planning.stopping import Budget, Covered, PartsFound, StopContext, Sure, ValueBelow, expected_coverage
+from jaxnbv.planning.stopping import Budget, Covered, StopContext, Sure, ValueBelow, expected_coverage
 from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning import Grid, SDFSurface, SensorNoise, scan
 from jaxnbv.scanning.sdf import Sphere
