@@ -20,7 +20,7 @@ from typing import NamedTuple, TypeAlias
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -41,15 +41,14 @@ _MATCH_DISTANCES = (0.08, 0.08, 0.08, 0.04, 0.04, 0.04, 0.02, 0.02, 0.01, 0.01)
 # Ratio of the width c of rho to the median disagreement, and number of least-squares steps in a round.
 _LOSS_WIDTH, _NUM_STEPS = 2.0, 3
 # Prior standard deviation of a pose error: in radians, and of its shift as a fraction of the distance from the cameras.
-# The errors of neighbouring points are correlated. Therefore _POINTS_PER_SAMPLE points count as one independent point.
+# Errors of neighbouring points are correlated, so this many points count as one independent point.
 _PRIOR_DEVIATION, _POINTS_PER_SAMPLE = 0.03, 50
 # The views determine all of X if the smallest eigenvalue of J^T J exceeds this fraction of the largest. The ratio is
 # 4e-6 for three views of a shelf from one side, and 1e-3 or more for views that determine X.
 _MIN_EIGENVALUE_RATIO = 3e-4
 # A correction is rejected if it moves points by more than this fraction of their distance from the cameras.
 _MAX_CORRECTION = 0.15
-# Views that differ by more than _DISAGREEMENT_RATIO times the noise disagree. A correction must divide their difference
-# by _MIN_IMPROVEMENT.
+# Ratio of disagreement to noise above which views disagree, and factor by which a correction must reduce it.
 _DISAGREEMENT_RATIO, _MIN_IMPROVEMENT = 3.0, 1.5
 _Corrections: TypeAlias = Float[np.ndarray, "views 4 4"]
 
@@ -59,20 +58,18 @@ class Alignment(eqx.Module):
 
     Lengths are in the units of the poses.
 
-    - `disagreement`: (views,), for each view the median point-to-plane distance between its points and the nearest
-      points of overlapping views, with uncorrected poses. NaN for a view that overlaps no other view.
-    - `angle`: (views,), for each view the median angle between the normals of these pairs of points, in radians.
+    - `disagreement`: for each view the median point-to-plane distance between its points and the nearest points of
+      overlapping views, with uncorrected poses. NaN for a view that overlaps no other view.
+    - `angle`: for each view the median angle between the normals of these pairs of points, in radians.
     - `noise`: median point-to-plane distance between neighbouring points of the same view.
     - `corrected`: `disagreement` with corrected poses.
-    - `corrections`: (views, 4, 4), the correction X of each view. The true pose of the camera is `matrix @ X`, where
-      `matrix` is the reported pose. All X are identities if corrected poses do not agree much better.
+    - `corrections`: the correction X of each view. The true pose of the camera is `matrix @ X`, where `matrix` is the
+      reported pose. All X are identities if corrected poses do not agree much better.
     - `is_mount`: whether all views have the same X, which is then an error of the mount.
     - `covariance`: covariance of the mount's error: a rotation vector (radians), then a shift, in the camera's axes.
-    - `is_determined`: whether the views determine all components of the mount's error. Undetermined components stay
-      close to zero.
-    - `weakest`: direction of the mount's error that the views determine least: a rotation vector, then a shift.
-    - `num_pairs`: number of pairs of views that were compared. Each view is compared with up to four other views of
-      similar direction.
+    - `is_determined`: whether the views determine all components of the mount's error. Others stay close to zero.
+    - `weakest`: direction of the mount's error that the views determine least, in the same components.
+    - `num_pairs`: number of compared pairs: each view and up to four others of similar direction.
     - `distance`: median distance of points from the camera that measured them.
     """
 
@@ -92,8 +89,8 @@ class Alignment(eqx.Module):
     def disagrees(self) -> bool:
         """Whether the poses seem wrong.
 
-        True if the disagreement of a view exceeds three times the noise, and either poses were corrected or the views
-        do not determine all of the mount's error.
+        They do if a view's disagreement exceeds three times the noise, and either poses were corrected or the views do
+        not determine all of the mount's error.
         """
         exceeds_noise = bool(np.any(self.disagreement > _DISAGREEMENT_RATIO * self.noise))
         return exceeds_noise and (self.is_corrected or not self.is_determined)
@@ -110,7 +107,7 @@ class Alignment(eqx.Module):
 
     @property
     def motion(self) -> str:
-        """Advice which view to add, so that the views determine the `weakest` error of the mount better.
+        """The view to add, in words, so that the views determine the `weakest` error of the mount better.
 
         A shift of the mount along an axis, or a rotation about it, looks the same in all views if the axis has the same
         world direction in all views. The advised view changes this direction.
@@ -133,12 +130,7 @@ class _View(NamedTuple):
 
 
 class _Matches(NamedTuple):
-    """Matched points of pairs of views, each in the coordinates of its own camera.
-
-    - `views`: for each match, the indices of the two views.
-    - `first_points`, `first_normals`: point and normal in the first view.
-    - `second_points`, `second_normals`: point and normal in the second view.
-    """
+    """Matched points of pairs of views, each in the coordinates of its own camera; and the indices of the views."""
 
     views: Int[np.ndarray, "n 2"]
     first_points: Float[np.ndarray, "n 3"]
@@ -248,10 +240,7 @@ def _match_points(
 
 
 def _is_plausible(corrections: _Corrections, median_distance: float) -> bool:
-    """Return whether the corrections are small enough to be errors of poses.
-
-    They must move points by less than 15 % of `median_distance`, the median distance of points from the cameras.
-    """
+    """Return whether the corrections are small enough, relative to the points' distance, to be errors of poses."""
     angles, shifts = errors_of(corrections)
     return bool(np.max(median_distance * angles + shifts) < _MAX_CORRECTION * median_distance)
 
@@ -270,8 +259,7 @@ def _solve_corrections(
 ) -> _Corrections:
     """Return the corrections that minimise the disagreement of the views, starting from `start`.
 
-    If `is_mount`, all views get the same correction. Otherwise each view but the first gets its own. `median_distance`
-    is the median distance of points from the cameras.
+    All views get the same correction if `is_mount`. Otherwise each view but the first gets its own.
     """
     corrections, num_steps = start, 1 if is_mount else len(views) - 1
     for ratio in _MATCH_DISTANCES:
@@ -300,12 +288,8 @@ def _robust_step(
 ) -> Float[np.ndarray, " steps"]:
     """Return the `step` that minimises sum rho(residuals + jacobian @ step) + sum prior (errors + step)^2.
 
-    The method is iteratively reweighted least squares. rho is the robust loss of the module's docstring.
-
-    - `residuals`, `jacobian`: point-to-plane distances and their derivative, from `_linearise`.
-    - `scale`: width c of rho.
-    - `errors`: the corrections so far, as rotation vectors and shifts.
-    - `prior`: weights that pull the corrections towards zero.
+    The method is iteratively reweighted least squares. `scale` is the width c of the robust loss rho. `errors` are the
+    corrections so far, as rotation vectors and shifts.
     """
     step = np.zeros(jacobian.shape[1])
     for _ in range(_NUM_STEPS):
@@ -320,9 +304,9 @@ def _linearise(
 ) -> tuple[Float[np.ndarray, " n"], csr_array]:
     """Return the signed point-to-plane distance of each match, and its derivative.
 
-    The distance is n_q . (T_i X_i p - T_j X_j q), see the module's docstring. The derivative is with respect to steps
-    X <- X exp(step): one step for the mount, or one for each view but the first. Its six entries for a view are, up to
-    sign, (p x m, m) with the point p and the normal m = n_q in the coordinates of this view's camera.
+    The derivative is with respect to steps X <- X exp(step): one step for the mount, or one for each view but the
+    first. Its six entries for a view are, up to sign, (p x m, m) with the point p and the normal m = n_q in the
+    coordinates of this view's camera.
     """
     poses = np.stack([view.matrix for view in views]) @ corrections
     (first, second), count = matches.views.T, len(matches.views)
@@ -341,9 +325,8 @@ def _linearise(
     entries = [(block.ravel(), row, (6 * (view[:, None] - 1) + np.arange(6)).ravel()) for view, block in blocks]
     value, row, column = map(np.concatenate, zip(*entries, strict=True))
     is_free, size = column >= 0, (count, 6 * (len(views) - 1))
-    return np.sum(normals * differences, axis=1), csr_array(
-        coo_array((value[is_free], (row[is_free], column[is_free])), shape=size)
-    )
+    jacobian = csr_array((value[is_free], (row[is_free], column[is_free])), shape=size)
+    return np.sum(normals * differences, axis=1), jacobian
 
 
 def _transform(matrices: Float[np.ndarray, "n 4 4"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
@@ -364,14 +347,9 @@ def _logarithm(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6"]:
 def _disagreement(
     views: Sequence[_View], pairs: Sequence[tuple[int, int]], corrections: _Corrections, median_distance: float
 ) -> tuple[Float[np.ndarray, " views"], Float[np.ndarray, " views"]]:
-    """Return, for each view, how much it disagrees with the views that `pairs` compares it with.
+    """Return two medians over the matches of each view, given the corrected poses; NaN without matches.
 
-    Points of two views are matched after the poses are corrected. The results are two medians over a view's matches: of
-    the point-to-plane distance between the two points, and of the angle between their normals (radians). NaN for a view
-    without matches.
-
-    - `corrections`: the correction X of each view's pose.
-    - `median_distance`: median distance of points from the cameras. Matched points are at most 8 % of it apart.
+    The medians are of the point-to-plane distance between two points, and of the angle between their normals (radians).
     """
     matches = _match_points(views, pairs, corrections, _MATCH_DISTANCES[0] * median_distance)
     residuals, _ = _linearise(views, matches, corrections, is_mount=True)

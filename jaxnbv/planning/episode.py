@@ -35,7 +35,7 @@ class Episode(eqx.Module):
 
     - `scene`, `noise`: true surface and sensor noise; None if a real sensor took the views.
     - `first`: pose of the first view.
-    - `stop_reason`: reason that the stop rule gave for ending the episode; None if no rule ended it.
+    - `stop_reason`: reason of the stop rule; None if no rule ended the episode.
     - `frame`: frame of the user's world, in which the episode is shown and its cloud is saved.
     """
 
@@ -74,7 +74,7 @@ class Episode(eqx.Module):
     def actual_scores(self, observations: Iterable[Observations] | None = None) -> Iterator[float | None]:
         """Yield the acquisition's score of each view's actual scan, given the observations before the view.
 
-        In scene units; None for the first view. Compare a score with the value that the view's proposal expected.
+        Scores are in scene units, as the values that proposals expected; None for the first view.
 
         - `observations`: the result of `observations()`, if it is already computed.
         """
@@ -90,8 +90,8 @@ class Episode(eqx.Module):
     def load(cls, path: str | Path, planner: Planner | None = None, scene: Surface | None = None) -> "Episode":
         """Load a saved episode, or the views that `simulate` has stored so far.
 
-        - `planner`, `scene`: planner and scene to use in place of the stored ones. Give them if the stored ones hold a
-          function or network that cannot be restored. They must have the same descriptions as the stored ones.
+        - `planner`, `scene`: replace the stored ones, if these hold a function or network that cannot be restored. They
+          must have the same descriptions as the stored ones.
 
         **Raises:** `ValueError` if the folder holds no episode or no view, or if its planner or scene cannot be
         restored.
@@ -99,14 +99,14 @@ class Episode(eqx.Module):
         replacements = {name: value for name, value in (("planner", planner), ("scene", scene)) if value is not None}
         config = RunFolder.config_of(path, "episode", **replacements)
         folder = RunFolder(path, "episode", config)
-        stored = read_views(folder)
-        require(len(stored) > 0, f"{path} holds no view yet")
+        stored_views = read_views(folder)
+        require(len(stored_views) > 0, f"{path} holds no view yet")
         camera = config.pop("camera")
         episode = cls(**config)
-        after = episode.planner.replay(((pose, scan) for pose, scan, _ in stored), camera)
+        all_observations = episode.planner.replay(((pose, scan) for pose, scan, _ in stored_views), camera)
         views = tuple(
             View(pose, scan, observations.cloud, proposal, camera, observations.hypotheses)
-            for (pose, scan, proposal), observations in zip(stored, after, strict=True)
+            for (pose, scan, proposal), observations in zip(stored_views, all_observations, strict=True)
         )
         return dataclasses.replace(episode, views=views, stop_reason=_read_end(folder, len(views)))
 
@@ -154,7 +154,7 @@ def read_views(folder: RunFolder) -> list[tuple[Pose, PointCloud, Proposal | Non
 
 
 def _read_end(folder: RunFolder, views: int) -> str | None:
-    """Return the reason why an episode ended after `views` views; None if no rule ended it there."""
+    """Return why a rule ended an episode after `views` views; None if no rule did."""
     if not folder.file("end", 0).exists():
         return None
     end = folder.read("end", 0)

@@ -47,12 +47,9 @@ def run(
     rows: tuple[Surface, Pose, Key[Array, " episodes"]],
     at_once: int,
 ) -> tuple[ViewRecord, PointCloud, Bool[Array, " episodes"]]:
-    """Simulate episodes, and return three results for each episode.
+    """Simulate episodes. Return the record of each view, the last cloud, and whether the first view hit the object.
 
-    The results are the record of each view with axes (episodes, max_views), the cloud after the last view, and whether
-    the first view hit the object.
-
-    - `views`: number of views of each episode. Later rows of the records are zero.
+    - `views`: number of views of each episode. Later rows of the records (episodes, max_views) are zero.
     - `rows`: scene, first pose and random key of each episode. The leading axis is split among the devices.
     - `at_once`: number of episodes that a device computes together.
     """

@@ -16,6 +16,7 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.planning.episode_program import answers_by_parts, run
 from jaxnbv.planning.planner import Planner
+from jaxnbv.planning.simulate import check_num_views
 from jaxnbv.scanning import Noise, SensorNoise, Surface
 from jaxnbv.scanning.scanner import distance_problem
 from jaxnbv.scanning.scene_batch import scene_batch
@@ -29,7 +30,7 @@ class Episodes(eqx.Module):
     """Results of `episodes` in scene coordinates. All arrays have a leading axis of episodes.
 
     - `poses`: poses of the views, (episodes, views).
-    - `values`: value that the search gave each view; NaN for the first view, which was not proposed.
+    - `values`: value that the search gave each view; NaN for the first view.
     - `clouds`: the cloud D after the last view.
     - `answers`: values of `View.answer` after each view. None if there is no answer, or if the answer needs code
       outside JAX.
@@ -62,24 +63,15 @@ def episodes(
     - `first`: pose of the first view, or a batch with one pose for each key.
     - `views`: number of views of each episode. The same compiled program serves any number.
     - `keys`: a random key for each episode, `jax.random.split(key, episodes)`.
-    - `noise`: noise of the sensor.
     - `batch_size`: number of episodes that a device computes together. The default is one on a CPU, and all episodes of
       the device on a GPU. More episodes need more memory. If it is greater than one, the values equal those of
       `simulate` only up to rounding.
 
-    **Raises:** `ValueError` in the following cases:
-
-    - The scenes are triangle meshes or have different structures.
-    - There are different numbers of scenes and keys.
-    - `views` is less than 1 or greater than the planner's `max_views`.
-    - The first view of an episode sees nothing.
-    - The value of a view is not finite.
+    **Raises:** `ValueError` for triangle meshes, scenes of different structures, different numbers of scenes and keys,
+    or `views` less than 1 or greater than the planner's `max_views`; if the first view of an episode sees nothing; and
+    if the value of a view is not finite.
     """
-    require(views >= 1, f"asked for {views} views; ask for at least one")
-    require(
-        views <= planner.max_views,
-        f"asked for {views} views but the planner has room for {planner.max_views}: raise Planner(max_views=...)",
-    )
+    check_num_views(planner, views)
     require(batch_size is None or batch_size >= 1, f"the batch size is {batch_size}; it must be at least 1")
     are_keys = isinstance(keys, Array) and jnp.issubdtype(keys.dtype, jax.dtypes.prng_key)
     require(
@@ -103,10 +95,7 @@ def episodes(
 
 
 def _batch_of_poses(first: Pose, count: int) -> Pose:
-    """Return the first pose of each episode, as a batch (count,).
-
-    **Raises:** `ValueError` unless `first` is one pose or `count` poses, or if a pose is far from the scene.
-    """
+    """Return the first pose of each episode, as a batch (count,), from one pose or `count` poses."""
     batch = first.position.shape[:-1]
     require(
         batch in ((), (count,)),
@@ -127,14 +116,8 @@ def _devices(count: int) -> AbstractContextManager:
 def _check(
     planner: Planner, values: Float[np.ndarray, "b v"], clouds: PointCloud, sees: Bool[np.ndarray, " b"]
 ) -> None:
-    """Check the results of all episodes.
-
-    **Raises:** `ValueError` if a first view sees nothing, an answer is invalid, or a value is not finite.
-    """
-    require(
-        bool(sees.all()),
-        f"the first view of episode {sees.argmin()} sees nothing: point the camera at the object",
-    )
+    """Raise `ValueError` if a first view sees nothing, an answer is invalid, or a value is not finite."""
+    require(bool(sees.all()), f"the first view of episode {sees.argmin()} sees nothing: point the camera at the object")
     if planner.search.uses_samples:
         planner.acquisition.check(clouds[0])
     for episode, view in np.argwhere(~np.isfinite(values[:, 1:])):

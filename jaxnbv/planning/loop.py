@@ -1,7 +1,6 @@
 """The loop of an episode: propose a pose, take the view, add the scan, and check the stop rule.
 
-Simulations, studies and sessions at a real sensor use the same `Loop`. A loop holds all state that depends on the views
-so far: observations, proposals, random keys, clock and stop rule.
+Simulations, studies and sessions at a real sensor use the same `Loop`, which holds all state that depends on the views.
 """
 
 import copy
@@ -46,7 +45,7 @@ class View(eqx.Module):
     - `pose`: pose of the sensor.
     - `scan`: the scan, with noise; one row for each pixel.
     - `cloud`: the cloud D after this view.
-    - `proposal`: the proposal of the search; None if the view was not proposed, such as the first view.
+    - `proposal`: None if the view was not proposed, such as the first view.
     - `camera`: the camera that took the scan, in scene units.
     - `hypotheses`: hypotheses of the model after this view, see `Observations`.
     """
@@ -59,10 +58,7 @@ class View(eqx.Module):
     hypotheses: eqx.Module | None = None
 
     def answer(self, acquisition: Acquisition) -> Answer | None:
-        """Return the acquisition's answer after this view.
-
-        If the acquisition has no answer but the model has known parts, return the probability of each part instead.
-        """
+        """Return the acquisition's answer after this view, or without one the probability of each known part."""
         answer = acquisition.answer(self.cloud)
         if answer is None and isinstance(self.hypotheses, PartHypotheses):
             return identity_answer(self.hypotheses, acquisition)
@@ -70,12 +66,11 @@ class View(eqx.Module):
 
 
 class Step(NamedTuple):
-    """A view of an episode, with the inputs and the time of the search that proposed the view.
+    """A view of an episode, with the inputs and the duration of the search that proposed the view.
 
     - `observations`: observations after the view.
-    - `inputs`: inputs of the search: posterior and samples. None if the search uses no samples, for the first view, and
-      for a view that was read from a folder.
-    - `seconds`: duration of the search; zero for the first view and for a view that was read from a folder.
+    - `inputs`, `seconds`: None and zero for the first view, and for a view that was read from a folder. The inputs are
+      also None if the search uses no samples.
     """
 
     view: View
@@ -88,9 +83,8 @@ class Step(NamedTuple):
 class _StepState:
     """Intermediate results for the next view.
 
-    - `is_proposed`: whether a caller received the proposal. False if the proposal was computed for the stop rule only.
-    - `stop`: reason to stop, or None. Valid once `is_evaluated` is True.
-    - `is_evaluated`: whether the stop rule was evaluated.
+    - `is_proposed`: whether a caller received the proposal. False if it was computed for the stop rule only.
+    - `stop`: reason to stop, or None, once the rule `is_evaluated`.
     """
 
     inputs: StepInputs | None = None
@@ -109,8 +103,8 @@ class Loop:
 
     - `planner`: the planner, in scene coordinates.
     - `key`: random key. The random keys of view i depend only on `key` and i.
-    - `until`: stop rule; None for no stop rule.
-    - `frame`: frame of the user's world. The stop rule uses the units of this world.
+    - `until`: stop rule, or None.
+    - `frame`: frame of the user's world, in whose units the stop rule is.
     - `camera`: the sensor's camera in scene units, by default the planner's.
     - `on_stage`: function that is called with a name from `STAGES` when this stage begins.
 
@@ -138,10 +132,9 @@ class Loop:
         self._next = _StepState()
 
     def without_views(self, planner: Planner) -> "Loop":
-        """Return a copy without views that uses `planner`.
+        """Return a copy without views that uses `planner`, for a session that has detected obstacles or pose errors.
 
-        A session uses it once it has detected obstacles, and to add its views again after correcting their poses. The
-        copy keeps the time of the first view, from which stop rules count seconds.
+        The copy keeps the time of the first view, from which stop rules count seconds.
         """
         loop = copy.copy(self)
         loop.planner, loop.views, loop._observations = planner, (), None
@@ -149,10 +142,7 @@ class Loop:
         return loop
 
     def with_clutter(self, clutter: SignedDistance | None) -> "Loop":
-        """Return a copy with different clutter in the obstacles of its planner.
-
-        - `clutter`: solid in scene units; None for no clutter.
-        """
+        """Return a copy with different clutter, in scene units, in the obstacles of its planner."""
         assert self.planner.obstacles is not None
         loop = copy.copy(self)
         # tree_at skips the planner's checks, which take time and passed when the planner was created.
@@ -196,11 +186,7 @@ class Loop:
 
     @own_settings()
     def take(self, sensor: Sensor, first: Pose) -> Step | None:
-        """Take the next view with a sensor at the proposed pose, and add the view.
-
-        Return None if the episode has ended.
-
-        - `first`: pose of the first view.
+        """Take the next view with a sensor at the proposed pose, or at `first`; return None if the episode has ended.
 
         **Raises:** `ValueError` whenever `propose` or `add` raises it.
         """
@@ -216,16 +202,16 @@ class Loop:
         return Step(view, self.observations, inputs, seconds)
 
     def steps(
-        self, sensor: Sensor, first: Pose, stored: Iterable[tuple[Pose, PointCloud, Proposal | None]] = ()
+        self, sensor: Sensor, first: Pose, stored_views: Iterable[tuple[Pose, PointCloud, Proposal | None]] = ()
     ) -> Iterator[Step]:
         """Take views until the stop rule holds or `max_views` is reached, and yield the step of each view.
 
         - `first`: pose of the first view.
-        - `stored`: stored views of the same episode, in order. They are added first, and the sensor is not used.
+        - `stored_views`: stored views of the episode, in order. They are added first, without the sensor.
 
         **Raises:** `ValueError` whenever `take` raises it, for example when every candidate has been visited.
         """
-        for pose, scan, proposal in stored:
+        for pose, scan, proposal in stored_views:
             if proposal is not None:
                 self.set_stored_proposal(proposal)
             yield Step(self.add(pose, scan), self.observations, None, 0.0)
@@ -254,18 +240,16 @@ class Loop:
         return self._next.proposal
 
     def replace_proposal(self, proposal: Proposal) -> None:
-        """Use this proposal for the next view instead of the search's, because an arm can reach it."""
+        """Use this proposal for the next view instead of the search's."""
         self._next.proposal = proposal
 
     def set_stored_proposal(self, proposal: Proposal) -> None:
-        """Use a stored proposal for the next view, without a new search."""
+        """Use a stored proposal for the next view, without a search."""
         self._next = _StepState(proposal=proposal, is_proposed=True)
 
     def inputs(self) -> StepInputs:
         """Return the inputs of the search for the next view. They are computed once for each view."""
-        if not self.planner.search.uses_samples:
-            return StepInputs(self.observations)
-        return self._sample_inputs()
+        return self._sample_inputs() if self.planner.search.uses_samples else StepInputs(self.observations)
 
     @own_settings()
     def done(self) -> str | None:
@@ -296,7 +280,7 @@ class Loop:
         return self._next.stop
 
     def in_world(self, value: Float[Array, ""]) -> float:
-        """Convert a value of the search, or the value's standard error, to world units."""
+        """Convert a value of the search, or its standard error, to world units."""
         return float(self.frame.length_to_world(value, self.planner.quantity.length_power))
 
     def _surfaces(self) -> GridSurface:

@@ -14,8 +14,7 @@ class PartsFound(StopRule):
     """Stop once the segmenter predicts enough points for every part.
 
     - `points`: smallest number of predicted points for each part.
-    - `parts`: names of the parts to find, by default all parts of the segmenter. Give names if the object may lack some
-      of the segmenter's parts.
+    - `parts`: names of the parts to find, by default all parts of the segmenter. Give them if the object may lack some.
 
     **Raises:** `ValueError` for a number of points below one, an acquisition without a segmenter, or a name that is not
     a part of the segmenter.
@@ -80,7 +79,7 @@ class Placed(StopRule):
 
     The error is `surface_error`, a root mean square over the surface and over the hypotheses.
 
-    - `length`: largest error at which to stop, in world units in a session, and in scene units in a simulation.
+    - `length`: largest error at which to stop, in world units (in a simulation, scene units).
 
     **Raises:** `ValueError` for a length that is not positive, or a planner without known parts.
     """
@@ -92,7 +91,6 @@ class Placed(StopRule):
         require(self.length > 0, f"the length is {self.length}; it must be positive")
 
     def after(self, context: StopContext) -> str | None:
-        error = float(
-            context.frame.length_to_world(surface_error(hypotheses_of(context.observations), context.observations))
-        )
+        error = surface_error(hypotheses_of(context.observations), context.observations)
+        error = float(context.frame.length_to_world(error))
         return f"its surface is known to {error:.2g}" if error <= self.length else None

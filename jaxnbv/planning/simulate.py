@@ -38,43 +38,35 @@ def simulate(
 ) -> Episode:
     """Simulate an episode: scan a known surface from `first`, then from the planner's proposals.
 
-    View i does not depend on `views`, the total number of views. An interrupted run with a folder continues after its
-    last view. On a CPU with the same versions, its result is bit for bit that of an uninterrupted run. On a GPU the
-    bits may differ, because the order of sums varies between runs. The stop rule is checked after the last stored view,
-    so you can continue a run with a different stop rule.
+    View i does not depend on `views`. An interrupted run with a folder continues after its last view. On a CPU with the
+    same versions, its result is bit for bit that of an uninterrupted run. On a GPU the bits may differ, because the
+    order of sums varies. You can continue a run with a different stop rule, which is checked after the last stored
+    view.
 
     - `scene`: the true surface: a surface, a solid or a trimesh mesh.
     - `first`: pose of the first view, in scene coordinates.
     - `views`: total number of views, unless the stop rule ends the episode earlier.
     - `key`: random key. The random numbers of view i depend only on `key` and i.
-    - `noise`: noise of the sensor.
     - `folder`: folder that stores every finished view.
     - `progress`: whether to show the stages on a progress bar.
     - `until`: stop rule, for example `Sure(0.95) | Budget(seconds=60)`.
     - `each`: function that is called with the step of every view, including stored views.
 
-    **Raises:** `ValueError` in four cases:
-
-    - `views` is less than 1 or greater than the planner's `max_views`.
-    - The first view sees nothing.
-    - The folder belongs to a run with different arguments.
-    - The folder already holds more views.
+    **Raises:** `ValueError` if `views` is less than 1 or greater than the planner's `max_views`, if the first view sees
+    nothing, or if the folder belongs to a run with different arguments or already holds more views.
     """
-    require(views >= 1, f"asked for {views} views; ask for at least one")
-    require(
-        views <= planner.max_views,
-        f"asked for {views} views but the planner has room for {planner.max_views}: raise Planner(max_views=...)",
-    )
+    check_num_views(planner, views)
     check_key(key)
     require(first.position.ndim == 1, "the first pose is a batch of poses: give one, poses[0] say")
     surface = as_surface(scene)
     episode = Episode(planner, surface, noise, first, key)
     store = None if folder is None else episode.open(folder)
     with store.writing() if store else nullcontext():
-        stored = read_views(store) if store else []
+        stored_views = read_views(store) if store else []
+        count = len(stored_views)
         require(
-            len(stored) <= views,
-            f"asked for {views} views but {folder} already holds {len(stored)}: ask for more, or choose another folder",
+            count <= views,
+            f"asked for {views} views but {folder} already holds {count}: ask for more, or choose another folder",
         )
         with progress_bar(total=views * len(STAGES), enabled=progress) as bar:
 
@@ -87,9 +79,9 @@ def simulate(
                 return observe_scene(surface, planner.camera, pose, noise, key, planner.obstacles)
 
             loop = Loop(planner, key, until, on_stage=on_stage)
-            for step in itertools.islice(loop.steps(sensor, first, stored), views):
+            for step in itertools.islice(loop.steps(sensor, first, stored_views), views):
                 index = len(loop.views) - 1
-                if store and index >= len(stored):
+                if store and index >= count:
                     store.write("view", index, pose=step.view.pose, scan=step.view.scan, proposal=step.view.proposal)
                 if each is not None:
                     each(step)
@@ -101,6 +93,15 @@ def simulate(
         if store:
             episode.write_end(store)
     return episode
+
+
+def check_num_views(planner: Planner, views: int) -> None:
+    """Raise `ValueError` unless the planner has room for this number of views, at least one."""
+    require(views >= 1, f"asked for {views} views; ask for at least one")
+    require(
+        views <= planner.max_views,
+        f"asked for {views} views but the planner has room for {planner.max_views}: raise Planner(max_views=...)",
+    )
 
 
 def observe_scene(

@@ -53,12 +53,9 @@ class StopContext:
     surfaces: Callable[[], GridSurface]
     frame: Frame
 
-    def cost(self, poses: tuple[Pose, ...], of: CostFunction) -> float:
-        """Return the cost of the path through scene poses.
-
-        - `of`: cost function, which gets poses in world coordinates.
-        """
-        return total_cost(poses, WorldCost(of, self.frame))
+    def cost(self, poses: tuple[Pose, ...], cost: CostFunction) -> float:
+        """Return the cost of the path through scene poses. `cost` gets poses in world coordinates."""
+        return total_cost(poses, WorldCost(cost, self.frame))
 
 
 class StopRule(eqx.Module):
@@ -74,14 +71,13 @@ class StopRule(eqx.Module):
         return
 
     def after(self, context: StopContext) -> str | None:
-        """Return the reason to stop after the views so far, as a text; None to continue."""
+        """Return the reason to stop after the views so far; None to continue."""
         return None
 
     def before(self, context: StopContext, pose: Pose, value: float) -> str | None:
-        """Return the reason to stop before the proposed view, as a text; None to continue.
+        """Return the reason to stop before the proposed view; None to continue.
 
-        - `pose`: proposed pose, in scene coordinates.
-        - `value`: value of the proposed pose, in world units.
+        - `pose`, `value`: proposed pose in scene coordinates, and its value in world units.
         """
         return None
 
@@ -112,15 +108,14 @@ class AnyOf(StopRule):
 
 
 def checked_reason(rule: StopRule, reason: str | None) -> str | None:
-    """Check a reason that a rule returned, and return the reason unchanged.
+    """Return the reason that a rule returned.
 
     **Raises:** `ValueError` unless the reason is a non-empty string or None.
     """
-    is_valid = reason is None or (isinstance(reason, str) and bool(reason))
-    name = type(rule).__name__
     require(
-        is_valid,
-        f"the stop rule {name} returned {short_text(reason)}: it must return the reason in words, or None to go on",
+        reason is None or (isinstance(reason, str) and bool(reason)),
+        f"the stop rule {type(rule).__name__} returned {short_text(reason)}: it must return the reason in words, or "
+        "None to go on",
     )
     return reason
 
@@ -128,8 +123,8 @@ def checked_reason(rule: StopRule, reason: str | None) -> str | None:
 class Sure(StopRule):
     """Stop once the most probable class has at least a given probability.
 
-    It must have this probability given the cloud D, and also given each of several random halves of D. The halves are
-    checked because a classifier may be sure of a single cloud by chance.
+    It must also have this probability given each of several random halves of the cloud D, because a classifier may be
+    sure of a single cloud by chance.
 
     - `probability`: smallest probability at which to stop, within (0, 1).
     - `num_resamplings`: number of random halves.
@@ -154,7 +149,7 @@ class Sure(StopRule):
         return self.reason(context.planner.acquisition, context.observations.cloud, context.key)
 
     def reason(self, acquisition: Acquisition, cloud: PointCloud, key: PRNGKeyArray) -> str | None:
-        """Return the reason to stop given a cloud, as a text; None to continue. `key` draws the halves."""
+        """Return the reason to stop given a cloud; None to continue. `key` draws the halves."""
         acquisition = _class_acquisition(acquisition)
         answer = acquisition.answer(cloud)
         best = int(np.argmax(answer.values))
@@ -181,7 +176,7 @@ def _class_acquisition(acquisition: Acquisition) -> ClassAcquisition:
 
 @jax.jit
 def half_of(cloud: PointCloud, key: PRNGKeyArray) -> PointCloud:
-    """Return a random subset of a cloud, to which each point belongs with probability one half."""
+    """Return a random subset of a cloud, which contains each point with probability one half."""
     return cloud.only(jax.random.bernoulli(key, 0.5, cloud.mask.shape))
 
 
@@ -190,7 +185,7 @@ class Covered(StopRule):
 
     - `share`: fraction of the area at which to stop, within (0, 1].
     - `size`: surface within this distance of measured surface counts as seen, in world units (`NewSurface.size`). The
-      default is the acquisition's size if the acquisition is a `NewSurface`, otherwise the size of `NewSurface()`.
+      default is the size of the acquisition if this is a `NewSurface`, otherwise that of `NewSurface()`.
 
     **Raises:** `ValueError` for a `share` outside (0, 1], or a size that is not positive.
     """
@@ -212,28 +207,27 @@ class Covered(StopRule):
         return f"{100 * share:.1f} % of what can be seen is expected to be covered" if share >= self.share else None
 
 
-def expected_coverage(context: StopContext, new: NewSurface) -> float:
+def expected_coverage(context: StopContext, new_surface: NewSurface) -> float:
     """Return the expected fraction of the visible area that the views so far have seen.
 
     The visible area is the area of the posterior samples that is visible from any candidate, see `seen_share`. Sampled
     surface that an earlier view should have measured but did not is left out.
 
-    - `new`: acquisition that decides which surface is new, that is, not seen yet.
+    - `new_surface`: acquisition that decides which surface is not seen yet.
     """
     planner, observations, surfaces = context.planner, context.observations, context.surfaces()
     if observations.looks is not None and not planner.acquisition.measurable_only:
         surfaces = observations.looks.without_unmeasured(surfaces, observations.poses)
     poses = planner.search.poses_around()
     barrier = barrier_of(planner.obstacles, planner.camera, poses)
-    newness = context_of(new, observations)
+    newness = context_of(new_surface, observations)
     return float(seen_share(newness, surfaces, planner.camera, poses, observations.poses, barrier))
 
 
 class ValueBelow(StopRule):
     """Stop once the proposed view's value is below a limit.
 
-    - `value`: limit in the unit of the search's values. Lengths are in world units in a session, and in scene units in
-      a simulation.
+    - `value`: limit in the unit of the search's values, with lengths in world units (in a simulation, scene units).
     """
 
     value: float = eqx.field(static=True)
@@ -253,7 +247,7 @@ class Budget(StopRule):
 
     - `seconds`: time limit, counted from the first view that this process adds. The time is checked between views.
     - `cost`: limit of the cost of the whole path through all views.
-    - `of`: function that returns the cost of a move. In a session it gets poses in world coordinates.
+    - `of`: cost of a move between two poses in world coordinates (in a simulation, scene coordinates).
 
     **Raises:** `ValueError` if both limits are None, or if a limit is not positive.
     """
