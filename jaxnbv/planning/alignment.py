@@ -130,7 +130,7 @@ class _View(NamedTuple):
 
 
 class _Matches(NamedTuple):
-    """Matched points of pairs of views, each in the coordinates of its own camera; and the indices of the views."""
+    """Matched points of two views each, in the coordinates of their own cameras, and the views' indices."""
 
     views: Int[np.ndarray, "n 2"]
     first_points: Float[np.ndarray, "n 3"]
@@ -240,7 +240,7 @@ def _match_points(
 
 
 def _is_plausible(corrections: _Corrections, median_distance: float) -> bool:
-    """Return whether the corrections are small enough, relative to the points' distance, to be errors of poses."""
+    """Return whether the corrections move points little enough to be errors of poses."""
     angles, shifts = errors_of(corrections)
     return bool(np.max(median_distance * angles + shifts) < _MAX_CORRECTION * median_distance)
 

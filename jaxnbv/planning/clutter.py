@@ -19,8 +19,6 @@ from jaxnbv.scanning.sdf import Sampled
 _NUM_CELLS = 48
 # Smallest number of an image's points in an occupied cell. Fewer points may be flying pixels at a depth edge.
 _MIN_POINTS = 5
-
-
 # Largest normalised image coordinate (x / z or y / z) for which the distortion formula is used.
 _MAX_COORDINATE = 3.0
 
@@ -42,19 +40,11 @@ class Clutter(NamedTuple):
         """Return clutter without votes."""
         return cls(np.zeros((_NUM_CELLS,) * 3, np.int64), half_extent, box)
 
-    def with_image(
-        self,
-        image: Image,
-        camera: Camera,
-        pose: Pose,
-        frame: Frame,
-        obstacles: Obstacles,
-    ) -> "Clutter":
-        """Return a copy with the votes of one more image.
+    def with_image(self, image: Image, camera: Camera, pose: Pose, frame: Frame, obstacles: Obstacles) -> "Clutter":
+        """Return a copy with the votes of one more image. Cells in or next to an obstacle get no votes.
 
-        - `image`, `camera`, `pose`: the image, the sensor and the pose, in world units.
-        - `frame`: frame of the session's world.
-        - `obstacles`: obstacles in scene units. Cells in or next to an obstacle get no votes.
+        - `camera`, `pose`: the sensor and its pose, in world units.
+        - `obstacles`: obstacles in scene units.
         """
         depth = np.where(np.isfinite(image.depth), image.scale * np.asarray(image.depth, np.float64), 0.0)
         if image.robot is not None:

@@ -47,7 +47,7 @@ def run(
     rows: tuple[Surface, Pose, Key[Array, " episodes"]],
     at_once: int,
 ) -> tuple[ViewRecord, PointCloud, Bool[Array, " episodes"]]:
-    """Simulate episodes. Return the record of each view, the last cloud, and whether the first view hit the object.
+    """Return the views' records of simulated episodes, the last clouds, and whether first views hit.
 
     - `views`: number of views of each episode. Later rows of the records (episodes, max_views) are zero.
     - `rows`: scene, first pose and random key of each episode. The leading axis is split among the devices.

@@ -29,7 +29,7 @@ class Image(NamedTuple):
     """A depth image as the user added it.
 
     - `depth`: depth image in the user's unit.
-    - `matrix`: camera-to-world matrix from the user.
+    - `matrix`: camera-to-world matrix.
     - `scale`: factor from `depth` to world units.
     - `mask`: mask of the pixels that show the object; None if every pixel may show it.
     - `robot`: mask of the pixels that show the robot; None if no pixel is known to show it.
@@ -76,9 +76,7 @@ class Image(NamedTuple):
         return local @ np.asarray(pose.rotation, np.float64).T + np.asarray(pose.position, np.float64)
 
     def with_robot(self, ignore: Ignore, camera: Camera, pose: Pose) -> "Image":
-        """Return a copy with the mask of the robot's pixels.
-
-        - `ignore`: function that is called with the measured world points, and returns which belong to the robot.
+        """Return a copy with the mask of the robot's pixels, by `ignore` of the measured world points.
 
         **Raises:** `ValueError` if `ignore` does not return a bool for each point.
         """
@@ -98,12 +96,10 @@ class Image(NamedTuple):
         return cloud if self.robot is None else only_where(cloud, ~self.robot, camera, stride)
 
     def is_blank(self, cloud: PointCloud) -> bool:
-        """Return whether the image has no measurement.
+        """Return whether the image has no measurement, given its points in the box.
 
-        True if `cloud` is empty, and either no pixel is valid or all valid pixels have the same value. Such a value
-        means "not measured".
-
-        - `cloud`: the points of the image in the box.
+        True if `cloud` is empty, and either no pixel is valid or all valid pixels have the same value, which then means
+        "not measured".
         """
         if bool(cloud.mask.any()):
             return False
@@ -111,10 +107,9 @@ class Image(NamedTuple):
         return not bool(np.any(cloud.missed)) or (len(values) == 1 and bool(np.isfinite(values[0])))
 
     def check_not_stale(self, earlier: "tuple[Image, ...]") -> None:
-        """Check that the image is not a stale frame, which the driver recorded before the camera moved.
+        """Raise `ValueError` if one of the `earlier` images has the same depths but a different pose.
 
-        **Raises:** `ValueError` if one of the `earlier` images has the same depths but a different pose. An image
-        without a positive depth is not checked.
+        The driver then recorded the frame before the camera moved. An image without a positive depth is not checked.
         """
         if not (self.depth > 0).any():
             return
@@ -130,7 +125,7 @@ class Image(NamedTuple):
 def only_where(cloud: PointCloud, pixels: Bool[np.ndarray, "height width"], camera: Camera, stride: int) -> PointCloud:
     """Return a cloud with only the points of some pixels. Its rays (`sight`, `missed`) do not change.
 
-    - `pixels`: mask of the pixels to keep, at the image's full resolution.
+    - `pixels`: mask of the pixels to keep, at full resolution.
     - `stride`: stride of the rows and columns from which the cloud was made.
     """
     if camera.distortion:

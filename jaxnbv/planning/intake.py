@@ -26,8 +26,7 @@ from jaxnbv.scanning import Obstacles
 class Intake:
     """The images of a session so far, and the table, clutter and pose errors detected in the images.
 
-    - `camera`, `box`, `convention`: as in the session, in world units.
-    - `frame`: frame of the session's world.
+    - `camera`, `box`, `frame`, `convention`: as in the session, in world units.
     - `planner`: planner in scene coordinates. If the planner's `obstacles` is None, the first image is searched for a
       table, and all images for clutter.
     """
@@ -49,9 +48,7 @@ class Intake:
         return intake
 
     def add(self, loop: Loop, image: Image, on_accept: Callable[[], None] = lambda: None) -> Loop | None:
-        """Add an image to the loop as a view, and return the loop.
-
-        Return None, and change nothing, if the image is blank and is not the first image.
+        """Add an image to the loop, and return the loop; None for a blank image that is not the first.
 
         - `on_accept`: function that is called after all checks and before the view is added.
 
@@ -86,10 +83,7 @@ class Intake:
         return loop
 
     def _cloud(self, image: Image, pose: Pose, is_first: bool) -> PointCloud:
-        """Return the points of an image in the box, or in the margin around the box that carving needs.
-
-        **Raises:** `ValueError` if the first image shows nothing of the box.
-        """
+        """Return the points of an image in the box, or in the margin around the box that carving needs."""
         region, sampler = self.box, self.planner.sampler
         if sampler.carving is not None:
             region = sampler.carving.with_room(region, sampler.grid, self.frame)

@@ -132,7 +132,7 @@ class Loop:
         self._next = _StepState()
 
     def without_views(self, planner: Planner) -> "Loop":
-        """Return a copy without views that uses `planner`, for a session that has detected obstacles or pose errors.
+        """Return a copy without views that uses `planner`, once a session has found obstacles or pose errors.
 
         The copy keeps the time of the first view, from which stop rules count seconds.
         """
@@ -186,7 +186,7 @@ class Loop:
 
     @own_settings()
     def take(self, sensor: Sensor, first: Pose) -> Step | None:
-        """Take the next view with a sensor at the proposed pose, or at `first`; return None if the episode has ended.
+        """Take the next view with a sensor at the proposed pose, or at `first`. None if the episode has ended.
 
         **Raises:** `ValueError` whenever `propose` or `add` raises it.
         """

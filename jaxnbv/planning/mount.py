@@ -22,7 +22,6 @@ _MIN_CHANGE = 0.5
 class MountError:
     """Alignment of a session's images, and the pose corrections that the session currently uses.
 
-    - `camera`: the sensor.
     - `convention`: axes of the images' matrices, see `Pose.from_matrix`.
     - `corrections`: (views, 4, 4), the correction X of each image. The true pose of the camera is `matrix @ X`, in
       OpenCV's axes.
@@ -36,15 +35,12 @@ class MountError:
         self._alignment: Alignment | None = None
 
     def add(self, image: Image, index: int) -> None:
-        """Add the image with this index. An image that was added before is ignored.
-
-        - `image`: image in which pixels without a measurement have depth zero, see `Image.without_sentinels`.
-        """
+        """Add the image (after `Image.without_sentinels`) with this index, unless it was added before."""
         if index == len(self._images):
             self._images.append(image)
 
     def alignment(self) -> Alignment:
-        """Return the alignment of the images so far, from all measured points, also those outside the box.
+        """Return the alignment of the images, from all measured points, also those outside the box.
 
         **Raises:** `ValueError` for fewer than two images.
         """
@@ -60,7 +56,7 @@ class MountError:
         return self._alignment
 
     def warn_if_misaligned(self) -> bool:
-        """Warn if the images disagree, and return whether they do. Return False for fewer than three images."""
+        """Warn if three or more images disagree, and return whether they do."""
         if len(self._images) < _MIN_VIEWS or not (alignment := self.alignment()).disagrees:
             return False
         warn_of_mount(alignment)
@@ -87,7 +83,7 @@ class MountError:
         return Pose.from_matrix(np.asarray(poses.to_matrix(), np.float64) @ np.linalg.inv(self.mount))
 
     def update(self) -> bool:
-        """Update the corrections from the images so far, and return whether they changed noticeably."""
+        """Update the corrections, and return whether they changed noticeably."""
         if len(self._images) < _MIN_VIEWS:
             return False
         alignment = self.alignment()

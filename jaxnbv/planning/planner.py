@@ -52,13 +52,13 @@ else:
 class Planner(eqx.Module):
     """Bayesian next-best-view selection (the paper's Algorithm 1): `init`, `propose` and `observe`.
 
-    - `acquisition`: the expected value of a view. You can also pass a plain function of a cloud. Then a view's value is
-      the expected improvement of this utility.
+    - `acquisition`: the expected value of a view. For a plain function of a cloud, it is the expected improvement of
+      this utility.
     - `search`: method that finds the pose of the highest expected value.
     - `camera`: the sensor whose scans are simulated.
     - `sampler`: draws the surfaces that fit the observations.
     - `cost`: cost of moving the camera from the last view to the next; None to ignore it.
-    - `obstacles`: solids around the object, or None. Obstacles may hide the object, and cameras keep clear of them.
+    - `obstacles`: solids around the object, or None. They may hide the object, and cameras keep clear of them.
     - `capacity`: largest number of points in the cloud D. Larger clouds are thinned by farthest point sampling.
     - `max_views`: largest number of views that the observations can hold.
 
@@ -68,8 +68,7 @@ class Planner(eqx.Module):
     **Raises:** `ValueError` in the following cases:
 
     - `capacity` or `max_views` is below one.
-    - The search cannot work with the acquisition, the camera or the cost. For example, a gradient search needs an
-      acquisition that JAX can differentiate.
+    - The search cannot work with the acquisition (a gradient search needs derivatives), the camera or the cost.
     - The acquisition needs known parts, but the sampler's model has none.
     - JAX cannot trace a utility, classifier or segmenter, or it returns an array of the wrong shape.
     """
@@ -135,8 +134,7 @@ class Planner(eqx.Module):
 
         **Raises:** `ValueError` if the cloud is empty, if a point is not finite or outside the scene's grid, if more
         than a few stray points are outside the carving's volume, if a normal's length differs from 1 by more than 1 %,
-        or if a sensor's scan does not have one row for each ray of the camera; and whenever the acquisition's `check`
-        raises it.
+        if a sensor's scan does not have one row for each ray of the camera, or if the acquisition's `check` raises it.
         """
         camera = camera or self.camera
         self._check(pose, scan, camera, is_first=True)
@@ -216,10 +214,7 @@ class Planner(eqx.Module):
 
     @own_settings()
     def step_inputs(self, observations: Observations, key: PRNGKeyArray) -> StepInputs:
-        """Return the inputs of the search, for `choose`. `propose` calls both.
-
-        The inputs are the result of `sample_inputs`, or only the observations if the search uses no samples.
-        """
+        """Return the inputs for `choose`: `sample_inputs`, or the observations if no samples are used."""
         check_type(observations, Observations, "observations")
         return self.sample_inputs(observations, key) if self.search.uses_samples else StepInputs(observations)
 
@@ -227,9 +222,9 @@ class Planner(eqx.Module):
     def sample_inputs(self, observations: Observations, key: PRNGKeyArray) -> StepInputs:
         """Return the observations, the model's posterior given them, and surfaces drawn from the posterior.
 
-        For an acquisition with `measurable_only` (`NewSurface`), the drawn surfaces lack those regions that an earlier
-        view should have measured but did not. For an acquisition with `needs_hypotheses` (`Identify`), there is no
-        posterior, and the only surface is that of the most probable part.
+        For an acquisition with `measurable_only` (`NewSurface`), the surfaces lack regions that an earlier view should
+        have measured but did not. For an acquisition with `needs_hypotheses` (`Identify`), there is no posterior, and
+        the only surface is that of the most probable part.
         """
         if self.acquisition.needs_hypotheses:
             return StepInputs(observations, None, hypotheses_of(observations).surfaces(self.sampler.grid, 1))
@@ -281,10 +276,7 @@ class Planner(eqx.Module):
         return observations.add_view(pose, scan, camera, self.sampler.carving, obstacles)
 
     def _check(self, pose: Pose | None, scan: PointCloud, camera: Camera, is_first: bool) -> None:
-        """Check the arguments of `init` (if `is_first`) or `observe`.
-
-        **Raises:** `ValueError` for invalid arguments.
-        """
+        """Raise `ValueError` for invalid arguments of `init` (if `is_first`) or `observe`."""
         for value, hint, name in ((scan, PointCloud, "scan"), (pose, Pose | None, "pose"), (camera, Camera, "camera")):
             check_type(value, hint, f"the {name}")
         check_single(scan, "the scan")
@@ -313,7 +305,7 @@ def _propose(search: Search, problem: Problem, key: PRNGKeyArray) -> Proposal:
 
 
 def _checked_proposal(planner: Planner, problem: Problem, proposal: Proposal) -> Proposal:
-    """Check a proposal, and return the proposal unchanged.
+    """Return the proposal.
 
     **Raises:** `ValueError` that names the cause if the value is not finite, or if every candidate has been visited.
     """
@@ -337,10 +329,7 @@ def _checked_proposal(planner: Planner, problem: Problem, proposal: Proposal) ->
 
 
 def _check_parts(planner: Planner, problem: Problem, proposal: Proposal) -> None:
-    """Find why a value is not finite, at the first candidate with such a value.
-
-    **Raises:** `ValueError` that names the cost or the component of the acquisition that is not finite.
-    """
+    """Raise `ValueError` that names the cost, or the component of the acquisition, that is not finite."""
     values = proposal.values
     is_invalid = jnp.isnan(values) | (values == jnp.inf)
     pose = proposal.candidates[int(jnp.argmax(is_invalid))] if bool(is_invalid.any()) else proposal.pose

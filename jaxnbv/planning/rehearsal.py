@@ -22,11 +22,7 @@ _RADIUS = 0.2
 
 
 class Rehearsal(NamedTuple):
-    """Result of a rehearsal.
-
-    - `programs`: number of programs that were compiled or read from the cache.
-    - `seconds`: duration of the rehearsal.
-    """
+    """The number of programs that were compiled or read from the cache, and the duration of the rehearsal."""
 
     programs: int
     seconds: float
@@ -38,7 +34,7 @@ class Rehearsal(NamedTuple):
 def rehearse(intake: Intake, loop: Loop) -> Rehearsal:
     """Add two simulated images of a ball on a table, and propose a pose after each image.
 
-    - `intake`, `loop`: intake and loop without views. The rehearsal changes both, so do not use them afterwards.
+    The intake and the loop have no views. The rehearsal changes them, so do not use them afterwards.
     """
     start, programs = time.monotonic(), 0
 
@@ -67,10 +63,9 @@ def slanted_poses(poses: Pose, count: int) -> Pose:
 
 
 def ball_on_a_table(camera: Camera, pose: Pose, box: Box) -> Float[np.ndarray, "height width"]:
-    """Return a depth image of a ball in the middle of a box, with a table at the bottom of the box.
+    """Return a depth image of a ball in the middle of a box, with a table at the bottom (scene units).
 
-    The depths are exact, in scene units with y up. A pixel is zero if its ray misses ball and table, or if the hit is
-    outside the camera's range.
+    A pixel is zero if its ray misses both, or if the hit is outside the camera's range.
     """
     origin = np.asarray(pose.position, np.float64)
     directions = np.asarray(camera.pixel_directions(), np.float64)

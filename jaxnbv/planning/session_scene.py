@@ -49,9 +49,10 @@ def in_scene(
 ) -> Planner:
     """Return a copy of a planner for a sensor and a box, in scene coordinates.
 
-    - `camera`, `box`, `convention`: as for `Session`, in world units.
-    - `matrices`: poses as for `Session`, in world units; None for the candidates of the planner's search.
-    - `obstacles`: as for `Session`, in world units; None for the planner's own obstacles.
+    Arguments are as for `Session`, in world units.
+
+    - `matrices`: poses; None for the candidates of the planner's search.
+    - `obstacles`: None for the planner's own obstacles.
     """
     search = planner.search.upper_half()
     if matrices is not None:

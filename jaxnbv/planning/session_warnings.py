@@ -21,7 +21,7 @@ _CALLER, _CALLER_OF_ADD = 3, 4
 def warn_of_cut(box: Box, points: Float[np.ndarray, "n 3"], voxel: float, faces: frozenset[str]) -> frozenset[str]:
     """Warn about faces of the box that seem to cut the object. Return the faces of all warnings so far.
 
-    - `box`, `points`: box and measured points in world units, up to about a voxel outside the box.
+    - `points`: measured points in the box and up to about a voxel outside, in world units.
     - `voxel`: side of a cell of the planner's grid, in world units.
     - `faces`: faces of earlier warnings, which are not repeated.
     """
@@ -56,11 +56,7 @@ def warn_of_blank() -> None:
 
 
 def warn_of_no_table(up: str, others: tuple[str, ...]) -> None:
-    """Warn that no table was detected under the object.
-
-    - `up`: the session's upward axis.
-    - `others`: axes with which a table would be detected if they were upward.
-    """
+    """Warn that no table was detected with `up`, and name the axes `others` with which one would be."""
     if others:
         axes = " or ".join(f'up="{axis}"' for axis in others)
         problem = f'no table is found with up="{up}", but a plane would be one with {axes}: give that if it is upward'
@@ -96,7 +92,7 @@ def warn_of_mount(alignment: Alignment) -> None:
 def warn_of_inside(box: Box, cameras: Float[np.ndarray, "n 3"], candidates: Float[np.ndarray, "m 3"]) -> None:
     """Warn if the last camera is the first one inside the box and all candidates are outside.
 
-    - `cameras`, `candidates`: positions of the views so far and of the candidates. They and `box` are in world units.
+    - `cameras`, `candidates`: positions of the views so far and of the candidates, in world units.
     """
     low, high = box.low, box.high
     is_inside, any_inside = (np.all((x > low) & (x < high), axis=1) for x in (cameras, candidates))
@@ -110,9 +106,7 @@ def warn_of_inside(box: Box, cameras: Float[np.ndarray, "n 3"], candidates: Floa
 
 
 def warn_of_little(value: float, error: float | None, value_at_visited: float) -> None:
-    """Warn that even the best view may have no value.
-
-    Either everything has been seen, or no candidate looks at the unseen surface.
+    """Warn that even the best view may have no value: nothing is unseen, or no candidate looks at it.
 
     - `value`, `error`: value of the best view and its standard error, in world units.
     - `value_at_visited`: mean value expected at visited poses, where nothing new is left to see, in world units.

@@ -150,9 +150,9 @@ class Sessions:
     def next(self) -> Float[np.ndarray, "4 4"]:
         """Return the camera-to-world matrix of the pose for the next image.
 
-        The pose is the candidate with the highest sum of values in world units. The sum is over the objects for which
-        the stop rule does not hold yet, or over all objects if there is no such object. The result stays the same until
-        an image is added. No pose is proposed twice.
+        The pose is the candidate with the highest sum of values over the objects for which the stop rule does not hold
+        yet, or over all objects if there is none. The result stays the same until an image is added. No pose is
+        proposed twice.
 
         **Raises:** `ValueError` before the first image, if all candidates were proposed, and whenever
         `Planner.propose` raises it.
@@ -175,7 +175,7 @@ class Sessions:
         return "; ".join(f"{number}: {reason}" for number, reason in reasons.items())
 
     def _session(self, number: int, box: Box) -> Session:
-        """Load the session of an object from its folder, or create the session if there is no folder."""
+        """Load the session of an object from its folder, or create it."""
         folder = None if self._folder is None else self._folder / str(number)
         if folder is not None and folder.exists():
             return Session.load(folder, self._planner, self.until, self._progress)
@@ -194,10 +194,7 @@ class Sessions:
         )
 
     def _table_of(self, cloud: PointCloud) -> Obstacles:
-        """Detect the table under the objects in the cloud of a whole image, and return it in world units.
-
-        If there is no table, warn and return `Obstacles()`.
-        """
+        """Return the table under the objects, in world units. If there is none, warn and return `Obstacles()`."""
         table = table_under(self._frame.to_scene(cloud), self._frame.to_scene(self.box))
         if table is None:
             warnings.warn(
@@ -241,8 +238,7 @@ class Sessions:
     def _object_near(self, points: Float[np.ndarray, "n 3"]) -> int | None:
         """Return the number of the earlier object to which a cluster belongs; None for a new object.
 
-        The cluster belongs to the object whose surface is nearest to its points, if the distance is below the gap. The
-        distance is the expected distance over the object's hypotheses.
+        It belongs to the object of the smallest expected distance to its points, if the distance is below the gap.
         """
         subset = points[np.linspace(0, len(points) - 1, _NUM_COMPARED).astype(int)]
         distances = {number: _expected_distance(session, subset) for number, session in self.objects.items()}
@@ -264,10 +260,9 @@ class Sessions:
 
 
 def clusters(points: Float[np.ndarray, "n 3"], gap: float) -> Int[np.ndarray, " n"]:
-    """Return the index of each point's cluster.
+    """Return the index of each point's cluster. Points within about `gap` are in the same cluster.
 
-    Points within about `gap` of each other are in the same cluster. Distances are computed between cells whose side is
-    a quarter of the gap. Therefore the cost hardly grows with the density of the points.
+    Distances are between cells whose side is a quarter of the gap, so the cost hardly grows with the density of points.
     """
     if len(points) == 0:
         return np.zeros(0, int)
@@ -287,7 +282,7 @@ def _values(session: Session) -> Float[np.ndarray, " candidates"]:
 def _expected_distance(session: Session, points: Float[np.ndarray, "n 3"]) -> float:
     """Return the median over points of the expected distance from the surface of a session's object.
 
-    The distance is in world units. The expectation is over the object's hypotheses except "none of these".
+    World units. The expectation is over the object's hypotheses except "none of these".
     """
     hypotheses, frame = hypotheses_of(session.observations), session.frame
     scene_points = jnp.asarray(frame.to_scene(points), hypotheses.weights.dtype)

@@ -26,7 +26,6 @@ _NUM_PLANES, _NUM_COUNTED = 1000, 3000
 class _Points(NamedTuple):
     """Points of an image relative to the middle of a box, with normals and weights.
 
-    - `is_inside`: mask of the points in the box.
     - `is_near_box`: mask of the points in, under, above or close beside the box.
     - `weights`: weights that decrease with the horizontal distance from the middle of the box.
     """
@@ -94,7 +93,7 @@ def other_ups(cloud: PointCloud, box: Box, up: str) -> tuple[str, ...]:
 def _points_around(
     cloud: PointCloud, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], side: float
 ) -> _Points:
-    """Return points relative to the middle of a box with corners `low` and `high` and longest side `side`."""
+    """Return points relative to the middle of a box with longest side `side`."""
     points, normals = (rows.astype(np.float64) for rows in cloud.to_numpy())
     is_inside = np.all((points > low) & (points < high), axis=1)
     margin = np.array([_MAX_SIDE_DISTANCE * side, np.inf, _MAX_SIDE_DISTANCE * side])
@@ -106,8 +105,6 @@ def _points_around(
 
 def _best_plane(image: _Points, lowest: float, highest: float) -> tuple[Float[np.ndarray, "3"], float] | None:
     """Return the normal n and offset d of the table plane n . x = d; None if no plane can be a table.
-
-    Among the planes that can be a table, the plane with the most points outside the box is returned.
 
     - `lowest`, `highest`: limits of the plane's height at the middle of the box.
     """
@@ -152,7 +149,7 @@ def _best_plane(image: _Points, lowest: float, highest: float) -> tuple[Float[np
 def _on_and_below(
     image: _Points, normals: Float[np.ndarray, "k 3"], offsets: Float[np.ndarray, " k"]
 ) -> tuple[Bool[np.ndarray, "n k"], Bool[np.ndarray, "n k"]]:
-    """Return masks of the points on each plane and of the points below each plane."""
+    """Return masks of the points on each plane, and below it."""
     height = image.points @ normals.T - offsets
     return (np.abs(height) <= _TOLERANCE) & (image.normals @ normals.T >= _MIN_NORMAL_COSINE), height < -_TOLERANCE
 
@@ -162,7 +159,7 @@ def _is_table(
 ) -> Bool[np.ndarray, " k"]:
     """Return, for each plane, whether so few points lie below it that it may be a table.
 
-    These are the last two conditions of `table_under`. `is_on` and `is_below` are the result of `_on_and_below`.
+    These are the last two conditions of `table_under`.
     """
     is_clear = is_below[image.is_inside].sum(axis=0) <= _MAX_STRAY_FRACTION * image.is_inside.sum()
     return is_clear & (is_on[image.is_near_box].sum(axis=0) >= is_below[image.is_near_box].sum(axis=0))

@@ -25,7 +25,6 @@ The cost is finite and at least zero, in any unit. The function must use JAX ope
 coordinates in a session, and in scene coordinates in a simulation.
 """
 
-
 _COST, _ONE_NUMBER = "the cost of going from one pose to another", "make it one number a pose, finite and zero or more"
 
 
@@ -55,17 +54,15 @@ arc_length = ArcLength()
 
 
 class WorldCost(eqx.Module):
-    """Cost function of scene poses, which converts them to world poses for another cost function.
+    """Cost function of scene poses, which converts them to world poses for the cost function `of`.
 
-    - `of`: cost function of poses in world coordinates. An `ArcLength` without a centre uses the middle of the scene.
-    - `frame`: frame of the user's world.
+    An `ArcLength` without a centre uses the middle of the scene.
     """
 
     of: CostFunction
     frame: Frame
 
     def __call__(self, start: Pose, end: Pose) -> Float[Array, ""]:
-        """Return the cost, in the unit of `of`."""
         of = self.of
         if isinstance(of, ArcLength) and of.center is None:
             of = ArcLength(self.frame.center)
@@ -75,9 +72,9 @@ class WorldCost(eqx.Module):
 class ValuePerCost(eqx.Module):
     """Value of a view divided by the cost of the view: value / (fixed + cost of the move).
 
-    - `of`: cost function of the move between two poses: `arc_length` or your own function. In a session it gets poses
-      in world coordinates.
-    - `fixed`: fixed cost of every view, in the unit of `of`. It may be the time that the sensor needs for an image.
+    - `of`: cost of the move between two poses in world coordinates (in a simulation, scene coordinates): `arc_length`
+      or your own function.
+    - `fixed`: fixed cost of every view, in the unit of `of`, such as the time that the sensor needs for an image.
 
     **Raises:** `ValueError` if `fixed` is not positive.
     """
@@ -94,7 +91,7 @@ class ValuePerCost(eqx.Module):
     ) -> Float[Array, "*samples poses"]:
         """Return the values of poses, each divided by the fixed cost plus the cost of the move to the pose.
 
-        The move starts at the last view of the observations. Without a view, only the fixed cost counts.
+        The move starts at the last view. Without a view, only the fixed cost counts.
         """
         cost = jax.vmap(lambda pose: checked_result(self.of(observations.poses.last, pose), _COST, 0, _ONE_NUMBER))(
             poses
@@ -104,12 +101,12 @@ class ValuePerCost(eqx.Module):
         return values / (self.fixed + jnp.where(observations.num_views > 0, cost, 0.0))
 
     def in_world(self, frame: Frame) -> "ValuePerCost":
-        """Return a copy for scene poses, whose cost function `of` still gets world poses."""
+        """Return a copy for scene poses, whose cost function still gets world poses."""
         of = self.of.of if isinstance(self.of, WorldCost) else self.of
         return dataclasses.replace(self, of=WorldCost(of, frame))
 
     def quantity(self, value: Quantity) -> Quantity:
-        """Return the name, unit and meaning of values per cost, given those of the values alone."""
+        """Return the quantity of values per cost, given that of the values alone."""
         meaning = f"{value.meaning.rstrip('.')}, over the cost of going there."
         unit = f"{value.unit or ('' if value.length_power else value.name)} per unit of cost".lstrip()
         return dataclasses.replace(value, name=f"{value.name} per cost", unit=unit, meaning=meaning)
