@@ -65,11 +65,13 @@ def points_of_depth(
         depth, missed = undistort_image(depth, jnp.asarray(missed), plane_points, matrix, camera.distortion)
     block_side = 1 if is_traced(depth) else find_block_side(np.isfinite(depth) & (np.asarray(depth) > 0))
     # The rounding is an array, so that a program compiled for one unit of depth runs for any unit.
-    image = depth, jnp.asarray(missed), camera, pose, stride, jnp.asarray(rounding, depth.dtype), box, block_side
-    (points, normals, mask, missed, sight), inside = _points_and_normals(*image)
-    if box is not None and not is_traced(points):
-        _warn_of_nothing_inside(np.asarray(points)[np.asarray(mask)], np.asarray(inside)[np.asarray(mask)], box)
-    mask = mask & inside
+    image = depth, jnp.asarray(missed), camera, pose, stride, jnp.asarray(rounding, depth.dtype), block_side
+    (points, normals, mask, missed, sight), nearest = _points_and_normals(*image)
+    if box is not None:
+        inside, crosses_box = _in_box(points, nearest, box, camera, pose, stride)
+        if not is_traced(points):
+            _warn_of_nothing_inside(np.asarray(points)[np.asarray(mask)], np.asarray(inside)[np.asarray(mask)], box)
+        mask, missed = mask & inside, missed | (crosses_box & ~inside)
     points, normals = (jnp.where(mask[:, None], vectors, 0.0) for vectors in (points, normals))
     return points, normals, mask, missed, sight
 
@@ -82,10 +84,9 @@ def _points_and_normals(
     pose: Pose,
     stride: int,
     rounding: Float[Array, ""],
-    box: Box | None,
     block_side: int,
-) -> tuple[Rows, Bool[Array, " n"]]:
-    """Return the cloud's rows, even for points outside the box, and whether each point lies in the box.
+) -> tuple[Rows, Float[Array, " n"]]:
+    """Return the cloud's rows, and a lower bound on the depth around each row's pixel (NaN without a depth).
 
     - `rounding`: standard deviation of the rounding of depths.
     """
@@ -104,13 +105,19 @@ def _points_and_normals(
     local = jnp.where(valid, jnp.where(has_normal, smooth, depth), 0.0).reshape(-1, 1)
     points = pose.to_scene(local * strided_camera.pixel_directions())
     normals = jnp.matmul(normals.reshape(-1, 3), pose.rotation.T, precision="highest")
+    nearest = jnp.where(valid, nearest, jnp.nan).reshape(-1)
+    return (points, normals, mask, missed.reshape(-1), sight), nearest
 
-    missed, inside = missed.reshape(-1), jnp.ones_like(mask)
-    if box is not None:
-        crosses_box = valid.reshape(-1) & (nearest.reshape(-1) >= _depth_behind(box, strided_camera, pose))
-        inside = box(points) <= 0
-        missed = missed | (crosses_box & ~inside)
-    return (points, normals, mask, missed, sight), inside
+
+@program
+def _in_box(
+    points: Float[Array, "n 3"], nearest: Float[Array, " n"], box: Box, camera: Camera, pose: Pose, stride: int
+) -> tuple[Bool[Array, " n"], Bool[Array, " n"]]:
+    """Return whether each point lies in a box, and whether each ray was measured beyond the box.
+
+    - `nearest`: see `_points_and_normals`.
+    """
+    return box(points) <= 0, nearest >= _depth_behind(box, camera.strided(stride), pose)
 
 
 def _strided_samples(

@@ -18,10 +18,10 @@ from jaxnbv.geometry.volume import ray_interval
 from jaxnbv.scanning.cubic import CORNERS, cubic, first_bracket, first_root
 from jaxnbv.scanning.scanner import implicit_depth
 
-# Once at most a fifth of the rays of a march is unfinished, the march continues with these only, unless the batch is
-# smaller than an image. With a quarter instead of a fifth, a march is as fast but takes a third longer to compile.
+# Once at most a fifth of the rays of a march is unfinished, the march continues with these only. Each further batch size
+# takes most of a second to compile, so small batches are not reduced, and a quarter would be no faster than a fifth.
 _SHRINK_FACTOR = 5
-_MIN_BATCH = 2500
+_MIN_BATCH = 4000
 
 # A ray grazes the surface if the slope of f along the ray, per cell, is below this fraction of the spread of f over the
 # cell's corners.
