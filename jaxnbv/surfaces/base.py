@@ -28,8 +28,7 @@ _NUM_SAMPLES = 64
 def _on_torus(has_shape: Callable[[Any], bool], description: str) -> Callable[..., Any]:
     """Make a decorator that checks that a method's arguments are arrays of coordinates in [-pi, pi].
 
-    Sampled functions have the period 2 pi, so points outside [-pi, pi]^3 would only repeat points inside. The scene is
-    [-pi/2, pi/2]^3, an eighth of this cube, and surfaces lie only in the scene.
+    Sampled functions have the period 2 pi, so points outside [-pi, pi]^3 would only repeat points inside.
 
     - `has_shape`, `description`: whether an array has the right shape, and this shape in words for the error message.
     """
@@ -62,10 +61,7 @@ on_grid_of_torus = _on_torus(lambda axis: axis.ndim == 1, "the nodes along one a
 
 
 def sampling_method(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Decorate a sampling method so that it checks its random key and its number of samples.
-
-    **Raises:** the method raises `ValueError` if the key is not a JAX random key, or for a number of samples below 1.
-    """
+    """Decorator: check the random key and the number of samples. **Raises:** `ValueError` for others."""
 
     @functools.wraps(method)
     def call(self: Any, key: PRNGKeyArray, num_samples: int) -> Any:
@@ -108,9 +104,8 @@ class Fields(eqx.Module):
 class SurfacePosterior(eqx.Module):
     """The posterior p(f | D). The surface is where f equals `level`, and f is greater outside.
 
-    A subclass defines `level` and `sample`. If it has closed forms of `mean`, `variance` and `probability_inside`, it
-    overrides these methods. By default they are estimated from 64 samples, drawn with a fixed key. The same samples are
-    evaluated at all points.
+    A subclass defines `level` and `sample`, and overrides `mean`, `variance` and `probability_inside` if it has closed
+    forms. By default they are estimated from 64 samples, drawn with a fixed key and evaluated at all points.
     """
 
     level: eqx.AbstractVar[Float[Array, ""]]
@@ -121,21 +116,15 @@ class SurfacePosterior(eqx.Module):
 
     @property
     def has_closed_forms(self) -> bool:
-        """Whether the class overrides `mean`. If not, the mean and the variance are estimated from samples."""
+        """Whether the class overrides `mean`, which is otherwise estimated from samples."""
         return type(self).mean is not SurfacePosterior.mean
 
     def kinds(self) -> dict[str, float]:
-        """Return the probability of each kind of known shape, such as "chair", most likely first.
-
-        Models without known shapes return an empty dictionary.
-        """
+        """Return the probability of each kind of known shapes, such as "chair", most likely first."""
         return {}
 
     def names_of_samples(self, key: PRNGKeyArray, num_samples: int) -> list[str]:
-        """Return the name of the known shape of each sample that `sample` draws with this key.
-
-        Models without known shapes return empty names.
-        """
+        """Return the known shape's name, or "", of each sample that `sample` draws with this key."""
         return [""] * num_samples
 
     def mean(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
@@ -169,22 +158,19 @@ class SurfaceModel(eqx.Module):
     def condition(self, observations: Observations | PointCloud) -> SurfacePosterior:
         """Return the posterior p(f | observations).
 
-        All models use the filled rows of the cloud. Some models also use the space that was seen to be empty.
-        Implementations convert a `PointCloud` with `as_observations`.
+        All models use the filled rows of the cloud, some also the space that was seen to be empty. Implementations
+        convert a `PointCloud` with `as_observations`.
         """
 
     def add_state(self, observations: Observations) -> Observations:
-        """Add the state that the model carries from view to view, and return the observations.
+        """Return the observations with the state that the model carries from view to view (by default none).
 
-        The loop calls this method after each view. By default a model carries no state.
+        The loop calls this method after each view.
         """
         return observations
 
     def in_scene(self, frame: Frame) -> "SurfaceModel":
-        """Return a copy in which the sizes of parts are converted from a frame's world units to scene units.
-
-        A model without known parts at true size is returned unchanged.
-        """
+        """Return a copy with the sizes of known parts, if any, converted from a frame's world to scene units."""
         return self
 
     @property
@@ -193,5 +179,5 @@ class SurfaceModel(eqx.Module):
         return False
 
     def check(self, cloud: PointCloud) -> None:
-        """Warn if a cloud does not suit the model. The cloud's values must be concrete (not traced)."""
+        """Warn if a cloud, whose values must not be traced, does not suit the model."""
         return

@@ -41,7 +41,7 @@ class NormalDraws(NamedTuple):
 class GeometricSPSRPosterior(TrigonometricPosterior):
     """The posterior p(f | D) under `GeometricSPSR`, in closed form and as pathwise samples.
 
-    - `level`: mean of E f(x_j) over the points x_j of D. The surface is where f equals the level.
+    - `level`: mean of E f(x_j) over the points x_j of D.
     - `mean_coefficients`: coefficients of E f, see `surfaces/trigonometric.py`.
     - `weights`: A^-1 n, where n are the observed normals and A is their covariance.
     - `solver`: applies A^-1, and has the cloud, spectrum and noise that define A. For more than 16,384 points it uses
@@ -97,14 +97,14 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
     def level_shift(self, means: MeansAtData) -> Float[Array, " s"]:
         """Return the change of the level that each mean function m_s causes.
 
-        The change is the mean of m_s(x_j) over the data, minus the level of a posterior with the normals grad m_s(x_j).
-        The level is linear in the normals, so its slope is computed once for all mean functions.
+        It is the mean of m_s(x_j) over the data, minus the level of a posterior with the normals grad m_s(x_j). The
+        level is linear in the normals, so its slope is computed once for all mean functions.
         """
         explained = jnp.einsum("snd,nd->s", means.gradients, _level_slope(self), precision="highest")
         return jnp.mean(means.values, axis=1, where=self.cloud.mask) - explained
 
     def prior_draws(self, key: PRNGKeyArray, num_samples: int) -> NormalDraws:
-        """Draw the normal field v and the noise of the normals from the prior."""
+        """Draw the normal field v and the noise of the normals."""
         scale, dtype = jnp.sqrt(mode_variance(self.spectrum)), self.weights.dtype
         modes, shape = scale.shape[0], self.cloud.points.shape
         transform = NonuniformTransform(self.cloud.points, self.truncation)
@@ -121,27 +121,25 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
     def condition_draws(self, draws: NormalDraws, means: MeansAtData) -> Float[Array, "s a a a"]:
         """Condition the draws on the normals, and return the coefficients of the samples.
 
-        A sample is Poisson(v + k(., X) A^-1 (n - grad m(X) - v(X) - eps)). Here v and eps are draws of the normal field
-        and of the noise, n are the normals at the points X, m is a mean function, and A is the covariance of n.
+        A sample is Poisson(v + k(., X) A^-1 (n - grad m(X) - v(X) - eps)), with a mean function m.
         """
         return self._reconstruct_samples(draws.coefficients, self.solver.solve(self._residual(draws, means)))
 
     def _residual(self, draws: NormalDraws, means: MeansAtData) -> Float[Array, "s n 3"]:
-        """Return the normals minus the means' gradients and the drawn normals, with zeros in unfilled rows."""
         return jnp.where(self.cloud.mask[:, None], self.cloud.normals - means.gradients - draws.noisy_normals, 0.0)
 
     def whitened_residual(self, draws: NormalDraws, means: MeansAtData) -> Float[Array, "s n 3"]:
-        """Return C^-1 times the result of `_residual`, with C the Cholesky factor of the normals' covariance."""
+        """Return C^-1 times the normals minus the means' gradients and the draws, with A = C C^T."""
         return self.solver.whiten(self._residual(draws, means))
 
     def update_draws(
-        self, coefficients: Float[Array, "s 3 a a a"], whitened: Float[Array, "s n 3"]
+        self, coefficients: Float[Array, "s 3 a a a"], residual: Float[Array, "s n 3"]
     ) -> Float[Array, "s a a a"]:
-        """Return the coefficients of Poisson(v + k(., X) C^-T z) for each sample.
+        """Return the coefficients of Poisson(v + k(., X) C^-T z), with z a whitened residual.
 
-        `coefficients` are those of the drawn normal field v, and `whitened` is z, the result of `whitened_residual`.
+        - `coefficients`: those of the drawn normal field v.
         """
-        return self._reconstruct_samples(coefficients, self.solver.unwhiten(whitened))
+        return self._reconstruct_samples(coefficients, self.solver.unwhiten(residual))
 
     def _reconstruct_samples(
         self, coefficients: Float[Array, "s 3 a a a"], weights: Float[Array, "s n 3"]
@@ -172,21 +170,14 @@ def condition_on_normals(cloud: PointCloud, spectrum: Spectra, noise: Scalar) ->
 def reconstruct(
     transform: NonuniformTransform, weights: Float[Array, "n 3"], spectrum: Spectra
 ) -> Float[Array, "a a a"]:
-    """Return the coefficients of f = Poisson(k(., X) w), with k the prior covariance of the normal field.
-
-    - `transform`: transform at the points X.
-    - `weights`: w.
-    """
+    """Return the coefficients of Poisson(k(., X) w), with weights w and the points X of the transform."""
     return solve_poisson(mode_variance(spectrum) * transform.adjoint(weights))
 
 
 def mean_at_data(
     transform: NonuniformTransform, coefficients: Float[Array, "a a a"], cloud: PointCloud
 ) -> Float[Array, ""]:
-    """Average the function with these coefficients over the points of a cloud.
-
-    - `transform`: transform at the points of the cloud.
-    """
+    """Average the function with these coefficients over a cloud, which has the points of the transform."""
     values = transform.evaluate(coefficients[None])[:, 0]
     return jnp.sum(jnp.where(cloud.mask, values, 0.0)) / jnp.sum(cloud.mask)
 

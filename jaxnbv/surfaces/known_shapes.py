@@ -42,7 +42,7 @@ from jaxnbv.surfaces.values import OnSurface
 
 
 def short_ranged(longest_side: float = 2.5, truncation: int = 32) -> ScreenedSPSR:
-    """Return the default model of the difference between an object of this size and a known shape.
+    """Return the default model of the difference between an object and a known shape.
 
     - `longest_side`: longest side of the object's bounding box, in scene units.
     - `truncation`: largest frequency along each axis.
@@ -59,7 +59,6 @@ def short_ranged(longest_side: float = 2.5, truncation: int = 32) -> ScreenedSPS
 class KnownShapes(SurfaceModel):
     """A mixture prior of known shapes, registered to the scan, and a model for "none of these".
 
-    - `bank`: the shapes.
     - `residual`: the model of the difference between object and shape. Its short lengthscale limits it to the
       neighbourhood of the scan.
     - `poses`: the possible placements of shapes in the scene.
@@ -112,7 +111,7 @@ class KnownShapes(SurfaceModel):
         )
 
     def fit(self, observations: Observations) -> tuple[Hypotheses, Float[Array, " h_and_none"]]:
-        """Return the shapes registered to the scan, and their weights followed by that of "none of these"."""
+        """Return the shapes registered to the scan, and their weights and that of "none of these"."""
         fits = register(self.bank, Prior(self.poses, self.box), FitTargets.of(observations), self.num_starts)
         return fits, _weights(fits, self.inverse_temperature, self.misfit_of_none)
 
@@ -147,10 +146,7 @@ def _weights(fits: Hypotheses, inverse_temperature: float, misfit_of_none: float
 
 
 class Hypothesis(NamedTuple):
-    """A possible identity of the object: a shape's name, probability, misfit to the scan and placement.
-
-    The placement of "none of these" is None.
-    """
+    """A possible identity of the object. The placement of "none of these" is None."""
 
     name: str
     weight: float
@@ -162,8 +158,7 @@ class KnownShapesPosterior(SurfacePosterior):
     """The posterior p(f | D) under `KnownShapes`.
 
     - `level`: zero.
-    - `fits`: the registered shapes.
-    - `weights`: weights of the shapes in `fits`, followed by the weight of "none of these".
+    - `fits`, `weights`: the registered shapes; and their weights, followed by the weight of "none of these".
     - `residual`: posterior of the difference between object and shape, which draws samples about the shapes.
     - `of_none`: posterior of f if the object is none of the shapes.
     """
@@ -265,7 +260,7 @@ class PlacedShapes(Fields):
 
     They are bounded by h, and at the surface their gradient equals that of d.
 
-    - `solids`, `placements`: the solids and their placements, both along a leading axis.
+    - `solids`, `placements`: both along a leading axis.
     - `bound`: h, in scene units.
     """
 
@@ -282,10 +277,9 @@ class PlacedShapes(Fields):
 
 
 class MixtureFields(Fields):
-    """A batch of samples in which each sample comes from one of two batches.
+    """A batch of samples in which each sample comes from one of two batches of the same size.
 
-    - `of_shapes`, `of_none`: the two batches, of the same size.
-    - `level`: the level of `of_none`, which is subtracted from the values of `of_none`.
+    - `level`: the level of `of_none`, which is subtracted from its values.
     - `is_none`: for each sample, whether it comes from `of_none`.
     """
 

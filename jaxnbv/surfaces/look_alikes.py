@@ -56,10 +56,8 @@ class _Grid:
 def _difference(one: _Grid, other: _Grid, ratio: float) -> float:
     """Return the largest difference of signed distances to two centred shapes, near the surface of `one`.
 
-    The shape `other` is rotated by right angles to make this difference smallest. The result is infinite if the side
-    lengths differ in every rotation.
-
-    - `ratio`: factor that scales `other` to the units of `one`.
+    The shape `other` is scaled by `ratio` and rotated by right angles to make this difference smallest. The result is
+    infinite if the side lengths differ in every rotation.
     """
     smallest, points = np.inf, None
     for rotation in _ROTATIONS:

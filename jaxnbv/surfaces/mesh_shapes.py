@@ -30,10 +30,7 @@ _T = TypeVar("_T")
 
 
 def as_tuple(values: Sequence[_T], name: str) -> tuple[_T, ...]:
-    """Return the values as a tuple.
-
-    **Raises:** `ValueError` if the values are not iterable. The message calls them `name`.
-    """
+    """Return a tuple. **Raises:** `ValueError` if the values, called `name`, are not iterable."""
     try:
         return tuple(values)
     except TypeError as error:
@@ -65,8 +62,8 @@ class MeshShape(NamedTuple):
     """A mesh as a shape of a bank, scaled so that its longest side is 2.5.
 
     - `solid`: signed distance of the shape, on a grid.
-    - `extremes`: the farthest vertex of the shape in each of several evenly spread directions.
-    - `from_mesh`: the similarity transform from the coordinates of the mesh to the coordinates of the shape.
+    - `extremes`: the farthest vertex in each of several evenly spread directions.
+    - `from_mesh`: the similarity transform from coordinates of the mesh to coordinates of the shape.
     """
 
     solid: Sampled
@@ -77,11 +74,9 @@ class MeshShape(NamedTuple):
 def shapes_of_meshes(
     paths: Sequence[Path | trimesh.Trimesh], resolution: int, sheet: float, num_extremes: int, up: str, progress: bool
 ) -> tuple[list[MeshShape], list[int]]:
-    """Return the shapes of all usable meshes, and the indices of these meshes.
+    """Return the shapes of all usable meshes, and their indices. Warn of each unusable mesh.
 
-    A `UserWarning` names each unusable mesh and the reason.
-
-    - `num_extremes`: number of `MeshShape.extremes`. See `ShapeBank.from_meshes` for the other settings.
+    See `ShapeBank.from_meshes` for the settings.
 
     **Raises:** `ValueError` if no mesh can be used.
     """
@@ -136,7 +131,7 @@ def _sample(mesh: TriangleMesh, resolution: int, sheet: float, num_extremes: int
 
 
 def _read(file: Path) -> dict[str, np.ndarray] | None:
-    """Read cached arrays, or return None if the file is missing or damaged."""
+    """Read cached arrays; None if the file is missing or damaged."""
     try:
         with np.load(file) as archive:
             return {name: archive[name] for name in _ARRAYS}

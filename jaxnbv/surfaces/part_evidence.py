@@ -60,10 +60,10 @@ class Rays(NamedTuple):
 
     - `sight`: length of each ray in scene units; infinite without a return, zero for padding.
     - `is_object`: whether the ray ended on the object.
-    - `weight`: number of independent rays that the ray counts as. The weight is lower if rays are closer together than
+    - `weight`: number of independent rays that the ray counts as. It is lower if rays are closer together than
       `_CORRELATION_LENGTH`, and higher if the ray also represents rays that were left out.
     - `empty_nodes`: mask of the nodes of `grid` that were seen to be empty.
-    - `tau`: scale of residuals in the misfit, in scene units, see `misfit_of`.
+    - `tau`: scale of residuals in scene units, see `misfit_of`.
     """
 
     origins: Float[Array, "n 3"]
@@ -128,8 +128,7 @@ def _estimate_noise(
 ) -> Float[Array, ""]:
     """Return the standard deviation of the noise in the ray lengths on the object; zero without data.
 
-    The estimate uses third differences along rows and columns of the images. Without noise these differences are near
-    zero on a surface of low curvature.
+    Third differences along rows and columns of an image are near zero on a surface of low curvature without noise.
     """
     images = jnp.where(is_object, sight.reshape(-1), jnp.nan).reshape(-1, camera.height, camera.width)
     differences = [jnp.diff(images, 3, axis=axis).reshape(-1) for axis in (1, 2)]
@@ -161,11 +160,9 @@ def evidence(bank: ShapeBank, hypotheses: Hypotheses, rays: Rays) -> tuple[Float
 
 
 def ray_weight(distance: Float[Array, ""], camera: Camera) -> Float[Array, ""]:
-    """Return the number of independent rays that one ray of a camera counts as, at this distance.
+    """Return the number of independent rays that a camera's ray counts as, at this distance of the object.
 
-    The number is the ray's area on the object divided by the area within which rays have dependent errors.
-
-    - `distance`: distance from the camera to the object, in scene units.
+    It is the ray's area on the object divided by the area within which rays have dependent errors.
     """
     fx, fy = camera.focal_lengths
     return distance**2 / (fx * fy * _CORRELATION_LENGTH**2)
@@ -181,8 +178,8 @@ def _deepest_penetration(
 ) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
     """Return the smallest signed distance to a solid along each ray, and whether it is evidence.
 
-    A ray is followed to its end. The distance is zero if the ray misses the solid. It is evidence if the ray has a
-    return. Without a return, it is evidence only if the position of the smallest distance was seen to be empty.
+    The distance is zero if the ray misses the solid. It is evidence if the ray has a return, or if the position of the
+    smallest distance was seen to be empty.
     """
 
     def stride(state, _):

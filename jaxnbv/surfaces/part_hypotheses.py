@@ -28,8 +28,8 @@ class PartHypotheses(eqx.Module):
     """Parts of a bank, each with a placement, the most likely first.
 
     - `bank`: the parts at true size, in scene units.
-    - `placed`: part and placement of each hypothesis. A part may have several placements. If several placements of a
-      part have equal surfaces, only one has a weight above zero.
+    - `placed`: part and placement of each hypothesis. Of several placements of a part with equal surfaces, only one has
+      a weight above zero.
     - `weights`: probability of each hypothesis, followed by the probability of "none of these".
     - `tau`: scale of the distance between measured points and the surface, in scene units, see `part_evidence`.
     """
@@ -54,10 +54,7 @@ class PartHypotheses(eqx.Module):
         return jnp.append(self.shape_weights, self.weights[-1])
 
     def names(self) -> dict[str, float]:
-        """Return a dict from part name to probability, most likely first, including "none of these".
-
-        Parts without a hypothesis are left out.
-        """
+        """Return the probability of each part with a hypothesis and of "none of these", most likely first."""
         weights = np.asarray(self.shape_weights, np.float64)
         probability = {name: float(weight) for name, weight in zip(self.bank.names, weights, strict=True) if weight > 0}
         probability[NONE] = float(self.weights[-1])
@@ -65,7 +62,7 @@ class PartHypotheses(eqx.Module):
 
     @property
     def most_likely(self) -> tuple[int, Placement]:
-        """The most likely part, as an index in the bank, and the most likely placement of this part."""
+        """The most likely part, as an index in the bank, and its most likely placement."""
         shapes, weights = np.asarray(self.placed.shape), np.asarray(self.weights)[:-1]
         part = int(np.argmax(np.bincount(shapes, weights, len(self.bank))))
         row = int(np.argmax(np.where(shapes == part, weights, -1.0)))
@@ -88,8 +85,7 @@ def identify(
     """Return the weighted hypotheses given the observations.
 
     - `bank`: the parts at true size, in scene units.
-    - `poses`: the possible placements of the parts.
-    - `box`: a box around the object.
+    - `poses`, `box`: the possible placements of the parts, and a box around the object.
     - `previous`: the hypotheses after the previous view, which are kept while they fit; None for the first view.
     """
     targets = FitTargets.of(observations)

@@ -30,11 +30,9 @@ _MIN_ERROR, _ERROR_PER_MEDIAN = 0.005, 1.4826
 class ObjectPose(eqx.Module):
     """World pose of a part.
 
-    - `name`: name of the part.
     - `matrix`: rigid motion from the coordinates of the part's mesh, in world units, to the world.
     - `covariance`: joint covariance of the rotation (rotation vector about the part's centre, radians, world axes) and
-      of the centre's position (world units). It includes the errors of the points, and assumes that the object is this
-      part.
+      of the centre's position (world units), given that the object is this part. It includes the errors of the points.
     - `alternatives`: all equivalent matrices of a symmetric part, starting with `matrix`. A part that is round about an
       axis has 72 alternatives, five degrees apart, or 144 if its two ends are equal.
     """
@@ -63,9 +61,8 @@ def object_pose(hypotheses: PartHypotheses, observations: Observations, frame: F
 def surface_error(hypotheses: PartHypotheses, observations: Observations) -> float:
     """Return the expected distance of the most likely part's surface from the true one, in scene units.
 
-    The distance is a root mean square over points of the part's surface. It has two contributions: the uncertainty of
-    the part's pose, due to the errors of the scanned points; and the distance to the surface of each hypothesis,
-    weighted by the probability of the hypothesis.
+    It is a root mean square over points of the part's surface, and combines the uncertainty of the part's pose, due to
+    the errors of the scanned points, with the distances to the surfaces of the hypotheses, weighted by probability.
     """
     part, placement = hypotheses.most_likely
     shape = hypotheses.bank.shape(jnp.asarray(part))
@@ -92,8 +89,8 @@ def distances_to(hypotheses: PartHypotheses, points: Float[Array, "p 3"]) -> Flo
 def symmetries(shape: Shape) -> Float[np.ndarray, "n 3 3"]:
     """Return the rotations about a shape's centre that leave the shape unchanged, the identity first.
 
-    The function tests rotations by multiples of five degrees about each axis, and the rotations of a cube onto itself.
-    The result contains all products of a symmetry about an axis and a symmetry among the rotations of the cube.
+    Rotations by multiples of five degrees about each axis are tested, and the rotations of a cube onto itself. The
+    result contains all products of a symmetry about an axis and a symmetry among the rotations of the cube.
     """
     vectors = [angle * axis for axis in np.eye(3) for angle in np.arange(0.0, 2.0 * np.pi, _ANGLE_STEP)]
     about_axes, of_cube = Rotation.from_rotvec(vectors).as_matrix(), Rotation.create_group("O").as_matrix()
@@ -122,8 +119,8 @@ def _max_change(shape: Shape, rotations: Float[Array, "n 3 3"], probes: Float[Ar
 def _covariance(shape: Shape, placement: Placement, targets: FitTargets) -> Float[np.ndarray, "6 6"]:
     """Return the joint covariance of the rotation about the part's centre and of the shift, in the scene.
 
-    The covariance is (J^T J / s^2 + P)^-1, where J is the derivative of the distances from the points to the part, s
-    the standard deviation of these distances, and P the precision of a broad prior.
+    It is (J^T J / s^2 + P)^-1, where J is the derivative of the distances from the points to the part, s the standard
+    deviation of these distances, and P the precision of a broad prior.
     """
     distance, gradient = values_and_gradients(lambda x: placement.distance(shape.solid, x), targets.points)
     mask = np.asarray(targets.mask)
@@ -142,6 +139,6 @@ def _matrix(linear: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"]) -> 
 
 
 def _make_rigid(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """Return the matrix with its linear part, which has rounding errors, replaced by the nearest rotation."""
+    """Replace the linear part of a matrix, which has rounding errors, by the nearest rotation."""
     left, _, right = np.linalg.svd(matrix[:3, :3])
     return _matrix(left @ right, matrix[:3, 3])

@@ -1,10 +1,10 @@
 """Search for parts of known size, and their placements, that fit the scan.
 
-Each part is tried in the same number of placements, and its best few placements are refined by Gauss-Newton steps on
-the misfit E of `registration`. The best distinct results of each part are refined again on more points, together with
-the hypotheses of the previous view. Finally all parts are tried in each of the best placements so far, since the right
-placement of a part may have been found only for a similar part. The search keeps results for every part, so no part is
-lost because a similar part fits better. The time grows linearly with the number of parts.
+Each part is tried in the same number of placements, and its best few are refined by Gauss-Newton steps on the misfit E
+of `registration`. The best distinct results of each part are refined again on more points, together with the hypotheses
+of the previous view. Finally all parts are tried in each of the best placements so far, since the right placement of a
+part may have been found only for a similar part. Results are kept for every part, so no part is lost because a similar
+part fits better. The time grows linearly with the number of parts.
 """
 
 import dataclasses
@@ -24,6 +24,7 @@ from jaxnbv.surfaces.registration import (
     Hypotheses,
     Prior,
     evaluate,
+    flatten,
     keep_first,
     reevaluate,
     refine,
@@ -47,10 +48,9 @@ _NUM_PROBES, _NUM_RAYS = 4096, 1024
 
 
 def placeholder_hypotheses(dtype: Any) -> Hypotheses:
-    """Return placeholders for the hypotheses of the view before the first.
+    """Return placeholders for the hypotheses of the view before the first, with infinite misfit.
 
-    Each placeholder is the first part at the identity placement with infinite misfit. As an extra start of the search,
-    it does no harm.
+    Each is the first part at the identity placement. As an extra start of the search, it does no harm.
     """
     identity = Placement(jnp.eye(3, dtype=dtype), jnp.zeros(3, dtype), jnp.ones(3, dtype))
     one = Hypotheses(jnp.zeros((), int), identity, jnp.asarray(jnp.inf, dtype), jnp.asarray(False))
@@ -72,8 +72,7 @@ def search_parts(
     The misfit is the L of `part_evidence`, or without rays the E of `registration`. If placements of a part have equal
     surfaces, for example by symmetry, all but the best get an infinite misfit.
 
-    - `bank`: parts at true size, in scene units.
-    - `poses`, `box`: the possible placements of the parts, and a box around the object.
+    - `bank`, `poses`, `box`: as for `identify`.
     - `targets`, `rays`: points and rays of the views so far.
     - `previous`: the hypotheses of the previous view, which are refined and kept while they fit.
     - `num_starts`: number of placements tried for each part.
@@ -82,8 +81,8 @@ def search_parts(
     few, some = targets.first(_COARSE[1]), targets.first(_FINE[1])
     starts = _group(evaluate(bank, prior, _starts(bank, prior, targets, num_starts), few), len(bank))
     best = jax.vmap(lambda one: one.best(_COARSE[0]))(starts)
-    coarse = refine(bank, prior, _flatten(best), few, _COARSE[2])
-    fine = _flatten(jax.vmap(lambda one: _keep_distinct(one, _FINE[0]))(_group(coarse, len(bank))))
+    coarse = refine(bank, prior, flatten(best), few, _COARSE[2])
+    fine = flatten(jax.vmap(lambda one: _keep_distinct(one, _FINE[0]))(_group(coarse, len(bank))))
     fine = refine(bank, prior, jax.tree.map(lambda *rows: jnp.concatenate(rows), fine, previous), some, _FINE[2])
     placements = jax.tree.map(lambda rows: jnp.stack(len(bank) * [rows]), _keep_distinct(fine, _NUM_SHARED).placement)
     swapped = _group(reevaluate(bank, prior, evaluate(bank, prior, placements, some), some), len(bank))
@@ -91,7 +90,7 @@ def search_parts(
     old = jax.tree.map(lambda rows: rows[-NUM_HYPOTHESES:], fine)
     pool = jax.tree.map(lambda *rows: jnp.concatenate(rows, axis=1), _group(new, len(bank)), swapped)
     pool = jax.vmap(lambda one: _keep_distinct(one, _FINE[0]))(pool)
-    last = refine(bank, prior, jax.tree.map(lambda *rows: jnp.concatenate(rows), _flatten(pool), old), some, _LAST)
+    last = refine(bank, prior, jax.tree.map(lambda *rows: jnp.concatenate(rows), flatten(pool), old), some, _LAST)
     if rays is None:
         last = reevaluate(bank, prior, last, targets)
     else:
@@ -107,14 +106,10 @@ def _group(hypotheses: Hypotheses, num_shapes: int) -> Hypotheses:
     return jax.tree.map(lambda rows: rows.reshape(num_shapes, -1, *rows.shape[1:]), hypotheses)
 
 
-def _flatten(hypotheses: Hypotheses) -> Hypotheses:
-    return jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), hypotheses)
-
-
 def _keep_distinct(hypotheses: Hypotheses, count: int) -> Hypotheses:
     """Return the best `count` hypotheses with distinct placements, regardless of their shapes.
 
-    If there are fewer distinct placements, the remaining rows are hypotheses with infinite misfit.
+    If there are fewer, the remaining rows have infinite misfit.
     """
     ranked = hypotheses.best(len(hypotheses.misfit))
     shift = ranked.placement.shift
@@ -126,10 +121,9 @@ def _keep_distinct(hypotheses: Hypotheses, count: int) -> Hypotheses:
 def _starts(bank: ShapeBank, prior: Prior, targets: FitTargets, num_starts: int) -> Placement:
     """Return start placements (axis 1) of each shape (axis 0): rotations, each at a few positions.
 
-    The scan stays where it is, and the shape is moved: at each position the bounding box of the rotated shape contains
-    the scan, if it is large enough. At the first position of a rotation, the box is centred on the scan across the line
-    of sight, and its side that faces the sensor touches the scan. The other positions are spread over all positions
-    that contain the scan, so they differ much if the scan is a small patch of the shape.
+    At each position the bounding box of the rotated shape contains the scan, if it is large enough. At the first
+    position of a rotation, the box is centred on the scan across the line of sight, and its side that faces the sensor
+    touches the scan. The others are spread over all positions that contain the scan.
     """
     dtype = targets.points.dtype
     rotations = jnp.asarray(prior.poses.rotations_of(len(bank), max(1, num_starts // _NUM_POSITIONS)), dtype)
@@ -156,15 +150,14 @@ def _starts(bank: ShapeBank, prior: Prior, targets: FitTargets, num_starts: int)
 
     def place_shape(shape, shape_rotations):
         place_rotations = jax.vmap(place, (None, 0, 0))
-        placements = jax.vmap(place_rotations, (None, None, 0))(shape, shape_rotations, fractions)
-        return jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), placements)
+        return flatten(jax.vmap(place_rotations, (None, None, 0))(shape, shape_rotations, fractions))
 
     all_rotations = jnp.broadcast_to(rotations, (len(bank), *rotations.shape[1:]))
     return jax.vmap(place_shape)(bank.shapes, all_rotations)
 
 
 def _axes_of_sight(targets: FitTargets) -> Float[Array, "3 3"]:
-    """Return orthogonal unit vectors as rows: two across the line of sight, one toward the sensor.
+    """Return unit vectors as rows: two across the line of sight, and one toward the sensor.
 
     The direction toward the sensor is estimated by the mean normal of the scan.
     """
@@ -177,10 +170,9 @@ def _axes_of_sight(targets: FitTargets) -> Float[Array, "3 3"]:
 
 
 def _mark_repeats(bank: ShapeBank, box: Box, hypotheses: Hypotheses) -> Hypotheses:
-    """Mark each hypothesis that has the same surface as a better hypothesis of the same part.
+    """Mark each hypothesis that has the same surface as an earlier one of the same part.
 
-    Returns all hypotheses. Those marked have `is_distinct` False and an infinite misfit. The hypotheses must be sorted,
-    best first.
+    It gets `is_distinct` False and an infinite misfit. The hypotheses must be sorted, best first.
     """
     dtype = hypotheses.misfit.dtype
     low, high = jnp.asarray(box.low, dtype) - _MARGIN, jnp.asarray(box.high, dtype) + _MARGIN

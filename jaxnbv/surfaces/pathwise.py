@@ -38,8 +38,8 @@ class MeansAtData(NamedTuple):
 class DataPoints(NamedTuple):
     """The data points where `sample_about` evaluates the mean functions of the samples.
 
-    - `gradient_points`: points where the gradients of the mean functions are subtracted from the observed normals.
-    - `value_points`: points where the values of the mean functions are used, for observed values of f or for the level.
+    - `gradient_points`: points of the observed normals, from which gradients are subtracted.
+    - `value_points`: points where values are used, for observed values of f or for the level.
     """
 
     gradient_points: Float[Array, "n 3"]
@@ -47,11 +47,7 @@ class DataPoints(NamedTuple):
 
 
 class FieldsAbout(Fields):
-    """Samples f_s = m_s + r_s about mean functions m_s.
-
-    - `means`: the mean functions m_1, ..., m_S.
-    - `residual`: the differences r_1, ..., r_S between the samples and their mean functions.
-    """
+    """Samples f_s = m_s + r_s, with mean functions m_s (`means`) and differences r_s (`residual`)."""
 
     means: Fields
     residual: TrigonometricFields
@@ -67,9 +63,9 @@ class FieldsAbout(Fields):
 
 
 class TrigonometricPosterior(SurfacePosterior):
-    """A Gaussian posterior with a band-limited prior. Its mean and its samples are band-limited too.
+    """A Gaussian posterior with a band-limited prior, whose mean and samples are band-limited too.
 
-    - `mean_coefficients`: coefficients of the mean E f in the basis of `surfaces/trigonometric.py`.
+    - `mean_coefficients`: coefficients of E f in the basis of `surfaces/trigonometric.py`.
     """
 
     mean_coefficients: eqx.AbstractVar[Float[Array, "a a a"]]
@@ -95,10 +91,7 @@ class TrigonometricPosterior(SurfacePosterior):
     @on_torus
     @program
     def probability_inside(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
-        """Return P(f(x) < level) = Phi((level - E f(x)) / sqrt(Var f(x))) at points in scene coordinates.
-
-        The cost is that of the variance.
-        """
+        """Return P(f(x) < level) = Phi((level - E f(x)) / sqrt(Var f(x))) at points in scene coordinates."""
         variance = self.variance(x)
         deviation = jnp.sqrt(jnp.maximum(variance, jnp.finfo(variance.dtype).tiny))
         return norm.cdf((self.level - self.mean(x)) / deviation)
@@ -116,12 +109,12 @@ class TrigonometricPosterior(SurfacePosterior):
         """Draw one sample m_s + g_s of f about each of S mean functions.
 
         g_s is a sample of the posterior given the observed normals minus grad m_s, and the observed values minus m_s.
-        If all mean functions are zero, the result equals that of `sample` with the same key. For any mean function, the
-        surface of a sample is where its returned field equals `posterior.level`.
+        If all mean functions are zero, the result equals that of `sample` with this key. The surface of a sample is
+        where its returned field equals `posterior.level`.
 
         - `means`: the mean functions m_s, which must be differentiable once.
         - `noise_scale`: factor on the standard deviation of the samples about the posterior mean, a single number or
-          one for each mean function. With 0, each sample is the posterior mean about m_s, for any key.
+          one for each mean function. With 0, each sample is the posterior mean about m_s.
 
         **Raises:** `ValueError` for means that are not `Fields`, a noise scale that is negative or not finite, a number
         of noise scales that differs from the number of mean functions, or means that are not finite at the data.
@@ -163,36 +156,28 @@ class TrigonometricPosterior(SurfacePosterior):
 
     @abstractmethod
     def prior_draws(self, key: PRNGKeyArray, num_samples: int) -> Any:
-        """Draw from the prior and from the noise of the data.
-
-        The result is a tree of arrays of mean zero, with a leading axis of samples.
-        """
+        """Draw from the prior and from the noise of the data: arrays of mean zero, with an axis of samples."""
 
     @abstractmethod
     def condition_draws(self, draws: Any, means: MeansAtData) -> Float[Array, "s a a a"]:
         """Condition the draws on the data minus the means, and return the coefficients of the samples.
 
-        The result is jointly linear in the draws, the data and the means. It does not include the means themselves.
+        They are jointly linear in the draws, the data and the means, and do not include the means themselves.
         """
 
 
 class _Zeros(Fields):
-    """Mean functions that are zero everywhere."""
-
     count: int = eqx.field(static=True)
 
     def __call__(self, x: Float[AnyArray, "n 3"]) -> Float[Array, "s n"]:
         return jnp.zeros((self.count, len(x)), jnp.asarray(x).dtype)
 
-    def gradient(self, x: Float[AnyArray, "n 3"]) -> Float[Array, "s n 3"]:
-        return jnp.zeros((self.count, *x.shape), jnp.asarray(x).dtype)
-
 
 def fill_rows(points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Float[Array, "n 3"]:
     """Return the points with the first filled row copied into all unfilled rows.
 
-    Unfilled rows are zero, and a mean function may have no gradient at zero. Derivatives would then not be finite,
-    although the rows are masked.
+    Unfilled rows are zero, where a mean function may have no gradient. Derivatives would then not be finite, although
+    the rows are masked.
     """
     return jnp.where(mask[:, None], points, points[jnp.argmax(mask)])
 

@@ -49,7 +49,7 @@ class Placement(eqx.Module):
     def moved(self, step: Float[Array, "9"]) -> "Placement":
         """Return a copy that is rotated about the origin of the shape, shifted and scaled.
 
-        - `step`: rotation vector (3), shift (3), and logarithms of the scale factors (3).
+        - `step`: rotation vector, shift, and logarithms of the scale factors.
         """
         return Placement(
             jnp.matmul(rotation_from_vector(step[:3]), self.rotation, precision="highest"),
@@ -86,15 +86,12 @@ class ShapePoses(eqx.Module):
 
     @property
     def rigid_basis(self) -> Float[np.ndarray, "9 k"]:
-        """Basis, as columns, of the ways in which a placement of fixed scale may change, see `step_basis`."""
+        """`step_basis` for a fixed scale."""
         return scipy.linalg.block_diag(self.rotation_axes(), np.eye(3), np.zeros((3, 0)))
 
     @property
     def step_basis(self) -> Float[np.ndarray, "9 k"]:
-        """Basis, as columns, of the ways in which a placement may change: rotation, shift and scale.
-
-        Each column is an argument of `Placement.moved`: a rotation vector, a shift, and logarithms of scale factors.
-        """
+        """Basis, as columns, of the steps of `Placement.moved` by which a placement may change."""
         smallest, largest = self.scale
         scales = np.zeros((3, 0)) if smallest == largest else np.eye(3) if self.by_axis else np.full((3, 1), 3**-0.5)
         return scipy.linalg.block_diag(self.rotation_axes(), np.eye(3), scales)
@@ -102,7 +99,7 @@ class ShapePoses(eqx.Module):
     def rotations_of(self, num_shapes: int, count: int) -> Float[AnyArray, "k m 3 3"]:
         """Return at most `count` start rotations for each of the first `num_shapes` shapes of a bank.
 
-        The first axis has length one if all shapes have the same rotations.
+        The first axis has length one if all shapes share the rotations.
         """
         return self.rotations(count)[None]
 

@@ -5,15 +5,15 @@ A shape with signed distance d and placement T has the misfit
     E = mean_j [ log(1 + d(x_j)^2 / 2 tau^2) + (1 - n_j . grad d(x_j)) / 2 ]
         + 2 mean_i log(1 + min(d(z_i) + margin, 0)^2 / tau^2) + prior(T)
 
-for scanned points x_j with normals n_j, and points z_i that were seen to be empty. Empty points count if they lie
-deeper inside the shape than the margin, 0.05. Without the points z_i, shapes would shrink onto the visible patch. The
-prior on shift and scale is weak. All shapes are tried in many rotations. The hypotheses of smallest E are refined by
+for scanned points x_j with normals n_j, and points z_i that were seen to be empty. A point z_i counts if it lies deeper
+inside the shape than the margin, 0.05. Without the points z_i, shapes would shrink onto the visible patch. The prior on
+shift and scale is weak. All shapes are tried in many rotations. The hypotheses of smallest E are refined by
 Gauss-Newton steps (iteratively reweighted least squares, with weights from the logarithms in E), while tau, the scale
 of the distances, falls from 0.12 to 0.03.
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -46,7 +46,7 @@ _MAX_STEP = 0.3
 class FitTargets(NamedTuple):
     """Data to which shapes are fitted: points with normals, and empty points, in scene coordinates.
 
-    The first rows of an array cover the region of all rows, more sparsely. `mask` and `is_empty` are False for padding.
+    The first rows cover the region of all rows, more sparsely. `mask` and `is_empty` are False for padding.
     """
 
     points: Float[Array, "n 3"]
@@ -82,7 +82,7 @@ def _choose_empty_points(observations: Observations) -> tuple[Float[Array, "m 3"
 def _first_empty_nodes(
     empty_nodes: Bool[Array, "g g g"], order: Int[Array, " nodes"]
 ) -> tuple[Int[Array, "m 3"], Bool[Array, " m"]]:
-    """Return the grid indices of the first empty nodes in the given order, and a mask of the filled rows."""
+    """Return the grid indices of the first empty nodes in this order, and a mask of the filled rows."""
     is_empty = empty_nodes.reshape(-1)[order]
     row = jnp.where(is_empty, jnp.cumsum(is_empty) - 1, _NUM_EMPTY)
     indices = jnp.zeros(_NUM_EMPTY, jnp.int32).at[row].set(order, mode="drop")
@@ -93,11 +93,9 @@ class Hypotheses(eqx.Module):
     """Explanations of a scan: shapes of a bank, each with a placement.
 
     - `shape`: index of each shape in the bank.
-    - `placement`: placement of each shape.
-    - `misfit`: how badly each placed shape fits the scan. It is E (see `surfaces/registration.py`), or for parts it may
-      be L (see `surfaces/part_evidence.py`).
-    - `is_distinct`: False for a hypothesis that nearly repeats a better hypothesis of the same shape. For `register`,
-      the rotations of the two differ by less than 15 degrees. For `search_parts`, the two have the same surface.
+    - `misfit`: E (see `surfaces/registration.py`), or for parts maybe L (see `surfaces/part_evidence.py`).
+    - `is_distinct`: False for a hypothesis that nearly repeats a better one of the same shape. For `register`, the
+      rotations of the two differ by less than 15 degrees. For `search_parts`, the two have the same surface.
     """
 
     shape: Int[Array, "*h"]
@@ -114,9 +112,8 @@ class Hypotheses(eqx.Module):
 class Prior(NamedTuple):
     """Prior over placements.
 
-    - `poses`: the possible placements.
     - `box`: a box that the object approximately fills.
-    - `is_true_size`: whether shapes have their true size. If so, they keep their scale and need not fill the box.
+    - `is_true_size`: whether shapes have their true size, so that they keep their scale and need not fill the box.
     """
 
     poses: ShapePoses
@@ -125,7 +122,7 @@ class Prior(NamedTuple):
 
     @property
     def step_basis(self) -> Float[np.ndarray, "9 k"]:
-        """Basis, as columns, of the ways in which a placement may change, see `ShapePoses.step_basis`."""
+        """See `ShapePoses.step_basis`."""
         return self.poses.rigid_basis if self.is_true_size else self.poses.step_basis
 
     def fill_box(self, shape: Shape, rotation: Float[Array, "3 3"]) -> Placement:
@@ -137,9 +134,9 @@ class Prior(NamedTuple):
         return Placement(rotation, 0.5 * (box_low + box_high) - 0.5 * scale * (low + high), jnp.broadcast_to(scale, 3))
 
     def deviation(self, shape: Shape, placement: Placement) -> Float[Array, "9"]:
-        """Return the step of `Placement.moved` from the placement that fills the box to this placement.
+        """Return the step of `Placement.moved` from the placement that fills the box to this one.
 
-        The rotation part of the step is zero. The whole step is zero for shapes at true size.
+        The rotation part is zero. The whole step is zero for shapes at true size.
         """
         if self.is_true_size:
             return jnp.zeros(9, placement.shift.dtype)
@@ -163,10 +160,8 @@ _PRECISION = _PRIOR_WEIGHT * np.array([0.0] * 3 + [_SHIFT_DEVIATION**-2] * 3 + [
 def register(bank: ShapeBank, prior: Prior, targets: FitTargets, num_starts: int) -> Hypotheses:
     """Return the shapes and placements that fit the scan best, best first.
 
-    All shapes are tried in many rotations, and the best hypotheses are refined. Then all shapes are tried in the
-    placements of a few of the refined hypotheses, and the best of all are refined again.
-
-    - `num_starts`: number of rotations tried, all shapes together.
+    All shapes are tried in many rotations (`num_starts`, all shapes together), and the best hypotheses are refined.
+    Then all shapes are tried in the placements of a few of these, and the best of all are refined again.
     """
     few, some = targets.first(_COARSE[1]), targets.first(_FINE[1])
     starts = _rotated_starts(bank, prior, few, num_starts)
@@ -197,8 +192,7 @@ def _rotated_starts(bank: ShapeBank, prior: Prior, targets: FitTargets, num_star
 def _swap_shapes(bank: ShapeBank, prior: Prior, hypotheses: Hypotheses, targets: FitTargets) -> Hypotheses:
     """Compute the misfit of each shape in the placements of some good hypotheses with distinct rotations.
 
-    Each shape takes the rotation of the hypothesis. Its shift and scale, relative to the placement that fills the box,
-    are also those of the hypothesis.
+    Each shape takes the rotation of the hypothesis, and its shift and scale relative to the box-filling placement.
     """
     ranked = hypotheses.best(len(hypotheses.misfit))
     is_distinct = _find_distinct(jnp.zeros_like(ranked.shape), ranked.placement.rotation)
@@ -213,10 +207,7 @@ def _swap_shapes(bank: ShapeBank, prior: Prior, hypotheses: Hypotheses, targets:
 
 
 def evaluate(bank: ShapeBank, prior: Prior, placements: Placement, targets: FitTargets) -> Hypotheses:
-    """Compute the misfit of each shape at each of its placements.
-
-    - `placements`: batch with a first axis of shapes, and a second axis of placements of the shape.
-    """
+    """Compute the misfit of each shape (first axis) at each of its placements (second axis)."""
     num_shapes, count = placements.scale.shape[:2]
 
     def misfits_of_shape(one):
@@ -224,15 +215,19 @@ def evaluate(bank: ShapeBank, prior: Prior, placements: Placement, targets: FitT
         return jax.vmap(lambda placement: _misfit(shape, prior, placement, targets, _FIRST_TAU))(shape_placements)
 
     misfit = jax.lax.map(misfits_of_shape, (bank.shapes, placements), batch_size=max(1, _BATCH_SIZE // count))
-    flat = jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), placements)
     shape = jnp.repeat(jnp.arange(num_shapes), count)
-    return Hypotheses(shape, flat, misfit.reshape(-1), jnp.ones(len(shape), bool))
+    return Hypotheses(shape, flatten(placements), misfit.reshape(-1), jnp.ones(len(shape), bool))
+
+
+def flatten(rows_of_shapes: Any) -> Any:
+    """Merge the first two axes, of shapes and of rows of each shape, of all arrays in a tree."""
+    return jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), rows_of_shapes)
 
 
 def refine(bank: ShapeBank, prior: Prior, starts: Hypotheses, targets: FitTargets, num_steps: int) -> Hypotheses:
-    """Refine each start by Gauss-Newton steps on the misfit E, while the scale tau of distances falls.
+    """Refine each start by Gauss-Newton steps on the misfit E, while tau falls.
 
-    Returns for each start the iterate whose E is smallest when evaluated at the last tau.
+    Return for each start the iterate whose E at the last tau is smallest.
     """
     taus = jnp.append(jnp.geomspace(_FIRST_TAU, _LAST_TAU, num_steps), _LAST_TAU)
     basis = jnp.asarray(prior.step_basis, targets.points.dtype)
@@ -257,10 +252,10 @@ def refine(bank: ShapeBank, prior: Prior, starts: Hypotheses, targets: FitTarget
 def reevaluate(bank: ShapeBank, prior: Prior, hypotheses: Hypotheses, targets: FitTargets) -> Hypotheses:
     """Return the hypotheses with the misfit E recomputed from all rows of `targets`, at the last tau."""
 
-    def judge(one):
+    def misfit(one):
         return _misfit(bank.shape(one.shape), prior, one.placement, targets, _LAST_TAU)
 
-    return dataclasses.replace(hypotheses, misfit=jax.lax.map(judge, hypotheses, batch_size=_BATCH_SIZE))
+    return dataclasses.replace(hypotheses, misfit=jax.lax.map(misfit, hypotheses, batch_size=_BATCH_SIZE))
 
 
 def _mean(values: Float[Array, " n"], mask: Bool[Array, " n"]) -> Float[Array, ""]:
@@ -270,7 +265,6 @@ def _mean(values: Float[Array, " n"], mask: Bool[Array, " n"]) -> Float[Array, "
 def _misfit(
     shape: Shape, prior: Prior, placement: Placement, targets: FitTargets, tau: Float[Array, ""] | float
 ) -> Float[Array, ""]:
-    """Return the misfit E of a placed shape. `tau`: scale of the distances in E, in scene units."""
     # One pass of `jax.jvp` computes all d(x_j) and n_j . grad d(x_j).
     distance, slope = jax.jvp(lambda x: placement.distance(shape.solid, x), (targets.points,), (targets.normals,))
     empty = placement.distance(shape.solid, targets.empty)
@@ -299,11 +293,9 @@ def _newton_step(
     tau: Float[Array, ""],
     basis: Float[Array, "9 k"],
 ) -> tuple[Float[Array, "9"], Float[Array, ""]]:
-    """Return a damped Gauss-Newton step on the misfit E, and E of `placement` at the last tau.
+    """Return a damped Gauss-Newton step of limited size, and the misfit E of `placement` at the last tau.
 
-    The step is limited in size and uses the given `tau`. Its term for the normals n is |n - grad d|^2 / 4.
-
-    - `basis`: the ways in which a placement may change, see `ShapePoses.step_basis`.
+    The step's term for the normals n is |n - grad d|^2 / 4. See `ShapePoses.step_basis` for `basis`.
     """
     points = jnp.concatenate([targets.points, targets.empty])
     distance, gradient = values_and_gradients(lambda x: placement.distance(shape.solid, x), points)
@@ -352,7 +344,7 @@ def _newton_step(
 
 
 def _find_distinct(shape: Int[Array, " h"], rotation: Float[Array, "h 3 3"]) -> Bool[Array, " h"]:
-    """Return a mask of the modes: hypotheses more than 15 degrees from all better modes of the same shape.
+    """Return a mask of the hypotheses more than 15 degrees from all better ones of the same shape.
 
     The hypotheses must be sorted, best first.
     """
@@ -366,7 +358,7 @@ def similar_rotations(rotation: Float[Array, "h 3 3"]) -> Bool[Array, "h h"]:
 
 
 def keep_first(is_same: Bool[Array, "h h"]) -> Bool[Array, " h"]:
-    """Return the mask of rows to keep. A row is dropped if it equals an earlier row that is kept.
+    """Return the mask of rows to keep: those that equal no earlier row that is kept.
 
     - `is_same`: for each pair of rows, whether they are equal.
     """

@@ -23,7 +23,7 @@ _UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 class Resting(ShapePoses):
     """Placements of parts that rest on a table: a stable pose, rotated by any angle about the vertical y.
 
-    A search starts from these poses. Refined hypotheses may tilt.
+    A search starts from these. Refined hypotheses may tilt.
 
     - `stable`: (k, p, 3, 3) rotations of each part of a bank to its stable poses, the most likely pose first.
     """
@@ -32,9 +32,7 @@ class Resting(ShapePoses):
 
     @classmethod
     def of(cls, bank: ShapeBank) -> "Resting":
-        """Compute the stable poses of a bank's parts.
-
-        They follow from each part's convex hull, and from its centre of mass as a solid of uniform density.
+        """Compute the stable poses of a bank's parts, as solids of uniform density, from their convex hulls.
 
         **Raises:** `ValueError` for an empty bank.
         """

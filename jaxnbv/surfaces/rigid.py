@@ -44,7 +44,7 @@ _SWEEP = 72
 _MIN_FIT_RATIO, _MIN_AMBIGUITY = 0.97, 0.01
 
 Nearest = Callable[[Float[np.ndarray, "n 3"]], tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]]
-"""A function that maps points to the nearest points on a mesh, and to the normals of the mesh there."""
+"""A function from points to the nearest points on a mesh, and the normals there."""
 
 
 class Registration(NamedTuple):
@@ -52,8 +52,8 @@ class Registration(NamedTuple):
 
     - `matrix`: the motion from the scan to the mesh.
     - `median_distance`: median distance of the scan's points from the mesh, after this motion.
-    - `ambiguity`: if other motions fit nearly as well, the largest distance between the mesh placed by one of them and
-      the mesh placed by `matrix`, a mean over the mesh. It is 0 if none of these motions is clearly different.
+    - `ambiguity`: the largest distance, a mean over the mesh, between the mesh placed by `matrix` and by a motion that
+      fits nearly as well. It is 0 if no such motion is clearly different.
     """
 
     matrix: Float[np.ndarray, "4 4"]
@@ -86,7 +86,7 @@ class _Equations(NamedTuple):
 
 
 class _Stage(NamedTuple):
-    """Scan points and normals that one stage uses, and the surface to which the stage registers the scan."""
+    """Scan points and normals of one stage, and the surface to which it registers them."""
 
     points: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
@@ -96,8 +96,8 @@ class _Stage(NamedTuple):
     def equations(self, motions: _Motions, scale: float | None = None) -> _Equations:
         """Return the normal equations of the next Gauss-Newton step for each motion.
 
-        - `scale`: distance from the surface at which a point's weight halves. The default, for each motion, is twice
-          the median distance of the moved points from the surface.
+        - `scale`: distance from the surface at which a point's weight halves. The default is twice the median distance
+          of the moved points.
         """
         arms = np.einsum("nj,sij->sni", self.points, motions.rotations)
         positions = arms + motions.shifts[:, None]
@@ -124,7 +124,7 @@ class _Stage(NamedTuple):
         return motions
 
     def best(self, motions: _Motions, scale: float, count: int) -> _Motions:
-        """Return the `count` motions with the best fits, without motions that nearly equal a better motion."""
+        """Return the `count` motions with the best fits that do not nearly equal a better motion."""
         rows: list[int] = []
         for row in np.argsort(-self.equations(motions, scale).fit(scale), kind="stable").tolist():
             cosine = 0.5 * (np.einsum("kij,ij->k", motions.rotations[rows], motions.rotations[row]) - 1.0)
@@ -146,10 +146,10 @@ class _Stage(NamedTuple):
 
 
 def orient_outward(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, bool]:
-    """Return a cleaned copy of a mesh with faces wound outward, and whether the mesh is a solid.
+    """Return a copy of a mesh with faces wound outward, and whether the mesh is a solid.
 
-    Duplicate vertices and faces of zero area are removed, and the faces are wound consistently. Winding numbers on both
-    sides of the surface distinguish a solid, which may have holes, from a sheet. A sheet is not turned outward.
+    Duplicate vertices and faces of zero area are removed. Winding numbers on both sides of the surface distinguish a
+    solid, which may have holes, from a sheet. A sheet is wound consistently, but to either side.
     """
     mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     mesh.merge_vertices()
@@ -241,8 +241,7 @@ def _initial_motions(
 ) -> _Motions:
     """Return the initial motions: rotations, each with a few shifts that put the scan in the mesh's box.
 
-    The first shift centres the scan, and moves it along its mean normal to the front of the mesh. The other shifts are
-    random.
+    The first shift centres the scan, and moves it along its mean normal to the front of the mesh. Others are random.
     """
     rotations = FreeRotation().rotations(_NUM_ROTATIONS)
     rotated = np.einsum("nj,sij->sni", points[:_THIRD], rotations)
@@ -262,7 +261,7 @@ def _initial_motions(
 def _mesh_distance(first: _Motions, second: _Motions, samples: Float[np.ndarray, "m 3"], nearest: Nearest) -> float:
     """Return the mean distance of the mesh placed by `second` from the mesh placed by `first`.
 
-    Motions map the scan to the mesh, so their inverses place the mesh at the scan. `samples` are points on the mesh.
+    The inverses of the motions place the mesh, of which `samples` are points, at the scan.
     """
     moved = (samples - second.shifts[0]) @ second.rotations[0] @ first.rotations[0].T + first.shifts[0]
     return float(np.mean(np.linalg.norm(moved - nearest(moved)[0], axis=1)))

@@ -86,8 +86,6 @@ class ScreenedSPSR(SurfaceModel):
     def condition(self, observations: Observations | PointCloud) -> "ScreenedSPSRPosterior":
         """Return the posterior of g = f - c, where c is the level of f, given the cloud and empty space.
 
-        The cost is that of the base, plus one triangular solve with the base's factor for each value.
-
         **Raises:** `ValueError` for a capacity above 16,384, for values that are not finite or at points outside
         [-pi/2, pi/2]^3, if the covariance of the values is singular in the dtype's precision, and whenever
         `GeometricSPSR.condition` raises it. Under `jit` values cannot be checked, and the posterior is NaN instead.
@@ -118,18 +116,18 @@ def _condition(
     observations = eqx.tree_at(lambda e: e.cloud, observations, base.cloud)
     spectrum, rows = model.base.spectrum, concatenate_rows(model.values, observations)
     value_unit = _value_unit(base, model.offset)
-    whitened = jnp.where(rows.mask, base.solver.whitened_cross(rows.points), 0.0)
-    explained = jnp.einsum("dnk,dnl->kl", whitened, whitened, precision="highest")
+    whitened_cross = jnp.where(rows.mask, base.solver.whitened_cross(rows.points), 0.0)
+    explained = jnp.einsum("dnk,dnl->kl", whitened_cross, whitened_cross, precision="highest")
     level_variance = model.level_deviation**2
     covariance = function_covariance(rows.points, rows.points, spectrum) - explained + level_variance
     covariances = jnp.where(rows.mask[:, None] & rows.mask, covariance, 0.0)
     # An unfilled row is a row of the identity, and its weight is zero.
     factor = CholeskyFactor.of(covariances + jnp.diag(jnp.where(rows.mask, (value_unit * rows.noise) ** 2, 1.0)))
 
-    # This is the posterior given the normals alone. The weights of the values and the mean replace its fields below.
+    # The posterior given the normals alone. The weights of the values and the mean are replaced below.
     level, zeros = jnp.zeros_like(base.level), jnp.zeros_like(rows.values)
     posterior = ScreenedSPSRPosterior(
-        level, base.mean_coefficients, model, base, rows, value_unit, whitened, factor, zeros
+        level, base.mean_coefficients, model, base, rows, value_unit, whitened_cross, factor, zeros
     )
     transform = NonuniformTransform(rows.points, model.base.truncation)
     row_values = transform.evaluate(base.mean_coefficients[None])[:, 0]
@@ -141,10 +139,7 @@ def _condition(
 
 
 def _value_unit(base: GeometricSPSRPosterior, offset: float) -> Float[Array, ""]:
-    """Return h, half the median rise of E f across the surface, given the normals alone.
-
-    h is at least half the prior standard deviation of f. See `ScreenedSPSR.offset`.
-    """
+    """Return h, see `ScreenedSPSR.offset`."""
     rows = some_rows(base.cloud, _NUM_UNIT_POINTS)
     points, step = base.cloud.points[rows], offset * base.cloud.normals[rows]
     mean = base.mean_field
@@ -153,7 +148,7 @@ def _value_unit(base: GeometricSPSRPosterior, offset: float) -> Float[Array, ""]
 
 
 class ScreenedDraws(NamedTuple):
-    """Prior draws: the normal field and its noise, the level c, and the noise e of the observed values."""
+    """Prior draws of the normal field and its noise, the level c, and the noise e of the observed values."""
 
     normals: NormalDraws
     level: Float[Array, " s"]
@@ -168,8 +163,8 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
     - `base`: the posterior p(f | normals).
     - `rows`: the observed values.
     - `value_unit`: h, the unit of the values, see `ScreenedSPSR.offset`.
-    - `whitened`: C^-1 K_df, where A = C C^T is the covariance of the normals, and K_df their covariance with f at the
-      points of `rows`.
+    - `whitened_cross`: C^-1 K_df, where A = C C^T is the covariance of the normals, and K_df their covariance with f at
+      the points of `rows`.
     - `factor`: the Cholesky factor of S, the covariance of the values given the normals.
     - `weights`: the weights w of the values in the posterior mean.
     """
@@ -180,7 +175,7 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
     base: GeometricSPSRPosterior
     rows: ValueRows
     value_unit: Float[Array, ""]
-    whitened: Float[Array, "3 n m"]
+    whitened_cross: Float[Array, "3 n m"]
     factor: CholeskyFactor
     weights: Float[Array, " m"]
 
@@ -195,7 +190,7 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
             # `normals`: whitened covariances of g with the normals. `values`: with the values, given the normals.
             normals = self.base.solver.whitened_cross(point[None])
             cross = function_covariance(self.rows.points, point[None], spectrum) + self.model.level_deviation**2
-            cross = cross - jnp.einsum("dnm,dnx->mx", self.whitened, normals, precision="highest")
+            cross = cross - jnp.einsum("dnm,dnx->mx", self.whitened_cross, normals, precision="highest")
             values = self.factor.whiten(jnp.where(self.rows.mask[:, None], cross, 0.0))
             return jnp.maximum(prior - jnp.sum(normals**2) - jnp.sum(values**2), 0.0)
 
@@ -206,11 +201,11 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
         return DataPoints(self.base.data_points().gradient_points, fill_rows(self.rows.points, self.rows.mask))
 
     def level_shift(self, means: MeansAtData) -> Float[Array, " s"]:
-        """Return zero for each mean function, because g is measured relative to the level."""
+        """Return zero for each mean function, because g is relative to the level."""
         return jnp.zeros(len(means.values), self.weights.dtype)
 
     def prior_draws(self, key: PRNGKeyArray, num_samples: int) -> ScreenedDraws:
-        """Draw the normal field, its noise, the level and the noise of the values from the prior."""
+        """Draw the normal field, its noise, the level and the noise of the values."""
         base_key, level_key, noise_key = jax.random.split(key, 3)
         normals = self.base.prior_draws(base_key, num_samples)
         dtype, shape = normals.noisy_normals.dtype, self.rows.noise.shape
@@ -219,17 +214,14 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
         return ScreenedDraws(normals, level, noise)
 
     def condition_draws(self, draws: ScreenedDraws, means: MeansAtData) -> Float[Array, "s a a a"]:
-        """Condition the draws on the normals and then on the values. Return the coefficients of the samples.
-
-        The samples are of g = f - c, where c is the level of f. The gradients of `means` are subtracted from the
-        observed normals, and their values from the observed values.
-        """
+        """Condition the draws on the normals and then on the values. Return the coefficients of samples of g."""
         residual = self.base.whitened_residual(draws.normals, means)
         coefficients, level, noise = draws.normals.coefficients, draws.level, draws.noise
         transform = NonuniformTransform(self.rows.points, self.model.base.truncation)
         row_values = shared_map(_evaluate, coefficients, transform)
         # Condition f at the values' points Y on the normals. Their residual r adds k(Y, X) A^-1 r, computed whitened.
-        row_values = row_values + jnp.einsum("dnm,snd->sm", self.whitened, residual, precision="highest") + means.values
+        update = jnp.einsum("dnm,snd->sm", self.whitened_cross, residual, precision="highest")
+        row_values = row_values + update + means.values
         weights = jax.vmap(self.solve)(self.value_unit * self.rows.values - row_values + level[:, None] - noise)
         return self._update_draws(coefficients, residual, -level, weights)
 
@@ -246,12 +238,11 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
     ) -> Float[Array, "s a a a"]:
         """Return the coefficients of g for each sample.
 
-        - `coefficients`: coefficients of the drawn normal field v.
+        - `coefficients`, `constant`: coefficients of the drawn normal field, and the drawn level, negated.
         - `residual`: whitened residual of the normals.
-        - `constant`: the level c of the draw, negated.
         - `weights`: the weights w of the values.
         """
-        remainder = residual - jnp.einsum("dnm,sm->snd", self.whitened, weights, precision="highest")
+        remainder = residual - jnp.einsum("dnm,sm->snd", self.whitened_cross, weights, precision="highest")
         fields = self.base.update_draws(coefficients, remainder)
         transform = NonuniformTransform(self.rows.points, self.model.base.truncation)
         variance = mode_variance(self.model.base.spectrum)
@@ -262,18 +253,12 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
 
 
 def _evaluate(normals: Float[Array, "3 a a a"], transform: NonuniformTransform) -> Float[Array, " m"]:
-    """Return the values of f = Poisson(v) at the points of the transform.
-
-    - `normals`: coefficients of the normal field v.
-    """
+    """Return the values of Poisson(v) at the points of the transform, for a normal field v."""
     return transform.evaluate(solve_poisson(normals)[None])[:, 0]
 
 
 def _reconstruct(
     weights: Float[Array, " m"], transform: NonuniformTransform, variance: Float[Array, "a a a"]
 ) -> Float[Array, "a a a"]:
-    """Return the coefficients of -cov(f, f(Y)) w, where Y are the transform's points, and w the weights.
-
-    - `variance`: prior variances of the coefficients of each component of the normal field.
-    """
+    """Return the coefficients of -cov(f, f(Y)) w, where Y are the transform's points, and w the weights."""
     return inverse_laplacian(variance * transform.adjoint(weights[:, None])[0])

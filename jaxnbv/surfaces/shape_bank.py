@@ -29,7 +29,6 @@ _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 class Shape(NamedTuple):
     """One shape of a bank, or several along a leading axis.
 
-    - `solid`: signed distance of the shape.
     - `extremes`: points on the surface. For every direction, one of them is nearly the farthest point of the shape.
     """
 
@@ -72,7 +71,7 @@ class ShapeBank(eqx.Module):
     ) -> "ShapeBank":
         """Make a bank of solids of one type.
 
-        The signed distances are evaluated exactly, without a grid. One compiled program evaluates any of the solids.
+        The signed distances are evaluated exactly, without a grid.
 
         - `names`: by default the indices.
         - `is_true_size`: whether the solids are as large as the real objects, see `from_meshes`.
@@ -123,8 +122,7 @@ class ShapeBank(eqx.Module):
           matter. Their longest side becomes 2.5.
         - `up`: the upward axis of the meshes, see `Frame`.
 
-        A `UserWarning` names each unusable mesh, which is left out. A `UserWarning` also names each pair of parts at
-        true size that are equal.
+        A `UserWarning` names each unusable mesh, which is left out, and each pair of parts at true size that are equal.
 
         **Raises:** `ValueError` if no mesh can be used, if the number of names differs from the number of meshes, for
         numbers out of range, or for an unknown unit.
@@ -151,14 +149,10 @@ class ShapeBank(eqx.Module):
         return dataclasses.replace(bank, is_true_size=True)._resize(sizes)
 
     def in_scene(self, frame: Frame) -> "ShapeBank":
-        """Return a copy with true sizes converted from a frame's world units to scene units.
-
-        A bank without true sizes is returned unchanged.
-        """
+        """Return a copy with true sizes, if any, converted from a frame's world units to scene units."""
         return self._resize(jnp.full(len(self), frame.scale)) if self.is_true_size else self
 
     def _resize(self, factors: Float[Array, " k"]) -> "ShapeBank":
-        """Return a copy with each shape scaled by its factor."""
         if self.solids is None:
             return self
         if isinstance(self.solids, Scaled):
@@ -206,10 +200,7 @@ class ShapeBank(eqx.Module):
 
 
 def _metres(scale: float | str) -> float:
-    """Return the length of a named unit in metres. A number is returned unchanged.
-
-    **Raises:** `ValueError` for an unknown unit, or a length that is not positive.
-    """
+    """Return the length of a named unit in metres. A number is returned unchanged."""
     if isinstance(scale, str):
         require(
             scale in _METRES, f"the unit is {scale!r}: give one of {', '.join(_METRES)}, or its length in the world"
@@ -235,10 +226,7 @@ def encode_names(names: Sequence[str]) -> UInt8[Array, "k c"]:
 
 @program
 def _extremes(solids: SignedDistance) -> Float[Array, "k p 3"]:
-    """Return points on each solid's surface.
-
-    They start on a large sphere around the solid, and move along the gradient of its signed distance by Newton steps.
-    """
+    """Return points on each solid's surface, by Newton steps on its distance, from a large sphere."""
     start = fibonacci_sphere(NUM_EXTREMES, _START_RADIUS)
 
     def of_solid(solid):
@@ -248,8 +236,7 @@ def _extremes(solids: SignedDistance) -> Float[Array, "k p 3"]:
             return points - (distance / jnp.where(square > 0, square, 1.0))[:, None] * gradient, None
 
         points = jax.lax.scan(stride, start, length=_NUM_STRIDES)[0]
-        # If a solid gives only a bound of the distance, some points may not reach the surface. A point that did reach
-        # the surface replaces each of them.
+        # If a solid gives only a bound of the distance, points may not reach the surface. One that did replaces them.
         is_on_surface = jnp.abs(solid(points)) < _MAX_DISTANCE
         return jnp.where(is_on_surface[:, None], points, points[jnp.argmax(is_on_surface)])
 
@@ -259,10 +246,7 @@ def _extremes(solids: SignedDistance) -> Float[Array, "k p 3"]:
 def values_and_gradients(
     function: Callable[[Float[Array, "n 3"]], Float[Array, " n"]], points: Float[Array, "n 3"]
 ) -> tuple[Float[Array, " n"], Float[Array, "n 3"]]:
-    """Return the values and gradients of a function at points, by one forward sweep for each direction.
-
-    - `function`: maps points to values. The value at a point must depend on this point alone.
-    """
+    """Return the values and gradients at points of a function whose value at a point depends on it alone."""
     values, derivative = jax.linearize(function, points)
     columns = [derivative(jnp.broadcast_to(direction, points.shape)) for direction in jnp.eye(3, dtype=points.dtype)]
     return values, jnp.stack(columns, axis=-1)

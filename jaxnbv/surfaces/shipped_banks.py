@@ -21,11 +21,7 @@ _FURNITURE = Upright(by_axis=True)
 
 
 class ShippedBank(NamedTuple):
-    """Description of a bank that ships with jaxnbv.
-
-    - `form`: returns a solid with the same PyTree structure as the bank's solids.
-    - `poses`: the possible placements of the bank's objects.
-    """
+    """A solid with the PyTree structure of a bank's solids, and the possible placements of these."""
 
     form: Callable[[], SignedDistance]
     poses: ShapePoses

@@ -51,12 +51,12 @@ class GeometricSPSR(SurfaceModel):
     """Matern prior on the normal field v over the torus, with f as its Poisson reconstruction.
 
     - `lengthscale`: ell, in units of the circumference 2 pi: 0.005 is 0.031 in scene units. Several lengthscales make a
-      sum of independent priors: short lengthscales for detail, and long lengthscales for the overall shape.
+      sum of independent priors: short ones for detail, and long ones for the overall shape.
     - `variance`: variance per axis, one for each lengthscale. Without truncation, Var v_d = variance^3 for each d.
     - `noise`: standard deviation of each component of the observed normals.
     - `nu`: smoothness, 1/2, 3/2 or 5/2.
     - `truncation`: L, the largest frequency along each axis. Frequencies up to L hold the fraction `kept_variance` of
-      the prior's variance, which is 49 % for the defaults. The defaults are the paper's values.
+      the prior's variance, 49 % for the defaults. The defaults are the paper's values.
 
     `lengthscale`, `variance` and `noise` are array leaves, so the posterior is differentiable in them.
 
@@ -112,8 +112,7 @@ class GeometricSPSR(SurfaceModel):
     def check(self, cloud: PointCloud) -> None:
         """Warn if the median distance between neighbouring points exceeds 2.5 times the longest lengthscale.
 
-        Such points hardly constrain the samples. At this distance, the standard deviation of f minus its level at the
-        data is 0.9 times its prior standard deviation.
+        Then the standard deviation of f minus its level at the data is 0.9 times that of the prior or more.
         """
         points, _ = cloud.to_numpy()
         if len(points) < 2 or is_traced(self):

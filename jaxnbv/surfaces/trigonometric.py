@@ -73,10 +73,7 @@ def _frequency(coefficients: Float[Array, "*s a a a"], axis: int) -> Float[Array
 def evaluate_on_grid(
     coefficients: Float[Array, "*s a a a"], basis: Float[Array, "g a"] | Float[np.ndarray, "g a"]
 ) -> Float[Array, "*s g g g"]:
-    """Return the values on a tensor grid, by three matrix products per function.
-
-    - `basis`: values of the basis at the nodes along one axis of the grid.
-    """
+    """Return the values on a tensor grid, given the basis at the nodes along one axis of the grid."""
     values = jnp.einsum("...abc,kc->...abk", coefficients, basis, precision="highest")
     values = jnp.einsum("...abk,jb->...ajk", values, basis, precision="highest")
     return jnp.einsum("...ajk,ia->...ijk", values, basis, precision="highest")
@@ -92,7 +89,6 @@ class TrigonometricFields(Fields):
 
     @on_torus
     def __call__(self, x: Float[AnyArray, "n 3"]) -> Float[Array, "s n"]:
-        """Return the values of all functions at the points x (scene coordinates)."""
         x = jnp.asarray(x, dtype=self.coefficients.dtype)
         samples, modes = self.coefficients.shape[0], self.coefficients.shape[-1]
 
@@ -111,7 +107,6 @@ class TrigonometricFields(Fields):
 
     @on_grid_of_torus
     def on_grid(self, axis: Float[AnyArray, " g"]) -> Float[Array, "s g g g"]:
-        """Return the values on the grid axis x axis x axis, one function at a time to bound the memory."""
         basis = circle_basis(jnp.asarray(axis, dtype=self.coefficients.dtype), self.coefficients.shape[-1] // 2)
         return shared_map(evaluate_on_grid, self.coefficients, basis)
 
@@ -119,10 +114,10 @@ class TrigonometricFields(Fields):
 class NonuniformTransform(eqx.Module):
     """Fast transforms between coefficients up to frequency L and values at given points of the scene.
 
-    `evaluate` evaluates a function on a tensor grid that covers the scene, twice as fine as its highest frequency
-    needs. It then interpolates the values with a Kaiser-Bessel window. The effect of the window on each frequency is
-    divided out beforehand (Dutt and Rokhlin 1993; Barnett, Magland and af Klinteberg 2019 on windows). The error is
-    close to rounding error, about 1e-6 in float32 and 1e-12 in float64. `adjoint` is the transpose of `evaluate`.
+    `evaluate` interpolates values on a tensor grid that covers the scene, twice as fine as the highest frequency needs,
+    with a Kaiser-Bessel window. The effect of the window on each frequency is divided out beforehand (Dutt and Rokhlin
+    1993; Barnett, Magland and af Klinteberg 2019 on windows). The error is close to rounding error, about 1e-6 in
+    float32 and 1e-12 in float64. `adjoint` is the transpose of `evaluate`.
 
     - `start`: first node of each point's window, per axis.
     - `weights`: the window's values at its nodes, per axis.

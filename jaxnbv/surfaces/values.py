@@ -1,8 +1,7 @@
 """Observed values of f relative to its level, beside the normals, which observe the gradient of f.
 
-Values are in units of h, because the scale of f depends on the prior. Given the normals alone, E f is larger a small
-distance outside the scanned surface than the same distance inside, and h is half the difference (see
-`ScreenedSPSR.offset`).
+Values are in units of h, because the scale of f depends on the prior. h is half the rise of E f across the scanned
+surface, given the normals alone (see `ScreenedSPSR.offset`).
 """
 
 import math
@@ -78,9 +77,9 @@ class ValueSource(eqx.Module):
     def rows(self, observations: Observations) -> ValueRows:
         """Return the observed values that this source adds.
 
-        The method is called under `jit`, so the number of rows may depend only on the capacity of the cloud.
-        `condition` of the model raises an error for a filled row outside [-pi/2, pi/2]^3. If the user calls `condition`
-        under `jit`, it cannot check the rows, and the posterior is NaN.
+        The method is called under `jit`, so the number of rows may depend only on the capacity of the cloud. A filled
+        row outside [-pi/2, pi/2]^3 makes `condition` of the model raise an error, or under `jit` makes the posterior
+        NaN.
         """
 
 
