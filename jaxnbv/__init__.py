@@ -45,7 +45,7 @@ def _html_of(value: Any) -> str:
 
 
 def _show_in_notebooks() -> None:
-    """Let IPython, if it runs, show `_NOTEBOOK_CLASSES` as HTML. Their modules are imported at first display."""
+    """Let IPython, if it runs, show `_NOTEBOOK_CLASSES` as HTML. Modules are imported at first display."""
     ipython = sys.modules.get("IPython")
     shell = None if ipython is None else ipython.get_ipython()
     if shell is not None:

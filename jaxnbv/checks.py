@@ -75,9 +75,9 @@ def is_traced(*trees) -> bool:
 
 
 def check_fields(module: Any) -> None:
-    """Check the fields of a module by `check_type`. Call this first in `__check_init__`.
+    """Raise `ValueError` that names the first field of a module that contradicts its annotation.
 
-    **Raises:** `ValueError` that names the first field whose value contradicts its annotation.
+    Call this first in `__check_init__`.
     """
     hints = get_type_hints(type(module))
     for field in dataclasses.fields(module):
@@ -88,7 +88,7 @@ def check_fields(module: Any) -> None:
 def own_settings() -> Iterator[None]:
     """Context manager or decorator: allow rank promotion, type promotion and transfers in JAX.
 
-    A user's strict settings in `jax.config` are meant for the user's own code. `jax_debug_nans` is not changed.
+    A user's strict settings in `jax.config` are meant for the user's own code.
     """
     with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"), jax.transfer_guard("allow"):
         yield
@@ -115,8 +115,8 @@ def checked(function: _F) -> _F:
 def check_type(value: Any, hint: Any, name: str) -> None:
     """Raise `ValueError` if the value called `name` contradicts a plain type hint.
 
-    Plain hints are int, float, bool, a tuple of two or three floats, classes, `Callable`, and a union of any of these
-    with None. Other hints are ignored.
+    Plain hints are int, float, bool, a tuple of two or three floats, classes, `Callable`, and a union with None. Others
+    are ignored.
     """
     if hint is int:
         is_whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
@@ -140,7 +140,7 @@ def check_type(value: Any, hint: Any, name: str) -> None:
 
 
 def check_index(index: Any, batch: tuple[int, ...], name: str) -> None:
-    """Raise `ValueError` for an index out of the range of a `batch`'s shape, which JAX would clamp."""
+    """Raise `ValueError` for an index out of the range of a shape `batch`, which JAX would clamp."""
     if isinstance(index, int | np.integer):
         check_batch(batch, name)
         require(-batch[0] <= index < batch[0], f"{name} has {batch[0]} along its first axis: there is no index {index}")
@@ -158,10 +158,7 @@ def check_key(key: Any) -> None:
 
 
 def on_host(tree: Any) -> Any:
-    """Return a tree with NumPy arrays; unchanged if it is traced.
-
-    NumPy compiles nothing, whereas JAX compiles a program for each operation outside `jit`.
-    """
+    """Return a tree with NumPy arrays, whose operations compile nothing; unchanged if it is traced."""
     return tree if is_traced(tree) else jax.tree.map(np.asarray, tree)
 
 
@@ -229,25 +226,21 @@ def functions_of_users() -> Iterator[None]:
     try:
         yield
     except tuple(_UNTRACEABLE) as error:
-        user_frames = [
-            frame
-            for frame in traceback.extract_tb(error.__traceback__)
-            if not frame.filename.startswith(_LIBRARY_FOLDERS)
-        ]
-        if not user_frames:
+        frames = traceback.extract_tb(error.__traceback__)
+        frame = next((frame for frame in reversed(frames) if not frame.filename.startswith(_LIBRARY_FOLDERS)), None)
+        if frame is None:
             raise
-        location = f"{user_frames[-1].filename}:{user_frames[-1].lineno}"
         problem, remedy = next(words for kind, words in _UNTRACEABLE.items() if isinstance(error, kind))
         raise InputError(
-            f"{user_frames[-1].name} {problem} ({location}): {remedy}, or wrap a network from outside JAX in "
-            "HostClassifier or HostSegmenter"
+            f"{frame.name} {problem} ({frame.filename}:{frame.lineno}): {remedy}, or wrap a network from outside JAX "
+            "in HostClassifier or HostSegmenter"
         ) from error
 
 
 def checked_result(value: Any, name: str, axes: int, requirement: str) -> Any:
-    """Check a value that a user's function returned, and return it unchanged.
+    """Return a value, called `name`, that a user's function returned.
 
-    - `name`, `requirement`: the name of the value, and a description of valid values, for the error message.
+    - `requirement`: description of valid values for the error message.
 
     **Raises:** `ValueError` unless it is an array of real numbers with this number of axes (0 also for plain numbers).
     """
@@ -258,7 +251,7 @@ def checked_result(value: Any, name: str, axes: int, requirement: str) -> Any:
 
 
 def short_text(value: Any) -> str:
-    """Return a short text for a value in an error message. For an array it gives shape and type."""
+    """Return a short text for a value in an error message, for an array its shape and type."""
     if isinstance(value, AnyArray):
         return f"an array of shape {value.shape} and type {value.dtype}" if value.ndim else str(value)
     if isinstance(value, str | int | float | complex | tuple | list | dict | None):
@@ -280,7 +273,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _classes(hint: Any) -> tuple[type, ...]:
-    """Return the classes in a type hint, or an empty tuple if the hint contains anything but classes."""
+    """Return the classes in a type hint; none if it contains anything else."""
     kinds = get_args(hint) if isinstance(hint, types.UnionType) or get_origin(hint) is Union else (hint,)
     # A jaxtyping annotation is a class too, but does not count here, because shapes are checked elsewhere.
     is_plain = all(isinstance(kind, type) and not hasattr(kind, "dim_str") and kind is not object for kind in kinds)

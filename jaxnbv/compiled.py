@@ -18,11 +18,10 @@ _THRESHOLDS = {"jax_persistent_cache_min_compile_time_secs": 0.0, "jax_persisten
 
 
 def keep_compiled(folder: str | Path | None = None) -> str:
-    """Store compiled programs on disk, where later processes and child processes load them.
+    """Store compiled programs on disk for later processes and child processes, and return the folder.
 
-    Returns the folder. Call this function before the first step. Compiling takes 10 to 90 seconds. Later processes load
-    the package's own programs in two seconds without tracing them again (see `jaxnbv.programs`). They load all other
-    programs from JAX's cache.
+    Call this before the first step. Compiling takes 10 to 90 seconds. Later processes load the package's own programs
+    in two seconds without tracing them again (see `jaxnbv.programs`), and all others from JAX's cache.
 
     - `folder`: by default JAX's cache folder (`JAX_COMPILATION_CACHE_DIR`), or a folder in the user's cache if that is
       not set. The folder is never emptied automatically, and you may delete it at any time.
@@ -56,7 +55,7 @@ def keep_compiled(folder: str | Path | None = None) -> str:
 
 
 def _check_writable(folder: Path) -> None:
-    """Raise `ValueError` if no file can be written to the folder. JAX would only warn, once for each program."""
+    """Raise `ValueError` if no file can be written to the folder. JAX would warn once for each program."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):

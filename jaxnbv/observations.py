@@ -32,9 +32,7 @@ class EmptyPoints(NamedTuple):
 
 
 class Observations(eqx.Module):
-    """Everything observed so far, in scene coordinates. Immutable.
-
-    Array shapes are fixed, so that views do not recompile programs.
+    """Everything observed so far, in scene coordinates. Array shapes are fixed, so nothing recompiles.
 
     - `cloud`: the kept points, the paper's D.
     - `poses`: the poses of the views.
@@ -66,7 +64,7 @@ class Observations(eqx.Module):
         """Return the observations of a cloud before any view. No node is marked empty yet.
 
         - `max_views`: number of poses for which memory is reserved.
-        - `camera`: `looks` stores ray lengths along the rays of this camera.
+        - `camera`: `looks` stores lengths of its rays.
         """
         empty = None if grid is None else jnp.zeros((grid.resolution,) * 3, bool)
         looks = None if grid is None else Looks.empty(grid, camera, max_views).with_points(cloud)
@@ -110,7 +108,7 @@ class Observations(eqx.Module):
 
 
 def as_observations(value: Observations | PointCloud) -> Observations:
-    """Convert a cloud to observations without views, or return observations unchanged.
+    """Convert a cloud to observations without views; return observations unchanged.
 
     **Raises:** `ValueError` for any other type, and for a batch of clouds.
     """
@@ -131,10 +129,8 @@ def _is_stray(cloud: PointCloud, empty: Bool[Array, "g g g"], grid: Grid) -> Boo
     """Return whether each point is stray: alone, and in a grid cell whose nodes were all seen to be empty.
 
     A point is alone if no other point is within twice the spacing, the median distance between neighbours. Points on a
-    connected surface are about one spacing apart in a thinned cloud, so they are not alone. Therefore no point is stray
-    just because it is on a thin part that a view missed, or because the pose of its image is slightly wrong.
-
-    - `empty`: mask of the nodes that were seen to be empty.
+    connected surface are about one spacing apart in a thinned cloud. So no point is stray just because it is on a thin
+    part that a view missed, or because the pose of its image is slightly wrong.
     """
     is_empty_cell = jax.lax.reduce_window(empty, True, jax.lax.bitwise_and, (2, 2, 2), (1, 1, 1), "VALID")
     cell = tuple(grid.cell_of(cloud.points).T)

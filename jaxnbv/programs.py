@@ -51,7 +51,7 @@ class _ArrayPlaceholder:
 class _Executable(NamedTuple):
     """A program that is compiled for arguments with certain shapes, types and static values.
 
-    - `call`: the compiled function from the arguments' arrays to the output arrays.
+    - `call`: function from the arguments' arrays to the output arrays.
     - `result`: the result with an `_ArrayPlaceholder` in place of each array.
     """
 
@@ -89,13 +89,10 @@ class _Program:
         return jax.tree.map(lambda x: outputs[x.index] if isinstance(x, _ArrayPlaceholder) else x, executable.result)
 
     def _load_or_compile(self, folder: Path, static: Any, tree: Any, leaves: list, kinds: tuple) -> _Executable | None:
-        """Load or compile the program for these arguments.
-
-        Returns None if the arguments contain code of a module that is not permitted.
+        """Load or compile the program; return None if the arguments contain code that is not permitted.
 
         - `static`: the arguments without their arrays.
-        - `tree`, `leaves`: structure and leaves of a tree of these arrays.
-        - `kinds`: shape and type of each array.
+        - `tree`, `leaves`, `kinds`: structure and leaves of a tree of these arrays, and their shapes and types.
         """
         function = self._function.__module__, self._function.__qualname__
         try:
@@ -113,10 +110,7 @@ class _Program:
         return self._compile(entry, static, tree, leaves)
 
     def _compile(self, entry: Path, static: Any, tree: Any, leaves: list) -> _Executable:
-        """Trace the function for these arguments, and return the program.
-
-        If the same lowered code is already stored, for a different entry, the program is loaded. Otherwise it is
-        compiled and stored.
+        """Trace the function, and return the program, compiled unless its lowered code is stored already.
 
         - `entry`: path of the file for these arguments, in which the name of the program's file is stored.
         - `static`, `tree`, `leaves`: see `_load_or_compile`.
@@ -211,7 +205,7 @@ def _machine() -> str:
 class _ForeignCodeError(Exception):
     """An argument contains code of a module that is not permitted, so the program is not stored.
 
-    A stored program could be outdated, because changes of this code do not change the key that finds it.
+    Changes of this code would not change the key that finds the program.
     """
 
 
@@ -227,10 +221,7 @@ class _Pickler(pickle.Pickler):
 
 
 def _pickle(x: Any) -> bytes:
-    """Pickle an object so that equal objects give equal bytes.
-
-    **Raises:** `_ForeignCodeError` for code of a module that is not permitted, or for an object that pickle refuses.
-    """
+    """Pickle an object so that equal objects give equal bytes. **Raises:** `_ForeignCodeError`."""
     file = io.BytesIO()
     pickler = _Pickler(file)
     # Turn off the memo, with which two equal objects give different bytes than the same object twice.
@@ -245,7 +236,7 @@ def _pickle(x: Any) -> bytes:
 def _without_names(code: str) -> str:
     """Return lowered code with numbers in place of functions' names, in order of appearance.
 
-    JAX's own names of the functions depend on what the process lowered before, so equal code would differ.
+    JAX's names of the functions depend on what the process lowered before.
     """
     numbers: dict[str, int] = {}
 
@@ -290,7 +281,7 @@ def _initialise_lapack() -> None:
 
 
 def _read(path: Path) -> bytes | None:
-    """Return the bytes that `_write` stored, or None if the file is missing or damaged."""
+    """Return the bytes that `_write` stored; None if the file is missing or damaged."""
     if not path.exists():
         return None
     data = path.read_bytes()
@@ -301,7 +292,7 @@ def _read(path: Path) -> bytes | None:
 def _write(path: Path, data: bytes) -> None:
     """Write a file atomically, so that other processes never read a part of it.
 
-    Only warns if the file cannot be written (for example on a full disk), because the compiled program works anyway.
+    Warn if it cannot be written, for example on a full disk.
     """
     packed = zlib.compress(data, 1)
     part = path.with_name(f"{path.name}.{uuid.uuid4().hex}")

@@ -51,9 +51,8 @@ MODELS = ("screened", "paper")
 
 
 class StepInputs(eqx.Module):
-    """The inputs of one step, the computation that chooses a view. They are computed once per step.
+    """The inputs of one step, the computation that chooses a view.
 
-    - `observations`: the observations so far.
     - `posterior`: p(f | observations); None if nothing needs it.
     - `surfaces`: samples of the posterior along a leading axis; None if nothing needs them.
     """
@@ -106,15 +105,13 @@ class SurfaceSampler(eqx.Module):
 
         - `name`: "screened" is the default `ScreenedSPSR`, with lengths in proportion to the longest side. The boundary
           of the volume counts as outside. Samples are carved, so they avoid empty space and stay in the volume.
-          "paper" is the published model with its published values. It uses normals only, and its samples are not
-          carved.
+          "paper" is the published model with its published values. It uses normals only, without carving.
         - `longest_side`: longest side of the object's bounding box, in scene units.
         - `quick`: use fewer frequencies.
         - `volume`: by default a cube about the origin whose sides are `longest_side`. A volume that you pass may cut
           the object.
         - `solid`: leave out `EmptySpace`, which assumes that unseen space next to empty space is likely to be empty
-          too. Set this for a body that is nowhere thin, such as the pyramid: its hidden side is as large as its visible
-          side, so the assumption does not hold.
+          too. This does not hold for a body whose hidden side is as large as its visible side, such as the pyramid.
 
         **Raises:** `ValueError` for an unknown name, or a longest side that is not positive.
         """
@@ -133,10 +130,9 @@ class SurfaceSampler(eqx.Module):
 
     @own_settings()
     def with_bank(self, bank: ShapeBank, poses: ShapePoses) -> "SurfaceSampler":
-        """Return a copy whose prior is `KnownShapes`, a mixture over a bank.
+        """Return a copy whose prior is `KnownShapes`: a bank, and the current model for "none of these".
 
-        Shapes are registered within the carving's volume, or within `Box()` if there is no carving. The current model
-        becomes the mixture's "none of these".
+        Shapes are registered within the carving's volume, or within `Box()` if there is no carving.
 
         - `poses`: the possible placements of the shapes in the scene.
         """
@@ -149,7 +145,7 @@ class SurfaceSampler(eqx.Module):
 
     @property
     def without_bank(self) -> "SurfaceSampler":
-        """A copy without a bank: its prior is the model that `KnownShapes` uses for "none of these"."""
+        """A copy without a bank, whose prior is the model for "none of these"."""
         return (
             dataclasses.replace(self, model=self.model.model_of_none) if isinstance(self.model, KnownShapes) else self
         )
@@ -184,9 +180,7 @@ class SurfaceSampler(eqx.Module):
     def sample(
         self, observations: Observations | PointCloud, key: PRNGKeyArray, posterior: SurfacePosterior | None = None
     ) -> GridSurface:
-        """Draw `num_samples` samples of the surface given the observations, on the grid and carved.
-
-        The samples lie along a leading axis.
+        """Draw `num_samples` carved samples of the surface on the grid, along a leading axis.
 
         - `posterior`: the result of `posterior(observations)`, if it is already computed.
 
@@ -251,8 +245,7 @@ class SurfaceSampler(eqx.Module):
     def probability_inside(self, observations: Observations | PointCloud) -> Float[Array, "g g g"]:
         """Return P(f < level | observations) at the grid's nodes.
 
-        At each node, the estimate is the fraction of the samples that are below the level there. `num_samples` samples
-        are drawn with a fixed key and carved. This works for any model.
+        The estimate is the fraction of `num_samples` carved samples, drawn with a fixed key, that are below the level.
 
         **Raises:** `ValueError` whenever `sample` raises it.
         """
@@ -263,9 +256,9 @@ class SurfaceSampler(eqx.Module):
         """Return a mesh of the surface where the carved posterior mean equals its level (marching cubes).
 
         The mesh is in scene coordinates (its frame is the identity), with faces wound outward. Where nothing was
-        scanned, the mesh shows the surface that the model predicts. Connected components of the mesh that have fewer
-        than four points of the cloud near them are left out, and a warning gives their number. If the surface leaves
-        the grid, the mesh ends there with an open edge.
+        scanned, it shows the surface that the model predicts. Connected components with fewer than four points of the
+        cloud near them are left out, and a warning gives their number. If the surface leaves the grid, the mesh ends
+        there with an open edge.
 
         **Raises:** `ValueError` if the mean equals its level nowhere in the grid, and whenever
         `SurfaceSampler.posterior` raises it.
@@ -289,9 +282,9 @@ class SurfaceSampler(eqx.Module):
         return TriangleMesh(vertices, faces, Frame())
 
     def adapt(self, observations: Observations | PointCloud) -> Observations:
-        """Return the observations in the form that this sampler uses.
+        """Return the observations as this sampler uses them: without carving, empty nodes are dropped.
 
-        Without carving, empty nodes are dropped. A `PointCloud` becomes observations in which no node is empty.
+        A `PointCloud` becomes observations in which no node is empty.
 
         **Raises:** `ValueError` if the observations have a different grid than the sampler, or if they have no grid
         although samples are carved.

@@ -19,11 +19,8 @@ from jax.sharding import AxisType, PartitionSpec, get_abstract_mesh
 
 
 def shared_map(function: Callable[..., Any], rows: Any, *shared_args: Any, at_once: int = 1) -> Any:
-    """Map `function(row, *shared_args)` over the rows of a tree, with the rows divided among devices.
+    """Map `function(row, *shared_args)` over the rows of a tree by `jax.lax.map`, divided among devices.
 
-    Each device maps its rows by `jax.lax.map`.
-
-    - `rows`: arrays with a leading axis of rows. `shared_args`: further arguments, the same for all rows.
     - `at_once`: number of rows that a device computes together.
     """
 
@@ -34,19 +31,16 @@ def shared_map(function: Callable[..., Any], rows: Any, *shared_args: Any, at_on
 
 
 def batched_map(function: Callable[..., Any], rows: Any, at_once: int) -> Any:
-    """Map a function over batches of `at_once` rows by `jax.lax.map`.
-
-    If `at_once` is 1, rows are not batched, because XLA would be 50 % slower with batches of one row.
-    """
+    """Map a function over batches of `at_once` rows by `jax.lax.map`."""
+    # XLA would be 50 % slower with batches of one row.
     return jax.lax.map(function, rows, batch_size=at_once if at_once > 1 else None)
 
 
 def run_sharded(function: Callable[..., Any], rows: Any, *shared_args: Any) -> Any:
     """Return `function(rows, *shared_args)`, with the rows of the leading axis divided among devices.
 
-    All devices get the whole result. The function must treat the rows independently. If there are more devices than
-    rows, each device computes all rows. All arrays must be arguments, because arrays in a closure do not reach the
-    devices.
+    All devices get the whole result. The function must treat the rows independently, and get all arrays as arguments,
+    because arrays in a closure do not reach the devices. If there are more devices than rows, each computes all rows.
     """
     axes, devices = _axes()
     count = len(jax.tree.leaves(rows)[0])

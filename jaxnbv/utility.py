@@ -39,11 +39,8 @@ class Quantity(eqx.Module):
 
 
 class Answer(eqx.Module):
-    """The answer that a cloud D gives to the question of a task: named numbers.
+    """The answer of a cloud D to the question of a task: named numbers. `jaxnbv.viz` puts them into words.
 
-    `jaxnbv.viz` puts the numbers into words.
-
-    - `names`, `values`: one name for each value.
     - `form`: format of a value, for `str.format`.
     """
 
@@ -52,10 +49,7 @@ class Answer(eqx.Module):
     form: str = "{:.4g}"
 
     def in_world(self, frame: Frame) -> "Answer":
-        """Return a copy whose text gives points and lengths in the frame's world.
-
-        The default is for answers without points and lengths, and returns the answer unchanged.
-        """
+        """Return a copy with points and lengths, if any, in the frame's world."""
         return self
 
 
@@ -93,20 +87,17 @@ class Utility(eqx.Module):
         return default_batch_size()
 
     def answer(self, cloud: PointCloud) -> Answer | None:
-        """Return the answer that a cloud gives to the task's question, or None if its utility is the answer."""
+        """Return the answer that a cloud gives to the task's question; None if its utility is the answer."""
         return None
 
     def answer_values(self, cloud: PointCloud) -> Float[Array, " n"] | None:
-        """Return the values of `answer` by JAX operations.
-
-        None if there is no answer, or if the answer needs code outside JAX.
-        """
+        """Return the values of `answer` by JAX operations; None without an answer, or if that is impossible."""
         return None
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> Answer | None:
-        """Return the correct answer for the true surface `scene`. `cloud` holds points on all of the surface.
+        """Return the correct answer for the true surface `scene`; None if it is `answer` of this `cloud`.
 
-        None means that `answer`, applied to this cloud, gives the correct answer.
+        - `cloud`: points on all of the surface.
         """
         return None
 
@@ -134,7 +125,7 @@ class FunctionUtility(Utility):
 def plain_function(value: Any, name: str, example: str = "") -> Callable[..., Any]:
     """Return the value unchanged if it is a function.
 
-    - `name`, `example`: name of the argument, and an example of a valid argument, for the error message.
+    - `name`, `example`: name of the argument, and a valid argument, for the error message.
 
     **Raises:** `ValueError` for anything else, including a class.
     """

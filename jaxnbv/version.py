@@ -8,10 +8,7 @@ __version__ = importlib.metadata.version("jaxnbv")
 
 
 def check_jax(jaxlib_version: str) -> None:
-    """Refuse a version of jaxlib that the package's requirements exclude.
-
-    Such versions compute wrong values on CPUs. `pip` does not install them together with jaxnbv, but a later
-    `pip install` may.
+    """Refuse a version of jaxlib that the package excludes, but a later `pip install` may install.
 
     **Raises:** `ImportError` with the accepted versions.
     """
