@@ -172,7 +172,10 @@ def _surfaces(
 def _live_text(
     episode: Episode, answer: Answer | None, kinds: list[tuple[str, float]], proposal: Proposal | None
 ) -> str:
-    """Return the answer, the next view (in world units), the amount seen and the kinds of known shapes, as Markdown."""
+    """Return the answer, the next view (in world units) and the amount seen, as Markdown.
+
+    Without an answer, the text also names the kinds of known shapes.
+    """
     num_views, quantity, frame = len(episode.views), episode.planner.quantity, episode.frame
     lines = list[str]()
     if answer is not None:
@@ -185,7 +188,7 @@ def _live_text(
         lines.append(f"**The next view** looks from {pose_text(proposal.pose, frame)}: {quantity.name} {value}.")
     coverage = coverage_answers(episode, None)[-1]
     lines.append(f"**{num_views} view{'s' if num_views > 1 else ''}**, {coverage.amount} of surface seen")
-    lines += [kinds_text(kinds)] if kinds else []
+    lines += [kinds_text(kinds)] if kinds and answer is None else []
     return "\n\n".join(lines)
 
 

@@ -111,8 +111,8 @@ def likeliest_shape(
     """Return the likeliest shape of the likeliest kind; None if "none of these" is nearly certain.
 
     - `hypotheses`, `weights`: the registered shapes and their weights. The last weight is that of "none of these".
-    - `answer`: probabilities of classes. If each kind is one of the classes, they multiply the weights of the kinds, so
-      that a picture does not contradict the answer beside it.
+    - `answer`: probabilities of classes. If each kind is one of the classes, the weights of the kinds are multiplied by
+      them and normalised, so that a picture does not contradict the answer beside it.
     """
     weights = np.asarray(weights, np.float64)
     if weights[-1] > _MAX_NONE_PROBABILITY:
@@ -124,8 +124,8 @@ def likeliest_shape(
         kinds[names[row]] = kinds.get(names[row], 0.0) + weights[row]
     if answer is not None and kinds.keys() <= set(answer.names):
         chances = dict(zip(answer.names, answer.values.tolist(), strict=True))
-        factor = sum(kinds.values()) / max(sum(kinds[kind] * chances[kind] for kind in kinds), 1e-30)
-        kinds = {kind: factor * weight * chances[kind] for kind, weight in kinds.items()}
+        total = max(sum(kinds[kind] * chances[kind] for kind in kinds), 1e-30)
+        kinds = {kind: weight * chances[kind] / total for kind, weight in kinds.items()}
     likely = sorted(kinds, key=lambda kind: -kinds[kind])[:_MAX_HYPOTHESES]
     first = _place_shape(bank, hypotheses, rows[likely[0]], kinds[likely[0]])
     shape = dataclasses.replace(first, name=likely[0], is_part=False)

@@ -84,7 +84,7 @@ def test_a_shape_of_a_bank_is_drawn_as_registered_and_the_others_as_disputed_spa
     assert likeliest_shape(bank, placed, np.array([0.02, 0.03, 0.95]), cloud) is None
     # A classifier that recognises a cube changes 0.2 : 0.3 to 0.18 : 0.03, of 0.5 in all. Other classes change nothing.
     by_class = likeliest_shape(bank, placed, weights, cloud, Answer(("slab", "cube"), np.array([0.1, 0.9])))
-    assert (by_class.name, by_class.probability) == ("cube", pytest.approx(0.5 * 0.18 / 0.21))
+    assert (by_class.name, by_class.probability) == ("cube", pytest.approx(0.18 / 0.21))
     assert likeliest_shape(bank, placed, weights, cloud, Answer(("ball",), np.ones(1))).name == "slab"
 
 
