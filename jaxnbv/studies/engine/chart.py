@@ -1,6 +1,7 @@
 """The chart of a study: its measures by view, one line per method, with intervals over scenes."""
 
 import io
+import textwrap
 from typing import Any
 
 import matplotlib as mpl
@@ -20,6 +21,8 @@ CHART = "chart.png"
 # Offset between methods, as a share of the distance between two columns, so that equal values stay visible.
 _DODGE = 0.06
 _PANELS_A_ROW = 3
+# Letters in a line of a panel's title.
+_TITLE_WIDTH = 24
 # Colour, line and marker. The palette suits colour-blind readers (Okabe and Ito); lines and markers suit print.
 # The new methods are vermilion. Baselines look the same in every study.
 _OURS, _SECOND, _THIRD = ("#d55e00", "-", "o"), ("#cc79a7", "-", "v"), ("#e69f00", "-", "^")
@@ -67,7 +70,7 @@ def chart(table: pd.DataFrame, study: type[Study]) -> bytes:
         for axes, measure in zip(panels, measures, strict=False):
             _draw(axes, rows[rows["quantity"] == measure.name], measure, rows["method"].unique().tolist())
             unit = f"%, mean of {scenes} scenes" if measure.unit == "%" else measure.unit
-            axes.set(title=measure.title, xlabel=measure.key_name, ylabel=unit)
+            axes.set(title=textwrap.fill(measure.title, _TITLE_WIDTH), xlabel=measure.key_name, ylabel=unit)
         for axes in panels[len(measures) :]:
             axes.axis("off")
         lines = {line.get_label(): line for axes in panels for line in axes.containers}

@@ -2,6 +2,7 @@
 
 import json
 import os
+from collections import Counter
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -61,7 +62,7 @@ def chapters(folder: str | Path) -> list[Chapter]:
     folder = Path(folder)
     require(os.path.isdir(folder), f"there is no folder {folder}: {_REMEDY}")
     kinds = _kinds()
-    by_place: dict[tuple[int, Path], Chapter] = {}
+    records: dict[tuple[int, Path], tuple[dict[str, Any], type[Study]]] = {}
     for file in sorted(folder.rglob("study.json")):
         if any(file.parent.glob("scene_*.json")):
             record = read_record(file.parent, "study", _REMEDY)
@@ -70,10 +71,13 @@ def chapters(folder: str | Path) -> list[Chapter]:
             name = name.rpartition(":")[2] if isinstance(name, str) else name
             if not isinstance(name, str) or name not in kinds:
                 raise InputError(f"{file} belongs to the study {name!r}, which this version does not know: {_REMEDY}")
-            chapter = _chapter(file.parent, file.parent.relative_to(folder), record, kinds[name])
-            by_place[list(kinds).index(name), file] = chapter
-    require(len(by_place) > 0, f"{folder} holds no study that has a scene: {_REMEDY}")
-    return [by_place[place] for place in sorted(by_place)]
+            records[list(kinds).index(name), file.parent] = record, kinds[name]
+    require(len(records) > 0, f"{folder} holds no study that has a scene: {_REMEDY}")
+    counts = Counter(index for index, _ in records)
+    return [
+        _chapter(path, str(path.relative_to(folder)) if counts[index] > 1 else "", *records[index, path])
+        for index, path in sorted(records)
+    ]
 
 
 def _kinds() -> dict[str, type[Study]]:
@@ -87,7 +91,12 @@ def _kinds() -> dict[str, type[Study]]:
     return kinds
 
 
-def _chapter(path: Path, subfolder: Path, record: dict[str, Any], kind: type[Study]) -> Chapter:
+def _chapter(path: Path, name: str, record: dict[str, Any], kind: type[Study]) -> Chapter:
+    """Return the chapter of a study.
+
+    - `path`: its folder.
+    - `name`: name that distinguishes it from others of its kind; empty for the only one.
+    """
     records = read_records(path)
     table = results(records, kind)
     parts: dict[str, list[tuple[str, str]]] = {}
@@ -102,6 +111,6 @@ def _chapter(path: Path, subfolder: Path, record: dict[str, Any], kind: type[Stu
         f"{seconds / len(records):.0f} seconds per scene with all methods, {seconds / 3600:.2f} hours in all.",
         f"Made with {versions_text}.",
     ]
-    title = kind.title if subfolder == Path() else f"{kind.title}: {subfolder}"
+    title = f"{kind.title}: {name}" if name else kind.title
     body = f"{kind.explanation} {table_legend(kind)}", verdicts(table, kind), parts, images
     return Chapter(title, len(records), facts, *body, json.dumps(record["config"], indent=1))

@@ -47,7 +47,8 @@ def test_a_chapter_tells_means_differences_times_and_versions(tmp_path):
 def test_html_holds_its_images_and_nothing_of_the_settings_is_code(tmp_path):
     folder = written(tmp_path / "runs" / "study-toy")
     page = write_page(tmp_path / "runs", tmp_path / "new" / "page.html").read_text()
-    assert f"{ToyStudy.title}: study-toy" in page
+    assert ToyStudy.title in page
+    assert "study-toy" not in page
     images = [base64.b64decode(image) for image in re.findall(r'src="data:image/png;base64,([^"]+)"', page)]
     assert len(images) == 2
     assert images[1] == (folder / "picture_0.png").read_bytes()
@@ -57,6 +58,12 @@ def test_html_holds_its_images_and_nothing_of_the_settings_is_code(tmp_path):
     assert "Far apart | more is seen.</strong> Holds against 0 of 1: level with random" in page
     assert page.count("<summary>even: 2 scenes</summary>") == 1
     assert not re.search(r"(src|href)=.?http", page)
+
+
+def test_only_studies_of_one_kind_are_named_after_their_folders(tmp_path):
+    for name in ("one", "two"):
+        written(tmp_path / name)
+    assert [chapter.title for chapter in chapters(tmp_path)] == [f"{ToyStudy.title}: {name}" for name in ("one", "two")]
 
 
 def test_what_is_no_study_is_refused(tmp_path):
