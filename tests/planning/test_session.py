@@ -1,7 +1,6 @@
 """A live session with a simulated sensor."""
 
 import dataclasses
-import warnings
 
 import jax
 import numpy as np
@@ -13,7 +12,7 @@ from jaxnbv.checks import InputError
 from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
-from jaxnbv.geometry.pose import Pose, look_at
+from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
 from jaxnbv.planning.loop import view_keys
 from jaxnbv.planning.planner import Planner
@@ -21,14 +20,13 @@ from jaxnbv.planning.session import Session
 from jaxnbv.planning.stopping import Budget, StopRule, ValueBelow
 from jaxnbv.planning.travel import ValuePerCost
 from jaxnbv.sampler import StepInputs, SurfaceSampler
-from jaxnbv.scanning import Carving, Grid, Obstacles, scan
-from jaxnbv.search import DiscreteSearch, FarthestView, GradientSearch, HalvingSearch, SphereCandidates
+from jaxnbv.scanning import Carving, Grid, scan
+from jaxnbv.search import DiscreteSearch, FarthestView, GradientSearch, SphereCandidates
 from jaxnbv.surfaces import GeometricSPSR, OutsideBoundary, ScreenedSPSR
 from jaxnbv.tasks import Coverage
 from jaxnbv.viz import write_report
 
 CENTER_OF_BOX, KEY = np.mean(BOX, axis=0), jax.random.key(4)
-AWAY = POSES @ np.diag([-1.0, 1.0, -1.0, 1.0])
 
 
 @pytest.fixture(scope="module")
@@ -126,19 +124,6 @@ def test_default_poses_are_above_the_object(elevation):
     assert least - 1e-3 < lowest < least + 0.1
 
 
-@pytest.mark.parametrize(
-    ("planner", "worth"),
-    [(planner_of(), "0 ± 0"), (planner_of(num_samples=1), "0"), (planner_of(HalvingSearch()), "0 ± 0")],
-    ids=["several samples", "one sample", "default search"],
-)
-def test_poses_that_look_away_have_no_value_and_warn(planner, worth):
-    """A single sample has no standard error."""
-    session = begun(poses=AWAY, planner=planner)
-    with pytest.warns(UserWarning, match=rf"the best view is worth {worth}: none is sure.*give poses that look at the"):
-        session.next()
-    assert (session.next().standard_error is None) == (worth == "0")
-
-
 def test_nothing_recompiles_after_the_second_image(compilations):
     session, after = session_of(), []
     matrix = FIRST
@@ -163,69 +148,6 @@ def test_an_unreached_pose_is_not_proposed_again():
     session.add(shot(FIRST), FIRST, depth_scale=1e-3)
     with pytest.raises(InputError, match="all 4 candidates have been visited"):
         session.next()
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"depth_scale": 1.0}, "give the depth's scale, 0.001 for millimetres"),
-        ({"matrix": FIRST @ np.diag([-1.0, 1.0, -1.0, 1.0])}, "the box .* lies behind the camera"),
-        ({"depth": np.ones((5, 5))}, r"the depth image is \(5, 5\) but the camera has \(48, 64\)"),
-        ({"depth": np.zeros((48, 64))}, "the first scan is empty: no point to start from"),
-    ],
-)
-def test_a_wrong_image_is_named_and_changes_nothing(given, message, tmp_path):
-    session = session_of(tmp_path)
-    right = {"depth": shot(FIRST), "matrix": FIRST, "depth_scale": 1e-3}
-    with pytest.raises(InputError, match=message):
-        session.add(**right | given)
-    assert len(session.views) == 0
-    assert not list(tmp_path.glob("*.npz"))
-    session.add(**right)
-    assert len(session.views) == 1
-
-
-def test_an_image_beside_the_box_is_warned_of():
-    """It may be intended, except for the first image."""
-    session = session_of()
-    inverse = np.linalg.inv(FIRST)
-    problem = r"none of the \d+ points .* lies in the box .* Is the pose from camera to world"
-    with pytest.raises(InputError, match=f"the first image shows nothing of the box: {problem}"):
-        session.add(shot(FIRST), inverse, depth_scale=1e-3)
-    session.add(shot(FIRST), FIRST, depth_scale=1e-3)
-    with pytest.warns(UserWarning, match=problem):
-        session.add(shot(POSES[0]), inverse, depth_scale=1e-3)
-
-
-def test_an_image_of_an_earlier_moment_than_its_pose_is_refused(tmp_path):
-    """Also by a session that is loaded from its folder. From the same pose the image may be added again. In metres, NaN
-    stands for no measurement."""
-    begun(tmp_path)
-    session, stale = session_of(tmp_path), shot(FIRST)
-    with pytest.raises(InputError, match=r"bit for bit equal to image 1, which has a diff.*Discard the frames"):
-        session.add(stale.copy(), POSES[0], depth_scale=1e-3)
-    session.add(stale, FIRST.astype(np.float32), depth_scale=1e-3)
-    stale[20, 20] += 1
-    session.add(stale, POSES[0], depth_scale=1e-3)
-    metres = np.where(stale > 400, 1e-3 * stale, np.nan)
-    session.add(metres, POSES[1])
-    with pytest.raises(InputError, match="bit for bit equal to image 4"):
-        session.add(metres.copy(), POSES[2])
-    assert len(session.views) == len(list(tmp_path.glob("image_*"))) == 4
-
-
-def test_a_later_image_that_measured_nothing_is_no_view(tmp_path):
-    session = begun(tmp_path)
-    before = session.observations
-    for index, value in enumerate((0, 65535, 10000, np.nan)):
-        image = np.full((48, 64), value, float if index == 3 else np.uint16)
-        with pytest.warns(UserWarning, match="measured nothing .* left out: take it again"):
-            session.add(image, POSES[index], depth_scale=1e-3)
-    assert len(session.views) == len(list(tmp_path.glob("image_*"))) == 1
-    assert session.observations is before
-    # An image past the object is a view.
-    session.add(np.full((48, 64), np.inf), POSES[0], depth_scale=1e-3)
-    assert len(session.views) == 2
 
 
 @pytest.mark.parametrize(
@@ -256,17 +178,6 @@ def test_the_box_is_the_volume_of_the_model_and_of_the_carving():
     assert fitted.sampler.model.values[1].volume == own
     assert max(scene.high) == pytest.approx(1.25)
     assert fitted.camera.fov == pytest.approx(CAMERA.fov)
-
-
-def test_a_box_that_cuts_the_object_warns_once_for_each_face():
-    """Two centimetres of the ball are beyond the box at +x, and nothing at the other faces."""
-    session = session_of(box=(BOX[0], (0.38, 0.32, 0.24)))
-    with pytest.warns(UserWarning, match=r"beyond the box at \+x: \d+ % of the points .* larger box") as warning_list:
-        session.add(shot(FIRST), FIRST, depth_scale=1e-3)
-    assert len(warning_list) == 1
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        session.add(shot(POSES[0]), POSES[0], depth_scale=1e-3)
 
 
 def test_travel_counts_from_where_the_camera_was(finished):
@@ -348,70 +259,3 @@ def test_a_report_stands_upright_and_needs_no_truth(finished, tmp_path):
     page = write_report(finished.episode, tmp_path, progress=False).read_text()
     assert "that of a real sensor" in page
     assert page.count("<li>View") == 3
-
-
-DEEP = (0.18, 0.08, -0.02), BOX[1]
-BELOW = np.array([[around(angle, -0.4), around(angle, 0.6)] for angle in (0.5, 2.5, 4.5)]).reshape(-1, 4, 4)
-
-
-def test_the_table_is_detected_and_avoided_with_a_warning():
-    """The box reaches two centimetres into the table. Half of the poses are below the table. The table is part of the
-    object on request."""
-    session = session_of(box=DEEP, poses=BELOW, obstacles=None)
-    with pytest.warns(UserWarning, match=r"stands on a plane through \[.*, -0\.00.*Obstacles\(\) to keep it"):
-        session.add(shot(FIRST), FIRST, depth_scale=1e-3)
-    points, _ = session.cloud.to_numpy()
-    # The rest of the table is nearer to the ball than the margin.
-    assert (points[:, 2] > 0.001).mean() > 0.98
-    assert np.isneginf(np.asarray(session.next().proposal.values)[::2]).all()
-    assert session.next().matrix[2, 3] > 0.1
-    kept = session_of(box=DEEP, poses=BELOW)
-    with pytest.warns(UserWarning, match="go on beyond the box") as warning_list:
-        kept.add(shot(FIRST), FIRST, depth_scale=1e-3)
-    assert not any("stands on a plane" in str(one.message) for one in warning_list)
-    points, _ = kept.cloud.to_numpy()
-    assert (points[:, 2] < 0.001).mean() > 0.1
-    assert np.isfinite(np.asarray(kept.next().proposal.values)).all()
-
-
-def test_a_room_scanned_from_inside_needs_poses_inside():
-    """The warning comes once, at the first image from inside."""
-    half, place = np.array([2.0, 1.5, 1.2]), np.array([0.3, -0.2, 0.1])
-    images = []
-    for target in ((2.0, 0.5, 0.0), (-2.0, 0.5, 0.0)):
-        pose = look_at(place, target, up=(0.0, 0.0, 1.0))
-        directions = np.asarray(CAMERA.pixel_directions(), np.float64) @ np.asarray(pose.rotation, np.float64).T
-        depth = np.min((np.sign(directions) * half - place) / directions, axis=1).reshape(48, 64)
-        images.append((depth, np.asarray(pose.matrix, np.float64)))
-    room = (tuple(-half - 0.05), tuple(half + 0.05))
-    session = session_of(box=room, poses=None)
-    with pytest.warns(UserWarning, match=r"stands inside the box, but all \d+ candidates stand outside .*poses="):
-        session.add(*images[0])
-    inside = session_of(box=room, poses=np.stack([matrix for _, matrix in images]))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        session.add(*images[1])
-        inside.add(*images[0])
-    assert np.asarray(Box(*room)(inside.next().matrix[:3, 3])) < 0
-
-
-@pytest.mark.parametrize("up", ["y", "-x", "-z"])
-def test_the_table_reveals_a_wrong_up(up):
-    """The warning comes once, with the right axis."""
-    session = session_of(box=DEEP, obstacles=None, up=up)
-    with pytest.warns(UserWarning, match="no table is found") as warning_list:
-        session.add(shot(FIRST), FIRST, depth_scale=1e-3)
-    message = f'no table is found with up="{up}", but a plane would be one with up="z": give that'
-    assert [message in str(one.message) for one in warning_list].count(True) == 1
-
-
-def test_a_missing_table_warns_unless_obstacles_are_given():
-    away = shot(FIRST) * np.linalg.norm(CAMERA.pixel_directions(), axis=1).reshape(48, 64)
-    image = np.where(away < 600.0, shot(FIRST), 0)
-    session = session_of(obstacles=None)
-    with pytest.warns(UserWarning, match=r'no table .* under the box with up="z".*Obstacles\(\) if there is none'):
-        session.add(image, FIRST, depth_scale=1e-3)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        session.add(image, FIRST, depth_scale=1e-3)
-        session_of(obstacles=Obstacles()).add(image, FIRST, depth_scale=1e-3)
