@@ -80,10 +80,9 @@ class Episode(eqx.Module):
         """
         yield None
         acquisition = self.planner.acquisition
-        for before, view in zip(
-            self.observations() if observations is None else observations, self.views[1:], strict=False
-        ):
-            context = context_of(acquisition, before)
+        all_observations = self.observations() if observations is None else observations
+        for observations_before, view in zip(all_observations, self.views[1:], strict=False):
+            context = context_of(acquisition, observations_before)
             yield float(_score(acquisition, context, ImaginedView(view.scan, view.camera, view.pose)))
 
     @classmethod

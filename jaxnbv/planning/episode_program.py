@@ -66,18 +66,18 @@ def _episode(
     max_views = planner.max_views
     observations, record, sees_object = in_parts(_first_view, planner, noise, scene, first, key)
     records = jax.tree.map(lambda leaf: jnp.zeros((max_views, *leaf.shape), leaf.dtype).at[0].set(leaf), record)
-    arrays, rest = eqx.partition(observations, eqx.is_array)
+    arrays, static = eqx.partition(observations, eqx.is_array)
 
     # The number of iterations is traced, so the same program serves any number of views.
     def add(index: Any, state: Any) -> Any:
         arrays, pending, records = state
-        before = eqx.combine(arrays, rest), pending
-        after, pending, record = in_parts(_next_view, planner, noise, scene, key, index, *before)
+        observations = eqx.combine(arrays, static)
+        observations, pending, record = in_parts(_next_view, planner, noise, scene, key, index, observations, pending)
         records = jax.tree.map(lambda rows, row: rows.at[index].set(row), records, record)
-        return eqx.filter(after, eqx.is_array), pending, records
+        return eqx.filter(observations, eqx.is_array), pending, records
 
     arrays, _, records = jax.lax.fori_loop(1, views, add, (arrays, PoseList.empty(max_views), records))
-    return records, eqx.combine(arrays, rest).cloud, sees_object
+    return records, eqx.combine(arrays, static).cloud, sees_object
 
 
 def _first_view(

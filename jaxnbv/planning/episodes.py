@@ -84,9 +84,9 @@ def episodes(
     # The value of the first view is NaN, so JAX must not check for NaN.
     with _devices(count), jax.debug_nans(False):
         at_once = min(batch_size or (1 if on_cpu() else count), rows_per_device(count))
-        records, clouds, sees = run(planner, noise, jnp.asarray(views), rows, at_once)
+        records, clouds, sees_object = run(planner, noise, jnp.asarray(views), rows, at_once)
         poses, values, answers = jax.tree.map(lambda leaf: leaf[:, :views], records)
-    _check(planner, np.asarray(values), clouds, np.asarray(sees))
+    _check(planner, np.asarray(values), clouds, np.asarray(sees_object))
     if answers is not None and answers_by_parts(planner):
         assert isinstance(planner.sampler.model, KnownShapes)
         _, weights = weights_by_name(planner.sampler.model.bank, np.asarray(answers), planner.acquisition)
@@ -114,10 +114,13 @@ def _devices(count: int) -> AbstractContextManager:
 
 
 def _check(
-    planner: Planner, values: Float[np.ndarray, "b v"], clouds: PointCloud, sees: Bool[np.ndarray, " b"]
+    planner: Planner, values: Float[np.ndarray, "b v"], clouds: PointCloud, sees_object: Bool[np.ndarray, " b"]
 ) -> None:
     """Raise `ValueError` if a first view sees nothing, an answer is invalid, or a value is not finite."""
-    require(bool(sees.all()), f"the first view of episode {sees.argmin()} sees nothing: point the camera at the object")
+    require(
+        bool(sees_object.all()),
+        f"the first view of episode {sees_object.argmin()} sees nothing: point the camera at the object",
+    )
     if planner.search.uses_samples:
         planner.acquisition.check(clouds[0])
     for episode, view in np.argwhere(~np.isfinite(values[:, 1:])):

@@ -33,6 +33,7 @@ class MountError:
         self._images: list[Image] = []
         self._clouds: list[PointCloud] = []
         self._alignment: Alignment | None = None
+        self._has_warned = False
 
     def add(self, image: Image, index: int) -> None:
         """Add the image (after `Image.without_sentinels`) with this index, unless it was added before."""
@@ -55,12 +56,11 @@ class MountError:
             self._alignment = align_views(self._clouds, poses)
         return self._alignment
 
-    def warn_if_misaligned(self) -> bool:
-        """Warn if three or more images disagree, and return whether they do."""
-        if len(self._images) < _MIN_VIEWS or not (alignment := self.alignment()).disagrees:
-            return False
-        warn_of_mount(alignment)
-        return True
+    def warn_if_misaligned(self) -> None:
+        """Warn once if three or more images disagree."""
+        if not self._has_warned and len(self._images) >= _MIN_VIEWS and (alignment := self.alignment()).disagrees:
+            self._has_warned = True
+            warn_of_mount(alignment)
 
     @property
     def mount(self) -> Float[np.ndarray, "4 4"]:

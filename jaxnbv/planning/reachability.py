@@ -122,13 +122,13 @@ def _options(
         rows = range(start, min(start + _BATCH_SIZE, len(values)))
         for row, answer in zip(rows, answers(poses[jnp.asarray(rows)]), strict=True):
             pose, value = poses[row], float(values[row])
-            reason, options = _reason_if_refused(pose, refused_poses), []
-            if reason is None and isinstance(answer, str):
-                reason, options = answer, _rolled_options(loop, pose, value, answers)
-            elif reason is None:
+            options: list[_Option] = []
+            if (reason := _reason_if_refused(pose, refused_poses)) is not None:
+                refusals[reason] += 1
+            elif not isinstance(answer, str):
                 options = [_Option(pose, value, answer)]
-            if not options:
-                refusals[str(reason)] += 1
+            elif not (options := _rolled_options(loop, pose, value, answers)):
+                refusals[answer] += 1
             yield options
 
 

@@ -141,13 +141,10 @@ class Session:
         self._initial_planner = in_scene(planner, *setup, matrices, obstacles)
         self._intake = Intake(*setup, self._initial_planner)
         strided_camera = self.frame.to_scene(self.camera.strided(self._intake.stride))
-        self._loop = Loop(
-            self._initial_planner, self.key, self.until, self.frame, strided_camera, on_stage=self._show_stage
-        )
+        self._loop = Loop(self._initial_planner, self.key, until, self.frame, strided_camera, self._show_stage)
         self._cut_faces: frozenset[str] = frozenset()
         self._next: NextView | None = None
-        self.correct_mount, self._warned_of_mount = correct_mount, False
-        self.reachable, self.ignore = reachable, ignore
+        self.correct_mount, self.reachable, self.ignore = correct_mount, reachable, ignore
         self._refused_poses: list[RefusedPose] = []
         self._rehearsal_lock = threading.RLock()
         self._folder: SessionFolder | None = None
@@ -322,8 +319,8 @@ class Session:
         self._cut_faces = warn_of_cut(self.box, points, voxel, self._cut_faces)
         if self.correct_mount:
             self._correct()
-        elif self.correct_mount is not None and not self._warned_of_mount:
-            self._warned_of_mount = self._intake.mount_error.warn_if_misaligned()
+        elif self.correct_mount is not None:
+            self._intake.mount_error.warn_if_misaligned()
 
     @own_settings()
     def next(self, seconds: float = math.inf) -> NextView:
@@ -341,8 +338,9 @@ class Session:
         if self._next is None:
             with self._lock_folder() as folder, self._planning():
                 require(len(self.views) > 0, _NO_IMAGE)
-                arguments = self.reachable, self._matrices, self._refused_poses, seconds
-                proposal, refusals = best_reachable(self._loop, *arguments)
+                proposal, refusals = best_reachable(
+                    self._loop, self.reachable, self._matrices, self._refused_poses, seconds
+                )
                 next_view = self._to_next_view(proposal, refusals)
                 at_visited = proposal.value_at_visited
                 value_at_visited = 0.0 if at_visited is None else self._loop.in_world(at_visited)

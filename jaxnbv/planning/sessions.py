@@ -73,7 +73,7 @@ class Sessions:
         self._frame, self._planner, self._key = scene_session.frame, planner, scene_session.key
         self._obstacles, self._progress = obstacles, progress
         self._num_images = 0
-        self._mount_error, self._warned_of_mount = MountError(camera, scene_session.convention), False
+        self._mount_error = MountError(camera, scene_session.convention)
         self._longest_part = 2.0 * float(jnp.max(jnp.linalg.norm(bank.shapes.extremes, axis=-1)))
         self._gap = _GAP * float(np.max(self.box.high - self.box.low)) if gap is None else gap
         require(self._gap > 0, f"the gap is {gap}; it must be positive")
@@ -145,7 +145,7 @@ class Sessions:
         self._next = None
         self._mount_error.add(image, self._num_images)
         self._num_images += 1
-        self._warned_of_mount = self._warned_of_mount or self._mount_error.warn_if_misaligned()
+        self._mount_error.warn_if_misaligned()
 
     def next(self) -> Float[np.ndarray, "4 4"]:
         """Return the camera-to-world matrix of the pose for the next image.

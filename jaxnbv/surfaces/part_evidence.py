@@ -84,9 +84,9 @@ class Rays(NamedTuple):
             return None
         origins, directions = (rows.reshape(-1, 3) for rows in looks.camera.rays(poses.rows))
         count, sight = len(origins), looks.sight.reshape(-1)
-        returned = jnp.isfinite(sight) & (sight > 0)
-        points = origins + jnp.where(returned, sight, 0.0)[:, None] * directions
-        is_object = returned & (looks(points) <= looks.grid.spacing)
+        has_return = jnp.isfinite(sight) & (sight > 0)
+        points = origins + jnp.where(has_return, sight, 0.0)[:, None] * directions
+        is_object = has_return & (looks(points) <= looks.grid.spacing)
         noise = _estimate_noise(looks.sight, is_object, looks.camera)
         distance = jnp.sum(jnp.where(is_object, sight, 0.0)) / jnp.maximum(jnp.sum(is_object), 1)
 

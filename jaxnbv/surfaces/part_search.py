@@ -25,6 +25,7 @@ from jaxnbv.surfaces.registration import (
     Prior,
     evaluate,
     flatten,
+    join,
     keep_first,
     reevaluate,
     refine,
@@ -78,19 +79,20 @@ def search_parts(
     - `num_starts`: number of placements tried for each part.
     """
     prior = Prior(poses, box, is_true_size=True)
-    few, some = targets.first(_COARSE[1]), targets.first(_FINE[1])
-    starts = _group(evaluate(bank, prior, _starts(bank, prior, targets, num_starts), few), len(bank))
+    coarse_targets, fine_targets = targets.first(_COARSE[1]), targets.first(_FINE[1])
+    starts = _group(evaluate(bank, prior, _starts(bank, prior, targets, num_starts), coarse_targets), len(bank))
     best = jax.vmap(lambda one: one.best(_COARSE[0]))(starts)
-    coarse = refine(bank, prior, flatten(best), few, _COARSE[2])
+    coarse = refine(bank, prior, flatten(best), coarse_targets, _COARSE[2])
     fine = flatten(jax.vmap(lambda one: _keep_distinct(one, _FINE[0]))(_group(coarse, len(bank))))
-    fine = refine(bank, prior, jax.tree.map(lambda *rows: jnp.concatenate(rows), fine, previous), some, _FINE[2])
+    fine = refine(bank, prior, join(fine, previous), fine_targets, _FINE[2])
     placements = jax.tree.map(lambda rows: jnp.stack(len(bank) * [rows]), _keep_distinct(fine, _NUM_SHARED).placement)
-    swapped = _group(reevaluate(bank, prior, evaluate(bank, prior, placements, some), some), len(bank))
-    new = jax.tree.map(lambda rows: rows[:-NUM_HYPOTHESES], fine)
-    old = jax.tree.map(lambda rows: rows[-NUM_HYPOTHESES:], fine)
-    pool = jax.tree.map(lambda *rows: jnp.concatenate(rows, axis=1), _group(new, len(bank)), swapped)
+    swaps = evaluate(bank, prior, placements, fine_targets)
+    swaps = _group(reevaluate(bank, prior, swaps, fine_targets), len(bank))
+    previous = jax.tree.map(lambda rows: rows[-NUM_HYPOTHESES:], fine)
+    fine = jax.tree.map(lambda rows: rows[:-NUM_HYPOTHESES], fine)
+    pool = join(_group(fine, len(bank)), swaps, axis=1)
     pool = jax.vmap(lambda one: _keep_distinct(one, _FINE[0]))(pool)
-    last = refine(bank, prior, jax.tree.map(lambda *rows: jnp.concatenate(rows), flatten(pool), old), some, _LAST)
+    last = refine(bank, prior, join(flatten(pool), previous), fine_targets, _LAST)
     if rays is None:
         last = reevaluate(bank, prior, last, targets)
     else:
@@ -111,11 +113,11 @@ def _keep_distinct(hypotheses: Hypotheses, count: int) -> Hypotheses:
 
     If there are fewer, the remaining rows have infinite misfit.
     """
-    ranked = hypotheses.best(len(hypotheses.misfit))
-    shift = ranked.placement.shift
+    hypotheses = hypotheses.best(len(hypotheses.misfit))
+    shift = hypotheses.placement.shift
     distances = jnp.linalg.norm(shift[:, None] - shift, axis=-1)
-    is_distinct = keep_first(similar_rotations(ranked.placement.rotation) & (distances < _MAX_SHIFT))
-    return dataclasses.replace(ranked, misfit=jnp.where(is_distinct, ranked.misfit, jnp.inf)).best(count)
+    is_distinct = keep_first(similar_rotations(hypotheses.placement.rotation) & (distances < _MAX_SHIFT))
+    return dataclasses.replace(hypotheses, misfit=jnp.where(is_distinct, hypotheses.misfit, jnp.inf)).best(count)
 
 
 def _starts(bank: ShapeBank, prior: Prior, targets: FitTargets, num_starts: int) -> Placement:

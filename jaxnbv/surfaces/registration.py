@@ -163,13 +163,12 @@ def register(bank: ShapeBank, prior: Prior, targets: FitTargets, num_starts: int
     All shapes are tried in many rotations (`num_starts`, all shapes together), and the best hypotheses are refined.
     Then all shapes are tried in the placements of a few of these, and the best of all are refined again.
     """
-    few, some = targets.first(_COARSE[1]), targets.first(_FINE[1])
-    starts = _rotated_starts(bank, prior, few, num_starts)
-    coarse = refine(bank, prior, starts.best(_COARSE[0]), few, _COARSE[2])
-    fine = refine(bank, prior, coarse.best(_FINE[0]), some, _FINE[2])
-    swapped = _swap_shapes(bank, prior, fine, few).best(_LAST[0])
-    candidates = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), fine, swapped)
-    last = refine(bank, prior, candidates.best(_LAST[0]), some, _LAST[2])
+    coarse_targets, fine_targets = targets.first(_COARSE[1]), targets.first(_FINE[1])
+    starts = _rotated_starts(bank, prior, coarse_targets, num_starts)
+    coarse = refine(bank, prior, starts.best(_COARSE[0]), coarse_targets, _COARSE[2])
+    fine = refine(bank, prior, coarse.best(_FINE[0]), fine_targets, _FINE[2])
+    swaps = _swap_shapes(bank, prior, fine, coarse_targets).best(_LAST[0])
+    last = refine(bank, prior, join(fine, swaps).best(_LAST[0]), fine_targets, _LAST[2])
     fits = reevaluate(bank, prior, last, targets).best(_LAST[0])
     return dataclasses.replace(fits, is_distinct=_find_distinct(fits.shape, fits.placement.rotation))
 
@@ -194,9 +193,9 @@ def _swap_shapes(bank: ShapeBank, prior: Prior, hypotheses: Hypotheses, targets:
 
     Each shape takes the rotation of the hypothesis, and its shift and scale relative to the box-filling placement.
     """
-    ranked = hypotheses.best(len(hypotheses.misfit))
-    is_distinct = _find_distinct(jnp.zeros_like(ranked.shape), ranked.placement.rotation)
-    seeds = jax.tree.map(lambda leaf: leaf[jnp.argsort(~is_distinct, stable=True)[:_NUM_SHARED]], ranked)
+    hypotheses = hypotheses.best(len(hypotheses.misfit))
+    is_distinct = _find_distinct(jnp.zeros_like(hypotheses.shape), hypotheses.placement.rotation)
+    seeds = jax.tree.map(lambda leaf: leaf[jnp.argsort(~is_distinct, stable=True)[:_NUM_SHARED]], hypotheses)
     placements = seeds.placement
     steps = jax.vmap(lambda index, placement: prior.deviation(bank.shape(index), placement))(seeds.shape, placements)
 
@@ -217,6 +216,11 @@ def evaluate(bank: ShapeBank, prior: Prior, placements: Placement, targets: FitT
     misfit = jax.lax.map(misfits_of_shape, (bank.shapes, placements), batch_size=max(1, _BATCH_SIZE // count))
     shape = jnp.repeat(jnp.arange(num_shapes), count)
     return Hypotheses(shape, flatten(placements), misfit.reshape(-1), jnp.ones(len(shape), bool))
+
+
+def join(*parts: Hypotheses, axis: int = 0) -> Hypotheses:
+    """Concatenate hypotheses along an axis."""
+    return jax.tree.map(lambda *rows: jnp.concatenate(rows, axis), *parts)
 
 
 def flatten(rows_of_shapes: Any) -> Any:

@@ -73,19 +73,19 @@ def bank_poses(name: str) -> ShapePoses:
     return SHIPPED_BANKS[name].poses
 
 
-def read_bank(path: Path, like: SignedDistance) -> ShapeBank:
+def read_bank(path: Path, form: SignedDistance) -> ShapeBank:
     """Read a bank that `scripts/make_banks.py` wrote.
 
     The file stores floating-point numbers in 16 bits, and integers in 8. A distance on a grid is stored as its 8-bit
     difference from the previous node, in units of `QUANTUM`.
 
-    - `like`: a solid with the same PyTree structure as the bank's solids.
+    - `form`: a solid with the same PyTree structure as the bank's solids.
     """
     dtypes = {"f": np.float32, "i": np.int32, "b": np.bool_}
     with np.load(path) as archive:
         names = [str(one) for one in archive["names"]]
         *leaves, extremes = (archive[key] for key in sorted(archive.files) if key != "names")
-    if isinstance(like, Sampled):
+    if isinstance(form, Sampled):
         leaves[0] = QUANTUM * np.cumsum(leaves[0], axis=-1, dtype=np.int8).astype(np.float32)
     arrays = [jnp.asarray(leaf.astype(dtypes[leaf.dtype.kind])) for leaf in (*leaves, extremes)]
-    return ShapeBank(jax.tree.unflatten(jax.tree.structure(like), arrays[:-1]), arrays[-1], encode_names(names))
+    return ShapeBank(jax.tree.unflatten(jax.tree.structure(form), arrays[:-1]), arrays[-1], encode_names(names))
