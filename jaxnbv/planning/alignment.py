@@ -145,8 +145,8 @@ def align_views(clouds: Sequence[PointCloud], poses: Sequence[Pose]) -> Alignmen
 
     If no two views overlap, `disagreement` is NaN and `is_determined` is False.
 
-    - `clouds`: points and normals of each view, in the same frame as the poses. Include points around the object, since
-      more overlap gives better estimates.
+    - `clouds`: points and normals of each view, in the frame of the poses. Include points around the object, since more
+      overlap gives better estimates.
     - `poses`: pose of each view, possibly with an error.
 
     **Raises:** `ValueError` for fewer than two views, different numbers of clouds and poses, or clouds without points.
@@ -171,11 +171,8 @@ def align_views(clouds: Sequence[PointCloud], poses: Sequence[Pose]) -> Alignmen
     corrections, is_mount, corrected = identities, True, disagreement
     candidate, _ = _disagreement(views, pairs, mount, median_distance)
     exceeds_noise = bool(np.any(disagreement > _DISAGREEMENT_RATIO * noise))
-    if (
-        exceeds_noise
-        and _is_plausible(mount, median_distance)
-        and _MIN_IMPROVEMENT * _median(candidate) < _median(disagreement)
-    ):
+    is_improved = _MIN_IMPROVEMENT * _median(candidate) < _median(disagreement)
+    if exceeds_noise and is_improved and _is_plausible(mount, median_distance):
         corrections, corrected = mount, candidate
     if exceeds_noise and len(views) > 2 and np.any(corrected > _DISAGREEMENT_RATIO * noise):
         separate = _solve_corrections(views, pairs, identities, median_distance, is_mount=False)
@@ -262,6 +259,7 @@ def _solve_corrections(
     All views get the same correction if `is_mount`. Otherwise each view but the first gets its own.
     """
     corrections, num_steps = start, 1 if is_mount else len(views) - 1
+    deviation = _PRIOR_DEVIATION * np.tile(np.repeat([1.0, median_distance], 3), num_steps)
     for ratio in _MATCH_DISTANCES:
         matches = _match_points(views, pairs, corrections, ratio * median_distance)
         if len(matches.views) == 0:
@@ -269,11 +267,7 @@ def _solve_corrections(
         residuals, jacobian = _linearise(views, matches, corrections, is_mount)
         scale = max(_LOSS_WIDTH * float(np.median(np.abs(residuals))), _ROUNDING * median_distance)
         errors = np.concatenate([_logarithm(matrix) for matrix in corrections[-num_steps:]])
-        prior = (
-            _POINTS_PER_SAMPLE
-            * (scale / (_PRIOR_DEVIATION * np.tile(np.repeat([1.0, median_distance], 3), num_steps))) ** 2
-        )
-        step = _robust_step(residuals, jacobian, scale, errors, prior)
+        step = _robust_step(residuals, jacobian, scale, errors, _POINTS_PER_SAMPLE * (scale / deviation) ** 2)
         steps = np.tile(step, (len(views), 1)) if is_mount else np.concatenate([np.zeros(6), step]).reshape(-1, 6)
         corrections = corrections @ np.stack([_exponential(row) for row in steps])
     return corrections

@@ -46,9 +46,7 @@ class Clutter(NamedTuple):
         - `camera`, `pose`: the sensor and its pose, in world units.
         - `obstacles`: obstacles in scene units.
         """
-        depth = np.where(np.isfinite(image.depth), image.scale * np.asarray(image.depth, np.float64), 0.0)
-        if image.robot is not None:
-            depth = np.where(image.robot, 0.0, depth)
+        depth = image.world_depth if image.robot is None else np.where(image.robot, 0.0, image.world_depth)
         points = np.asarray(frame.to_scene(image.points(camera, pose)[depth > 0]), np.float64)
         cells = np.floor((points + self.half_extent) / self.spacing).astype(int)
         cells = cells[((cells >= 0) & (cells < _NUM_CELLS)).all(axis=1)]

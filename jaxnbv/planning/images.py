@@ -66,9 +66,14 @@ class Image(NamedTuple):
         """
         return self._replace(depth=without_sentinels(self.depth, camera, pose, self.scale, box))
 
+    @property
+    def world_depth(self) -> Float[np.ndarray, "height width"]:
+        """The depth image in world units, with zeros for values that are not finite."""
+        return np.where(np.isfinite(self.depth), self.scale * np.asarray(self.depth, np.float64), 0.0)
+
     def points(self, camera: Camera, pose: Pose) -> Float[np.ndarray, "height width 3"]:
         """Return the world point of each pixel, or the camera's position for a pixel without a measurement."""
-        depth = np.where(np.isfinite(self.depth), self.scale * np.asarray(self.depth, np.float64), 0.0)
+        depth = self.world_depth
         rays = np.asarray(camera.pixel_directions(), np.float64).reshape(*depth.shape, 3)
         if camera.distortion:
             rays = np.stack([*undistort_points(rays[..., 0], rays[..., 1], camera.distortion), rays[..., 2]], axis=-1)

@@ -98,8 +98,8 @@ class _StepState:
 class Loop:
     """A running episode.
 
-    The cost of the next move and the distance to earlier cameras refer to the actual poses of views, not to proposed
-    poses. No pose is proposed twice, even if the view was taken elsewhere.
+    The cost of the next move and the distance to earlier cameras refer to the actual poses of views. No pose is
+    proposed twice, even if the view was taken elsewhere.
 
     - `planner`: the planner, in scene coordinates.
     - `key`: random key. The random keys of view i depend only on `key` and i.
@@ -124,7 +124,7 @@ class Loop:
         if until is not None:
             until.check(planner.acquisition)
         self.planner, self.key, self.until, self.frame = planner, key, until, frame
-        self.camera, self._on_stage = planner.camera if camera is None else camera, on_stage
+        self.camera, self._on_stage = camera or planner.camera, on_stage
         self.views: tuple[View, ...] = ()
         self._observations: Observations | None = None
         self._pending = PoseList.empty(planner.max_views)
@@ -255,7 +255,7 @@ class Loop:
     def done(self) -> str | None:
         """Return the stop rule's reason to stop; None to continue.
 
-        The rule is evaluated once for each view. If the rule needs samples or a proposal, `propose` reuses these.
+        The rule is evaluated once for each view. `propose` reuses samples and proposals that the rule needs.
 
         **Raises:** `ValueError` if the rule needs the next proposal and `propose` raises it.
         """

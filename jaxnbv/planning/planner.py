@@ -120,8 +120,8 @@ class Planner(eqx.Module):
     @property
     def quantity(self) -> Quantity:
         """Name and unit of the proposals' values, and the power of length in this unit."""
-        value = self.search.quantity(self.acquisition)
-        return value if self.cost is None else self.cost.quantity(value)
+        quantity = self.search.quantity(self.acquisition)
+        return quantity if self.cost is None else self.cost.quantity(quantity)
 
     @own_settings()
     def init(self, pose: Pose | None, scan: PointCloud, camera: Camera | None = None) -> Observations:

@@ -32,7 +32,7 @@ from jaxnbv.programs import program
 from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.sharding import shared_map
 from jaxnbv.surfaces.base import Fields, SurfaceModel, SurfacePosterior, sampling_method
-from jaxnbv.surfaces.part_hypotheses import NONE, PartHypotheses, identify
+from jaxnbv.surfaces.part_hypotheses import NONE, PartHypotheses, hypotheses_of, identify
 from jaxnbv.surfaces.placement import FreeRotation, Placement, ShapePoses
 from jaxnbv.surfaces.registration import FitTargets, Hypotheses, Prior, register
 from jaxnbv.surfaces.screened import ScreenedSPSR, ScreenedSPSRPosterior
@@ -127,10 +127,8 @@ class KnownShapes(SurfaceModel):
         if self.bank.solids is None:
             return of_none
         if self.carries_hypotheses:
-            hypotheses = (
-                self.add_state(observations).hypotheses if observations.hypotheses is None else observations.hypotheses
-            )
-            assert isinstance(hypotheses, PartHypotheses)
+            is_added = observations.hypotheses is not None
+            hypotheses = hypotheses_of(observations if is_added else self.add_state(observations))
             fits, weights = hypotheses.placed, hypotheses.weights
         else:
             fits, weights = self.fit(observations)

@@ -49,8 +49,8 @@ class ScreenedSPSR(SurfaceModel):
 
     The defaults were the best over validation objects in `benchmarks/imagination.py`.
 
-    - `base`: the prior, and the noise of the normals. The default has a short lengthscale for detail, and a long
-      lengthscale for the overall shape, which lets values affect f far from their points.
+    - `base`: the prior, and the noise of the normals. The default has a short lengthscale for detail, and a long one
+      for the overall shape, which lets values affect f far from their points.
     - `values`: sources of values, see `jaxnbv.surfaces.values`.
     - `level_deviation`: prior standard deviation of the level, which is broad compared with the values of f.
     - `offset`: distance from the surface, in scene units, at which the unit h of values is measured. The rise at a
