@@ -35,7 +35,6 @@ class Observations(eqx.Module):
     """Everything observed so far, in scene coordinates. Array shapes are fixed, so nothing recompiles.
 
     - `cloud`: the kept points, the paper's D.
-    - `poses`: the poses of the views.
     - `grid`: the grid of `looks`, `empty_nodes` and `obstacle_nodes`; None if there are none of these.
     - `looks`: the measured surface and the measured ray lengths of each view, see `Looks`.
     - `empty_nodes`: mask of the nodes that some scan showed to be empty.
@@ -61,9 +60,8 @@ class Observations(eqx.Module):
         obstacle_nodes: Bool[Array, "g g g"] | None = None,
         camera: Camera = Camera(),
     ) -> "Observations":
-        """Return the observations of a cloud before any view. No node is marked empty yet.
+        """Return the observations of a cloud before any of `max_views` views. No node is marked empty yet.
 
-        - `max_views`: number of poses for which memory is reserved.
         - `camera`: `looks` stores lengths of its rays.
         """
         empty = None if grid is None else jnp.zeros((grid.resolution,) * 3, bool)

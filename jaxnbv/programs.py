@@ -113,7 +113,6 @@ class _Program:
         """Trace the function, and return the program, compiled unless its lowered code is stored already.
 
         - `entry`: path of the file for these arguments, in which the name of the program's file is stored.
-        - `static`, `tree`, `leaves`: see `_load_or_compile`.
         """
         result = None
 

@@ -9,11 +9,9 @@ from tqdm import tqdm
 def progress_bar(
     items: Iterable[Any] | None = None, enabled: bool = True, leave: bool = False, **settings: Any
 ) -> "tqdm[Any]":
-    """Return a progress bar over `items`, or up to the `total` in the settings. Shown on terminals only.
+    """Return a progress bar over `items` or up to `total`, on terminals only, with tqdm's `settings`.
 
-    - `enabled`: False hides the bar.
     - `leave`: whether the bar stays on the screen once it is full.
-    - `settings`: further arguments of tqdm, such as `desc`.
     """
     # The bar shows no remaining time. The first step compiles, so the estimate would be poor.
     bar_format = "{desc}: {n_fmt} of {total_fmt} |{bar:20}| {elapsed}"

@@ -133,8 +133,6 @@ class SurfaceSampler(eqx.Module):
         """Return a copy whose prior is `KnownShapes`: a bank, and the current model for "none of these".
 
         Shapes are registered within the carving's volume, or within `Box()` if there is no carving.
-
-        - `poses`: the possible placements of the shapes in the scene.
         """
         box = Box() if self.carving is None else bounding_box(self.carving.volume)
         longest_side = float(np.max(box.high - box.low))

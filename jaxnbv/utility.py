@@ -123,9 +123,7 @@ class FunctionUtility(Utility):
 
 
 def plain_function(value: Any, name: str, example: str = "") -> Callable[..., Any]:
-    """Return the value unchanged if it is a function.
-
-    - `name`, `example`: name of the argument, and a valid argument, for the error message.
+    """Return the value, an argument called `name`, if it is a function.
 
     **Raises:** `ValueError` for anything else, including a class.
     """

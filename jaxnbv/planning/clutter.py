@@ -43,8 +43,7 @@ class Clutter(NamedTuple):
     def with_image(self, image: Image, camera: Camera, pose: Pose, frame: Frame, obstacles: Obstacles) -> "Clutter":
         """Return a copy with the votes of one more image. Cells in or next to an obstacle get no votes.
 
-        - `camera`, `pose`: the sensor and its pose, in world units.
-        - `obstacles`: obstacles in scene units.
+        Camera and pose are in world units, obstacles in scene units.
         """
         depth = image.world_depth if image.robot is None else np.where(image.robot, 0.0, image.world_depth)
         points = np.asarray(frame.to_scene(image.points(camera, pose)[depth > 0]), np.float64)

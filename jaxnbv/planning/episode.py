@@ -89,8 +89,8 @@ class Episode(eqx.Module):
     def load(cls, path: str | Path, planner: Planner | None = None, scene: Surface | None = None) -> "Episode":
         """Load a saved episode, or the views that `simulate` has stored so far.
 
-        - `planner`, `scene`: replace the stored ones, if these hold a function or network that cannot be restored. They
-          must have the same descriptions as the stored ones.
+        - `planner`, `scene`: planner and scene, if the stored ones hold a function or network that cannot be restored.
+          They must have the same descriptions as the stored ones.
 
         **Raises:** `ValueError` if the folder holds no episode or no view, or if its planner or scene cannot be
         restored.

@@ -59,11 +59,7 @@ class Image(NamedTuple):
         return cls(pixels.copy(), as_numbers(matrix, "the matrix of a pose", np.float64), scale, pixel_mask)
 
     def without_sentinels(self, camera: Camera, pose: Pose, box: Box) -> "Image":
-        """Return a copy in which pixels whose value stands for "not measured" have depth zero.
-
-        Such a value is the largest of an integer type, or it fills many pixels and is beyond the camera's range or well
-        beyond the box, see `jaxnbv.geometry.depth_image`.
-        """
+        """Return a copy with depth zero at values for "not measured", see `jaxnbv.geometry.depth_image`."""
         return self._replace(depth=without_sentinels(self.depth, camera, pose, self.scale, box))
 
     @property

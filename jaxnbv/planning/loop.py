@@ -58,7 +58,7 @@ class View(eqx.Module):
     hypotheses: eqx.Module | None = None
 
     def answer(self, acquisition: Acquisition) -> Answer | None:
-        """Return the acquisition's answer after this view, or without one the probability of each known part."""
+        """Return the acquisition's answer after this view; without one, the probability of each known part."""
         answer = acquisition.answer(self.cloud)
         if answer is None and isinstance(self.hypotheses, PartHypotheses):
             return identity_answer(self.hypotheses, acquisition)
@@ -104,7 +104,7 @@ class Loop:
     - `planner`: the planner, in scene coordinates.
     - `key`: random key. The random keys of view i depend only on `key` and i.
     - `until`: stop rule, or None.
-    - `frame`: frame of the user's world, in whose units the stop rule is.
+    - `frame`: frame of the user's world, in whose units the stop rule computes.
     - `camera`: the sensor's camera in scene units, by default the planner's.
     - `on_stage`: function that is called with a name from `STAGES` when this stage begins.
 
@@ -186,7 +186,7 @@ class Loop:
 
     @own_settings()
     def take(self, sensor: Sensor, first: Pose) -> Step | None:
-        """Take the next view with a sensor at the proposed pose, or at `first`. None if the episode has ended.
+        """Take and add the next view, at the proposed pose or first at `first`; None if the episode has ended.
 
         **Raises:** `ValueError` whenever `propose` or `add` raises it.
         """

@@ -22,7 +22,6 @@ _MIN_CHANGE = 0.5
 class MountError:
     """Alignment of a session's images, and the pose corrections that the session currently uses.
 
-    - `convention`: axes of the images' matrices, see `Pose.from_matrix`.
     - `corrections`: (views, 4, 4), the correction X of each image. The true pose of the camera is `matrix @ X`, in
       OpenCV's axes.
     """

@@ -107,10 +107,9 @@ class Planner(eqx.Module):
     def for_parts(cls, bank: ShapeBank, poses: ShapePoses = FreeRotation(), acquisition: Any = Identify()) -> "Planner":  # noqa: B008
         """Return a planner that identifies which part of a bank the object is, and estimates the part's pose.
 
-        - `bank`: parts at true size, from `ShapeBank.from_meshes(folder, scale="m")`. Lengths are in world units in a
-          session, and in scene units in a simulation.
+        - `bank`: parts at true size, from `ShapeBank.from_meshes(folder, scale="m")`, in world units (in a simulation,
+          scene units).
         - `poses`: prior of the part's pose. The default allows every rotation.
-        - `acquisition`: the expected value of a view.
 
         **Raises:** `ValueError` for a bank without parts, or not at true size.
         """
@@ -188,9 +187,6 @@ class Planner(eqx.Module):
     def replay(self, views: Iterable[tuple[Pose, PointCloud]], camera: Camera | None = None) -> Iterator[Observations]:
         """Yield the observations after each view, by `init` for the first view and `observe` for the others.
 
-        - `views`: pose and scan of each view.
-        - `camera`: the camera that took the scans, by default the planner's.
-
         **Raises:** `ValueError` whenever `init` or `observe` raises it.
         """
         observations = None
@@ -239,7 +235,6 @@ class Planner(eqx.Module):
         """Search for the next pose, given the inputs of the search.
 
         - `inputs`: result of `step_inputs`, or inputs with samples of your own.
-        - `pending`: as in `propose`.
 
         **Raises:** `ValueError` if every candidate has been visited, or if the value of a candidate is not finite.
         """

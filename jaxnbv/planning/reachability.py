@@ -61,10 +61,10 @@ def best_reachable(
     be reached. The poses that the search evaluated are checked in batches, highest value first, until no unchecked pose
     can be better. If a pose cannot be reached, the pose is tried with the camera rotated about its optical axis.
 
-    - `reachable`: the user's function, which returns the scores; None if all poses can be reached.
+    - `reachable`: the user's function; None if all poses can be reached.
     - `to_matrices`: function that converts scene poses to the matrices for `reachable`.
     - `refused_poses`: poses that are excluded, also with the camera rotated about its optical axis.
-    - `seconds`: time limit. After this time, the best pose so far is used.
+    - `seconds`: time after which the best pose so far is used.
 
     **Raises:** `ValueError` if no pose can be reached, if `reachable` returns an invalid answer, and whenever
     `Loop.propose` raises it.
@@ -158,10 +158,7 @@ def _evaluated_poses(proposal: Proposal) -> tuple[Pose, Float[np.ndarray, " pose
 
 
 def _with_pose(proposal: Proposal, pose: Pose, value: float) -> Proposal:
-    """Return a copy of a proposal with a different pose and value.
-
-    The standard error is that of the candidate with this value, or None if there is no such candidate.
-    """
+    """Return a copy with this pose and value, and the standard error of a candidate with this value."""
     error, errors, is_same = proposal.standard_error, proposal.standard_errors, proposal.values == value
     if value != float(proposal.value):
         error = errors[jnp.argmax(is_same)] if errors is not None and bool(is_same.any()) else None
@@ -183,12 +180,7 @@ def _reason_if_refused(pose: Pose, refused_poses: Sequence[RefusedPose]) -> str 
 
 
 def _answers(reachable: Reachable, matrices: Float[np.ndarray, "n 4 4"]) -> list[float | str]:
-    """Return, for each matrix, a score above 0, or the reason why the arm cannot reach the pose.
-
-    True and None become the score 1. False and the score 0 become the reason "not reachable".
-
-    **Raises:** `ValueError` unless the function returns a list of bools, reasons or scores.
-    """
+    """Return, for each matrix, a score above 0, or the reason why the arm cannot reach the pose."""
     answers = reachable(matrices)
     is_list = isinstance(answers, list | tuple) or (hasattr(answers, "shape") and len(answers.shape) == 1)
     require(
@@ -199,10 +191,7 @@ def _answers(reachable: Reachable, matrices: Float[np.ndarray, "n 4 4"]) -> list
 
 
 def _answer(answer: Any) -> float | str:
-    """Convert an answer of the user's function to a score or a reason.
-
-    **Raises:** `ValueError` unless the answer is a bool, None, a string or a number from 0 to 1.
-    """
+    """Convert an answer to a score or a reason. True and None become the score 1; False and 0 a reason."""
     if answer is None or isinstance(answer, str):
         return 1.0 if answer is None else answer
     is_number = isinstance(answer, bool | int | float) or (hasattr(answer, "dtype") and answer.dtype.kind in "bif")

@@ -84,7 +84,7 @@ class Session:
       `Obstacles()` if there are none. By default the session detects obstacles:
 
       - A plane under the object in the first image counts as a table, which a warning names. Its points are removed,
-        and cameras keep clear of it. Without such a plane, a warning names values of `up` that would give one.
+        and cameras keep clear of it. If there is none, a warning names other values of `up` that would give one.
       - Surfaces outside the box become coarse obstacles. They may hide the object, and cameras keep clear of them.
 
     - `poses`: (n, 4, 4), poses at which the sensor can be held. The default is the candidates of the planner's search,
@@ -168,8 +168,8 @@ class Session:
     ) -> "Session":
         """Load a session from its folder, to continue after its last image.
 
-        - `planner`: replaces the stored planner, if that contains a function or network that cannot be restored. Both
-          planners must have the same description.
+        - `planner`: the planner, if the stored one contains a function or network that cannot be restored. Both must
+          have the same description.
         - `until`, `progress`, `reachable`, `ignore`: as for a new session. The folder does not store them.
 
         **Raises:** `ValueError` if the folder holds no session, or if the stored planner cannot be restored.

@@ -19,10 +19,7 @@ KIND = "session"
 class SessionFolder:
     """The stored images, proposals and refused poses of a session, in order.
 
-    - `path`: path of the folder.
-    - `config`: arguments of the session.
-
-    **Raises:** `ValueError` for a folder of a session with different arguments.
+    **Raises:** `ValueError` for a folder of a session with a different `config`, its arguments.
     """
 
     def __init__(self, path: str | Path, config: dict[str, Any]):
@@ -31,8 +28,6 @@ class SessionFolder:
     @contextmanager
     def writing(self, num_images: int) -> "Iterator[SessionFolder]":
         """Context manager: lock the folder for writing, and yield it.
-
-        - `num_images`: number of images in the session.
 
         **Raises:** `ValueError` if a different process writes to the folder or has added images.
         """

@@ -21,8 +21,7 @@ _CALLER, _CALLER_OF_ADD = 3, 4
 def warn_of_cut(box: Box, points: Float[np.ndarray, "n 3"], voxel: float, faces: frozenset[str]) -> frozenset[str]:
     """Warn about faces of the box that seem to cut the object. Return the faces of all warnings so far.
 
-    - `points`: measured points in the box and up to about a voxel outside, in world units.
-    - `voxel`: side of a cell of the planner's grid, in world units.
+    - `points`: measured points in the box and up to about a voxel outside, in world units, as is the `voxel`.
     - `faces`: faces of earlier warnings, which are not repeated.
     """
     fractions = box.shares_beyond(points, 0.5 * voxel)
@@ -90,10 +89,7 @@ def warn_of_mount(alignment: Alignment) -> None:
 
 
 def warn_of_inside(box: Box, cameras: Float[np.ndarray, "n 3"], candidates: Float[np.ndarray, "m 3"]) -> None:
-    """Warn if the last camera is the first one inside the box and all candidates are outside.
-
-    - `cameras`, `candidates`: positions of the views so far and of the candidates, in world units.
-    """
+    """Warn if the last camera is the first inside the box and all candidates are outside (world units)."""
     low, high = box.low, box.high
     is_inside, any_inside = (np.all((x > low) & (x < high), axis=1) for x in (cameras, candidates))
     if is_inside[-1] and is_inside.sum() == 1 and not any_inside.any():

@@ -105,12 +105,7 @@ def check_num_views(planner: Planner, views: int) -> None:
 
 
 def observe_scene(
-    scene: Surface,
-    camera: Camera,
-    pose: Pose,
-    noise: Noise,
-    key: PRNGKeyArray,
-    obstacles: Obstacles | None = None,
+    scene: Surface, camera: Camera, pose: Pose, noise: Noise, key: PRNGKeyArray, obstacles: Obstacles | None = None
 ) -> PointCloud:
     """Return a noisy scan of the true surface, which obstacles may hide. Compiled if `scene.in_jit`."""
     barrier = None if obstacles is None else _barrier(obstacles, camera, pose)
@@ -119,12 +114,7 @@ def observe_scene(
 
 
 def _noisy_scan(
-    scene: Surface,
-    camera: Camera,
-    pose: Pose,
-    barrier: Float[Array, " rays"] | None,
-    noise: Noise,
-    key: PRNGKeyArray,
+    scene: Surface, camera: Camera, pose: Pose, barrier: Float[Array, " rays"] | None, noise: Noise, key: PRNGKeyArray
 ) -> PointCloud:
     return noise(scan(scene, camera, pose, barrier), key, camera, pose)
 

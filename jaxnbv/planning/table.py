@@ -45,20 +45,16 @@ def table_under(cloud: PointCloud, box: Box) -> Obstacles | None:
 
     The obstacle is the half space below the table's plane. Its margin is the default margin, or three standard
     deviations of the table points' heights over the plane if this is larger. RANSAC (Fischler and Bolles 1981) draws
-    planes through random triples of points, which are mostly close to the box. Among the planes that can be a table,
-    the one with the most points outside the box is used. A plane can be a table if it satisfies four conditions:
+    planes through random triples of points, mostly close to the box. Among the planes that can be a table, the one with
+    the most points outside the box is used. A plane can be a table if it satisfies four conditions:
 
     - It is level to within 30 degrees, so it is not a wall.
-    - Its height at the middle of the box is below the top of the box. It is at most a quarter of the box's longest side
-      below the bottom.
+    - At the middle of the box it is below the top, and at most a quarter of the box's longest side below the bottom.
     - At most 2 % of the points in the box are below the plane, so it is not the top of an object.
     - Of the points in, under, above and close beside the box, at least as many are on the plane as below it. So it is
       not the edge of something in the air.
 
-    Arguments are in scene coordinates with y up.
-
-    - `cloud`: points of the whole image, also outside the box.
-    - `box`: box around the object.
+    The box around the object, and the cloud of the whole image, are in scene coordinates with y up.
     """
     low, high = box.low, box.high
     side, middle = float((high - low).max()), 0.5 * (low + high)

@@ -120,7 +120,7 @@ class SurfacePosterior(eqx.Module):
         return type(self).mean is not SurfacePosterior.mean
 
     def kinds(self) -> dict[str, float]:
-        """Return the probability of each kind of known shapes, such as "chair", most likely first."""
+        """Return the probability of each kind of known shape ("chair"), most likely first; {} without any."""
         return {}
 
     def names_of_samples(self, key: PRNGKeyArray, num_samples: int) -> list[str]:

@@ -19,13 +19,7 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.programs import program
 from jaxnbv.sharding import shared_map
 from jaxnbv.surfaces.base import on_torus
-from jaxnbv.surfaces.covariance import (
-    Scalar,
-    Spectra,
-    function_covariance,
-    function_variance,
-    mode_variance,
-)
+from jaxnbv.surfaces.covariance import Scalar, Spectra, function_covariance, function_variance, mode_variance
 from jaxnbv.surfaces.pathwise import DataPoints, MeansAtData, TrigonometricPosterior, fill_rows
 from jaxnbv.surfaces.solver import Solver, solver_of
 from jaxnbv.surfaces.trigonometric import NonuniformTransform, solve_poisson
@@ -135,10 +129,7 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
     def update_draws(
         self, coefficients: Float[Array, "s 3 a a a"], residual: Float[Array, "s n 3"]
     ) -> Float[Array, "s a a a"]:
-        """Return the coefficients of Poisson(v + k(., X) C^-T z), with z a whitened residual.
-
-        - `coefficients`: those of the drawn normal field v.
-        """
+        """Return the coefficients of Poisson(v + k(., X) C^-T z), given those of v, and the residual z."""
         return self._reconstruct_samples(coefficients, self.solver.unwhiten(residual))
 
     def _reconstruct_samples(

@@ -45,7 +45,6 @@ def short_ranged(longest_side: float = 2.5, truncation: int = 32) -> ScreenedSPS
     """Return the default model of the difference between an object and a known shape.
 
     - `longest_side`: longest side of the object's bounding box, in scene units.
-    - `truncation`: largest frequency along each axis.
     """
     scale = longest_side / 2.5
     # Long lengthscales, or values at points off the surface, would change the shape far from the scan. `noise` covers
@@ -111,7 +110,7 @@ class KnownShapes(SurfaceModel):
         )
 
     def fit(self, observations: Observations) -> tuple[Hypotheses, Float[Array, " h_and_none"]]:
-        """Return the shapes registered to the scan, and their weights and that of "none of these"."""
+        """Return the registered shapes, and their weights, followed by that of "none of these"."""
         fits = register(self.bank, Prior(self.poses, self.box), FitTargets.of(observations), self.num_starts)
         return fits, _weights(fits, self.inverse_temperature, self.misfit_of_none)
 

@@ -61,7 +61,6 @@ def mesh_paths(meshes: str | Path | Sequence[str | Path | trimesh.Trimesh]) -> l
 class MeshShape(NamedTuple):
     """A mesh as a shape of a bank, scaled so that its longest side is 2.5.
 
-    - `solid`: signed distance of the shape, on a grid.
     - `extremes`: the farthest vertex in each of several evenly spread directions.
     - `from_mesh`: the similarity transform from coordinates of the mesh to coordinates of the shape.
     """

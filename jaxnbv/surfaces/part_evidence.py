@@ -59,7 +59,6 @@ class Rays(NamedTuple):
     """Rays of the views so far, in random order.
 
     - `sight`: length of each ray in scene units; infinite without a return, zero for padding.
-    - `is_object`: whether the ray ended on the object.
     - `weight`: number of independent rays that the ray counts as. It is lower if rays are closer together than
       `_CORRELATION_LENGTH`, and higher if the ray also represents rays that were left out.
     - `empty_nodes`: mask of the nodes of `grid` that were seen to be empty.

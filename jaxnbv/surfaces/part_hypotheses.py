@@ -31,7 +31,7 @@ class PartHypotheses(eqx.Module):
     - `placed`: part and placement of each hypothesis. Of several placements of a part with equal surfaces, only one has
       a weight above zero.
     - `weights`: probability of each hypothesis, followed by the probability of "none of these".
-    - `tau`: scale of the distance between measured points and the surface, in scene units, see `part_evidence`.
+    - `tau`: scale of the distances of measured points from the surface, in scene units, see `part_evidence`.
     """
 
     bank: ShapeBank

@@ -73,8 +73,7 @@ def search_parts(
     The misfit is the L of `part_evidence`, or without rays the E of `registration`. If placements of a part have equal
     surfaces, for example by symmetry, all but the best get an infinite misfit.
 
-    - `bank`, `poses`, `box`: as for `identify`.
-    - `targets`, `rays`: points and rays of the views so far.
+    - `bank`: parts at true size, in scene units.
     - `previous`: the hypotheses of the previous view, which are refined and kept while they fit.
     - `num_starts`: number of placements tried for each part.
     """

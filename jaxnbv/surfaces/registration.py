@@ -93,7 +93,7 @@ class Hypotheses(eqx.Module):
     """Explanations of a scan: shapes of a bank, each with a placement.
 
     - `shape`: index of each shape in the bank.
-    - `misfit`: E (see `surfaces/registration.py`), or for parts maybe L (see `surfaces/part_evidence.py`).
+    - `misfit`: E (see `surfaces/registration.py`), or for parts with rays L (see `surfaces/part_evidence.py`).
     - `is_distinct`: False for a hypothesis that nearly repeats a better one of the same shape. For `register`, the
       rotations of the two differ by less than 15 degrees. For `search_parts`, the two have the same surface.
     """
@@ -362,10 +362,7 @@ def similar_rotations(rotation: Float[Array, "h 3 3"]) -> Bool[Array, "h h"]:
 
 
 def keep_first(is_same: Bool[Array, "h h"]) -> Bool[Array, " h"]:
-    """Return the mask of rows to keep: those that equal no earlier row that is kept.
-
-    - `is_same`: for each pair of rows, whether they are equal.
-    """
+    """Return the mask of rows to keep: those that equal no earlier row that is kept."""
     order = jnp.arange(is_same.shape[0])
 
     def keep(is_first, index):

@@ -239,8 +239,7 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
         """Return the coefficients of g for each sample.
 
         - `coefficients`, `constant`: coefficients of the drawn normal field, and the drawn level, negated.
-        - `residual`: whitened residual of the normals.
-        - `weights`: the weights w of the values.
+        - `residual`, `weights`: whitened residual of the normals, and the weights w of the values.
         """
         remainder = residual - jnp.einsum("dnm,sm->snd", self.whitened_cross, weights, precision="highest")
         fields = self.base.update_draws(coefficients, remainder)

@@ -40,7 +40,6 @@ class ShapeBank(eqx.Module):
     """Known shapes, each centred in its own frame. Shapes of the same kind are oriented alike.
 
     - `solids`: all shapes as one batch, whose arrays have a leading axis of shapes; None for an empty bank.
-    - `extremes`: extreme points of each shape, as in `Shape`.
     - `codes`: the names in UTF-8, as an array so that compiled programs do not depend on the names.
     - `from_mesh`: (k, 4, 4) similarity transforms from the coordinates of each mesh to the coordinates of its shape;
       None if the shapes do not come from meshes.

@@ -21,13 +21,7 @@ from jaxtyping import Array, Float
 from jaxnbv.checks import InputError
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.sharding import shared_map
-from jaxnbv.surfaces.covariance import (
-    Scalar,
-    Spectra,
-    function_normal_covariance,
-    mode_variance,
-    normal_covariance,
-)
+from jaxnbv.surfaces.covariance import Scalar, Spectra, function_normal_covariance, mode_variance, normal_covariance
 from jaxnbv.surfaces.factor import CholeskyFactor
 from jaxnbv.surfaces.trigonometric import NonuniformTransform
 
@@ -43,7 +37,6 @@ class Solver(eqx.Module):
     """A solver for the covariance A of the normals of a cloud.
 
     - `cloud`: D, with zeros in unfilled rows.
-    - `spectrum`: spectrum of the prior.
     - `noise`: standard deviation of the normals' components.
 
     `whiten`, `unwhiten` and `whitened_cross` need the factor. They raise `ValueError` if A is not factorised.
