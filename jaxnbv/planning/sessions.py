@@ -150,9 +150,9 @@ class Sessions:
     def next(self) -> Float[np.ndarray, "4 4"]:
         """Return the camera-to-world matrix of the pose for the next image.
 
-        The pose is the candidate with the highest sum of values over the objects for which the stop rule does not hold
-        yet, or over all objects if there is none. The result stays the same until an image is added. No pose is
-        proposed twice.
+        The pose is the candidate with the highest sum of values (world units) over the objects for which the stop rule
+        does not hold yet, or over all objects if there is none. The result stays the same until an image is added. No
+        pose is proposed twice.
 
         **Raises:** `ValueError` before the first image, if all candidates were proposed, and whenever
         `Planner.propose` raises it.

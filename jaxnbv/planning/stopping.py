@@ -1,15 +1,7 @@
 """Stop rules: conditions that end an episode, checked after each view and for each proposed view.
 
-    rule         limit of the rule                                        checks the proposed view too
-    Sure         a probability                                            no
-    PartsFound   a number of points for each part                         no
-    Identified   a probability                                            no
-    Placed       a length                                                 no
-    Covered      a fraction of the visible area                           no
-    ValueBelow   a value of the search, with lengths in world units       yes
-    Budget       a time in seconds, or a cost of the path in the world    if a cost is given
-
 Rules are combined with `|`. The episode ends as soon as one rule holds. In a simulation, world units are scene units.
+`ValueBelow`, and `Budget` with a cost, also check the proposed view. `planning/part_rules.py` has rules about parts.
 """
 
 import dataclasses
