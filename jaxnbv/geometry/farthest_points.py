@@ -15,7 +15,7 @@ def farthest_point_indices(points: Float[Array, "n d"], mask: Bool[Array, " n"],
     """Return the indices of `count` rows, each chosen as far as possible from all earlier chosen rows.
 
     The first filled row (`mask` is True) is chosen first. Ties go to the first row. No row is chosen twice while an
-    unchosen filled row is left, even if points coincide. Then the first filled row repeats.
+    unchosen filled row is left, even if points coincide. After that, the first filled row is repeated.
 
     **Raises:** `ValueError` if `count` < 1.
     """

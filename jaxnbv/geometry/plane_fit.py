@@ -42,15 +42,16 @@ def fit_planes(
     min_noise: float | Float[Array, ""],
     block_side: int = 1,
 ) -> tuple[Float[Array, "k l"], Float[Array, "k l 3"], Bool[Array, "k l"]]:
-    """Fit a plane at every `stride`-th row and column. Return its depth, its normal and whether it exists.
+    """Fit a plane to a window of pixels around every `stride`-th row and column.
 
+    Return the plane's depth and normal at the middle of the window, and whether the window has enough points.
     Normals are in the camera's frame and point towards the camera. In an image without gaps, the returned depth differs
     from the measured depth by at most three standard deviations of the noise.
 
     - `depth`: depths, positive and finite where `valid`.
     - `camera`: the camera of the whole image.
     - `min_noise`: lower bound on the standard deviation of the noise, such as that of rounding.
-    - `block_side`: side of the blocks of pixels that give one sample each. Windows are counted in blocks.
+    - `block_side`: side of the blocks of pixels that give one sample each. Windows consist of such blocks.
     """
     focal = jnp.asarray(camera.focal_lengths, depth.dtype)
     strided = slice(stride // 2, None, stride)

@@ -282,8 +282,11 @@ def _robust_step(
 ) -> Float[np.ndarray, " steps"]:
     """Return the `step` that minimises sum rho(residuals + jacobian @ step) + sum prior (errors + step)^2.
 
-    The method is iteratively reweighted least squares. `scale` is the width c of the robust loss rho. `errors` are the
-    corrections so far, as rotation vectors and shifts.
+    The method is iteratively reweighted least squares.
+
+    - `scale`: width c of the robust loss rho.
+    - `errors`: errors of the poses as estimated so far, as rotation vectors and shifts.
+    - `prior`: weight of each squared error, its inverse prior variance.
     """
     step = np.zeros(jacobian.shape[1])
     for _ in range(_NUM_STEPS):

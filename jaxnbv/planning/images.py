@@ -77,7 +77,9 @@ class Image(NamedTuple):
         return local @ np.asarray(pose.rotation, np.float64).T + np.asarray(pose.position, np.float64)
 
     def with_robot(self, ignore: Ignore, camera: Camera, pose: Pose) -> "Image":
-        """Return a copy with the mask of the robot's pixels, by `ignore` of the measured world points.
+        """Return a copy with a mask of the robot's pixels.
+
+        - `ignore`: function that returns whether each of the measured world points belongs to the robot.
 
         **Raises:** `ValueError` if `ignore` does not return a bool for each point.
         """

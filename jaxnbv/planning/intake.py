@@ -42,7 +42,7 @@ class Intake:
         self.clutter = self._no_clutter()
 
     def without_images(self) -> "Intake":
-        """Return a copy without images that keeps the pose corrections, for adding the images again."""
+        """Return a copy that has no images but keeps the pose corrections, so that images can be added again."""
         intake = copy.copy(self)
         intake.images, intake.clutter = (), self._no_clutter()
         return intake

@@ -53,7 +53,7 @@ class SessionFolder:
     def store_image(self, index: int, image: Image) -> None:
         """Store an image, and delete a stored proposal for the image after it.
 
-        Such a proposal was computed from images that the user has deleted since.
+        There is one only if the user has deleted the folder's last images. It was computed from these.
         """
         self._folder.file("proposal", index + 1).unlink(missing_ok=True)
         pixels = {"mask": image.mask, "robot": image.robot}

@@ -1,4 +1,4 @@
-"""The box of a session, and the session's planner in scene coordinates."""
+"""The box of a session, and the conversion of the session's planner to scene coordinates."""
 
 import dataclasses
 

@@ -18,8 +18,8 @@ from jaxnbv.geometry.volume import ray_interval
 from jaxnbv.scanning.cubic import CORNERS, cubic, first_bracket, first_root
 from jaxnbv.scanning.scanner import implicit_depth
 
-# Once at most a fifth of the rays of a march is unfinished, the march continues with these only. Each further batch size
-# takes most of a second to compile, so small batches are not reduced, and a quarter would be no faster than a fifth.
+# Once at most a fifth of the rays of a march is unfinished, the march continues with these only. Each further batch
+# size takes most of a second to compile, so small batches are not reduced. A quarter would be no faster than a fifth.
 _SHRINK_FACTOR = 5
 _MIN_BATCH = 4000
 

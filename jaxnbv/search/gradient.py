@@ -32,9 +32,9 @@ class GradientSearch(Search):
 
     - `dof`: 2 for `SpherePoses()`, 6 for `FreePoses()`.
     - `space`: pose space to use in place of `dof`, for example `ConstrainedPoses()`.
-    - `num_starts`: number of starts. The candidates of the highest values are the starts.
+    - `num_starts`: number of starts, the candidates with the highest values.
     - `iterations`: number of steps from each start. Each step evaluates the acquisition and its gradient once.
-    - `learning_rate`: learning rate of Adam, in the units of the space's parameters: about radians or scene units.
+    - `learning_rate`: learning rate of Adam, in the units of the parameters: roughly radians, or scene units.
     - `num_candidates`: number of candidates, which are evaluated first. They are spread evenly over the space, and
       rotated at random together. If the number equals `num_starts`, every candidate is a start.
     - `solver`: Optimistix minimiser to use in place of Adam, for example `optimistix.BFGS(rtol=1e-4, atol=1e-4)`. The

@@ -109,9 +109,9 @@ class HalvingSearch(CandidateSearch):
 class _Block(NamedTuple):
     """Candidates that are scored together on one posterior sample.
 
-    - `sorts`: whether to rank the first `num_left` candidates by their mean scores before this block is scored.
-    - `num_left`: number of remaining candidates before the ranking.
-    - `ranks`: ranks of the candidates to score; `_NO_RANK` for an unused entry.
+    - `num_left`: number of candidates that are still in the search.
+    - `sorts`: whether to order these by their mean scores so far before this block is scored.
+    - `ranks`: positions in this order of the candidates to score; `_NO_RANK` for an unused entry.
     """
 
     sorts: Bool[np.ndarray, "*blocks"]

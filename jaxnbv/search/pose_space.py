@@ -31,7 +31,10 @@ class PoseSpace(eqx.Module):
 
     @abstractmethod
     def retract(self, start: Pose, parameters: Float[Array, " parameters"]) -> Pose:
-        """Move `start` by the parameters, differentiably. Zero parameters keep a start that is in the space."""
+        """Move `start` by the parameters, differentiably.
+
+        If `start` lies in the space, zero parameters return it unchanged.
+        """
 
     def check_camera(self, camera: Camera) -> None:
         """Raise `ValueError` if the camera's field of view is too narrow for the poses."""

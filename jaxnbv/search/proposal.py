@@ -30,8 +30,8 @@ class Proposal(eqx.Module):
     - `pose`, `value`: the proposed pose and its value, in the unit of the search's quantity.
     - `candidates`, `values`: all candidates and their values. The value of an excluded candidate is -inf.
     - `trajectories`: trajectories of a gradient search from the best candidates; None for other searches.
-    - `standard_errors`: standard errors of the values as means over those posterior samples on which a candidate was
-      scored; None for a search without scores.
+    - `standard_errors`: standard errors of `values`. Each value is a mean over the posterior samples on which the
+      candidate was scored. None for a search without scores.
     - `difference_errors`: standard errors of the differences between the values and the best value, which are smaller,
       because the samples are the same. None for a search that does not score all candidates on all samples.
     - `standard_error`: standard error of `value`. NaN for one sample; None for a search without scores.

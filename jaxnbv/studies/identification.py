@@ -150,7 +150,7 @@ class IdentificationStudy(Study):
 
     @property
     def num_scenes(self) -> int | None:
-        """None (unlimited), because parts come again in new poses."""
+        """None (unlimited), because each part can be placed in ever new poses."""
         return None
 
     @property

@@ -127,7 +127,8 @@ def _estimate_noise(
 ) -> Float[Array, ""]:
     """Return the standard deviation of the noise in the ray lengths on the object; zero without data.
 
-    Third differences along rows and columns of an image are near zero on a surface of low curvature without noise.
+    It is computed from third differences along rows and columns of an image, which would be near zero without noise on
+    a surface of low curvature.
     """
     images = jnp.where(is_object, sight.reshape(-1), jnp.nan).reshape(-1, camera.height, camera.width)
     differences = [jnp.diff(images, 3, axis=axis).reshape(-1) for axis in (1, 2)]

@@ -61,8 +61,8 @@ def object_pose(hypotheses: PartHypotheses, observations: Observations, frame: F
 def surface_error(hypotheses: PartHypotheses, observations: Observations) -> float:
     """Return the expected distance of the most likely part's surface from the true one, in scene units.
 
-    It is a root mean square over points of the part's surface, and combines the uncertainty of the part's pose, due to
-    the errors of the scanned points, with the distances to the surfaces of the hypotheses, weighted by probability.
+    It is a root mean square over points of the part's surface. It has two parts: the uncertainty of the pose due to
+    errors of the scanned points, and the distances to the surfaces of all hypotheses, weighted by their probabilities.
     """
     part, placement = hypotheses.most_likely
     shape = hypotheses.bank.shape(jnp.asarray(part))

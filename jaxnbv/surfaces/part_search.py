@@ -122,9 +122,9 @@ def _keep_distinct(hypotheses: Hypotheses, count: int) -> Hypotheses:
 def _starts(bank: ShapeBank, prior: Prior, targets: FitTargets, num_starts: int) -> Placement:
     """Return start placements (axis 1) of each shape (axis 0): rotations, each at a few positions.
 
-    At each position the bounding box of the rotated shape contains the scan, if it is large enough. At the first
-    position of a rotation, the box is centred on the scan across the line of sight, and its side that faces the sensor
-    touches the scan. The others are spread over all positions that contain the scan.
+    At the first position of a rotation, the side of the shape's bounding box that faces the sensor touches the scan,
+    and the box is centred on the scan in the two directions across the line of sight. The other positions are spread
+    over all those at which the box contains the scan, if it is large enough.
     """
     dtype = targets.points.dtype
     rotations = jnp.asarray(prior.poses.rotations_of(len(bank), max(1, num_starts // _NUM_POSITIONS)), dtype)

@@ -176,8 +176,8 @@ class _Zeros(Fields):
 def fill_rows(points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Float[Array, "n 3"]:
     """Return the points with the first filled row copied into all unfilled rows.
 
-    Unfilled rows are zero, where a mean function may have no gradient. Derivatives would then not be finite, although
-    the rows are masked.
+    Unfilled rows hold the origin, where a mean function may have no gradient. Derivatives would then not be finite,
+    although the rows are masked.
     """
     return jnp.where(mask[:, None], points, points[jnp.argmax(mask)])
 

@@ -134,9 +134,9 @@ class Prior(NamedTuple):
         return Placement(rotation, 0.5 * (box_low + box_high) - 0.5 * scale * (low + high), jnp.broadcast_to(scale, 3))
 
     def deviation(self, shape: Shape, placement: Placement) -> Float[Array, "9"]:
-        """Return the step of `Placement.moved` from the placement that fills the box to this one.
+        """Return how far a placement deviates in shift and size from `fill_box` with the same rotation.
 
-        The rotation part is zero. The whole step is zero for shapes at true size.
+        The result is a step of `Placement.moved`, whose rotation is zero. It is all zero for shapes at true size.
         """
         if self.is_true_size:
             return jnp.zeros(9, placement.shift.dtype)

@@ -92,7 +92,7 @@ class DenseSolver(Solver):
 
     @classmethod
     def of(cls, cloud: PointCloud, spectrum: Spectra, noise: Scalar) -> "DenseSolver":
-        """Factorise A. See `Solver` for the arguments."""
+        """Return a solver with the Cholesky factor of A, the covariance of the normals. See `Solver`."""
         capacity = cloud.capacity
 
         def factorise(size: int):

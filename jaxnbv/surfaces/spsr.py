@@ -1,16 +1,15 @@
 """Geometric stochastic Poisson reconstruction (Holalkere et al. 2025), exact for the truncated prior.
 
-    prior    v_1, v_2, v_3 independent Gaussian processes on the torus of period 2 pi,
-             cov(v_d(x), v_d(y)) = sum_{|n|_inf <= L} s(n) cos(n.(x - y)),   s(n) = s1(n_1) s1(n_2) s1(n_3),
+    prior    v_1, v_2, v_3 independent Gaussian processes on the torus of period 2 pi, with the covariance function
+             k(x, y) = sum_{|m|_inf <= L} s(m) cos(m.(x - y)),   s(m) = s1(m_1) s1(m_2) s1(m_3),
              or a sum of such s, one for each lengthscale
-    Poisson  f_hat(n) = -i n . v_hat(n) / |n|^2,   f_hat(0) = 0
+    Poisson  f_hat(m) = -i m . v_hat(m) / |m|^2,   f_hat(0) = 0
     data     n_j = v(x_j) + eps_j,   eps_j ~ N(0, noise^2 I),   A = k(X, X) + noise^2 I
     sample   v_post = v + k(., X) A^-1 (n - v(X) - eps), v and eps from the prior;   f = Poisson(v_post)
 
-In the prior and in Poisson's equation, n is an integer frequency vector, s1 the Matern spectrum on the circle, and L
-the truncation. In the data and the sample, n are the observed normals at the points X, and k is the covariance of v.
-A sample's prior part, residual at the data and update come from the same draw (Matheron's rule; Wilson et al. 2020), so
-samples have exactly the posterior's distribution.
+Here m is an integer frequency vector, s1 the Matern spectrum on the circle, L the truncation, X are the observed
+points and n their normals. A sample's prior part, residual at the data and update come from the same draw (Matheron's
+rule; Wilson et al. 2020), so samples have exactly the posterior's distribution.
 """
 
 import functools

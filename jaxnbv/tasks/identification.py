@@ -173,7 +173,7 @@ def _information(images: _Image, context: ImaginedParts, camera: Camera) -> Floa
 def _misfits(image: _Image, others: _Image, tau: Float[Array, ""]) -> Float[Array, "h rays"]:
     """Return each ray's misfit between the image of one hypothesis and those of all, at most `MAX_MISFIT`.
 
-    It grows with the distance between the surfaces, and has this bound if the ray hits only one of them.
+    It grows with the distance between the two surfaces along the ray, and is `MAX_MISFIT` if the ray hits only one.
     """
     (reach, _, hits), (expected, cosine, are_expected) = image, others
     both = hits & are_expected

@@ -84,7 +84,7 @@ class Words:
 
     @property
     def found(self) -> str:
-        """The answer as a short text."""
+        """The answer after the view as a short text, such as "bathtub, probability 0.98"."""
         return self.said()
 
     @property
@@ -93,11 +93,15 @@ class Words:
         return f"within {100 * _MAX_CHANGE:.0f} % of the view before"
 
     def settled(self, answers: Sequence[Answer], holds: Holds) -> list[bool]:
-        """Return whether the answer after each view is reliable. The last of `answers` is this answer."""
+        """Return, for each view, whether the answer after it is reliable.
+
+        - `answers`: the answers after all views so far; the last one is `self.answer`.
+        - `holds`: function that returns whether a stop rule holds after the view with an index.
+        """
         return [False, *(np.allclose(now.values, was.values, rtol=_MAX_CHANGE) for was, now in pairwise(answers))]
 
     def charts(self, answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...]:
-        """Return charts of the answers over the views. The last of `answers` is this answer.
+        """Return charts of the answers over the views. The last of `answers` is `self.answer`.
 
         - `truth`: the answer if all of the surface had been seen.
         """
@@ -225,7 +229,7 @@ class _ColdestWords(Words):
 
 
 class CoverageAnswer(Answer):
-    """Surface seen: percent of the true surface, or an area in `unit`. `amount` is the text."""
+    """Surface seen: percent of the true surface, or an area in `unit`. `amount` returns it as text, such as "63 %"."""
 
     unit: str = "%"
 

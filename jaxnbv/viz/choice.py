@@ -97,8 +97,8 @@ def draw_acquisition(
 ) -> ScalarMappable | None:
     """Draw the candidates' values as a map of the sphere, and return the colours for a colour bar.
 
-    Without a proposal (for a given view) the map is empty, and the result is None. If the values are not random and
-    there are many candidates, the map is also coloured between them.
+    Without a proposal, for a view that was given and not chosen, the map is empty and the result is None. If there are
+    many candidates, the map is also coloured between them, except for random values.
 
     - `weight`: factor for the sizes of lines, marks and letters.
     """

@@ -266,7 +266,7 @@ def _mesh_of(source: _Mesh | TriangleMesh) -> trimesh.Trimesh:
 
 
 def _points_of(scan: _Mesh | PointCloud) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], float]:
-    """Return points of a scan, their normals, and the fraction of its surface that no view measured."""
+    """Return measured points of a scan, their normals, and the fraction of its area that was imagined."""
     if isinstance(scan, PointCloud):
         check_single(scan)
         points, normals = (rows.astype(np.float64) for rows in scan.to_numpy())

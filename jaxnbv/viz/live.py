@@ -156,7 +156,9 @@ def _surfaces(
 ) -> tuple[MeanSurface | None, list[tuple[str, Triangles]], list[tuple[str, float]]]:
     """Return the surface to show, some imagined surfaces with names, and kinds of known shapes with probabilities.
 
-    With known parts, the imagined surfaces are the likeliest parts. The surface agrees with the `answer`.
+    With known parts, the imagined surfaces are the likeliest parts.
+
+    - `answer`: probabilities of classes, which decide which known shape is shown; see `likeliest_shape`.
     """
     if isinstance(observations.hypotheses, PartHypotheses):
         parts = placed_parts(observations.hypotheses, NUM_SHOWN)

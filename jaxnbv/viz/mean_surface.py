@@ -58,10 +58,10 @@ class MeanSurface(eqx.Module):
 
 
 def mean_surface(sampler: SurfaceSampler, inputs: StepInputs) -> MeanSurface | None:
-    """Return the surface where the posterior mean, carved like samples, equals its level, or None.
+    """Return the surface where the carved posterior mean equals its level; None if there is none.
 
-    If the posterior in `inputs` has no closed forms, mean and deviation are computed from the samples in `inputs`, or
-    else from samples with a fixed key.
+    If the posterior in `inputs` has no closed forms, mean and deviation are computed from the samples in `inputs` or,
+    if there are none, from new samples with a fixed key.
     """
     observations, posterior, surfaces = inputs.observations, inputs.posterior, inputs.surfaces
     assert posterior is not None

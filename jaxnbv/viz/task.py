@@ -120,8 +120,8 @@ def coverage_answers(
     """Return how much of the surface was seen after each view.
 
     Given points of the true surface (`truth`), this is the percentage of them that was seen. Otherwise it is the sum of
-    the new areas that scans show, in squared world units. `NewSurface` defines what is new, with the acquisition's
-    settings if it is a `NewSurface`. An area measured at a slant counts in full here, but for less in the acquisition.
+    the new areas that scans show, in squared world units. What is new is defined by `NewSurface`: the episode's
+    acquisition, if it is one, or else the default. Unlike there, area that was measured at a slant counts in full.
     """
     views, acquisition = episode.views, episode.planner.acquisition
     if truth is not None:
@@ -154,7 +154,10 @@ def true_cloud(scene: Surface, count: int) -> PointCloud | None:
 
 
 def is_reliable_after(episode: Episode, answers: Sequence[Answer]) -> list[bool]:
-    """Return, for each view, whether its answer is reliable. Stop rules get the episode's random keys."""
+    """Return, for each view, whether its answer is reliable.
+
+    Stop rules, which decide this for probabilities, get the random keys of the episode.
+    """
 
     def holds(rule: Sure, index: int) -> bool:
         key, *_ = view_keys(episode.key, index + 1)

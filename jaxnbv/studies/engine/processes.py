@@ -39,9 +39,9 @@ class Processes(Executor):
         return self._threads.submit(self._call, function, args, kwargs)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Shut the executor down, and end its processes once all calls are done.
+        """Wait until all calls are done, then end the processes.
 
-        - `wait`: False returns without waiting for the calls, and the processes keep running.
+        - `wait`: False returns at once. The processes then stay until this process ends.
         - `cancel_futures`: True kills running calls and cancels the calls that have not started.
         """
         if cancel_futures:

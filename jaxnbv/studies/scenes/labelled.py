@@ -142,7 +142,7 @@ def _upright(axis):
 def assemble(primitives: list[Primitive], rotation_angle: float = 0.0, longest_side: float = 2.5) -> LabelledSolid:
     """Return the union of primitives, rotated about the y axis (radians), then moved and scaled.
 
-    The bounding box of the result is centred in the scene and has this longest side.
+    The bounding box of the result is centred at the origin, and its longest side is `longest_side`.
     """
     rotation = rotation_about((0.0, 1.0, 0.0), rotation_angle)
     return union(fit([move(p, rotation=rotation) for p in primitives], longest_side))

@@ -45,8 +45,8 @@ class Parts:
     def choose(self, index: int) -> int:
         """Return the index of the part for the scene with this index.
 
-        One half of the parts is for even indices, the other half for odd ones. In each half, every part comes once
-        before any part repeats.
+        Scenes with an even index use one half of the parts, scenes with an odd index the other half. In each half,
+        every part is used once before any part repeats.
         """
         half = np.random.default_rng(_ORDER_SEED).permutation(len(self.meshes))[index % 2 :: 2]
         return int(half[index // 2 % len(half)])
