@@ -229,7 +229,7 @@ class _ColdestWords(Words):
 
 
 class CoverageAnswer(Answer):
-    """Surface seen: percent of the true surface, or an area in `unit`. `amount` returns it as text, such as "63 %"."""
+    """Surface seen: percent of the true surface, or an area in `unit`. `amount` is a text, such as "63 %"."""
 
     unit: str = "%"
 
