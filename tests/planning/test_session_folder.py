@@ -87,7 +87,7 @@ def test_a_session_that_was_killed_ends_as_one_that_was_not(tmp_path):
         record(tmp_path / name)
 
     def contents(folder):
-        return {path.name: path.read_bytes() for path in sorted(folder.glob("*.npz"))}
+        return {path.name: path.read_bytes() for path in sorted(folder.glob("*_*.npz"))}
 
     whole = contents(tmp_path / "whole")
     assert len(whole) == 6
