@@ -205,6 +205,13 @@ def image_of_a_ball(matrix):
     return np.round(1000 * np.nan_to_num(depth, posinf=0.0)).clip(0, 65535).astype(np.uint16)
 
 
+def noisy_image_of_a_ball(matrix):
+    """As `image_of_a_ball`. Two pixels in a corner depend on the camera's position, so images differ."""
+    image = image_of_a_ball(matrix)
+    image[0, :2] = 1 + (1e4 * np.abs(np.asarray(matrix)[:2, 3] + 1.0)).astype(int) % 97
+    return image
+
+
 def poses_about_a_ball(count):
     angle = 2.0 * np.pi * np.arange(count) / count
     places = np.stack([0.8 * np.cos(angle), 0.8 * np.sin(angle), 0.3 + 0.2 * (np.arange(count) % 2)], axis=1)
@@ -227,7 +234,7 @@ def test_the_block_of_a_session_runs(tmp_path, monkeypatch):
         capacity=2048,
     )
     monkeypatch.setattr("jaxnbv.planning.session.usual_planner", lambda: planner)
-    variables = {"K": INTRINSICS, **CORNERS, "places": poses, "first": poses[0], "take_image": image_of_a_ball}
+    variables = {"K": INTRINSICS, **CORNERS, "places": poses, "first": poses[0], "take_image": noisy_image_of_a_ball}
     (block,) = (block for block in blocks("how_to/depth_camera.md") if "take_image" in block)
     exec(block, variables)
     session = variables["session"]
