@@ -206,7 +206,7 @@ def image_of_a_ball(matrix):
 
 
 def noisy_image_of_a_ball(matrix):
-    """As `image_of_a_ball`. Two pixels in a corner depend on the camera's position, so images differ."""
+    """Return `image_of_a_ball` with two pixels that depend on the camera's position, so that images differ."""
     image = image_of_a_ball(matrix)
     image[0, :2] = 1 + (1e4 * np.abs(np.asarray(matrix)[:2, 3] + 1.0)).astype(int) % 97
     return image
