@@ -88,7 +88,7 @@ def check_fields(module: Any) -> None:
 def own_settings() -> Iterator[None]:
     """Context manager or decorator: allow rank promotion, type promotion and transfers in JAX.
 
-    A user's strict settings in `jax.config` are meant for the user's own code.
+    A user's strict settings in `jax.config` are meant for the user's own code. `jax_debug_nans` is not changed.
     """
     with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"), jax.transfer_guard("allow"):
         yield
@@ -140,7 +140,7 @@ def check_type(value: Any, hint: Any, name: str) -> None:
 
 
 def check_index(index: Any, batch: tuple[int, ...], name: str) -> None:
-    """Raise `ValueError` for an index out of the range of a shape `batch`, which JAX would clamp."""
+    """Raise `ValueError` if a shape `batch` has no axes, or for an index out of its range, which JAX would clamp."""
     if isinstance(index, int | np.integer):
         check_batch(batch, name)
         require(-batch[0] <= index < batch[0], f"{name} has {batch[0]} along its first axis: there is no index {index}")

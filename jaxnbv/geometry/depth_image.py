@@ -86,7 +86,7 @@ def _points_and_normals(
     rounding: Float[Array, ""],
     block_side: int,
 ) -> tuple[Rows, Float[Array, " n"]]:
-    """Return the cloud's rows, and a lower bound on the depth around each row's pixel (NaN without a depth).
+    """Return the cloud's rows, and a lower bound on the depth around each row's pixel (-inf without a depth).
 
     - `rounding`: standard deviation of the rounding of depths.
     """
@@ -105,7 +105,7 @@ def _points_and_normals(
     local = jnp.where(valid, jnp.where(has_normal, smooth, depth), 0.0).reshape(-1, 1)
     points = pose.to_scene(local * strided_camera.pixel_directions())
     normals = jnp.matmul(normals.reshape(-1, 3), pose.rotation.T, precision="highest")
-    nearest = jnp.where(valid, nearest, jnp.nan).reshape(-1)
+    nearest = jnp.where(valid, nearest, -jnp.inf).reshape(-1)
     return (points, normals, mask, missed.reshape(-1), sight), nearest
 
 
@@ -117,7 +117,8 @@ def _in_box(
 
     - `nearest`: see `_points_and_normals`.
     """
-    return box(points) <= 0, nearest >= _depth_behind(box, camera.strided(stride), pose)
+    is_beyond = (nearest > -jnp.inf) & (nearest >= _depth_behind(box, camera.strided(stride), pose))
+    return box(points) <= 0, is_beyond
 
 
 def _strided_samples(

@@ -1,7 +1,9 @@
 """Depth images of a sensor: units, strides, boxes, ranges, and input that cannot be right."""
 
 import itertools
+import warnings
 
+import jax
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
@@ -289,3 +291,15 @@ def test_pixels_that_mix_a_near_and_a_far_surface_are_left_out_and_thin_parts_st
     assert np.minimum(from_ball, from_leg).max() < 0.012
     assert len(points) > 0.95 * np.sum(((near < 1.6) & ~mixed)[1::2, 1::2])
     assert np.sum(np.abs(points[:, 0] - 0.14) < 0.01) > (70 if share == 0 else 20)
+
+
+def test_holes_of_an_image_are_no_nan():
+    """A user may debug with `jax_debug_nans`. A ray without a depth has measured nothing, also beside the box."""
+    depth = np.full((12, 16), 2.0)
+    depth[:, ::4] = 0.0
+    box = nbv.Box((-0.1, -0.1, 1.9), (0.1, 0.1, 2.1))
+    pose = nbv.Pose(np.eye(3), np.zeros(3))
+    with jax.debug_nans(True), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        cloud = nbv.PointCloud.from_depth(depth, nbv.Camera(height=12, width=16), pose, box=box)
+    assert not np.asarray(cloud.missed).reshape(12, 16)[:, ::4].any()
