@@ -140,7 +140,10 @@ def check_type(value: Any, hint: Any, name: str) -> None:
 
 
 def check_index(index: Any, batch: tuple[int, ...], name: str) -> None:
-    """Raise `ValueError` if a shape `batch` has no axes, or for an index out of its range, which JAX would clamp."""
+    """Raise `ValueError` for an index out of the range of a shape `batch`, which JAX would clamp.
+
+    It also raises for an integer index if the shape has no axes.
+    """
     if isinstance(index, int | np.integer):
         check_batch(batch, name)
         require(-batch[0] <= index < batch[0], f"{name} has {batch[0]} along its first axis: there is no index {index}")
