@@ -1,17 +1,17 @@
-"""Compares the points of overlapping views, and estimates pose errors that explain the differences.
+"""Estimation of camera pose errors from the differences between overlapping views.
 
-The pose that the robot reports for view i is T_i, and the true pose of the camera is T_i X_i. If the mount of the
-camera is off, X_i = X is the same for all views. If single poses are off, each view has its own X_i, and X_0 = I. The
-X_i are estimated by minimising the disagreement of overlapping views,
+The robot reports the pose T_i for view i, but the true pose of the camera is T_i X_i. An error of the camera's mount on
+the robot gives all views the same X_i = X. If single poses are wrong, each view has its own X_i, and X_0 = I. The
+estimated X_i minimise the disagreement of overlapping views,
 
-    the sum over points p of view i and the nearest point q of view j  of  rho(n_q . (T_i X_i p - T_j X_j q)),
+    the sum of rho(n_q . (T_i X_i p - T_j X_j q)) over points p of view i and their nearest points q of view j,
 
 with the robust loss rho(r) = c^2 log(1 + r^2 / c^2), whose width c is twice the median disagreement. The points p and q
-are in the coordinates of cameras i and j, and the normal n_q at q is in world coordinates. A Gaussian prior keeps those
-components of X_i close to zero that no view determines. The nearest points are searched again in each round, within a
-distance that decreases (point-to-plane iterative closest points, Chen and Medioni 1992). The views determine all of X
-if the smallest eigenvalue of J^T J is large enough. J is the derivative with respect to X of all distances
-n_q . (T_i X_i p - T_j X_j q).
+are in the coordinates of cameras i and j, and the normal n_q at q is in world coordinates. The method is point-to-plane
+iterative closest points (Chen and Medioni 1992): each round finds the nearest points again, within a smaller distance.
+A Gaussian prior keeps components of X_i that no view determines close to zero. Let J be the derivative of all distances
+n_q . (T_i X_i p - T_j X_j q) with respect to X. The views determine all of X if the smallest eigenvalue of J^T J is
+large enough.
 """
 
 from collections.abc import Sequence
@@ -28,9 +28,9 @@ from jaxnbv.checks import checked, require
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.pose import Pose
 
-# Largest number of points of a view that are compared, and of other views with which a view is compared.
+# At most this many points of each view are compared, with those of at most this many other views.
 _MAX_POINTS, _MAX_OTHER_VIEWS = 800, 4
-# Largest angle between the directions of two views that are compared, and fewest matched points that count as overlap.
+# Views are compared if their directions differ by at most this angle. They overlap if this many points match.
 _MAX_ANGLE, _MIN_MATCHES = np.radians(70.0), 20
 # Rounding error of points, as a fraction of the points' median distance from the cameras.
 _ROUNDING = 1e-6
@@ -40,36 +40,36 @@ _MIN_COSINE = 0.7
 _MATCH_DISTANCES = (0.08, 0.08, 0.08, 0.04, 0.04, 0.04, 0.02, 0.02, 0.01, 0.01)
 # Ratio of the width c of rho to the median disagreement, and number of least-squares steps in a round.
 _LOSS_WIDTH, _NUM_STEPS = 2.0, 3
-# Prior standard deviation of a pose error: in radians, and of its shift as a fraction of the distance from the cameras.
-# Errors of neighbouring points are correlated, so this many points count as one independent point.
+# Prior standard deviation of a pose error: its rotation in radians, and its shift as a fraction of the points' distance
+# from the cameras. Errors of neighbouring points are correlated, so this many points count as one independent point.
 _PRIOR_DEVIATION, _POINTS_PER_SAMPLE = 0.03, 50
 # The views determine all of X if the smallest eigenvalue of J^T J exceeds this fraction of the largest. The ratio is
 # 4e-6 for three views of a shelf from one side, and 1e-3 or more for views that determine X.
 _MIN_EIGENVALUE_RATIO = 3e-4
 # A correction is rejected if it moves points by more than this fraction of their distance from the cameras.
 _MAX_CORRECTION = 0.15
-# Ratio of disagreement to noise above which views disagree, and factor by which a correction must reduce it.
+# Factor by which the disagreement must exceed the noise to matter, and factor by which a correction must reduce it.
 _DISAGREEMENT_RATIO, _MIN_IMPROVEMENT = 3.0, 1.5
 _Corrections: TypeAlias = Float[np.ndarray, "views 4 4"]
 
 
 class Alignment(eqx.Module):
-    """How much overlapping views disagree, and the pose error that explains it.
+    """Disagreement of overlapping views, and the pose errors that explain it.
 
     Lengths are in the units of the poses.
 
     - `disagreement`: for each view the median point-to-plane distance between its points and the nearest points of
       overlapping views, with uncorrected poses. NaN for a view that overlaps no other view.
-    - `angle`: for each view the median angle between the normals of these pairs of points, in radians.
+    - `angle`: for each view the median angle between the normals of the same pairs of points, in radians.
     - `noise`: median point-to-plane distance between neighbouring points of the same view.
-    - `corrected`: `disagreement` with corrected poses.
+    - `corrected`: the disagreement with corrected poses.
     - `corrections`: the correction X of each view. The true pose of the camera is `matrix @ X`, where `matrix` is the
       reported pose. All X are identities if corrected poses do not agree much better.
     - `is_mount`: whether all views have the same X, which is then an error of the mount.
-    - `covariance`: covariance of the mount's error: a rotation vector (radians), then a shift, in the camera's axes.
-    - `is_determined`: whether the views determine all components of the mount's error. Others stay close to zero.
-    - `weakest`: direction of the mount's error that the views determine least, in the same components.
-    - `num_pairs`: number of compared pairs: each view and up to four others of similar direction.
+    - `covariance`: covariance of the mount's error, a rotation vector (radians) and a shift, in the camera's axes.
+    - `is_determined`: whether the views determine all of the mount's error. Undetermined components stay close to zero.
+    - `weakest`: direction in which the views determine the mount's error least, in the same six components.
+    - `num_pairs`: number of compared pairs of views. Each view is compared with up to four others of similar direction.
     - `distance`: median distance of points from the camera that measured them.
     """
 
@@ -89,8 +89,8 @@ class Alignment(eqx.Module):
     def disagrees(self) -> bool:
         """Whether the poses seem wrong.
 
-        They do if a view's disagreement exceeds three times the noise, and either poses were corrected or the views do
-        not determine all of the mount's error.
+        True if a view's disagreement exceeds three times the noise, and either poses were corrected or the views do not
+        determine all of the mount's error.
         """
         exceeds_noise = bool(np.any(self.disagreement > _DISAGREEMENT_RATIO * self.noise))
         return exceeds_noise and (self.is_corrected or not self.is_determined)
@@ -107,7 +107,7 @@ class Alignment(eqx.Module):
 
     @property
     def motion(self) -> str:
-        """The view to add, in words, so that the views determine the `weakest` error of the mount better.
+        """Description of a further view that would determine the `weakest` error of the mount better.
 
         A shift of the mount along an axis, or a rotation about it, looks the same in all views if the axis has the same
         world direction in all views. The advised view changes this direction.
@@ -130,7 +130,7 @@ class _View(NamedTuple):
 
 
 class _Matches(NamedTuple):
-    """Matched points of two views each, in the coordinates of their own cameras, and the views' indices."""
+    """Pairs of matched points from two views, each in its own camera's coordinates, and the views' indices."""
 
     views: Int[np.ndarray, "n 2"]
     first_points: Float[np.ndarray, "n 3"]
@@ -147,9 +147,9 @@ def align_views(clouds: Sequence[PointCloud], poses: Sequence[Pose]) -> Alignmen
 
     - `clouds`: points and normals of each view, in the frame of the poses. Include points around the object, since more
       overlap gives better estimates.
-    - `poses`: pose of each view, possibly with an error.
+    - `poses`: reported pose of each view.
 
-    **Raises:** `ValueError` for fewer than two views, different numbers of clouds and poses, or clouds without points.
+    **Raises:** `ValueError` for fewer than two views, different numbers of clouds and poses, or no point in any cloud.
     """
     require(len(clouds) == len(poses), f"there are {len(clouds)} clouds and {len(poses)} poses: give a pose for each")
     require(len(clouds) >= 2, f"there are {len(clouds)} views: only two or more can disagree")
@@ -206,7 +206,7 @@ def _in_camera(cloud: PointCloud, pose: Pose) -> _View:
 
 
 def _pairs(views: Sequence[_View]) -> list[tuple[int, int]]:
-    """Return pairs of views that may show the same surface: each view and a few of similar direction."""
+    """Pair each view with the few views of most similar direction, which may show the same surface."""
     forward = np.stack([view.matrix[:3, 2] for view in views])
     angles = np.arccos(np.clip(forward @ forward.T, -1.0, 1.0))
     np.fill_diagonal(angles, np.inf)
@@ -219,7 +219,7 @@ def _match_points(
 ) -> _Matches:
     """Match each point of a pair's first view with the nearest point of the second view.
 
-    Matches are at most `max_distance` apart and have similar normals. Pairs of views with few matches are left out.
+    Matched points are at most `max_distance` apart and have similar normals. View pairs with few matches are left out.
     """
     clouds = [view.in_world(correction) for view, correction in zip(views, corrections, strict=True)]
     trees = [cKDTree(points) for points, _ in clouds]
@@ -237,7 +237,7 @@ def _match_points(
 
 
 def _is_plausible(corrections: _Corrections, median_distance: float) -> bool:
-    """Return whether the corrections move points little enough to be errors of poses."""
+    """Return whether the corrections are small enough to be pose errors."""
     angles, shifts = errors_of(corrections)
     return bool(np.max(median_distance * angles + shifts) < _MAX_CORRECTION * median_distance)
 
@@ -256,7 +256,7 @@ def _solve_corrections(
 ) -> _Corrections:
     """Return the corrections that minimise the disagreement of the views, starting from `start`.
 
-    All views get the same correction if `is_mount`. Otherwise each view but the first gets its own.
+    If `is_mount`, all views get the same correction. Otherwise each view except the first gets its own.
     """
     corrections, num_steps = start, 1 if is_mount else len(views) - 1
     deviation = _PRIOR_DEVIATION * np.tile(np.repeat([1.0, median_distance], 3), num_steps)
@@ -285,8 +285,8 @@ def _robust_step(
     The method is iteratively reweighted least squares.
 
     - `scale`: width c of the robust loss rho.
-    - `errors`: errors of the poses as estimated so far, as rotation vectors and shifts.
-    - `prior`: weight of each squared error, its inverse prior variance.
+    - `errors`: the current estimates of the pose errors, each a rotation vector followed by a shift.
+    - `prior`: weight of each squared error, proportional to its inverse prior variance.
     """
     step = np.zeros(jacobian.shape[1])
     for _ in range(_NUM_STEPS):
@@ -301,9 +301,9 @@ def _linearise(
 ) -> tuple[Float[np.ndarray, " n"], csr_array]:
     """Return the signed point-to-plane distance of each match, and its derivative.
 
-    The derivative is with respect to steps X <- X exp(step): one step for the mount, or one for each view but the
-    first. Its six entries for a view are, up to sign, (p x m, m) with the point p and the normal m = n_q in the
-    coordinates of this view's camera.
+    The derivative is with respect to steps of six entries, X <- X exp(step): one step for the mount, or one for each
+    view except the first. With respect to the step of a view it is, up to sign, (p x m, m), where the point p and the
+    normal m = n_q are in the coordinates of this view's camera.
     """
     poses = np.stack([view.matrix for view in views]) @ corrections
     (first, second), count = matches.views.T, len(matches.views)
@@ -344,9 +344,9 @@ def _logarithm(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6"]:
 def _disagreement(
     views: Sequence[_View], pairs: Sequence[tuple[int, int]], corrections: _Corrections, median_distance: float
 ) -> tuple[Float[np.ndarray, " views"], Float[np.ndarray, " views"]]:
-    """Return two medians over the matches of each view, given the corrected poses; NaN without matches.
+    """Return each view's median point-to-plane distance and median angle between normals (radians).
 
-    The medians are of the point-to-plane distance between two points, and of the angle between their normals (radians).
+    The medians are over the view's matches, at the corrected poses. They are NaN for a view without matches.
     """
     matches = _match_points(views, pairs, corrections, _MATCH_DISTANCES[0] * median_distance)
     residuals, _ = _linearise(views, matches, corrections, is_mount=True)

@@ -35,7 +35,7 @@ class Episode(eqx.Module):
 
     - `scene`, `noise`: true surface and sensor noise; None if a real sensor took the views.
     - `first`: pose of the first view.
-    - `stop_reason`: reason of the stop rule; None if no rule ended the episode.
+    - `stop_reason`: the stop rule's reason to end the episode; None if no rule ended it.
     - `frame`: frame of the user's world, in which the episode is shown and its cloud is saved.
     """
 
@@ -74,9 +74,9 @@ class Episode(eqx.Module):
     def actual_scores(self, observations: Iterable[Observations] | None = None) -> Iterator[float | None]:
         """Yield the acquisition's score of each view's actual scan, given the observations before the view.
 
-        Scores are in scene units, as the values that proposals expected; None for the first view.
+        Scores are in scene units, like the values of proposals. The first view has the score None.
 
-        - `observations`: the result of `observations()`, if it is already computed.
+        - `observations`: result of `observations()`, if you have it already.
         """
         yield None
         acquisition = self.planner.acquisition

@@ -1,4 +1,4 @@
-"""The compiled program of simulated episodes, which does the computation of `simulate` in JAX only."""
+"""The compiled program of simulated episodes, which computes what `simulate` does, in JAX only."""
 
 from typing import Any, NamedTuple
 
@@ -26,7 +26,7 @@ class ViewRecord(NamedTuple):
     """Result of one view of a simulated episode.
 
     - `value`: value that the search gave the view; NaN for the first view.
-    - `answer`: values of the acquisition's answer, or `PartHypotheses.part_weights` if `answers_by_parts`.
+    - `answer`: values of the acquisition's answer, or `part_weights` if `answers_by_parts`; None without an answer.
     """
 
     pose: Pose
@@ -35,7 +35,7 @@ class ViewRecord(NamedTuple):
 
 
 def answers_by_parts(planner: Planner) -> bool:
-    """Return whether `View.answer` is the probabilities of known parts, as the acquisition has no answer."""
+    """Return whether `View.answer` gives probabilities of parts because the acquisition has no answer."""
     return type(planner.acquisition).answer is Acquisition.answer and planner.sampler.model.carries_hypotheses
 
 
@@ -47,9 +47,9 @@ def run(
     rows: tuple[Surface, Pose, Key[Array, " episodes"]],
     at_once: int,
 ) -> tuple[ViewRecord, PointCloud, Bool[Array, " episodes"]]:
-    """Return the views' records of simulated episodes, the last clouds, and whether first views hit.
+    """Return records of the episodes' views, the last clouds, and whether each first view sees the object.
 
-    - `views`: number of views of each episode. Later rows of the records (episodes, max_views) are zero.
+    - `views`: number of views of each episode. The records are arrays (episodes, max_views), zero after this number.
     - `rows`: scene, first pose and random key of each episode. The leading axis is split among the devices.
     - `at_once`: number of episodes that a device computes together.
     """

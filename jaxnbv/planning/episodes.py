@@ -55,21 +55,21 @@ def episodes(
     """Simulate a batch of episodes in one compiled program.
 
     The results are those of `simulate` for each scene and key. On a CPU with the default `batch_size`, poses, values,
-    clouds and answers are bit for bit those of `simulate`. The episodes are split among the devices of `jax.set_mesh`,
-    by default among all local devices.
+    clouds and answers equal those of `simulate` bit for bit. The episodes are split among the devices of
+    `jax.set_mesh`, by default among all local devices.
 
     - `scenes`: a list with one solid or surface for each key, all of the same structure. `[scene] * len(keys)` repeats
       a scene. You can also pass a single solid or surface whose arrays have a leading axis, as `jax.vmap` returns.
     - `first`: pose of the first view, or a batch with one pose for each key.
     - `views`: number of views of each episode. The same compiled program serves any number.
-    - `keys`: a random key for each episode, `jax.random.split(key, episodes)`.
+    - `keys`: a random key for each episode, from `jax.random.split(key, episodes)`.
     - `batch_size`: number of episodes that a device computes together. The default is one on a CPU, and all episodes of
       the device on a GPU. More episodes need more memory. If it is greater than one, the values equal those of
       `simulate` only up to rounding.
 
     **Raises:** `ValueError` for triangle meshes, scenes of different structures, different numbers of scenes and keys,
-    or `views` less than 1 or greater than the planner's `max_views`; if the first view of an episode sees nothing; and
-    if the value of a view is not finite.
+    `views` less than 1 or greater than the planner's `max_views`, a first view that sees nothing, or a view whose value
+    is not finite.
     """
     check_num_views(planner, views)
     require(batch_size is None or batch_size >= 1, f"the batch size is {batch_size}; it must be at least 1")
@@ -107,7 +107,7 @@ def _batch_of_poses(first: Pose, count: int) -> Pose:
 
 
 def _devices(count: int) -> AbstractContextManager:
-    """Return a context in which JAX uses the mesh of devices that the user has set, or else `count` local devices."""
+    """Return a context in which JAX uses the user's mesh of devices, or else at most `count` local devices."""
     is_chosen = not get_abstract_mesh().empty or jax.config.jax_default_device is not None  # type: ignore[attr-defined]
     devices = jax.local_devices()[:count]
     return nullcontext() if is_chosen or len(devices) == 1 else jax.set_mesh(Mesh(np.array(devices), "devices"))
