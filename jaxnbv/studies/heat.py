@@ -35,10 +35,10 @@ from jaxnbv.viz.render import Still
 # Methods whose acquisition values the coldest point.
 HEAT_METHODS = ("heat", "heat-reached", "heat-halving")
 _OTHERS = ("coverage", *BASELINES)
-# The two estimates of the coldest point, and the points of the cloud from which each takes the coldest.
+# The two estimates of the coldest point, and the points of the cloud among which each finds it.
 ESTIMATES = {"all": "of all points", "reached": "of the warmed points"}
-# Points count as coldest if their temperature exceeds the lowest by at most this fraction of the range from the lowest
-# to the highest. Several points must count, because objects have symmetries and a mug's inner floor is equally cold.
+# Points count as coldest if their temperature exceeds the lowest by at most this fraction of the temperature range.
+# Several may count, because objects have symmetries, and because the inner floor of a mug is equally cold.
 _MAX_RELATIVE_EXCESS = 0.01
 # Matplotlib's inferno without its palest colours, which would not stand out against the grey of unscanned surface.
 _HEAT = LinearSegmentedColormap.from_list("heat", mpl.colormaps["inferno"](np.linspace(0.0, 0.9, 256)))
@@ -50,7 +50,7 @@ _MARKS: dict[str, dict[str, Any]] = {
 
 
 class Truth(NamedTuple):
-    """The temperature (degrees) of the true object, at points of its surface 1/40 scene unit apart."""
+    """The temperature (degrees) of the true object, at points at most 1/40 scene unit apart."""
 
     mesh: TriangleMesh
     points: Float[np.ndarray, "n 3"]
@@ -69,7 +69,7 @@ class Truth(NamedTuple):
 
 
 def _saturation(record: Record, method: str) -> dict[int, float]:
-    """Return, for each later view, 1.0 if the best candidate, and so every one, has value zero."""
+    """Return, for each view from the second on, 1.0 if even the best candidate has value zero, else 0.0."""
     steps = record["methods"][method]["steps"] if method in HEAT_METHODS else []
     return {view: float(step["value"] == 0.0) for view, step in enumerate(steps, start=2)}
 
@@ -94,8 +94,8 @@ class HeatStudy(Study):
     Meshes are heated at a random point. Procedural objects and their heat sources come from `heat_scene`. The study has
     the settings of `Study`, and:
 
-    - `num_points`: number of points to which the cloud is thinned before an imagined scan is added and the temperature
-      is simulated on both together.
+    - `num_points`: number of points to which the cloud is thinned before an imagined scan is added. The temperature is
+      simulated on both together.
     - `imagined_rays`: rays along each side of an imagined scan. True scans have 50 x 50 rays.
     - `true_grid`: grid on which a procedural object is meshed. The default resolves the thinnest rods (radius 0.04).
     """
@@ -146,7 +146,7 @@ class HeatStudy(Study):
         return Camera(height=self.imagined_rays, width=self.imagined_rays)
 
     def scene(self, index: int) -> Scene:
-        """Return the scene of an object. Its `task` is the point where the object is heated."""
+        """Return the scene with this index. Its `task` is the point where the object is heated."""
         file = self.mesh_file(index)
         if file is None:
             scene = heat_scene(index)
@@ -207,7 +207,7 @@ class HeatStudy(Study):
         return {"reached": fractions, "estimates": estimates}
 
     def scene_picture(self, record: Record, methods: Sequence[str], pixels: int) -> ScenePicture:
-        """Return images of the cloud's visible points, coloured by temperature, over the object in grey."""
+        """Return a picture of the cloud's visible points, coloured by temperature, over the object in grey."""
         scene, runs = self.scene(record["scene"]), record["methods"]
         truth, heat = self.truth(scene), heat_problem(scene)
         rendering = render_mesh(truth.mesh, opposite_direction(record), pixels)

@@ -22,8 +22,8 @@ class Entry(NamedTuple):
     - `question`: the question that the study answers, shown in the help.
     - `scenes`, `views`: default numbers of scenes and views.
     - `model`: default surface model: "known" (with known shapes), or the name of a model without known shapes.
-    - `options`: typer annotations of the settings that only this study has. A setting annotated by a `typer.Argument`
-      must be given. All others default to None.
+    - `options`: typer annotations of the settings that only this study has. A setting with a `typer.Argument` must be
+      given. The others default to None.
     """
 
     study: str

@@ -1,4 +1,4 @@
-"""Measures of classification studies: hits, visible cues, and the quality of samples and values.
+"""Measures of classification studies: correct predictions, visible cues, samples, and values of views.
 
 The cue is the part of an object that tells its class.
 """
@@ -13,24 +13,24 @@ from jaxnbv.checks import AnyArray
 from jaxnbv.sampler import StepInputs, SurfaceSampler
 from jaxnbv.studies.engine.measures import SECONDS, Measure, Record
 
-# A view shows the cue if at least this number of the view's rays hit the cue.
+# A view shows the cue if at least this many of its rays hit the cue.
 CUE_PIXELS = 150
-# Methods whose acquisition is cross-entropy. Their values are comparable.
+# Methods that maximise expected cross-entropy, so that their values can be compared.
 _BY_CROSS_ENTROPY = ("cross-entropy", "halving", "gradient-2dof", "gradient-constrained", "hybrid")
 
 
 def first_hits(correct: Bool[np.ndarray, "runs views"]) -> Bool[np.ndarray, "runs views"]:
-    """Return whether this or an earlier prediction is correct: true from the paper's T_first on."""
+    """Return whether any prediction up to each view is correct. This holds from the paper's T_first on."""
     return np.logical_or.accumulate(correct, axis=1)
 
 
 def stable_hits(correct: Bool[np.ndarray, "runs views"]) -> Bool[np.ndarray, "runs views"]:
-    """Return whether this and all later predictions are correct: true from the paper's T_stable on."""
+    """Return whether all predictions from each view on are correct: true from the paper's T_stable on."""
     return np.logical_and.accumulate(correct[:, ::-1], axis=1)[:, ::-1]
 
 
 def _hit_fraction(hits: Callable) -> Callable[[Record, str], Float[np.ndarray, " views"]]:
-    """Return the measure of the fraction of runs with a hit. Only random search has several runs."""
+    """Return a function that computes the fraction of runs with a hit. Only "random" has several runs."""
 
     def compute(record: Record, method: str) -> Float[np.ndarray, " views"]:
         guesses = np.argmax(record["methods"][method]["log_p"], axis=-1)
@@ -40,7 +40,7 @@ def _hit_fraction(hits: Callable) -> Callable[[Record, str], Float[np.ndarray, "
 
 
 def _cue_seen(record: Record, method: str) -> Float[np.ndarray, " views"] | list:
-    """Return, for each view, the fraction of runs that showed the cue by this view; [] without a cue."""
+    """Return the fraction of runs that have shown the cue by each view; [] for objects without a cue."""
     pixels = record["methods"][method]["pixels"]
     return first_hits(np.array(pixels) >= CUE_PIXELS).mean(axis=0) if pixels else []
 
@@ -53,10 +53,10 @@ def _value(record: Record, method: str) -> dict[int, float]:
 def roughness(sampler: SurfaceSampler, inputs: StepInputs) -> float:
     """Return the roughness of the samples in `inputs`.
 
-    It is the average number of grid cells that a sample's surface crosses, divided by the number of cells that the
-    surface of the posterior mean crosses. The mean is carved like the samples. If it has no closed form, it is the mean
-    of the samples. The roughness is about 1 for samples as smooth as the mean, and rises if the spacing of the data
-    exceeds the kernel's width. If it is near 5, values of an acquisition say little about which view is best.
+    This is the average number of grid cells that a sample's surface crosses, divided by the number of cells that the
+    surface of the posterior mean crosses. The mean is carved like the samples. If it has no closed form, the mean
+    of the samples takes its place. Samples as smooth as the mean have a roughness of about 1. The roughness grows if
+    the data are farther apart than the kernel's width. Near 5, an acquisition says little about which view is best.
     """
     posterior, surfaces = inputs.posterior, inputs.surfaces
     assert posterior is not None
@@ -78,7 +78,7 @@ def crossed_cells(values: Float[np.ndarray, "g g g"]) -> int:
 def rank_correlation(
     values: Float[AnyArray, " c"], true_values: Real[AnyArray, " c"], is_compared: Bool[np.ndarray, " c"]
 ) -> float | None:
-    """Return Spearman's rank correlation over the compared candidates; None if one side is constant."""
+    """Return Spearman's rank correlation over the compared candidates; None if either array is constant."""
     a, b = np.asarray(values)[is_compared], np.asarray(true_values)[is_compared]
     return None if np.ptp(a) == 0 or np.ptp(b) == 0 else float(spearmanr(a, b).statistic)
 

@@ -23,8 +23,8 @@ from jaxnbv.studies.scenes.class_object import ClassMesh, ClassSet, choose_hidde
 from jaxnbv.studies.scenes.splits import scene_key
 from jaxnbv.studies.scenes.truck_meshes import loaded_truck
 
-# Smallest angles from the base's normal, in degrees, of three groups of first views. About 40 %, 40 % and 20 % of the
-# cameras that cannot see the pattern fall into these groups.
+# Scenes are grouped by the angle between the first view and the base's normal. Each group starts at one of these angles
+# (degrees). About 40, 40 and 20 % of the cameras that cannot see the pattern fall into the groups.
 _ANGLES = (0, 110, 140)
 
 
@@ -42,12 +42,12 @@ class PyramidStudy(ClassificationStudy):
 
     @classmethod
     def group(cls, record: Record) -> str:
-        """Return a group name that says in which range the first view's angle from the base's normal lies."""
+        """Return the name of the scene's group, which gives the first view's angle from the base's normal."""
         min_angle = max(angle for angle in _ANGLES if angle <= record["angle"])
         return f"first view at {min_angle:03d}° or more from the base's normal"
 
     def scene_record(self, scene: Scene, truth: Truth, first: int) -> Record:
-        """Return the facts about the scene, with the angle between first view and base's normal in degrees."""
+        """Return the facts about the scene, including the first view's angle from the base's normal (degrees)."""
         direction = np.asarray(self.candidates.poses().position[first])
         # In the pyramid's own frame, the outward normal of the base is -z.
         assert isinstance(truth.class_object, Pyramid)
@@ -56,9 +56,9 @@ class PyramidStudy(ClassificationStudy):
         return super().scene_record(scene, truth, first) | {"angle": float(np.degrees(np.arccos(cosine)))}
 
     def first_view(self, scene: Scene) -> int:
-        """Return the index of a random candidate that hides the pattern but shows enough, see `shows_enough`.
+        """Return the index of a random candidate that hides the pattern but meets `shows_enough`.
 
-        **Raises:** `ValueError` if no candidate shows enough, or if none that shows enough hides the pattern.
+        **Raises:** `ValueError` if no candidate meets both conditions.
         """
         scans = scene.task.scans
         is_enough = [self.shows_enough(scene, scans[index]) for index in range(self.num_candidates)]
@@ -81,8 +81,8 @@ class TruckStudy(ClassificationStudy):
     network: ClassVar[str] = "truck"
     network_points: ClassVar[tuple[int, int]] = (2048, 1024)
     seed: ClassVar[int] = 11
-    # Keep both shipped networks. The network for imagined scans gets the paper's 1,024 points, and the network for true
-    # scans gets 2,048.
+    # Unlike the base class, keep the shipped network for imagined scans. It gets the paper's 1,024 points, and the
+    # network for true scans gets 2,048.
     paper: ClassVar[Mapping[str, Any]] = {**Study.paper, "num_points": 1024}
 
     num_points: int = eqx.field(static=True, default=1024)
@@ -98,8 +98,8 @@ class TruckStudy(ClassificationStudy):
     def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
         """Return the study, under the name "".
 
-        The option `meshes` is a folder with a subfolder `trucks` of truck meshes, and one subfolder per class of cargo,
-        see `class_meshes`.
+        The option `meshes` is a folder. Its subfolder `trucks` holds truck meshes, and it has one more subfolder per
+        class of cargo, see `class_meshes`.
 
         **Raises:** `ValueError` if there is no truck, and whenever `ClassificationStudy.configured` raises it.
         """
@@ -108,7 +108,7 @@ class TruckStudy(ClassificationStudy):
         return super().configured(model, views, quick, **options)
 
     def of_mesh(self, file: MeshFile, index: int) -> ClassMesh:
-        """Return a truck, `trucks[index % len(trucks)]`, that carries the object of a mesh file."""
+        """Return the truck `trucks[index % len(trucks)]`, loaded with the object of a mesh file."""
         truck = self.trucks[index % len(self.trucks)].read()
         return loaded_truck(truck, file.read(), file.label, scene_key(self.seed, self.split, index))
 

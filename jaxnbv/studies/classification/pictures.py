@@ -26,10 +26,10 @@ _BASE_COLOUR, _CUE_COLOUR = np.array([0.68, 0.72, 0.78]), np.array(mpl.colors.to
 def prediction_picture(
     scene: Scene, record: Record, methods: Sequence[str], pixels: int, classes: Sequence[str], cue: str
 ) -> ScenePicture:
-    """Return images of the true surface from each view, with the predicted class and its probability.
+    """Return a picture of the true surface from each view, with the predicted class and its probability.
 
     - `scene`: the scene of the record. Its `task` is a `Truth` of `ClassificationStudy`.
-    - `cue`: name of the part of the object that tells its class, which is tinted; "" for none.
+    - `cue`: name of the part of the object that tells its class; "" for none. The part is tinted.
     """
     runs, truth, camera = record["methods"], record["label"], Camera(height=pixels, width=pixels)
     poses = {method: poses_of(runs[method]) for method in methods}
@@ -48,7 +48,7 @@ def prediction_picture(
 
 
 def _image(scene: Scene, camera: Camera, pose: Pose, is_tinted: bool) -> Float[np.ndarray, "h w 3"]:
-    """Return an image of the scene from a pose, lit from the camera, with or without a tinted cue."""
+    """Return an image of the scene from a pose, lit from the camera; if `is_tinted`, the cue is tinted."""
     cloud = scan(scene.surface, camera, jax.tree.map(jnp.asarray, pose))
     is_on_cue = np.asarray(scene.task.class_object.on_cue(cloud.points)) & is_tinted
     points, normals, is_hit = (np.asarray(array) for array in (cloud.points, cloud.normals, cloud.mask))

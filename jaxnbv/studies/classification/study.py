@@ -38,7 +38,7 @@ from jaxnbv.tasks.classification import AnyClassifier, ClassAcquisition, Classif
 _NUM_RANDOM_RUNS = 8
 OTHERS = ("coverage", *BASELINES)
 _GRADIENT = ("gradient-2dof", "gradient-constrained")
-# Methods without an entry here maximise cross-entropy and differ in their searches. None stands for `Coverage`.
+# Acquisitions of methods; None stands for `Coverage`. All other methods use cross-entropy, each with its own search.
 _ACQUISITIONS: dict[str, type[ClassAcquisition] | None] = {
     **dict.fromkeys(OTHERS),
     "entropy": EntropyReduction,
@@ -50,7 +50,7 @@ class Truth(eqx.Module):
     """The class of a scene's object, and what the candidates show of the object.
 
     - `scans`: noisy scan of the true object from each candidate.
-    - `cue_pixels`: number of rays of each candidate that hit the cue, the part of the object that tells its class.
+    - `cue_pixels`: number of each candidate's rays that hit the cue, the part of the object that tells its class.
     """
 
     label: int
@@ -78,13 +78,13 @@ class ClassificationStudy(Study):
 
     It has the settings of `Study`, and:
 
-    - `classifier`: classifier of clouds in scene coordinates, applied to the cloud after each view.
-    - `imagined_classifier`: classifier applied to the cloud joined with an imagined scan; default: `classifier`. A
-      classifier that gets fewer points saves time.
-    - `framing`: size of the object in the image, which decides how much of the object a view shows.
+    - `classifier`: classifier of the cloud after each view, in scene coordinates.
+    - `imagined_classifier`: classifier of the cloud joined with an imagined scan; default: `classifier`. A classifier
+      that gets fewer points saves time.
+    - `framing`: size of the object in the image, and so how much of the object a view shows.
     - `split`: split from which the scenes come. Tune settings on the validation split.
     - `num_points`: number of points to which the cloud is thinned, once per step, before imagined scans are added.
-    - `first`: condition for first views.
+    - `first`: which first views are allowed.
 
     Class attributes:
 
@@ -92,7 +92,7 @@ class ClassificationStudy(Study):
     - `cue`: name of the part of the object that differs by class, such as "cargo"; "" for the whole object.
     - `network`: name of the shipped classifier.
     - `network_points`: numbers of points that `classifier` and `imagined_classifier` get.
-    - `framings`: framings of which a command makes one study each.
+    - `framings`: framings for which a command makes one study each.
     - `solid`: whether the objects have no thin parts, see `SurfaceSampler.preset`.
     """
 
@@ -144,11 +144,10 @@ class ClassificationStudy(Study):
 
     @classmethod
     def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
-        """Return one study for the option `framing`, or for each of `framings` without this option.
+        """Return one study for each of `framings`, or only for the option `framing` if it is given.
 
-        The keys are the values of the framings, or "" if the class has only one framing.
-
-        - `classifier`: option with the file of a network, see `load_checkpoint`; default: the shipped network.
+        The keys are the values of the framings, or "" if `framings` has only one. The option `classifier` is the file
+        of a network, see `load_checkpoint`; default: the shipped network.
 
         **Raises:** `ValueError` if the network has a different number of classes than the study, and whenever
         `load_checkpoint` raises it.
@@ -187,7 +186,7 @@ class ClassificationStudy(Study):
 
     @classmethod
     def group(cls, record: Record) -> str:
-        """Return a group name that says whether the first view shows the cue; "" if the study has none."""
+        """Return the name of the scene's group: whether the first view shows the cue; "" without a cue."""
         if not cls.cue:
             return ""
         # All methods share the first view.
@@ -195,7 +194,7 @@ class ClassificationStudy(Study):
         return f"first view {'with' if pixels[0][0] else 'without'} {cls.cue}"
 
     def scene(self, index: int) -> Scene:
-        """Return the scene of an object. Its `task` is a `Truth`.
+        """Return the scene with this index. Its `task` is a `Truth`.
 
         **Raises:** `ValueError` if there is no mesh with this index, or if the mesh cannot be read.
         """
@@ -212,7 +211,7 @@ class ClassificationStudy(Study):
         return Scene(index, name, surface_of(class_object), truth)
 
     def of_mesh(self, file: MeshFile, index: int) -> ClassMesh:
-        """Return the object of a mesh file, for the scene with this index."""
+        """Return the object of a mesh file for the scene with this index."""
         return ClassMesh(file.read(), file.label)
 
     def scene_record(self, scene: Scene, truth: Truth, first: int) -> Record:
@@ -242,7 +241,7 @@ class ClassificationStudy(Study):
         return super().search(method, scene)
 
     def sensor(self, scene: Scene) -> Sensor:
-        """Return a sensor whose scan from a candidate is the same for all methods and views."""
+        """Return a sensor that gives the same scan from a candidate in all methods and at all views."""
         base_sensor, poses = super().sensor(scene), self.candidates.poses()
 
         def look(pose, key):
@@ -265,8 +264,8 @@ class ClassificationStudy(Study):
         """Record the classifier's predictions after each view, and measures of each view.
 
         - Each view: the log probabilities of the classes, and the number of the view's rays that hit the cue.
-        - Each proposed view: the `roughness` of the posterior samples with which the view was chosen, and the rank
-          correlation between the candidates' values and the numbers of their rays that hit the cue.
+        - Each proposed view: the `roughness` of the samples from which it was chosen, and the rank correlation between
+          the values of the candidates and how many of their rays hit the cue.
         """
         lists: dict[str, list] = {name: [] for name in ("log_p", "pixels", "rank_correlation", "roughness")}
         for view, _, inputs, _ in episode:

@@ -1,4 +1,4 @@
-"""The chart of a study: its measures by view, one line per method, with intervals over scenes."""
+"""Chart of a study: one panel per measure, and one line per method, with intervals over scenes."""
 
 import io
 import textwrap
@@ -18,13 +18,13 @@ from jaxnbv.viz.style import GREY, INK, LINE
 
 # File in the folder of a study.
 CHART = "chart.png"
-# Offset between methods, as a share of the distance between two columns, so that equal values stay visible.
+# Horizontal offset between methods, as a fraction of the distance between two columns. It keeps equal values apart.
 _DODGE = 0.06
 _PANELS_A_ROW = 3
-# Letters in a line of a panel's title.
+# Largest number of characters in a line of a panel's title.
 _TITLE_WIDTH = 24
-# Colour, line and marker. The palette suits colour-blind readers (Okabe and Ito); lines and markers suit print.
-# The new methods are vermilion. Baselines look the same in every study.
+# Colour, line and marker. Most colours are those of Okabe and Ito, which colour-blind readers can tell apart. Lines and
+# markers are for prints without colour. The main methods are vermilion, and baselines look the same in every study.
 _OURS, _SECOND, _THIRD = ("#d55e00", "-", "o"), ("#cc79a7", "-", "v"), ("#e69f00", "-", "^")
 LOOKS = {
     "cross-entropy": _OURS,
@@ -50,12 +50,12 @@ LOOKS = {
     "random": (GREY, "--", "X"),
     "oracle": (INK, ":", "*"),
 }
-# Looks of the user's methods, in turn.
+# Looks of methods that `LOOKS` does not contain, such as the user's, in turn.
 _OTHERS = (("#8c564b", "-", "p"), ("#7f3fbf", "-", "h"), ("#b8860b", "--", "d"))
 
 
 def chart(table: pd.DataFrame, study: type[Study]) -> bytes:
-    """Draw a table of `results` over all scenes, one panel per measure, and return the PNG file as bytes.
+    """Draw a table of `results` over all scenes, with one panel per measure, and return a PNG file.
 
     Error bars show the bootstrap intervals, because bands of this many methods would overlap.
     """
@@ -99,7 +99,7 @@ def _draw(axes: Axes, rows: pd.DataFrame, measure: Measure, methods: list[str]) 
 
 
 def _look(method: str, index: int) -> dict[str, Any]:
-    """Return arguments of `Axes.errorbar` for a method. Its position decides if it is not in `LOOKS`."""
+    """Return arguments of `Axes.errorbar` for a method. For methods outside `LOOKS`, `index` decides."""
     colour, line, marker = LOOKS.get(method) or _OTHERS[index % len(_OTHERS)]
     width, size = (2.0, 5.5) if (colour, line, marker) == _OURS else (1.2, 4.4)
     bars = {"ecolor": mpl.colors.to_rgba(colour, 0.35), "elinewidth": 2.4}

@@ -22,7 +22,7 @@ _TIMEOUT = 5
 
 
 class Cluster(Executor):
-    """Executor that runs calls on the workers of a Dask scheduler. Each worker runs one call at a time.
+    """Executor that runs calls on the workers of a Dask scheduler, one call at a time on each.
 
     - `address`: address of the scheduler, such as "tcp://HOST:8786".
 
@@ -34,9 +34,9 @@ class Cluster(Executor):
     raise `ValueError` in these cases:
 
     - the scheduler is gone;
-    - a worker runs several calls at a time, or cannot import the function;
-    - a worker's software or number of threads differs from this process;
-    - a worker's device differs from the device of the first worker.
+    - a worker is set to run several calls at a time, or cannot import the function;
+    - a worker's software or number of threads differs from that of this process;
+    - a worker's device differs from that of the first worker.
     """
 
     def __init__(self, address: str):
@@ -72,21 +72,21 @@ class Cluster(Executor):
             raise
 
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future:
-        """Run a call on a worker, and return its future. Consecutive calls of one function send it once."""
+        """Run a call on a worker, and return its future. Consecutive calls of a function send it only once."""
         require(self._client.status == "running", self._lost)
         if function is not self._pickled[0]:
             # Pickle the function here, so that a worker compares versions before it imports the function's modules.
             content = optional("cloudpickle").dumps(function)
             self._pickled = function, self._client.submit(bytes, content, pure=False)
         task = self._client.submit(
-            # A lambda is pickled as code. So the scheduler needs no jaxnbv, and a worker without it can say so.
+            # A lambda is pickled as code, so the scheduler needs no jaxnbv. A worker without jaxnbv can report that.
             lambda *values: importlib.import_module("jaxnbv.studies.engine.cluster")._call(*values),
             self._pickled[1],
             self._versions,
             self._blas_threads,
             args,
             kwargs,
-            # Run calls in their order. Without a priority, Dask ignores the order of calls within a tenth of a second.
+            # Run calls in order. Without a priority, Dask may reorder calls that arrive within a tenth of a second.
             priority=-next(self._count),
             pure=False,
         )

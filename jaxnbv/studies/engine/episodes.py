@@ -1,4 +1,4 @@
-"""Functions that run and record an episode, and read its poses from the record."""
+"""Functions that run an episode, record it, and read its poses from the record."""
 
 import itertools
 from collections.abc import Callable, Iterator

@@ -9,7 +9,7 @@ from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.studies.engine.measures import KNOWN
 from jaxnbv.surfaces import KnownShapes, ShapeBank, Upright, bank_poses, shape_bank
 
-# Largest number of characters of a mesh's name in a shape's name, which also holds the index of the mesh.
+# A shape's name is the name of its mesh, cut to this number of characters, and the index of the mesh.
 _MAX_NAME_LENGTH = 50
 
 
@@ -25,7 +25,7 @@ def study_sampler(
 
     - `model`: name of a preset, or "known".
     - `bank`: name of a shipped bank of known shapes; "" for none.
-    - `files`: meshes to use as known shapes in place of `bank`. The shapes stay upright, with free proportions.
+    - `files`: meshes to use as known shapes in place of `bank`. They stay upright, and their proportions may vary.
     - `longest_side`, `quick`, `solid`: arguments of `SurfaceSampler.preset`.
 
     **Raises:** `ValueError` for an unknown model, or for "known" with neither meshes nor a bank.
@@ -42,7 +42,7 @@ def study_sampler(
 
 
 def keep_shapes(sampler: SurfaceSampler, is_selected: Callable[[str], bool]) -> SurfaceSampler:
-    """Return the sampler with only those known shapes, if it has any, whose names are selected."""
+    """Return the sampler with only the known shapes whose names are selected, if it has known shapes."""
     model = sampler.model
     if not isinstance(model, KnownShapes):
         return sampler
@@ -53,7 +53,7 @@ def keep_shapes(sampler: SurfaceSampler, is_selected: Callable[[str], bool]) -> 
 
 
 def without_own_shape(sampler: SurfaceSampler, files: Sequence[MeshFile], index: int) -> SurfaceSampler:
-    """Return the sampler without the known shape, if it has one, of the mesh `files[index]`."""
+    """Return the sampler without the known shape of the mesh `files[index]`, if it has this shape."""
     return keep_shapes(sampler, lambda name: name != _name(files, index))
 
 

@@ -25,7 +25,7 @@ class Chapter(NamedTuple):
     """The section about one study on the HTML page.
 
     - `scenes`: number of scenes; `facts`: sentences on times and versions.
-    - `explanation`: text that explains the measures and the cells of the tables.
+    - `explanation`: text about the measures and the cells of the tables.
     - `tables`: titles and HTML of the tables, for each group of scenes.
     - `images`: names and PNG content of the chart, drawn from the records, and of the pictures in the study's folder.
     - `settings`: settings of the study as JSON.
@@ -92,10 +92,9 @@ def _kinds() -> dict[str, type[Study]]:
 
 
 def _chapter(path: Path, name: str, record: dict[str, Any], kind: type[Study]) -> Chapter:
-    """Return the chapter of a study.
+    """Return the chapter of the study in the folder `path`.
 
-    - `path`: its folder.
-    - `name`: name that distinguishes it from others of its kind; empty for the only one.
+    `name` tells studies of one class apart. It is empty if there is only one.
     """
     records = read_records(path)
     table = results(records, kind)

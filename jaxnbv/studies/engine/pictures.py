@@ -18,7 +18,7 @@ from jaxnbv.viz.style import LINE, draw_border, save_figure
 
 # Inches: size of a tile, and the margins beside and above the grid.
 _TILE_SIZE, _SIDE_MARGIN, _TOP_MARGIN = (1.75, 1.95), 0.35, 0.75
-# Largest number of tiles in a row if there is one tile per method, and the least width of such a picture, in tiles.
+# Pictures with one tile per method: largest number of tiles in a row, and smallest width of the picture in tiles.
 _MAX_TILES_PER_ROW, _MIN_WIDTH = 5, 3
 
 
@@ -84,7 +84,7 @@ def _draw_one_tile_per_method(picture: ScenePicture, title: str, methods: Sequen
 def _empty_tiles(
     picture: ScenePicture, title: str, num_rows: int, num_columns: int, min_width: int = 1
 ) -> tuple[Figure, np.ndarray]:
-    """Return a figure with title, caption, legend and colour bar, and its grid of tiles, which are empty."""
+    """Return a figure with title, caption, legend and colour bar, and its grid of empty tiles."""
     size = (
         max(num_columns, min_width) * _TILE_SIZE[0] + _SIDE_MARGIN * (3 if picture.scale else 1),
         num_rows * _TILE_SIZE[1] + _TOP_MARGIN,

@@ -21,7 +21,7 @@ class Processes(Executor):
 
     The processes share the machine's cores evenly. They end when this process ends. If a process dies during a call,
     for example from lack of memory, the call runs again in a new process. If the new process dies too, the future
-    raises `BrokenExecutor`. An error that leaves a `with` block kills running calls.
+    raises `BrokenExecutor`. If an error ends a `with` block, running calls are killed.
     """
 
     def __init__(self, workers: int):
@@ -35,7 +35,7 @@ class Processes(Executor):
         self._lock, self._is_closed = threading.Lock(), False
 
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future:
-        """Run a call, which cloudpickle pickles, in one of the processes, and return its future."""
+        """Pickle a call by cloudpickle, run it in one of the processes, and return its future."""
         return self._threads.submit(self._call, function, args, kwargs)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
@@ -85,7 +85,7 @@ class Processes(Executor):
 
 
 def _end_with(parent: int) -> None:
-    """Start a thread that ends this process when its `parent` (process id) is gone, even if it was killed."""
+    """Start a thread that ends this process once its `parent` (process id) ends or is killed."""
 
     def watch() -> None:
         while os.getppid() == parent:

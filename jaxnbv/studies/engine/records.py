@@ -26,7 +26,7 @@ _NO_ARRAYS: Mapping[str, np.ndarray] = MappingProxyType({})
 
 
 class RecordFolder(ResultFolder):
-    """A folder with one record per scene, all of one configuration, which is stored in study.json.
+    """A folder with one record per scene, all with the same configuration, which study.json holds.
 
     - `config`, `arrays`: the configuration as JSON, and its large arrays, see `jaxnbv.storage.describe`.
     - `executor`: an executor with the interface of `concurrent.futures`, such as `Processes(8)` or a `Cluster`, that
@@ -48,10 +48,10 @@ class RecordFolder(ResultFolder):
         super().__init__(path, config, arrays)
 
     def collect(self, scenes: Sequence[int], run: Trial, progress: bool = True) -> list[Record]:
-        """Run the scenes that have no record yet, and return the records of all `scenes` in order.
+        """Run the scenes that have no record yet, and return the records of all `scenes` in order of index.
 
         `run` takes the index of a scene and returns its record, which is written at once. If `run` fails for a scene,
-        `failures` returns the error, and the next call of `collect` runs the scene again.
+        the scene has no record, `failures` returns the error, and the next call of `collect` runs the scene again.
 
         **Raises:** `ValueError` if a record is damaged, or if another process is writing in the folder.
         """
@@ -113,7 +113,7 @@ class RecordFolder(ResultFolder):
 
     def _write(self, index: int, record: Record) -> Record:
         """Write a record, and return it as `_read` would."""
-        # Turn number keys into text, as the file does, because the checksum depends on the order of sorted keys.
+        # JSON turns keys that are numbers into text, which sorts differently. So convert them before the checksum.
         record = json.loads(json.dumps(record))
         self.bind()
         content = {"format": _FORMAT, "index": index, "sha256": _checksum(index, record), "record": record}

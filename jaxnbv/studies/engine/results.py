@@ -20,11 +20,10 @@ _POSITIONS = ("ahead of", "level with", "behind")
 def results(records: Sequence[Record], study: type[Study]) -> pd.DataFrame:
     """Compute the statistics of all measures, one row per group of scenes, measure, key and method.
 
-    The column `at` holds the key: the view, or what else the measure's values belong to. Each row holds the method's
-    mean over the scenes, the standard error of the mean, and the bootstrap interval of the mean (`low`, `high`). The
-    `lead` is the mean over the scenes of the reference method's value minus this method's, and `lead_low` and
-    `lead_high` are its bootstrap interval. A method without values has no row. A scene counts only if it has a value
-    for every method that has a row.
+    The column `at` holds the key: a view, or another key of the measure. Each row holds the method's mean over the
+    scenes, the standard error of the mean, and the bootstrap interval of the mean (`low`, `high`). The `lead` is the
+    mean over the scenes of the reference method's value minus this method's, and `lead_low` and `lead_high` are its
+    bootstrap interval. A method without values has no row. A scene counts only if all methods with a row have a value.
 
     **Raises:** `ValueError` if there are no records.
     """
@@ -62,7 +61,7 @@ def _statistics(values: pd.DataFrame, reference: str) -> pd.DataFrame:
 
 
 def interval(values: Float[np.ndarray, "scenes columns"]) -> Float[np.ndarray, "2 columns"]:
-    """Return lower and upper ends of Efron's percentile bootstrap interval for the mean of each column.
+    """Return both ends of Efron's percentile bootstrap interval (of level `LEVEL`) for each column's mean.
 
     Scenes are drawn with replacement, and all columns use the same draws. For one scene, the interval has width zero.
     """
@@ -79,10 +78,10 @@ def groups_of(table: pd.DataFrame) -> dict[str, int]:
 
 
 def tables(table: pd.DataFrame, study: type[Study], group: str = _ALL) -> list[tuple[str, pd.DataFrame]]:
-    """Return two tables of text per measure, each as a title and a data frame, from `results`.
+    """Return two tables of formatted text for each measure, each as a title and a data frame.
 
-    Rows are methods, and columns are views or other keys. The first table has the means of the methods. The second has
-    the leads: the reference's mean minus another method's. A table without rows is left out.
+    `table` comes from `results`. Rows are methods, and columns are views or other keys. The first table has the means
+    of the methods. The second has the leads: the reference's mean minus another method's. Empty tables are left out.
     """
     texts = []
     for measure in study.measures:
@@ -104,7 +103,7 @@ def tables(table: pd.DataFrame, study: type[Study], group: str = _ALL) -> list[t
 
 
 def _means(rows: pd.DataFrame, measure: Measure, best: pd.Series) -> list[str]:
-    """Format means with their interval (if in percent) or standard error. A star marks the best."""
+    """Format means, with intervals if in percent, else with standard errors. A star marks the best mean."""
     texts = []
     for row, star in zip(rows.itertuples(), best, strict=True):
         if measure.unit == "%":
@@ -126,7 +125,7 @@ def _leads(rows: pd.DataFrame, measure: Measure) -> list[str]:
 
 
 def _star(is_marked: bool) -> str:
-    """Return a star, or a space that keeps the digits of right-aligned cells below one another."""
+    """Return a star, or a space of the same width, so that right-aligned digits stay below one another."""
     return "*" if is_marked else " "
 
 
@@ -150,7 +149,7 @@ def table_legend(study: type[Study]) -> str:
 class Verdict(NamedTuple):
     """Result of the check of one claim.
 
-    - `num_methods`, `num_held`: number of compared methods, and for how many of them the claim holds.
+    - `num_methods`: number of methods compared with the reference; `num_held`: how many of them the claim holds for.
     - `sentence`: text that lists the methods that the reference is ahead of, level with or behind.
     """
 
@@ -161,10 +160,10 @@ class Verdict(NamedTuple):
 
 
 def verdicts(table: pd.DataFrame, study: type[Study]) -> list[Verdict]:
-    """Check each claim over all scenes by comparing the reference with the claim's methods.
+    """Check each claim: over all scenes, compare the study's reference with the methods of the claim.
 
-    The comparison includes runs of these methods without known shapes. The reference is "level with" a method if the
-    interval of its lead includes zero. A claim is left out if none of its methods was run.
+    Runs of these methods without known shapes are compared too. The reference is "level with" a method if the interval
+    of its lead includes zero. A claim is left out if none of its methods was run.
     """
     checks = []
     for claim in study.claims:

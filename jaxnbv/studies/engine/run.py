@@ -1,4 +1,4 @@
-"""Functions that run the methods of a study on a scene, load stored studies, and replay views."""
+"""Functions that run a study's methods on a scene, load stored studies, and recompute scans."""
 
 import functools
 import time
@@ -26,8 +26,8 @@ def run_scene(
 ) -> Record:
     """Run all methods on one scene and return the record, from which tables and figures are made.
 
-    All methods share the first view, which is drawn from the candidates that show enough of the object. The methods
-    also share the sensor noise and the prior samples at each view.
+    All methods share the first view, which `Study.first_view` chooses, and the sensor noise and the prior samples at
+    each view.
 
     - `methods`: names of the study's methods to run; default: `Study.methods`.
     - `own`: the user's methods by name. Each is a function that makes the planner for a scene.
@@ -59,7 +59,7 @@ def load_study(folder: str | Path) -> tuple[Study, list[Record]]:
 
     **Raises:** `ValueError` if the folder holds no study, or if the study or a record is damaged.
     """
-    # Replace the names of methods in the file by None, because they are settings of the run and not of the study.
+    # Replace the names of methods by None, because they are settings of the run and not of the study.
     config = read_config(folder, "study", RecordFolder.format, {"methods": None, "own": None})
     return config["study"], read_records(folder)
 
@@ -99,7 +99,7 @@ def _user_planner(study: Study, scene: Scene, name: str, make: Factory) -> Plann
 
 
 def replay(study: Study, scene: Scene, run: Record) -> list[tuple[PointCloud, Observations]]:
-    """Recompute each scan and the observations after each scan from the poses in `run`, a method's record."""
+    """Return each scan and the observations after it, computed again from a method's record `run`."""
     # Observations depend only on the capacity and the carving of a planner, which are the same for all methods.
     planner, sensor = study.planner(study.methods[0], scene), study.sensor(scene)
     keys = [view_keys(study.key(scene.index, "episode"), index)[2] for index in range(len(run["views"]))]

@@ -13,7 +13,7 @@ _OVER_CANDIDATES: dict[str, Callable[..., Search]] = {
     "random": search.RandomView,
     "halving": search.HalvingSearch,
 }
-# Gradient search over free poses drifts to views that miss the object, as the paper found. Constrained poses keep the
+# The paper found that gradient search over free poses drifts to views that miss the object. Constrained poses keep the
 # object in view.
 _SPACES: dict[str, Callable[[float], PoseSpace]] = {
     "gradient-2dof": search.SpherePoses,
@@ -33,10 +33,9 @@ def search_of(
 ) -> Search:
     """Return the search named by a method, such as `RandomView` for "random".
 
-    Any other name gives `DiscreteSearch` over all candidates. A gradient search scores half of `num_candidates` poses,
-    and then follows the gradient from the best `num_starts` of them.
-
-    - `radius`: distance of the cameras from the scene's origin, in scene units.
+    An unknown name gives `DiscreteSearch` over all candidates. A gradient search scores half of `num_candidates` poses,
+    and then follows the gradient from the best `num_starts` of them. "hybrid" scores all candidates, and ignores
+    `num_starts`, `iterations` and `learning_rate`. `radius` is the cameras' distance from the origin, in scene units.
     """
     if method in _SPACES:
         settings = num_starts, iterations, learning_rate, max(num_candidates // 2, num_starts)

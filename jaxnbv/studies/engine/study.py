@@ -49,11 +49,11 @@ class Study(eqx.Module):
     A new study defines the abstract members. Settings:
 
     - `views`: number of views, including the first.
-    - `num_candidates`: number of candidate poses on the sphere of `radius` (scene units). Gradient searches score half
-      of this number before they follow the gradient.
+    - `num_candidates`: number of candidate poses on the sphere of `radius` (scene units). Gradient searches start from
+      the best poses among half of this number.
     - `sampler`, `capacity`: sampler of surfaces, and largest number of points of the cloud, as in `Planner`.
-    - `num_samples`, `grid_resolution`: number of samples, and nodes of the grid along each axis, which replace the
-      sampler's own.
+    - `num_samples`, `grid_resolution`: number of samples, and of the grid's nodes along each axis. Both replace the
+      sampler's own settings.
     - `camera`: camera of the sensor. Imagined scans may have fewer rays, see `imagined_camera`.
     - `num_starts`, `iterations`, `learning_rate`: starting poses, steps and learning rate of gradient searches.
     - `meshes`: mesh files, one per scene. Without mesh files, the scenes are procedural.
@@ -125,7 +125,7 @@ class Study(eqx.Module):
 
     @classmethod
     def configured(cls, model: str, views: int, quick: bool, **options: Any) -> "dict[str, Study]":
-        """Return the studies that one command runs, by the names of their subfolders ("" for a single study).
+        """Return the studies that one command runs. Keys are names of subfolders, or "" for a single study.
 
         - `model`: name of the surface model. With the model `known` and `meshes`, the bank of each scene holds all
           meshes except the scene's own.
@@ -172,7 +172,7 @@ class Study(eqx.Module):
 
     @abstractmethod
     def acquisition(self, method: str, scene: Scene) -> Acquisition:
-        """Return a method's acquisition. If its pytree structure is one for all scenes, it is compiled once."""
+        """Return a method's acquisition. Give it the same pytree structure for all scenes to compile it once."""
 
     def search(self, method: str, scene: Scene) -> Search:
         """Return the search of a method, see `search_of`."""
@@ -209,7 +209,7 @@ class Study(eqx.Module):
     def scene_picture(self, record: Record, methods: Sequence[str], pixels: int) -> ScenePicture | None:
         """Return the picture of a scene as a grid of small images; None if the study has no pictures.
 
-        - `methods`: methods to show, one row each; `pixels`: width and height of each image.
+        - `methods`: methods to show, one per row; `pixels`: width and height of each image.
         """
         return None
 
@@ -223,7 +223,7 @@ class Study(eqx.Module):
 
     @classmethod
     def group(cls, record: Record) -> str:
-        """Return the name of the record's group of scenes, which has its own tables, or "" for no group."""
+        """Return the name of the group to which the scene belongs; "" for none. Each group has its own tables."""
         return ""
 
     @property
@@ -253,7 +253,7 @@ class Study(eqx.Module):
         return Planner(*settings, capacity=self.capacity, max_views=self.views)
 
     def key(self, index: int, purpose: str) -> PRNGKeyArray:
-        """Return the random key for a purpose in a scene, which depends only on both and on the study's seed.
+        """Return a random key that depends only on the study's seed, the scene's index and the purpose.
 
         - `purpose`: "first" (first view), "episode", "scene" or "measure".
         """

@@ -17,8 +17,8 @@ from jaxnbv.viz.render import Still
 from jaxnbv.viz.style import GREY
 
 _CORRECT_COLOUR = "#00734f"
-# Longest edge of the triangles in a rendered image (short, because vertices have the colours), and radius of the ball
-# that the image shows, in scene units.
+# In scene units: longest edge of the triangles in a rendered image (short, because colours are given at vertices), and
+# radius of the ball that the image shows.
 _MAX_EDGE, _IMAGE_RADIUS = 0.05, 1.6
 
 
@@ -42,13 +42,13 @@ class ScenePicture(NamedTuple):
 
 
 def caption_tile(axes: Axes, text: str, is_correct: bool = False) -> None:
-    """Write a line of text below a tile. If `is_correct`, it is bold and green, with a tick."""
+    """Write a line of text below a tile, in bold green with a tick if `is_correct`."""
     colour, weight = (_CORRECT_COLOUR, "bold") if is_correct else (GREY, "normal")
     axes.set_xlabel(f"{'✓ ' if is_correct else ''}{text}", fontsize=9, color=colour, fontweight=weight)
 
 
 def opposite_direction(record: Record) -> Float[np.ndarray, "3"]:
-    """Return a direction opposite the first view, which all methods share, but sloping upwards."""
+    """Return a direction horizontally opposite to the first view's camera, and upwards (not normalised)."""
     run = next(iter(record["methods"].values()))
     position = np.asarray(run["views"][0]["position"])
     direction = -position[[0, 2]]
@@ -66,8 +66,8 @@ def render_mesh(
 ) -> Still:
     """Render a mesh, seen from the direction `eye`, in an image of `size` x `size` pixels.
 
-    - `value`: function that returns a value for each point, which colours the surface by the scale `norm`; default: one
-      colour. Values below 1e-6 count as 1e-6.
+    - `value`: function from points to values, which colour the surface on the scale `norm`; default: one colour. Values
+      below 1e-6 count as 1e-6.
     """
     vertices, faces = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, _MAX_EDGE, max_iter=12)
     fine = trimesh.Trimesh(vertices, faces)
@@ -79,7 +79,7 @@ def render_mesh(
 def draw_on(
     axes: Axes, rendering: Still, points: Float[np.ndarray, "n 3"], colours: Float[np.ndarray, "n channels"]
 ) -> None:
-    """Draw a rendered image and the points that its surface does not hide. Near points cover far ones."""
+    """Draw a rendered image, and on it the points (scene coordinates) that its surface does not hide."""
     axes.imshow(rendering.image, interpolation="antialiased", zorder=1)
     pixels, in_front = rendering.project(points)
     depth = (points - np.asarray(rendering.pose.position)) @ np.asarray(rendering.pose.forward)

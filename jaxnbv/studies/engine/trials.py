@@ -23,7 +23,7 @@ Outcomes: TypeAlias = Generator[tuple[int, Outcome], None, None]
 
 
 def outcomes(trial: Trial, indices: Sequence[int], executor: Executor | None = None) -> Outcomes:
-    """Run trials on the scenes with these indices, and yield index and outcome when a trial ends.
+    """Run a trial on each scene in `indices`, and yield the index and the outcome when it ends.
 
     The outcome is the trial's record, or a `Failure` if the trial raises an error or its process dies (the executor
     raises `BrokenExecutor`). Other errors of the executor are raised. Closing the generator cancels the trials that
