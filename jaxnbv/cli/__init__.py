@@ -1,4 +1,4 @@
-"""The command line. Its commands are the entry points of the group `jaxnbv.commands`: typer functions or apps."""
+"""The command line. Its commands are the entry points of the group `jaxnbv.commands`, typer functions or apps."""
 
 import sys
 from importlib.metadata import EntryPoint, entry_points
@@ -43,7 +43,7 @@ def _options(
         bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
     ] = False,
 ) -> None:
-    """Options of `jaxnbv` itself."""
+    """Keep compiled programs on disk, before any command runs."""
     try:
         keep_compiled()
     except InputError as error:
@@ -57,7 +57,7 @@ def _is_own(point: EntryPoint) -> bool:
 def _add_commands() -> None:
     """Add the commands of this package, then the commands of other packages.
 
-    A command of a different package is skipped if this package has a command of the same name.
+    If both have a command of the same name, that of the other package is skipped.
     """
     named = {point.name: point for point in sorted(entry_points(group="jaxnbv.commands"), key=_is_own)}
     for point in sorted(named.values(), key=lambda point: (not _is_own(point), point.name)):
@@ -67,7 +67,7 @@ def _add_commands() -> None:
                 app.add_typer(loaded, name=point.name)
             else:
                 app.command(point.name, cls=Command)(loaded)
-        # The module of another package can raise any error when it is imported.
+        # Importing a module of another package can raise any error.
         except (Exception, SystemExit) as error:
             package = point.dist.name if point.dist else point.module
             reason = " ".join(f"{type(error).__name__}: {error}".split())

@@ -1,4 +1,4 @@
-"""Background threads that do not keep the process from ending."""
+"""Calls in background threads. A process that ends does not wait for them."""
 
 import os
 import sys
@@ -20,13 +20,13 @@ def in_background(function: Callable[..., Any], *arguments: Any, **settings: Any
         except BaseException as error:
             future.set_exception(error)
 
-    # Use a daemon thread: at its end a process waits for the threads of an executor, but not for daemon threads.
+    # A process that ends waits for the threads of an executor, but not for daemon threads.
     threading.Thread(target=call, name=_NAME, daemon=True).start()
     return future
 
 
 def is_working() -> bool:
-    """Return whether a call of `in_background` still runs."""
+    """Return whether a call that `in_background` started is still running."""
     return any(thread.name == _NAME for thread in threading.enumerate())
 
 

@@ -73,7 +73,7 @@ class EpisodeOptions:
             show_default="in direction 0.8 0.9 2.2, at the candidates' distance; demo: a view that hides the answer",
         ),
     ] = None
-    noise: Annotated[float, sensor_option(metavar="X", help="Standard deviation of points and normals.")] = 0.01
+    noise: Annotated[float, sensor_option(metavar="X", help="Standard deviation of the noise.")] = 0.01
     model: Annotated[str, sampler_option(**one_of(MODELS, "MODEL"))] = "screened"
     known: KnownOption = None
     search: SearchOption

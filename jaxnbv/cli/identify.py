@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from jaxnbv.surfaces.part_pose import ObjectPose
 
 _NUM_NAMES, _BAR_WIDTH = 4, 24
-# A frame with fewer points than this in the box shows no object.
+# A frame shows no object if fewer of its points than this are in the box.
 _MIN_POINTS = 20
 _NO_FOLDER = (
     "is a file: identify needs depth images with the poses of the camera, since the empty space along rays also tells "
@@ -42,7 +42,7 @@ class IdentifyOptions:
             metavar="UNIT", help="Unit of the parts: mm, cm, m, in or ft if poses are in metres, else a number."
         ),
     ] = "m"
-    upright: Annotated[bool, task_option("--upright", help="The object stands as its part's mesh does.")] = False
+    upright: Annotated[bool, task_option("--upright", help="The object stands upright, like its mesh.")] = False
     parts_up: Annotated[str, task_option(metavar="AXIS", help="Upward axis of the parts, for --upright.")] = "y"
     views: Annotated[int, task_option(metavar="N", min=1, help="Number of frames to use, evenly spaced.")] = 8
     until: Annotated[
@@ -78,7 +78,7 @@ class IdentifyOptions:
 
 @command(IdentifyOptions, {name: RECORDING[name] for name in ("box", "intrinsics", "depth_scale")})
 def identify(options: IdentifyOptions, box: Any, intrinsics: Any, depth_scale: Any) -> None:
-    """Find out which part of a folder was recorded, and where it lies.
+    """Find out which of the parts in a folder was recorded, and where it lies.
 
     Prints the parts' names with probabilities after each frame, then the pose in the recording's world. With --several
     or --masks it prints both for each object. Nothing is trained. A part is a mesh at its true size. The answer can
@@ -143,7 +143,7 @@ def identify(options: IdentifyOptions, box: Any, intrinsics: Any, depth_scale: A
 
 
 def _shows(frames: "nbv.readers.RecordedFrames", index: int, corners: "np.ndarray") -> bool:
-    """Return whether a frame shows at least `_MIN_POINTS` points in a box."""
+    """Return whether a frame shows at least `_MIN_POINTS` points in a box, given two corners in world coordinates."""
     import numpy as np
 
     from jaxnbv.planning.images import Image
@@ -155,7 +155,7 @@ def _shows(frames: "nbv.readers.RecordedFrames", index: int, corners: "np.ndarra
 
 
 def _objects(sessions: Any, names: dict[int, str]) -> "dict[str, nbv.Session]":
-    """Return the session of each object, keyed by the object's name. The name of a single object is ""."""
+    """Return the session of each object, keyed by the object's name. The name is "" if there is only one object."""
     objects = getattr(sessions, "objects", None)
     if objects is None:
         return {"": sessions}
@@ -181,7 +181,7 @@ def _print_answer(name: str, session: "nbv.Session", unit: str | None) -> dict[s
 
 
 def pose_text(pose: "ObjectPose", unit: str) -> str:
-    """Return lines of text with the pose of a part and its standard deviations. `unit`: unit of the world."""
+    """Return the pose of a part and its standard deviations as text. `unit`: the world's unit of length."""
     import numpy as np
 
     angle, shift = np.sqrt(np.diag(pose.covariance)).reshape(2, 3).max(axis=1).tolist()

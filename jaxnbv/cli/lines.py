@@ -1,4 +1,4 @@
-"""Prints lines on the terminal about each finished view of an episode."""
+"""Prints each finished view of an episode on the terminal."""
 
 import sys
 
@@ -12,7 +12,7 @@ from jaxnbv.viz.answers import label_of, number_text, words_of
 
 
 class ViewPrinter:
-    """Prints two lines of at most 100 columns for each view: position and choice, then the answer."""
+    """Prints two lines about each view: position, points and why it was chosen, then the answer."""
 
     def __init__(self, planner: Planner):
         self.planner, self.count = planner, 0
@@ -37,7 +37,7 @@ def _print(line: str) -> None:
 
 
 def _choice_text(planner: Planner, view: View) -> str:
-    """Return why a view was chosen, as text: its value, and the rank of this value among the candidates."""
+    """Return the reason for choosing a view as text: its value, and the rank of this value among the candidates."""
     if view.proposal is None:
         return "given"
     value, values = float(view.proposal.value), np.asarray(view.proposal.values, np.float64)

@@ -15,7 +15,7 @@ from jaxnbv.errors import suggestion
 Position: TypeAlias = tuple[float, float, float]
 T = TypeVar("T")
 
-# A kind of option for each group of options in the help.
+# Each of these functions makes options of one group in the help.
 task_option = partial(typer.Option, rich_help_panel="Task")
 sensor_option = partial(typer.Option, rich_help_panel="Sensor")
 sampler_option = partial(typer.Option, rich_help_panel="Imagined surfaces")
@@ -25,15 +25,17 @@ planner_option = partial(typer.Option, rich_help_panel="Planner")
 
 
 def help_sentence(choices: Iterable[tuple[str, str]]) -> str:
-    """Join names and their meanings to one sentence, "name: meaning; ...", for the help."""
+    """Join names and their meanings into one sentence, "name: meaning; ...", for the help."""
     return "; ".join(f"{name}: {about}" for name, about in choices) + "."
 
 
 def one_of(choices: Mapping[str, str], metavar: str, about: str = "") -> dict[str, Any]:
-    """Make the settings of an option that takes one of these names. Its error suggests a similar name.
+    """Return arguments for `typer.Option`, so that the option accepts only the names in `choices`.
+
+    The error for any other name suggests a similar one.
 
     - `choices`: meanings for the help, keyed by name.
-    - `about`: sentence before these in the help.
+    - `about`: sentence that precedes the meanings in the help.
     """
 
     def parse(text: str) -> str:
@@ -48,8 +50,8 @@ def command(options: type[T], more: Mapping[str, Any] = {}) -> Callable[[Callabl
     """Decorator: make a typer command from a function whose first argument is a dataclass of options.
 
     - `options`: the dataclass. Its fields become options of the command.
-    - `more`: annotations of further options, keyed by name. Their values are passed as keyword arguments, with None for
-      an option without a value. A `typer.Argument` is required.
+    - `more`: annotations of further options, keyed by name. The function gets their values as keyword arguments, None
+      if the user gives no value. The user must give a value for a `typer.Argument`.
     """
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
@@ -76,11 +78,11 @@ def command(options: type[T], more: Mapping[str, Any] = {}) -> Callable[[Callabl
 class Command(TyperCommand):
     """A command that reads `--option A B` as `--option A --option B` if the option's metavar ends in dots.
 
-    An option can then be given a pattern of files, which a shell expands to several words.
+    A user can then give such an option a file pattern, which the shell expands to several words.
     """
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the words of a command and return the remaining words, as in click."""
+        """Parse the words of a command and return those that remain, as click's method does."""
         repeated = {flag for one in self.params if str(one.metavar).endswith("...") for flag in one.opts}
         words: list[str] = []
         flag = None

@@ -1,4 +1,4 @@
-"""Simulates the episode of a command: makes the planner, runs a baseline to compare, writes results and drawings."""
+"""Simulates an episode for a command: makes the planner, runs a baseline for comparison, and writes the results."""
 
 import dataclasses
 import functools
@@ -43,8 +43,9 @@ from jaxnbv.viz.task import rival_text
 
 
 class Sizes(NamedTuple):
-    """Sizes of a planner; None for those of the task.
+    """Sizes of a planner. A size of None is replaced by that of the task.
 
+    - `samples`, `candidates`: number of posterior samples, and number of candidate poses.
     - `capacity`: number of points to keep in the cloud.
     - `rays`: number of rays along each side of an image.
     """
@@ -63,7 +64,7 @@ _MAX_RIVAL_VIEWS = 10
 
 
 def stop_rule_of(texts: Sequence[str]) -> StopRule | None:
-    """Make a rule that holds when a rule in the texts, such as "sure=0.95", holds; None for "never".
+    """Return a rule that holds once any rule such as "sure=0.95" holds. None for no rules or "never".
 
     **Raises:** `ValueError` if a name is unknown, or if a value is not a number or out of range.
     """
@@ -89,7 +90,7 @@ def search_of(name: str, radius: float, count: int) -> Search:
 
 
 def sampler_of(model: str, quick: bool, bank: str | ShapeBank | None) -> SurfaceSampler:
-    """Make the sampler of imagined surfaces, with a bank of known shapes if given.
+    """Make the sampler of imagined surfaces, with or without a bank of known shapes.
 
     - `bank`: name of a shipped bank, a folder of upright meshes, or a bank of parts in any rotation. None or "none"
       for no bank.
@@ -121,7 +122,7 @@ def planner_of(
 
 
 def first_pose(place: Position, surface: Surface) -> Pose:
-    """Return the pose of a first view, which looks at the origin.
+    """Return the pose of a first view that looks from a place (scene coordinates) at the origin.
 
     **Raises:** `ValueError` for a position inside the object.
     """
@@ -131,9 +132,9 @@ def first_pose(place: Position, surface: Surface) -> Pose:
 
 
 def check_options(options: EpisodeOptions, until: Sequence[str] = ()) -> StopRule | None:
-    """Check options that would otherwise fail only after the object and the known shapes were made.
+    """Check options early, before the object and the known shapes are made. Return the stop rule.
 
-    Returns the stop rule. `until` is the default of `--until`.
+    - `until`: default of `--until`.
 
     **Raises:** `ValueError` for fewer than one view, an invalid stop rule, or known shapes for the paper's model.
     """
@@ -156,8 +157,8 @@ def run_episode(
 ) -> None:
     """Simulate an episode, print each view when it is finished, and write the episode and a report.
 
-    - `sizes`: sizes of the planner, unless `--quick` replaces them.
-    - `has_rival`: whether to run the baseline farthest view from the same first view, if there is a stop rule.
+    - `sizes`: sizes of the planner. With `--quick`, `QUICK` replaces them.
+    - `has_rival`: whether to also run farthest view, a baseline, from the same first view. It needs a stop rule.
     """
     start_time = time.perf_counter()
     if options.quick:
@@ -187,7 +188,7 @@ def run_episode(
             if sketch_run is not None:
                 sketch_run.result()
             sketch_run = in_background(sketches.add, step)
-        # Start the baseline only after the first view. Before, both threads would compile the same programs.
+        # Start the baseline only after the first view. Earlier, both threads would compile the same programs.
         if rival_run is None and has_rival:
             rival_settings = subject.surface, subject.first, _MAX_RIVAL_VIEWS, key, noise, folder / "farthest"
             rival_run = in_background(simulate, rival, *rival_settings, progress=False, until=stop_rule)

@@ -4,7 +4,7 @@ import importlib
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-# The package is lazy: it imports a module only when a name of this module is used.
+# `jaxnbv` is lazy: it imports a module only when a name from that module is used.
 import jaxnbv as nbv
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ SEARCHES = {
 
 
 class Stop(NamedTuple):
-    """A rule of `--until`: meaning of its number (for the help), and function from number to rule."""
+    """A rule of `--until`: what its number means, and a function that makes the rule from the number."""
 
     about: str
     rule: "Callable[[float], StopRule]"
@@ -59,6 +59,6 @@ STOPS = {
 
 
 def resolve(text: str) -> Any:
-    """Import and return the object that a text "module:name" names."""
+    """Import and return an object, given as "module:name"."""
     module, _, name = text.partition(":")
     return getattr(importlib.import_module(module), name)

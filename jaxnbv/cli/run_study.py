@@ -32,7 +32,7 @@ from jaxnbv.studies.registry import studies
 def run_study(name: str, options: StudyOptions, **settings: Any) -> None:
     """Run all parts of a study (for example, one part per framing) and write the results of each part.
 
-    - `settings`: values of the study's own options, None for options without a value.
+    - `settings`: values of the options that only this study has, None where the user gave no value.
 
     **Raises:** `ValueError` if there are no scenes, a method is unknown, options exclude each other, or a user's method
     cannot be imported. If scenes failed, raises `ValueError` after all results are written.
@@ -86,7 +86,7 @@ def run_study(name: str, options: StudyOptions, **settings: Any) -> None:
 
 
 def _executor(options: StudyOptions) -> AbstractContextManager[Executor | None]:
-    """Make the executor that runs the scenes, or None to run them in this process."""
+    """Return a context manager of the executor that runs the scenes, or of None to run them in this process."""
     require(
         options.cluster is None or options.workers == 1,
         f"--workers {options.workers} and --cluster {options.cluster} exclude each other: leave one out",
@@ -97,7 +97,7 @@ def _executor(options: StudyOptions) -> AbstractContextManager[Executor | None]:
 
 
 def _sources(folders: Iterable[Path], parts: Iterable[str]) -> dict[str, list[Path]]:
-    """Return the folders from which to copy records, keyed by part of the study."""
+    """Return, for each part of the study, the folders from which to copy records."""
     sources = {part: [folder / part for folder in folders if (folder / part / "study.json").exists()] for part in parts}
     for folder in folders:
         require(
@@ -108,7 +108,7 @@ def _sources(folders: Iterable[Path], parts: Iterable[str]) -> dict[str, list[Pa
 
 
 def _overrides(kind: type[Study], options: StudyOptions) -> dict[str, Any]:
-    """Return settings that replace the study's own. Single options take precedence over `--settings`."""
+    """Return settings that replace the study's own. Options such as `--grid` take precedence over `--settings`."""
     is_paper = options.settings == "paper"
     require(not (is_paper and options.quick), "--quick and --settings paper exclude each other: leave one out")
     single = {

@@ -1,4 +1,4 @@
-"""Output of the command line: text for encodings that lack characters, and warnings without repetition."""
+"""Output of the command line: replaces characters that an encoding lacks, and prints each warning only once."""
 
 import codecs
 import io
@@ -16,7 +16,7 @@ _READABLE = str.maketrans(_LETTERS | {"±": "+-", "°": " deg", "…": "...", "�
 
 
 def _readable(error: UnicodeError) -> tuple[str, int]:
-    """Return a replacement for characters that an encoding lacks: a similar text, or else their codes."""
+    """Return a similar text (or else codes) for characters that an encoding lacks, and the position after them."""
     assert isinstance(error, UnicodeEncodeError)
     text = error.object[error.start : error.end].translate(_READABLE)
     return text.encode("ascii", "backslashreplace").decode("ascii"), error.end
@@ -35,7 +35,7 @@ def write_readable() -> None:
 
 @contextmanager
 def each_warning_once() -> Iterator[None]:
-    """Context manager: print each warning once, and at its end how often each repeated warning occurred.
+    """Context manager: print each warning once, and at the end how often each repeated warning occurred.
 
     Python's own filter prints warnings again whenever a library has changed the filters.
     """

@@ -45,7 +45,7 @@ class StudyOptions:
     candidates: Annotated[int | None, _size_option(min=2, help="Number of candidate poses.")] = None
     samples: Annotated[int | None, _size_option(min=1, help="Number of posterior samples.")] = None
     grid: Annotated[int | None, _size_option(min=2, help="Nodes of the samples' grid along each axis.")] = None
-    capacity: Annotated[int | None, _size_option(min=1, help="Number of points to keep in D.")] = None
+    capacity: Annotated[int | None, _size_option(min=1, help="Number of points to keep in the cloud.")] = None
     model: Annotated[
         str | None,
         planner_option(

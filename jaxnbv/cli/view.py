@@ -14,7 +14,7 @@ from jaxnbv.cli.options import command
 @dataclass(frozen=True, kw_only=True)
 class ViewOptions:
     folder: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run or a session.")]
-    html: Annotated[Path | None, typer.Option(help="Write the scene to one HTML file that opens offline, and end.")] = (
+    html: Annotated[Path | None, typer.Option(help="Write the scene to an HTML file that opens offline, and exit.")] = (
         None
     )
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page.")] = 8080

@@ -39,9 +39,9 @@ class WarmUpOptions:
 def warm_up(options: WarmUpOptions) -> None:
     """Compile and keep the programs of a session with this camera.
 
-    The first proposal of the session then takes seconds. Call nbv.keep_compiled() in your own program to load them
-    there. If you use a different planner than the default, call session.rehearse() in your program instead of this
-    command.
+    The first proposal of the session then takes seconds. Call nbv.keep_compiled() in your own program to load the
+    compiled programs there. If your planner is not the default, call session.rehearse() in your program instead of
+    this command.
     """
     (fx, fy, cx, cy), (height, width) = options.intrinsics, options.size
     matrix = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]

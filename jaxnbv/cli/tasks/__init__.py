@@ -1,4 +1,4 @@
-"""The tasks of `jaxnbv demo` and `jaxnbv run`: all classes of `Task` in this folder that have a `name`."""
+"""The tasks of `jaxnbv demo` and `jaxnbv run`: all subclasses of `Task` in this folder that have a `name`."""
 
 import importlib
 import pkgutil

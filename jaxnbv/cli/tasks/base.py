@@ -1,4 +1,4 @@
-"""Base class of the tasks of the command line. Methods import JAX, so that a task is listed without importing JAX."""
+"""Base class of the command line's tasks. Only their methods import JAX, so that the help appears at once."""
 
 import math
 from abc import ABC, abstractmethod
@@ -20,7 +20,7 @@ class Subject(NamedTuple):
     """The object of an episode, with its acquisition and first pose.
 
     - `bank`: known shapes as in `--known`, or a bank of parts with sizes in scene units.
-    - `grid`, `question`: grid of the imagined surfaces and question at the head of the report; None for the defaults.
+    - `grid`, `question`: grid of the imagined surfaces, and question at the head of the report. None for the default.
     - `note`: text to print before the first view.
     """
 
@@ -52,7 +52,7 @@ class Task(ABC):
 
     @classmethod
     def setting(cls) -> "Setting":
-        """Return the camera, the candidates' distance and the number of candidates."""
+        """Return the camera, the candidates' distance from the origin, and the number of candidates."""
         from jaxnbv.scanning.sensors import USUAL_SETTING
 
         return USUAL_SETTING
@@ -68,7 +68,7 @@ class Task(ABC):
     @classmethod
     @abstractmethod
     def demo(cls, scene: int, seed: int) -> Subject:
-        """Return the demo's object with the number `scene`. `seed` decides its first view."""
+        """Return object number `scene` of the demo. `seed` decides its first view."""
 
 
 def default_first_pose(radius: float | None = None) -> "nbv.Pose":

@@ -31,9 +31,9 @@ class ClassTask(Task):
 
     @classmethod
     def demo(cls, scene: int, seed: int) -> Subject:
-        """Return a truck whose cargo is to be classified, and a first view from above that hides it.
+        """Return a truck whose cargo is the question, and a first view from above that hides the cargo.
 
-        Surfaces are imagined on the grid that was used to train the classifier.
+        The grid of the imagined surfaces is that of the classifier's training.
         """
         import jax
         import numpy as np

@@ -25,7 +25,7 @@ class HeatTask(Task):
         Position | None,
         task_option(
             metavar="X Y Z",
-            help="For heat: position in scene units. The object is heated at its nearest point to this.",
+            help="For heat: position in scene units. The object is heated at its point nearest to it.",
             show_default="the middle of the first view",
         ),
     ] = None
@@ -59,7 +59,7 @@ def _coldest_acquisition(source: "Float[np.ndarray, '3']") -> "nbv.Acquisition":
 def _source(
     position: Position | None, mesh: "nbv.TriangleMesh", camera: "nbv.Camera", first: "nbv.Pose"
 ) -> "Float[np.ndarray, '3']":
-    """Return the object's point nearest to `position`, or else the point in the middle of the first view."""
+    """Return the object's point nearest to `position`; if that is None, the point in the middle of the first view."""
     import jax
     import numpy as np
 

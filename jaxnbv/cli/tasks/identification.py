@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 # If all parts are this many times smaller or larger than the object, their unit must be wrong.
 _OTHER_UNIT = 20.0
-# Distance in scene units from which a view shows nearly the whole housing, and direction of the first view.
+# Distance in scene units at which a view shows nearly the whole housing. Direction of the first view from the housing.
 _RADIUS, _FIRST = 5.5, (-0.75, -0.42, 0.5)
 
 
@@ -73,13 +73,12 @@ class IdentifyTask(Task):
 
 
 def bank_of(folder: Path, scale: str, size: float, up: str = "y") -> "nbv.ShapeBank":
-    """Read the parts of a folder, and convert them to the units of a world.
+    """Read the parts of a folder, and convert them to world units.
 
     - `scale`, `up`: unit and upward axis of the parts, as in `--parts-scale` and `--parts-up`.
-    - `size`: approximate size of the object in the world.
+    - `size`: approximate size of the object in world units.
 
-    **Raises:** `ValueError` if all parts are far smaller or larger than the object, and whenever
-    `ShapeBank.from_meshes` raises it.
+    **Raises:** `ValueError` if all parts are far smaller or larger than the object, or if `ShapeBank.from_meshes` does.
     """
     import numpy as np
 
@@ -96,7 +95,7 @@ def bank_of(folder: Path, scale: str, size: float, up: str = "y") -> "nbv.ShapeB
 
 
 def as_unit(text: str) -> float | str:
-    """Return the number that a text states, or the text itself if it is the name of a unit."""
+    """Convert a text such as "0.001" to a number. Return any other text, the name of a unit, unchanged."""
     try:
         return float(text)
     except ValueError:

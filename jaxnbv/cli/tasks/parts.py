@@ -26,7 +26,7 @@ class PartTask(Task):
         str,
         task_option(
             metavar="NAME",
-            help="For parts: category of the object in ShapeNet-part. It must stand upright along y and face x.",
+            help="For parts: ShapeNet-part category of the object, which must stand upright along y and face x.",
         ),
     ]
     network: Annotated[Path | None, network_option] = None
