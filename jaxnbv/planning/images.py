@@ -17,11 +17,11 @@ from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
 
 Ignore: TypeAlias = Callable[[Float[np.ndarray, "n 3"]], Any]
-"""Function of world points (n, 3) that returns a bool for each point: True to ignore it, as a point of the robot."""
+"""Function of world points (n, 3) that returns, for each point, whether it belongs to the robot, as a bool."""
 
 # Largest number of rays of an image that are used. A cloud holds a few thousand points, so more rays only cost time.
 _MAX_RAYS = 20_000
-# Two pose matrices are equal if their entries differ by at most this. They may have been stored in 32 bits.
+# Pose matrices count as equal if their entries differ by at most this, because some may have been stored in 32 bits.
 _MATRIX_TOLERANCE = 1e-5
 
 
@@ -59,7 +59,7 @@ class Image(NamedTuple):
         return cls(pixels.copy(), as_numbers(matrix, "the matrix of a pose", np.float64), scale, pixel_mask)
 
     def without_sentinels(self, camera: Camera, pose: Pose, box: Box) -> "Image":
-        """Return a copy with depth zero at values for "not measured", see `jaxnbv.geometry.depth_image`."""
+        """Return a copy in which depths that mean "not measured" are zero, see `jaxnbv.geometry.depth_image`."""
         return self._replace(depth=without_sentinels(self.depth, camera, pose, self.scale, box))
 
     @property
@@ -79,7 +79,7 @@ class Image(NamedTuple):
     def with_robot(self, ignore: Ignore, camera: Camera, pose: Pose) -> "Image":
         """Return a copy with a mask of the robot's pixels.
 
-        - `ignore`: function that returns whether each of the measured world points belongs to the robot.
+        - `ignore`: function of the measured world points that returns, for each point, whether it belongs to the robot.
 
         **Raises:** `ValueError` if `ignore` does not return a bool for each point.
         """
@@ -99,10 +99,10 @@ class Image(NamedTuple):
         return cloud if self.robot is None else only_where(cloud, ~self.robot, camera, stride)
 
     def is_blank(self, cloud: PointCloud) -> bool:
-        """Return whether the image has no measurement, given its points in the box.
+        """Return whether the image has no measurement.
 
-        True if `cloud` is empty, and either no pixel is valid or all valid pixels have the same value, which then means
-        "not measured".
+        True if `cloud` (the points in the box) is empty, and either all its rays are invalid or all measured pixels
+        have the same value, which then means "not measured".
         """
         if bool(cloud.mask.any()):
             return False
@@ -112,7 +112,7 @@ class Image(NamedTuple):
     def check_not_stale(self, earlier: "tuple[Image, ...]") -> None:
         """Raise `ValueError` if one of the `earlier` images has the same depths but a different pose.
 
-        The driver then recorded the frame before the camera moved. An image without a positive depth is not checked.
+        In that case the driver returned a frame from before the move. An image without a positive depth is not checked.
         """
         if not (self.depth > 0).any():
             return
@@ -129,7 +129,7 @@ def only_where(cloud: PointCloud, pixels: Bool[np.ndarray, "height width"], came
     """Return a cloud with only the points of some pixels. Its rays (`sight`, `missed`) do not change.
 
     - `pixels`: mask of the pixels to keep, at full resolution.
-    - `stride`: stride of the rows and columns from which the cloud was made.
+    - `stride`: stride of the rows and columns that the cloud was made from.
     """
     if camera.distortion:
         # The rays of a cloud belong to a camera without distortion, so the mask must be resampled.
@@ -142,5 +142,5 @@ def only_where(cloud: PointCloud, pixels: Bool[np.ndarray, "height width"], came
 
 
 def stride_of(camera: Camera) -> int:
-    """Return the stride of rows and columns at which an image has at most about `_MAX_RAYS` rays."""
+    """Return the stride of rows and columns that leaves at most about `_MAX_RAYS` rays of an image."""
     return math.ceil(math.sqrt(camera.num_rays / _MAX_RAYS))

@@ -37,7 +37,7 @@ class Intake:
         self.images: tuple[Image, ...] = ()
         self.mount_error = MountError(camera, convention)
         self.table: Obstacles | None = None
-        # If no table is detected with the session's upward axis, the axes with which one would be detected.
+        # The other upward axes with which a table would be detected, if none is detected with the session's axis.
         self.other_ups: tuple[str, ...] = ()
         self.clutter = self._no_clutter()
 
@@ -52,7 +52,7 @@ class Intake:
 
         - `on_accept`: function that is called after all checks and before the view is added.
 
-        **Raises:** `ValueError` in the cases that `Session.add` lists. Nothing changes then.
+        **Raises:** `ValueError` in the cases that `Session.add` lists. The intake and the loop do not change then.
         """
         index = len(self.images)
         image.check_not_stale(self.images)
@@ -83,7 +83,7 @@ class Intake:
         return loop
 
     def _cloud(self, image: Image, pose: Pose, is_first: bool) -> PointCloud:
-        """Return the points of an image in the box, or in the margin around the box that carving needs."""
+        """Return the points of an image in the box, and in the margin around it that carving needs."""
         region, sampler = self.box, self.planner.sampler
         if sampler.carving is not None:
             region = sampler.carving.with_room(region, sampler.grid, self.frame)

@@ -43,7 +43,7 @@ class View(eqx.Module):
     """One view of an episode, in scene coordinates.
 
     - `pose`: pose of the sensor.
-    - `scan`: the scan, with noise; one row for each pixel.
+    - `scan`: the scan, with noise and one row for each pixel.
     - `cloud`: the cloud D after this view.
     - `proposal`: None if the view was not proposed, such as the first view.
     - `camera`: the camera that took the scan, in scene units.
@@ -66,11 +66,11 @@ class View(eqx.Module):
 
 
 class Step(NamedTuple):
-    """A view of an episode, with the inputs and the duration of the search that proposed the view.
+    """A view of an episode, and the search that proposed the view.
 
     - `observations`: observations after the view.
-    - `inputs`, `seconds`: None and zero for the first view, and for a view that was read from a folder. The inputs are
-      also None if the search uses no samples.
+    - `inputs`, `seconds`: inputs and duration of the search. They are None and zero for the first view and for a view
+      read from a folder. The inputs are also None if the search uses no samples.
     """
 
     view: View
@@ -84,7 +84,7 @@ class _StepState:
     """Intermediate results for the next view.
 
     - `is_proposed`: whether a caller received the proposal. False if it was computed for the stop rule only.
-    - `stop`: reason to stop, or None, once the rule `is_evaluated`.
+    - `stop`: the stop rule's reason to stop; None to continue, or if the rule is not `is_evaluated` yet.
     """
 
     inputs: StepInputs | None = None
@@ -98,8 +98,8 @@ class _StepState:
 class Loop:
     """A running episode.
 
-    The cost of the next move and the distance to earlier cameras refer to the actual poses of views. No pose is
-    proposed twice, even if the view was taken elsewhere.
+    The cost of the next move and the distance to earlier cameras are computed from the actual poses of views. No pose
+    is proposed twice, even if the view was taken elsewhere.
 
     - `planner`: the planner, in scene coordinates.
     - `key`: random key. The random keys of view i depend only on `key` and i.
@@ -132,7 +132,7 @@ class Loop:
         self._next = _StepState()
 
     def without_views(self, planner: Planner) -> "Loop":
-        """Return a copy without views that uses `planner`, once a session has found obstacles or pose errors.
+        """Return a copy without views that uses `planner`, after a change of obstacles or of earlier poses.
 
         The copy keeps the time of the first view, from which stop rules count seconds.
         """
@@ -142,7 +142,7 @@ class Loop:
         return loop
 
     def with_clutter(self, clutter: SignedDistance | None) -> "Loop":
-        """Return a copy with different clutter, in scene units, in the obstacles of its planner."""
+        """Return a copy whose planner's obstacles contain this clutter (scene units) instead of the present one."""
         assert self.planner.obstacles is not None
         loop = copy.copy(self)
         # tree_at skips the planner's checks, which take time and passed when the planner was created.
@@ -186,7 +186,9 @@ class Loop:
 
     @own_settings()
     def take(self, sensor: Sensor, first: Pose) -> Step | None:
-        """Take and add the next view, at the proposed pose or first at `first`; None if the episode has ended.
+        """Take the next view and add it. Return its step, or None if the stop rule has ended the episode.
+
+        The first view is taken at `first`, the others at the proposed poses.
 
         **Raises:** `ValueError` whenever `propose` or `add` raises it.
         """
@@ -255,7 +257,7 @@ class Loop:
     def done(self) -> str | None:
         """Return the stop rule's reason to stop; None to continue.
 
-        The rule is evaluated once for each view. `propose` reuses samples and proposals that the rule needs.
+        The rule is evaluated once for each view. `propose` reuses any samples and proposal that the rule computed.
 
         **Raises:** `ValueError` if the rule needs the next proposal and `propose` raises it.
         """

@@ -1,4 +1,4 @@
-"""Pose errors of a session, which are estimated from the session's images, and the corrected poses."""
+"""Pose errors estimated from a session's images, and the corrected poses."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -40,7 +40,7 @@ class MountError:
             self._images.append(image)
 
     def alignment(self) -> Alignment:
-        """Return the alignment of the images, from all measured points, also those outside the box.
+        """Return the alignment of the images, from all measured points inside and outside the box.
 
         **Raises:** `ValueError` for fewer than two images.
         """

@@ -14,7 +14,7 @@ class PartsFound(StopRule):
     """Stop once the segmenter predicts enough points for every part.
 
     - `points`: smallest number of predicted points for each part.
-    - `parts`: names of the parts to find, by default all parts of the segmenter. Give them if the object may lack some.
+    - `parts`: names of the parts to find, by default all of the segmenter's parts. Give names if some may be absent.
 
     **Raises:** `ValueError` for a number of points below one, an acquisition without a segmenter, or a name that is not
     a part of the segmenter.

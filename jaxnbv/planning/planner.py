@@ -52,8 +52,8 @@ else:
 class Planner(eqx.Module):
     """Bayesian next-best-view selection (the paper's Algorithm 1): `init`, `propose` and `observe`.
 
-    - `acquisition`: the expected value of a view. For a plain function of a cloud, it is the expected improvement of
-      this utility.
+    - `acquisition`: the expected value of a view. A plain function of a cloud counts as a utility, whose expected
+      improvement is the acquisition.
     - `search`: method that finds the pose of the highest expected value.
     - `camera`: the sensor whose scans are simulated.
     - `sampler`: draws the surfaces that fit the observations.
@@ -62,15 +62,15 @@ class Planner(eqx.Module):
     - `capacity`: largest number of points in the cloud D. Larger clouds are thinned by farthest point sampling.
     - `max_views`: largest number of views that the observations can hold.
 
-    No method changes the planner or the observations, and all methods run under `jit`. Programs are compiled at the
-    first two views only. For a cloud without a pose, use `planner.init(None, cloud)`.
+    No method changes the planner or the observations, and all methods run under `jit`. Programs are compiled only at
+    the first two views. For a cloud without a pose, use `planner.init(None, cloud)`.
 
     **Raises:** `ValueError` in the following cases:
 
     - `capacity` or `max_views` is below one.
     - The search cannot work with the acquisition (a gradient search needs derivatives), the camera or the cost.
     - The acquisition needs known parts, but the sampler's model has none.
-    - JAX cannot trace a utility, classifier or segmenter, or it returns an array of the wrong shape.
+    - JAX cannot trace a utility, classifier or segmenter, or one of these returns an array of the wrong shape.
     """
 
     acquisition: AnyAcquisition = eqx.field(converter=as_acquisition)
@@ -164,8 +164,8 @@ class Planner(eqx.Module):
         - `camera`: the camera that took the scan, by default the planner's. Scans of the same capacity from the same
           camera share one compiled program.
 
-        **Raises:** `ValueError` if the scan is invalid (see `init`), if the observations were started on a different
-        grid than the sampler's, or if the observations already hold `max_views` views.
+        **Raises:** `ValueError` if the scan is invalid (see `init`), if the observations' grid differs from the
+        sampler's, or if the observations already hold `max_views` views.
         """
         camera = camera or self.camera
         check_type(observations, Observations, "observations")
@@ -201,8 +201,7 @@ class Planner(eqx.Module):
 
         - `pending`: poses that were proposed earlier but not visited. They are not proposed again.
 
-        **Raises:** `ValueError` if every candidate has been visited, or if the observations were started on a different
-        grid than the sampler's.
+        **Raises:** `ValueError` if every candidate has been visited, or if the observations' grid is not the sampler's.
         """
         check_key(key)
         sample_key, search_key = jax.random.split(key)
@@ -210,7 +209,7 @@ class Planner(eqx.Module):
 
     @own_settings()
     def step_inputs(self, observations: Observations, key: PRNGKeyArray) -> StepInputs:
-        """Return the inputs for `choose`: `sample_inputs`, or the observations if no samples are used."""
+        """Return the inputs for `choose`: `sample_inputs`, or only observations if no samples are used."""
         check_type(observations, Observations, "observations")
         return self.sample_inputs(observations, key) if self.search.uses_samples else StepInputs(observations)
 
@@ -218,9 +217,9 @@ class Planner(eqx.Module):
     def sample_inputs(self, observations: Observations, key: PRNGKeyArray) -> StepInputs:
         """Return the observations, the model's posterior given them, and surfaces drawn from the posterior.
 
-        For an acquisition with `measurable_only` (`NewSurface`), the surfaces lack regions that an earlier view should
-        have measured but did not. For an acquisition with `needs_hypotheses` (`Identify`), there is no posterior, and
-        the only surface is that of the most probable part.
+        For an acquisition with `measurable_only` (`NewSurface`), the surfaces leave out regions that an earlier view
+        should have measured but did not. For an acquisition with `needs_hypotheses` (`Identify`), there is no
+        posterior, and the only surface is that of the most probable part.
         """
         if self.acquisition.needs_hypotheses:
             return StepInputs(observations, None, hypotheses_of(observations).surfaces(self.sampler.grid, 1))
@@ -240,7 +239,7 @@ class Planner(eqx.Module):
         """
         check_key(key)
         check_type(inputs, StepInputs, "the inputs of a step")
-        # NaN is valid here: it is the standard error of one sample. NaN from an acquisition is reported below.
+        # NaN is valid here, because the standard error of one sample is NaN. NaN from an acquisition is reported below.
         with functions_of_users(), jax.debug_nans(False):
             problem = Problem(inputs, self.camera, self.acquisition, self.obstacles, self.cost, pending).prepared()
             proposal = _propose(self.search, problem, key)
@@ -260,7 +259,7 @@ class Planner(eqx.Module):
     @jax.debug_nans(False)
     @program
     def expected_depth(self, surfaces: GridSurface, pose: Pose) -> Float[Array, "h w"]:
-        """Return the depth image that is expected from a pose, in scene units, see `mean_depth`."""
+        """Return the expected depth image from a pose, in scene units, see `mean_depth`."""
         scans = scan_samples(surfaces, self.camera, pose[None], barrier_of(self.obstacles, self.camera, pose[None]))
         depth = mean_depth(jax.tree.map(lambda rows: rows[:, 0], scans), pose)
         return depth.reshape(self.camera.height, self.camera.width)
@@ -324,7 +323,7 @@ def _checked_proposal(planner: Planner, problem: Problem, proposal: Proposal) ->
 
 
 def _check_parts(planner: Planner, problem: Problem, proposal: Proposal) -> None:
-    """Raise `ValueError` that names the cost, or the component of the acquisition, that is not finite."""
+    """Raise `ValueError` that names what is not finite: the cost, or a component of the acquisition."""
     values = proposal.values
     is_invalid = jnp.isnan(values) | (values == jnp.inf)
     pose = proposal.candidates[int(jnp.argmax(is_invalid))] if bool(is_invalid.any()) else proposal.pose

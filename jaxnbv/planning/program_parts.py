@@ -1,4 +1,4 @@
-"""Computes a function within a compiled program with the same bits as outside `jit`."""
+"""Computation of a function within a compiled program, with the same bits as outside `jit`."""
 
 from collections.abc import Callable
 from typing import Any
@@ -18,8 +18,8 @@ def in_parts(function: Callable[..., Any], *arguments: Any) -> Any:
 
     Outside `jit`, each operation and each jitted function that `function` calls is a separate program. In a single
     program, XLA would fuse operations. Fusion changes the bits, because a fused product and sum are rounded only once.
-    Therefore each operation becomes a call that XLA does not inline, and optimisation barriers around the call hide
-    constants from XLA. On a GPU, results are not reproducible to the bit, so the function is called directly.
+    Therefore each operation becomes a call that XLA does not inline, and optimisation barriers around the call keep XLA
+    from folding constants. On a GPU, bits are not reproducible anyway, so the function is called directly.
     """
     if not on_cpu():
         return function(*arguments)
