@@ -1,4 +1,4 @@
-"""The best pose that an arm can reach. A function of the user checks poses, best first."""
+"""Choice of the best pose that an arm can reach, by a function of the user that checks poses."""
 
 import dataclasses
 import math
@@ -22,11 +22,11 @@ from jaxnbv.search import Proposal
 Reachable: TypeAlias = Callable[[Float[np.ndarray, "n 4 4"]], Any]
 """Function of camera-to-world matrices (n, 4, 4) that returns, for each matrix, whether the arm can reach the pose.
 
-An answer is a bool; None if the pose can be reached, otherwise the reason as a text such as "joint limit"; or a score
-from 0 (not reachable) to 1, which multiplies the value of the pose.
+An answer is a bool, or a score from 0 (not reachable) to 1 that multiplies the value of the pose. It may also be a
+reason why the arm cannot reach the pose, such as "joint limit", or None if there is no such reason.
 """
 
-# Number of poses in one call of the function.
+# Number of poses in each call of the user's function.
 _BATCH_SIZE = 8
 # Rotations about the optical axis, in degrees, that are tried if the arm cannot reach the pose itself.
 _ROLLS = (45.0, -45.0, 90.0, -90.0, 135.0, -135.0, 180.0)
@@ -57,9 +57,9 @@ def best_reachable(
 ) -> tuple[Proposal, dict[str, int]]:
     """Propose the pose with the highest product of value and score, among poses that the arm can reach.
 
-    The loop's proposal becomes this pose and its value. Return it and, for each reason, the number of poses that cannot
-    be reached. The poses that the search evaluated are checked in batches, highest value first, until no unchecked pose
-    can be better. If a pose cannot be reached, the pose is tried with the camera rotated about its optical axis.
+    This pose and its value become the loop's proposal. Return the proposal and, for each reason, the number of poses
+    that cannot be reached. The poses that the search evaluated are checked in batches, highest value first, until no
+    unchecked pose can be better. If the arm cannot reach a pose, rotations of it about the optical axis are tried.
 
     - `reachable`: the user's function; None if all poses can be reached.
     - `to_matrices`: function that converts scene poses to the matrices for `reachable`.
@@ -110,13 +110,12 @@ def _options(
     refused_poses: Sequence[RefusedPose],
     refusals: Counter[str],
 ) -> Iterator[list[_Option]]:
-    """Check poses in order, and yield for each the list of its options, which the arm can reach.
+    """Yield, for each pose in order, the list of options that the arm can reach.
 
-    The only option is the pose itself if the arm can reach it. Otherwise the options are the rotations of the pose
-    about the optical axis that the arm can reach. If there is no option, count the reason in `refusals`.
+    The only option is the pose itself if the arm can reach it. Otherwise the options are its rotations about the
+    optical axis that the arm can reach. If the list is empty, the reason is counted in `refusals`.
 
-    - `answers`: function of a batch of poses. It returns the score of each pose, or the reason why the arm cannot reach
-      the pose.
+    - `answers`: function of a batch of poses that returns, for each, the score or the reason why it cannot be reached.
     """
     for start in range(0, len(values), _BATCH_SIZE):
         rows = range(start, min(start + _BATCH_SIZE, len(values)))
@@ -138,14 +137,14 @@ def _rolled_options(
     rolls = _rotations_about_axis(pose)
     scores = {index: score for index, score in enumerate(answers(rolls)) if not isinstance(score, str)}
     values, camera = np.full(len(_ROLLS), value), loop.planner.camera
-    # The rotation does not change the value if images are square, or if the search does not simulate them.
+    # A rotation changes the value only if the search simulates images that are not square.
     if scores and loop.planner.search.uses_samples and camera.height != camera.width:
         values = np.asarray(loop.planner.values_at(loop.inputs(), rolls), float)
     return [_Option(rolls[index], float(values[index]), score) for index, score in scores.items()]
 
 
 def _evaluated_poses(proposal: Proposal) -> tuple[Pose, Float[np.ndarray, " poses"]]:
-    """Return the poses that a search evaluated, and their values: the proposed pose, then the best first."""
+    """Return the evaluated poses and their values: the proposed pose, then the rest by decreasing value."""
     parts = [(proposal.candidates, proposal.values)]
     if proposal.trajectories is not None:
         parts.append(proposal.trajectories.flat)
@@ -175,7 +174,7 @@ def _rotations_about_axis(pose: Pose) -> Pose:
 
 
 def _reason_if_refused(pose: Pose, refused_poses: Sequence[RefusedPose]) -> str | None:
-    """Return why the user refused a pose or a rotation of it about the optical axis; None if neither."""
+    """Return why the user refused a pose or its rotation about the optical axis; None if not refused."""
     return next((refused.reason for refused in refused_poses if is_same_view(pose, refused.pose)), None)
 
 
@@ -191,7 +190,7 @@ def _answers(reachable: Reachable, matrices: Float[np.ndarray, "n 4 4"]) -> list
 
 
 def _answer(answer: Any) -> float | str:
-    """Convert an answer to a score or a reason. True and None become the score 1; False and 0 a reason."""
+    """Convert an answer to a score or a reason. True and None become the score 1, False and 0 a reason."""
     if answer is None or isinstance(answer, str):
         return 1.0 if answer is None else answer
     is_number = isinstance(answer, bool | int | float) or (hasattr(answer, "dtype") and answer.dtype.kind in "bif")

@@ -34,7 +34,7 @@ class Rehearsal(NamedTuple):
 def rehearse(intake: Intake, loop: Loop) -> Rehearsal:
     """Add two simulated images of a ball on a table, and propose a pose after each image.
 
-    The intake and the loop have no views. The rehearsal changes them, so do not use them afterwards.
+    Pass an intake and a loop without views, and do not use them afterwards, because the rehearsal changes them.
     """
     start, programs = time.monotonic(), 0
 
@@ -57,7 +57,7 @@ def rehearse(intake: Intake, loop: Loop) -> Rehearsal:
 
 
 def slanted_poses(poses: Pose, count: int) -> Pose:
-    """Return the `count` poses that look most nearly 30 degrees downward, since these show the table."""
+    """Return the `count` poses that look down most nearly by 30 degrees, so that they see the table."""
     down = -np.asarray(poses.forward)[:, 1]
     return poses[jnp.asarray(np.argsort(np.abs(down - 0.5), kind="stable")[:count])]
 
@@ -65,7 +65,7 @@ def slanted_poses(poses: Pose, count: int) -> Pose:
 def ball_on_a_table(camera: Camera, pose: Pose, box: Box) -> Float[np.ndarray, "height width"]:
     """Return a depth image of a ball in the middle of a box, with a table at the bottom (scene units).
 
-    A pixel is zero if its ray misses both, or if the hit is outside the camera's range.
+    A pixel is zero if its ray misses the ball and the table, or if the hit is outside the camera's range.
     """
     origin = np.asarray(pose.position, np.float64)
     directions = np.asarray(camera.pixel_directions(), np.float64)

@@ -1,4 +1,4 @@
-"""Live sessions, which take images of a real sensor and return the camera's next pose in the world."""
+"""Live sessions, which take images from a real sensor and return the camera's next pose."""
 
 import math
 import threading
@@ -55,7 +55,7 @@ class NextView(eqx.Module):
 
     - `matrix`: camera-to-world matrix of the pose to command, in the session's convention. With `correct_mount`, the
       matrix compensates for the error of the camera's mount.
-    - `value`: value that the search gave the pose, with lengths or areas in world units.
+    - `value`: value that the search gave the pose, in world units.
     - `standard_error`: standard error of the value as a mean over posterior samples; None with fewer than two samples.
     - `proposal`: result of the search, in scene coordinates.
     - `refusals`: for each reason, the number of poses that were tried but cannot be reached.
@@ -83,12 +83,12 @@ class Session:
     - `obstacles`: solids around the object, in world units, for example `Obstacles((table,), margin=0.005)`. Pass
       `Obstacles()` if there are none. By default the session detects obstacles:
 
-      - A plane under the object in the first image counts as a table, which a warning names. Its points are removed,
-        and cameras keep clear of it. If there is none, a warning names other values of `up` that would give one.
+      - A plane under the object in the first image counts as a table. A warning describes it, its points are removed,
+        and cameras keep clear of it. If no table is found, a warning names values of `up` that would give one.
       - Surfaces outside the box become coarse obstacles. They may hide the object, and cameras keep clear of them.
 
     - `poses`: (n, 4, 4), poses at which the sensor can be held. The default is the candidates of the planner's search,
-      in scene units around the centre of the box. If they are a whole sphere, only the upper half is used, because a
+      in scene units around the centre of the box. If these are a whole sphere, only its upper half is used, because a
       table may be below. Give poses to scan a room from inside, because the default poses are outside the box.
     - `folder`: folder in which images and proposals are stored before they are used. A session whose process was killed
       continues from this folder.
@@ -168,7 +168,7 @@ class Session:
     ) -> "Session":
         """Load a session from its folder, to continue after its last image.
 
-        - `planner`: the planner, if the stored one contains a function or network that cannot be restored. Both must
+        - `planner`: planner to use if the stored one contains a function or network that cannot be restored. Both must
           have the same description.
         - `until`, `progress`, `reachable`, `ignore`: as for a new session. The folder does not store them.
 
@@ -244,7 +244,7 @@ class Session:
     @property
     @own_settings()
     def alignment(self) -> Alignment:
-        """Disagreement of the images, and the error of their poses that explains it, in world units.
+        """Disagreement of the images, and the pose errors that explain it, in world units.
 
         **Raises:** `ValueError` for fewer than two images.
         """
@@ -327,8 +327,8 @@ class Session:
         """Propose the pose for the next image.
 
         The result is stored in the folder, and stays the same until an image is added. No pose is proposed twice, even
-        if its image was taken elsewhere. Warns if the value is at most three standard errors above the mean value that
-        is expected at visited poses, where nothing new is left to see.
+        if its image was taken elsewhere. Warn if the value is at most three standard errors above the mean value
+        expected at visited poses, where nothing is new.
 
         - `seconds`: time limit for calls of `reachable`. After this time, the best reachable pose so far is used.
 
@@ -365,12 +365,12 @@ class Session:
         return self.frame.length_to_world(np.asarray(self.planner.expected_depth(surfaces, proposal.pose)))
 
     def refuse(self, reason: str = "refused") -> None:
-        """Refuse the pose of `next`, because the camera cannot be held there.
+        """Refuse the pose that `next` returned, for example because the camera cannot be held there.
 
         The pose is not proposed again, and does not count as visited. `next` then returns the best remaining pose
         without a new search.
 
-        - `reason`: text under which `NextView.refusals` counts this pose from now on.
+        - `reason`: text that `NextView.refusals` uses for this pose from now on.
 
         **Raises:** `ValueError` if `next` was not called since the last image.
         """
@@ -445,5 +445,5 @@ class Session:
             self._bar = None
 
     def _lock_folder(self) -> AbstractContextManager[SessionFolder | None]:
-        """Context manager: lock the folder for writing, and yield it; None if the session has no folder."""
+        """Context manager: lock the folder for writing, and yield it, or None if the session has no folder."""
         return nullcontext() if self._folder is None else self._folder.writing(len(self.views))

@@ -19,7 +19,7 @@ KIND = "session"
 class SessionFolder:
     """The stored images, proposals and refused poses of a session, in order.
 
-    **Raises:** `ValueError` for a folder of a session with a different `config`, its arguments.
+    **Raises:** `ValueError` for a folder of a session with different arguments (`config`).
     """
 
     def __init__(self, path: str | Path, config: dict[str, Any]):
@@ -53,7 +53,7 @@ class SessionFolder:
     def store_image(self, index: int, image: Image) -> None:
         """Store an image, and delete a stored proposal for the image after it.
 
-        There is one only if the user has deleted the folder's last images. It was computed from these.
+        Such a proposal exists only if the user has deleted the folder's last images, from which it was computed.
         """
         self._folder.file("proposal", index + 1).unlink(missing_ok=True)
         pixels = {"mask": image.mask, "robot": image.robot}

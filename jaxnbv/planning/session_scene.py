@@ -28,7 +28,7 @@ def usual_planner() -> Planner:
 
 
 def box_of(corners) -> Box:
-    """Convert two corners to a `Box`, or return a `Box`. **Raises:** `ValueError` for anything else."""
+    """Convert two corners to a `Box`. A `Box` is returned as it is. **Raises:** `ValueError` for anything else."""
     if isinstance(corners, Box):
         return corners
     require(np.shape(corners) == (2, 3), f"the box is {short_text(corners)}; give two corners, (low, high), or a Box")
@@ -46,8 +46,8 @@ def in_scene(
 ) -> Planner:
     """Return a copy of a planner for a sensor and a box, in scene coordinates.
 
-    Arguments are as for `Session`, in world units, with `matrices` for the poses. None stands for the candidates of the
-    planner's search, and for the planner's own obstacles.
+    The arguments are those of `Session`, in world units. If `matrices` (the poses) or `obstacles` is None, the
+    planner's own candidates or obstacles are used.
     """
     search = planner.search.upper_half()
     if matrices is not None:

@@ -21,7 +21,7 @@ _CALLER, _CALLER_OF_ADD = 3, 4
 def warn_of_cut(box: Box, points: Float[np.ndarray, "n 3"], voxel: float, faces: frozenset[str]) -> frozenset[str]:
     """Warn about faces of the box that seem to cut the object. Return the faces of all warnings so far.
 
-    - `points`: measured points in the box and up to about a voxel outside, in world units, as is the `voxel`.
+    - `points`, `voxel`: measured points in the box and up to about a voxel outside, and the voxel size, in world units.
     - `faces`: faces of earlier warnings, which are not repeated.
     """
     fractions = box.shares_beyond(points, 0.5 * voxel)
@@ -55,7 +55,7 @@ def warn_of_blank() -> None:
 
 
 def warn_of_no_table(up: str, others: tuple[str, ...]) -> None:
-    """Warn that no table was detected with `up`, and name the axes `others` with which one would be."""
+    """Warn that no table was detected with the axis `up`, and name the axes `others` that would give one."""
     if others:
         axes = " or ".join(f'up="{axis}"' for axis in others)
         problem = f'no table is found with up="{up}", but a plane would be one with {axes}: give that if it is upward'
@@ -89,7 +89,7 @@ def warn_of_mount(alignment: Alignment) -> None:
 
 
 def warn_of_inside(box: Box, cameras: Float[np.ndarray, "n 3"], candidates: Float[np.ndarray, "m 3"]) -> None:
-    """Warn if the last camera is the first inside the box and all candidates are outside (world units)."""
+    """Warn if the last camera is the first one inside the box, while all candidates are outside (world units)."""
     low, high = box.low, box.high
     is_inside, any_inside = (np.all((x > low) & (x < high), axis=1) for x in (cameras, candidates))
     if is_inside[-1] and is_inside.sum() == 1 and not any_inside.any():
@@ -102,10 +102,10 @@ def warn_of_inside(box: Box, cameras: Float[np.ndarray, "n 3"], candidates: Floa
 
 
 def warn_of_little(value: float, error: float | None, value_at_visited: float) -> None:
-    """Warn that even the best view may have no value: nothing is unseen, or no candidate looks at it.
+    """Warn if even the best view may show nothing new, because all is seen or no candidate shows the rest.
 
     - `value`, `error`: value of the best view and its standard error, in world units.
-    - `value_at_visited`: mean value expected at visited poses, where nothing new is left to see, in world units.
+    - `value_at_visited`: mean value expected at visited poses, where nothing is new, in world units.
     """
     has_error = error is not None and math.isfinite(error)
     if value <= (3.0 * error if has_error and error is not None else 0.0) + value_at_visited:

@@ -1,4 +1,4 @@
-"""Sessions for several objects on a table: one session for each object, all with the same images."""
+"""Sessions for several objects on a table: one session for each object, with the same images."""
 
 import warnings
 from pathlib import Path
@@ -104,7 +104,7 @@ class Sessions:
         - `depth`, `matrix`, `depth_scale`: as for `Session.add`.
         - `labels`: number of the object at each pixel, or zero for no object. An object must have the same number in
           all images. By default, objects are clusters of points above the table. A cluster belongs to an earlier object
-          if the cluster is within `gap` of this object's points, or of the surface of this object's probable parts.
+          if it is within `gap` of the object's points, or of the surface of the object's probable parts.
 
         **Raises:** `ValueError` if no image so far shows an object, and whenever `Session.add` raises it.
         """
@@ -127,7 +127,7 @@ class Sessions:
                 is_valid, f"the labels are {short_text(labels)}: give whole numbers, one for each of the image's pixels"
             )
         numbers = np.where(is_inside, numbers, 0)
-        # Rows and columns that a session uses.
+        # The rows and columns of an image that a session uses.
         rows = slice(stride // 2, None, stride)
         shown_numbers, counts = np.unique(numbers[rows, rows].reshape(-1)[np.asarray(cloud.mask)], return_counts=True)
         for number in shown_numbers[counts >= _MIN_RAYS].tolist():
@@ -151,8 +151,8 @@ class Sessions:
         """Return the camera-to-world matrix of the pose for the next image.
 
         The pose is the candidate with the highest sum of values (world units) over the objects for which the stop rule
-        does not hold yet, or over all objects if there is none. The result stays the same until an image is added. No
-        pose is proposed twice.
+        does not hold yet, or over all objects if the rule holds for all. The result stays the same until an image is
+        added. No pose is proposed twice.
 
         **Raises:** `ValueError` before the first image, if all candidates were proposed, and whenever
         `Planner.propose` raises it.
@@ -238,7 +238,7 @@ class Sessions:
     def _object_near(self, points: Float[np.ndarray, "n 3"]) -> int | None:
         """Return the number of the earlier object to which a cluster belongs; None for a new object.
 
-        It belongs to the object of the smallest expected distance to its points, if the distance is below the gap.
+        The cluster belongs to the object with the smallest expected distance to the points, if that is below the gap.
         """
         subset = points[np.linspace(0, len(points) - 1, _NUM_COMPARED).astype(int)]
         distances = {number: _expected_distance(session, subset) for number, session in self.objects.items()}
@@ -248,8 +248,8 @@ class Sessions:
     def _box_around(self, points: Float[np.ndarray, "n 3"]) -> Box:
         """Return a cube that contains an object, given some of the object's points.
 
-        On each side, the cube extends beyond the points by their own extent, but only as far as the longest part could
-        reach. The sides are equal so that all objects can share the same compiled programs.
+        On each side, the cube extends beyond the points by their largest extent plus the gap, but only as far as the
+        longest part could reach. The sides are equal so that all objects can share the same compiled programs.
         """
         low, high = points.min(axis=0), points.max(axis=0)
         padding = float((high - low).max()) + self._gap
@@ -260,7 +260,7 @@ class Sessions:
 
 
 def clusters(points: Float[np.ndarray, "n 3"], gap: float) -> Int[np.ndarray, " n"]:
-    """Return the index of each point's cluster. Points within about `gap` are in the same cluster.
+    """Return the index of each point's cluster. Points less than about `gap` apart share a cluster.
 
     Distances are between cells whose side is a quarter of the gap, so the cost hardly grows with the density of points.
     """

@@ -39,11 +39,11 @@ def simulate(
     """Simulate an episode: scan a known surface from `first`, then from the planner's proposals.
 
     View i does not depend on `views`. An interrupted run with a folder continues after its last view. On a CPU with the
-    same versions, its result is bit for bit that of an uninterrupted run. On a GPU the bits may differ, because the
-    order of sums varies. You can continue a run with a different stop rule, which is checked after the last stored
-    view.
+    same package versions, its result equals that of an uninterrupted run bit for bit. On a GPU the bits may differ,
+    because the order of sums varies. You can continue a run with a different stop rule, which is checked after the last
+    stored view.
 
-    - `scene`: the true surface: a surface, a solid or a trimesh mesh.
+    - `scene`: the true surface, which is a `Surface`, a solid or a trimesh mesh.
     - `first`: pose of the first view, in scene coordinates.
     - `views`: total number of views, unless the stop rule ends the episode earlier.
     - `key`: random key. The random numbers of view i depend only on `key` and i.
