@@ -1,6 +1,6 @@
 """jaxnbv: task-specific next-best-view selection with uncertain geometry, in differentiable JAX.
 
-The public names are listed in `__init__.pyi`. Each is imported at its first use, since JAX takes seconds to import.
+`__init__.pyi` lists the public names. Each name is imported at its first use, because JAX takes seconds to import.
 """
 
 import importlib.metadata
@@ -20,7 +20,7 @@ _load_name, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         problem = f"module {__name__!r} has no attribute {name!r}."
-        # Without an object, Python adds no second suggestion to the message.
+        # With `obj=None`, Python does not append a suggestion of its own.
         raise AttributeError(f"{problem}{suggestion(name, __all__)}", name=name, obj=None)
     with explained_imports():
         return _load_name(name)
@@ -45,7 +45,7 @@ def _html_of(value: Any) -> str:
 
 
 def _show_in_notebooks() -> None:
-    """Let IPython, if it runs, show `_NOTEBOOK_CLASSES` as HTML. Modules are imported at first display."""
+    """If IPython is running, let it show `_NOTEBOOK_CLASSES` as HTML. This imports none of their modules."""
     ipython = sys.modules.get("IPython")
     shell = None if ipython is None else ipython.get_ipython()
     if shell is not None:

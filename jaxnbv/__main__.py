@@ -1,4 +1,4 @@
-"""Runs the command `jaxnbv` as `python -m jaxnbv`."""
+"""Entry point of `python -m jaxnbv`, which is the same as the command `jaxnbv`."""
 
 from jaxnbv.cli import main
 

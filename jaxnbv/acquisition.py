@@ -46,8 +46,8 @@ class Acquisition(eqx.Module):
     - `measurable_only`: whether samples omit surface that an earlier view should have measured, but did not (`Looks`).
     - `needs_hypotheses`: whether `context` reads the hypotheses of a model of known parts, and no posterior. The most
       likely part is then the only sample of the step.
-    - `gains_once`: whether a second view from the same pose gains nothing. The value that is estimated at the poses of
-      earlier views is then an error, by which a search over candidates decides what is tied, see `DiscreteSearch`.
+    - `gains_once`: whether a second view from the same pose gains nothing. Any value that is estimated at an earlier
+      pose is then an error. `DiscreteSearch` uses this error to decide which candidates are tied.
     """
 
     needs_posterior: ClassVar[bool] = False
@@ -72,12 +72,11 @@ class Acquisition(eqx.Module):
         poses: Pose,
         barrier: Float[Array, "poses rays"] | None = None,
     ) -> Float[Array, "samples poses *scores"]:
-        """Return the scores of the imagined scans of each sampled surface from each pose of a batch.
+        """Return the scores of imagined scans: one scan of each sampled surface from each pose.
 
-        An acquisition that is not a mean over samples may return a single row. The scans of
-        `scanning.grid.samples_at_once` samples from all poses are computed together, and must fit into memory.
-        `batch_size` scans are scored together. The samples are divided among the devices, or the poses if there are
-        fewer samples than devices.
+        An acquisition that is not a mean over samples may return a single row. The samples are divided among the
+        devices, or the poses if there are fewer samples than devices. Each device scans several samples together, from
+        all poses (see `samples_at_once`), and scores `batch_size` scans together.
 
         - `barrier`: distance along each ray to an obstacle, see `scan`.
         """
@@ -88,7 +87,7 @@ class Acquisition(eqx.Module):
         )
 
     def inputs(self, step: StepInputs) -> StepInputs:
-        """Return the inputs that `context` reads. Steps with inputs of equal shapes share one compilation."""
+        """Return only the inputs that `context` reads. Steps whose inputs have equal shapes share one compilation."""
         if self.cloud_only:
             return inputs_of(step.observations.cloud)
         return StepInputs(step.observations, step.posterior if self.needs_posterior else None)
@@ -109,7 +108,7 @@ class Acquisition(eqx.Module):
         return None
 
     def answer_values(self, cloud: PointCloud) -> Float[Array, " n"] | None:
-        """Return the values of `answer` by JAX operations; None without an answer, or if it needs other code."""
+        """Return the values of `answer`; None if there is no answer, or if JAX operations cannot compute it."""
         return None
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> Answer | None:
@@ -128,7 +127,7 @@ class Acquisition(eqx.Module):
 
 
 class ExpectedUtilityImprovement(Acquisition):
-    """Acquisition whose score max(0, u(D + scan) - u(D)) is the increase of a utility u by a scan.
+    """Acquisition whose score is max(0, u(D + scan) - u(D)), the gain of a utility u by a scan.
 
     D + scan is the cloud D with the scan's points added. The mean score over samples is the paper's alpha^(u).
 
@@ -156,7 +155,7 @@ class ExpectedUtilityImprovement(Acquisition):
         return checked_result(self.utility(cloud), f"the {self.utility.name} of a cloud", 0, "a utility is one number")
 
     def score(self, context: tuple[PointCloud, Float[Array, ""]], view: ImaginedView) -> Float[Array, ""]:
-        """Return by how much the view's scan raises the utility of the cloud, or 0 if it lowers the utility."""
+        """Return how much the view's scan raises the utility of the cloud, or 0 if it lowers the utility."""
         cloud, utility = context
         return zero_if_empty(view.scan, jnp.maximum(0.0, self._value(concatenate(cloud, view.scan)) - utility))
 
@@ -186,7 +185,7 @@ class ExpectedUtilityImprovement(Acquisition):
         return self.answer(cloud) if answer is None else answer
 
     def check(self, cloud: PointCloud) -> None:
-        """Raise `ValueError` for a utility that is not finite, and whenever the utility's `check` raises it."""
+        """Raise `ValueError` if the utility's `check` raises it, or if the cloud's utility is not finite."""
         self.utility.check(cloud)
         _, value = context_of(self, cloud)
         name, count = self.utility.name, int(cloud.count)
@@ -204,10 +203,10 @@ def as_acquisition(value: Any) -> Acquisition:
 
 
 class AcquisitionList(Acquisition):
-    """Several acquisitions on the same samples and the same scans. Each pose is scanned only once.
+    """Several acquisitions that score the same scans, so each sample is scanned only once from each pose.
 
-    The value is a vector: the values of `members`, which may be vectors too, concatenated in order. Use an
-    `AcquisitionList` with `expected_value` and `Problem.scores`, not in a planner.
+    The score is a vector, the concatenated scores of the `members`. Use an `AcquisitionList` with `expected_value` and
+    `Problem.scores`, not in a planner.
     """
 
     members: tuple[Acquisition, ...]
@@ -241,14 +240,14 @@ class AcquisitionList(Acquisition):
 
 
 def inputs_of(observations: StepInputs | Observations | PointCloud) -> StepInputs:
-    """Return step inputs unchanged, or make them from observations or a cloud, without posterior."""
+    """Return step inputs unchanged, or make them from observations or a cloud, without a posterior."""
     return observations if isinstance(observations, StepInputs) else StepInputs(as_observations(observations))
 
 
 def context_of(acquisition: Acquisition, observations: StepInputs | Observations | PointCloud) -> Any:
-    """Return the acquisition's context of these observations, computed by a compiled function.
+    """Compute the acquisition's context for these observations, as a compiled program.
 
-    **Raises:** `ValueError` if JAX cannot trace a user's function, or for a missing posterior.
+    **Raises:** `ValueError` if JAX cannot trace a user's function, or if the acquisition lacks a posterior.
     """
     inputs = _inputs(acquisition, observations)
     with functions_of_users():
@@ -285,13 +284,14 @@ def expected_value(
 ) -> Float[Array, "poses *scores"]:
     """Return the expected value at each pose: the mean score of imagined scans over the samples.
 
-    Supports `jit`, `grad` and `vmap`, in poses and observations. An `AcquisitionList` adds an axis for its members.
+    Supports `jit`, `grad` and `vmap` over poses and observations. An `AcquisitionList` adds an axis for its members.
 
     - `observations`: the observations, or a cloud D. An acquisition that needs the posterior requires `StepInputs`.
     - `surfaces`: the samples along a leading axis.
     - `barrier`: distance along each ray to an obstacle, see `scan`.
 
-    **Raises:** `ValueError` if JAX cannot trace a user's function, or if `Acquisition.check` does for concrete values.
+    **Raises:** `ValueError` if JAX cannot trace a user's function, if the acquisition lacks a posterior, or if
+    `Acquisition.check` raises it, which is called only if nothing is traced.
     """
     inputs = _inputs(acquisition, observations)
     # `check` needs concrete results. Under jit, results (and this zero) are traced even if all inputs are concrete.
@@ -307,8 +307,8 @@ def scores(
 ) -> Float[Array, "poses *scores"]:
     """Return the scores of a batch of scans, one scan from each pose.
 
-    - `samples_per_batch`: number of posterior samples for which this function runs at the same time. The number of
-      scans that are scored together is `acquisition.batch_size` divided by it.
+    - `samples_per_batch`: number of samples for which this function runs at the same time. The number of poses whose
+      scans are scored together is `acquisition.batch_size` divided by this number.
     """
     return batched_map(
         lambda rows: acquisition.score(context, ImaginedView(rows[0], camera, rows[1])),
@@ -317,7 +317,7 @@ def scores(
     )
 
 
-# Poses, and the distances to obstacles along the rays of each pose.
+# Poses, and for each pose the distance along each ray to an obstacle.
 _Views: TypeAlias = tuple[Pose, Float[Array, "poses rays"] | None]
 
 

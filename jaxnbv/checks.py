@@ -52,7 +52,7 @@ _MAX_FLOAT = float(np.finfo(np.float32).max)
 
 
 def check_device() -> None:
-    """Raise `ValueError` if JAX finds no device of the platform in the variable `JAX_PLATFORMS`."""
+    """Raise `ValueError` if JAX finds no device of the platform that `JAX_PLATFORMS` names."""
     try:
         jax.devices()
     # The type of the error depends on the plugins that are installed.
@@ -70,12 +70,12 @@ def require(condition: bool | np.bool_, message: str) -> None:
 
 
 def is_traced(*trees) -> bool:
-    """Return whether any leaf of the trees is a tracer, which has no value during a JAX transformation."""
+    """Return whether any leaf of the trees is a tracer, which stands for a value inside a JAX transformation."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
 
 
 def check_fields(module: Any) -> None:
-    """Raise `ValueError` that names the first field of a module that contradicts its annotation.
+    """Raise `ValueError` if a field of a module contradicts its annotation, see `check_type`.
 
     Call this first in `__check_init__`.
     """
@@ -88,7 +88,7 @@ def check_fields(module: Any) -> None:
 def own_settings() -> Iterator[None]:
     """Context manager or decorator: allow rank promotion, type promotion and transfers in JAX.
 
-    A user's strict settings in `jax.config` are meant for the user's own code. `jax_debug_nans` is not changed.
+    A user who forbids these in `jax.config` means the user's own code. `jax_debug_nans` is not changed.
     """
     with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"), jax.transfer_guard("allow"):
         yield
@@ -115,8 +115,8 @@ def checked(function: _F) -> _F:
 def check_type(value: Any, hint: Any, name: str) -> None:
     """Raise `ValueError` if the value called `name` contradicts a plain type hint.
 
-    Plain hints are int, float, bool, a tuple of two or three floats, classes, `Callable`, and a union with None. Others
-    are ignored.
+    Plain hints are int, float, bool, a tuple of two or three floats, classes, `Callable`, and a union with None. Other
+    hints are ignored.
     """
     if hint is int:
         is_whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
@@ -140,9 +140,9 @@ def check_type(value: Any, hint: Any, name: str) -> None:
 
 
 def check_index(index: Any, batch: tuple[int, ...], name: str) -> None:
-    """Raise `ValueError` for an index out of the range of a shape `batch`, which JAX would clamp.
+    """Raise `ValueError` if the shape `batch` has no axes, or an integer index is outside its first axis.
 
-    It also raises for an integer index if the shape has no axes.
+    JAX would clamp such an index. Only Python and NumPy integers are checked.
     """
     if isinstance(index, int | np.integer):
         check_batch(batch, name)
@@ -161,12 +161,12 @@ def check_key(key: Any) -> None:
 
 
 def on_host(tree: Any) -> Any:
-    """Return a tree with NumPy arrays, whose operations compile nothing; unchanged if it is traced."""
+    """Convert a tree's leaves to NumPy, so that operations compile nothing. Traced trees stay unchanged."""
     return tree if is_traced(tree) else jax.tree.map(np.asarray, tree)
 
 
 def native(value: Any) -> Any:
-    """Convert a NumPy array to native byte order and at most double precision; return others unchanged.
+    """Convert a NumPy array to native byte order and at most double precision; return other values unchanged.
 
     JAX's `jit` reads an array of non-native byte order without swapping the bytes.
     """
@@ -207,7 +207,7 @@ def as_numbers(value: Any, name: str, dtype: Any = float) -> np.ndarray:
     require(not has_masked, f"{name} is a masked array: give what is valid in it as a plain array")
     try:
         array = native(np.asarray(value))
-        # NumPy would convert text, dates, complex numbers and None to numbers.
+        # NumPy itself would also convert text, dates, complex numbers and None.
         is_real = array.dtype.kind in "biuf" or jnp.issubdtype(array.dtype, jnp.floating)
         is_real = is_real or (array.dtype.kind == "O" and all(isinstance(item, numbers.Real) for item in array.flat))
         require(is_real, f"{name} is {short_text(value)}; give real numbers")
@@ -221,7 +221,7 @@ def as_numbers(value: Any, name: str, dtype: Any = float) -> np.ndarray:
 
 @contextmanager
 def functions_of_users() -> Iterator[None]:
-    """Context manager for calls of a user's functions: explain JAX's tracing errors.
+    """Context manager for calls of a user's function, which replaces JAX's tracing errors by explanations.
 
     **Raises:** `ValueError` for a function that calls NumPy, selects rows by a mask, or counts, indexes or branches in
     Python with a traced value.
@@ -241,11 +241,11 @@ def functions_of_users() -> Iterator[None]:
 
 
 def checked_result(value: Any, name: str, axes: int, requirement: str) -> Any:
-    """Return a value, called `name`, that a user's function returned.
+    """Check a value, called `name`, that a user's function returned, and return the value.
 
     - `requirement`: description of valid values for the error message.
 
-    **Raises:** `ValueError` unless it is an array of real numbers with this number of axes (0 also for plain numbers).
+    **Raises:** `ValueError` unless it is an array of real numbers with this number of axes. A plain number has none.
     """
     dtype = getattr(value, "dtype", None)
     is_real = isinstance(value, numbers.Real) if dtype is None else any(jnp.issubdtype(dtype, kind) for kind in _REAL)
@@ -254,7 +254,7 @@ def checked_result(value: Any, name: str, axes: int, requirement: str) -> Any:
 
 
 def short_text(value: Any) -> str:
-    """Return a short text for a value in an error message, for an array its shape and type."""
+    """Return a short text for a value in an error message. An array is described by its shape and type."""
     if isinstance(value, AnyArray):
         return f"an array of shape {value.shape} and type {value.dtype}" if value.ndim else str(value)
     if isinstance(value, str | int | float | complex | tuple | list | dict | None):
@@ -278,6 +278,6 @@ def _is_number(value: Any) -> bool:
 def _classes(hint: Any) -> tuple[type, ...]:
     """Return the classes in a type hint; none if it contains anything else."""
     kinds = get_args(hint) if isinstance(hint, types.UnionType) or get_origin(hint) is Union else (hint,)
-    # A jaxtyping annotation is a class too, but does not count here, because shapes are checked elsewhere.
+    # Jaxtyping annotations are classes too, but do not count here, because shapes are checked elsewhere.
     is_plain = all(isinstance(kind, type) and not hasattr(kind, "dim_str") and kind is not object for kind in kinds)
     return kinds if is_plain else ()

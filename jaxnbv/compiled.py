@@ -10,7 +10,7 @@ import platformdirs
 
 from jaxnbv.errors import InputError
 
-# Name of the environment variable that contains the folder of the package's own programs.
+# Environment variable with the path of the folder in which `jaxnbv.programs` stores programs.
 PROGRAMS = "JAXNBV_PROGRAMS"
 _FOLDER_OPTION = "jax_compilation_cache_dir"
 # By default JAX does not store programs that compile within a second. Most programs of a step compile that fast.
@@ -21,10 +21,10 @@ def keep_compiled(folder: str | Path | None = None) -> str:
     """Store compiled programs on disk for later processes and child processes, and return the folder.
 
     Call this before the first step. Compiling takes 10 to 90 seconds. Later processes load the package's own programs
-    in two seconds without tracing them again (see `jaxnbv.programs`), and all others from JAX's cache.
+    in two seconds without tracing them again (see `jaxnbv.programs`), and load other programs from JAX's cache.
 
-    - `folder`: by default JAX's cache folder (`JAX_COMPILATION_CACHE_DIR`), or a folder in the user's cache if that is
-      not set. The folder is never emptied automatically, and you may delete it at any time.
+    - `folder`: by default JAX's cache folder (`JAX_COMPILATION_CACHE_DIR`) if it is set, otherwise a folder in the
+      user's cache. Nothing empties the folder automatically, and you may delete it at any time.
 
     **Raises:** `ValueError` if no file can be written to the folder.
     """
@@ -37,8 +37,8 @@ def keep_compiled(folder: str | Path | None = None) -> str:
         _check_writable(Path(path))
         os.environ[PROGRAMS] = str(Path(path) / "programs")
     if importlib.metadata.version("jaxlib").startswith("0.9."):
-        # On many CPUs, this version logs two long lines for each program that it loads. The program runs correctly all
-        # the same (jax issue 38445).
+        # On many CPUs, this version logs two long lines for each program that it loads, although the program runs
+        # correctly (jax issue 38445).
         os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     os.environ[_FOLDER_OPTION.upper()] = path
     for name, value in _THRESHOLDS.items():
@@ -55,7 +55,7 @@ def keep_compiled(folder: str | Path | None = None) -> str:
 
 
 def _check_writable(folder: Path) -> None:
-    """Raise `ValueError` if no file can be written to the folder. JAX would warn once for each program."""
+    """Raise `ValueError` if no file can be written to the folder. JAX would only warn, for each program."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):

@@ -29,7 +29,7 @@ def install(extra: str) -> str:
 
 
 class InputError(ValueError):
-    """An input from the user that cannot be used. The message names the value and the remedy."""
+    """Error for an input that cannot be used. The message names the value and the remedy."""
 
 
 def suggestion(name: str, names: Iterable[str]) -> str:

@@ -1,4 +1,4 @@
-"""The observations: kept points, poses of the views, and space that was seen to be empty."""
+"""The observations: points of all scans, poses of the views, and space that was seen to be empty."""
 
 import dataclasses
 from typing import NamedTuple
@@ -17,10 +17,10 @@ from jaxnbv.geometry.pose_list import PoseList
 from jaxnbv.programs import program
 from jaxnbv.scanning import Carving, Grid, Looks, Obstacles, barrier_of
 
-# A model uses 100 to 200 empty points. The time to choose them grows with the number of points to choose from.
+# Number of nodes per axis from which a model chooses 100 to 200 empty points. The choice takes longer with more nodes.
 _MAX_POINTS_PER_AXIS = 20
-# Largest number of points that are checked after each scan for being stray. The time is proportional to this number
-# times the capacity. Further points are checked after the next scan.
+# After each scan, at most this number of points are checked for being stray. The time is proportional to this number
+# times the capacity of the cloud. Further points are checked after the next scan.
 _MAX_STRAY_CHECKS = 512
 
 
@@ -34,7 +34,7 @@ class EmptyPoints(NamedTuple):
 class Observations(eqx.Module):
     """Everything observed so far, in scene coordinates. Array shapes are fixed, so nothing recompiles.
 
-    - `cloud`: the kept points, the paper's D.
+    - `cloud`: the thinned points of all scans, the paper's D.
     - `grid`: the grid of `looks`, `empty_nodes` and `obstacle_nodes`; None if there are none of these.
     - `looks`: the measured surface and the measured ray lengths of each view, see `Looks`.
     - `empty_nodes`: mask of the nodes that some scan showed to be empty.
@@ -60,9 +60,9 @@ class Observations(eqx.Module):
         obstacle_nodes: Bool[Array, "g g g"] | None = None,
         camera: Camera = Camera(),
     ) -> "Observations":
-        """Return the observations of a cloud before any of `max_views` views. No node is marked empty yet.
+        """Return observations of a cloud, with room for `max_views` views. They have no view and no empty node yet.
 
-        - `camera`: `looks` stores lengths of its rays.
+        - `camera`: the camera for whose rays `looks` stores lengths.
         """
         empty = None if grid is None else jnp.zeros((grid.resolution,) * 3, bool)
         looks = None if grid is None else Looks.empty(grid, camera, max_views).with_points(cloud)
@@ -75,7 +75,7 @@ class Observations(eqx.Module):
 
     @property
     def empty_points(self) -> EmptyPoints:
-        """Nodes of a coarser grid (at most 20 per axis), with a mask of those seen to be empty; for models."""
+        """Nodes of a coarser grid (at most 20 per axis), with a mask of the nodes that were seen to be empty."""
         if self.empty_nodes is None or self.grid is None:
             return EmptyPoints(jnp.zeros((1, 3), self.cloud.points.dtype), jnp.zeros(1, bool))
         stride = -(-self.grid.resolution // _MAX_POINTS_PER_AXIS)
@@ -99,7 +99,7 @@ class Observations(eqx.Module):
         - `carving`: the margin around rays within which nodes count as empty; None leaves `empty_nodes` unchanged.
         - `obstacles`: solids that may hide the object. A ray shows nothing behind them.
         """
-        # D is not an argument of the program, because the program would be compiled again for each capacity of D.
+        # The program does not get the cloud, because it would be compiled again for each capacity of the cloud.
         fields = self.poses, self.looks, self.empty_nodes
         poses, looks, empty = _with_view(*fields, pose, scan, camera, carving, obstacles)
         return dataclasses.replace(self, poses=poses, looks=looks, empty_nodes=empty)
@@ -126,9 +126,9 @@ def _join(cloud: PointCloud, scan: PointCloud, empty: Bool[Array, "g g g"] | Non
 def _is_stray(cloud: PointCloud, empty: Bool[Array, "g g g"], grid: Grid) -> Bool[Array, " n"]:
     """Return whether each point is stray: alone, and in a grid cell whose nodes were all seen to be empty.
 
-    A point is alone if no other point is within twice the spacing, the median distance between neighbours. Points on a
-    connected surface are about one spacing apart in a thinned cloud. So no point is stray just because it is on a thin
-    part that a view missed, or because the pose of its image is slightly wrong.
+    A point is alone if no other point is within twice the spacing, the median distance between neighbours. In a thinned
+    cloud, points on a connected surface are about one spacing apart. So a point on a thin part that a view missed is
+    not stray, and neither is a point of an image whose pose is slightly wrong.
     """
     is_empty_cell = jax.lax.reduce_window(empty, True, jax.lax.bitwise_and, (2, 2, 2), (1, 1, 1), "VALID")
     cell = tuple(grid.cell_of(cloud.points).T)

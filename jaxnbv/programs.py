@@ -60,7 +60,7 @@ class _Executable(NamedTuple):
 
 
 class _Program:
-    """A function under `eqx.filter_jit`. Its programs are stored on disk after `keep_compiled` was called."""
+    """A function that `eqx.filter_jit` compiles. After `keep_compiled`, its programs are stored on disk."""
 
     def __init__(self, function: Callable[..., Any]):
         functools.update_wrapper(self, function)
@@ -92,7 +92,7 @@ class _Program:
         """Load or compile the program; return None if the arguments contain code that is not permitted.
 
         - `static`: the arguments without their arrays.
-        - `tree`, `leaves`, `kinds`: structure and leaves of a tree of these arrays, and their shapes and types.
+        - `tree`, `leaves`, `kinds`: structure of the tree of these arrays, the arrays, and their shapes and types.
         """
         function = self._function.__module__, self._function.__qualname__
         try:
@@ -110,9 +110,9 @@ class _Program:
         return self._compile(entry, static, tree, leaves)
 
     def _compile(self, entry: Path, static: Any, tree: Any, leaves: list) -> _Executable:
-        """Trace the function, and return the program, compiled unless its lowered code is stored already.
+        """Trace the function. Then load its program, if lowered code like this is stored, or else compile it.
 
-        - `entry`: path of the file for these arguments, in which the name of the program's file is stored.
+        - `entry`: path of the file for these arguments. It stores the name of the program's file.
         """
         result = None
 
@@ -125,14 +125,14 @@ class _Program:
             return outputs
 
         array_function.__name__ = array_function.__qualname__ = self._function.__name__
-        # Unused arguments stay in the code. Without them, programs of different arguments could have the same code.
+        # Keep unused arguments in the code. Otherwise programs of different arguments could have the same code.
         lowered = jax.jit(array_function, keep_unused=True).lower(leaves)
         code = lowered.as_text()
         # A program with a callback to Python cannot be stored, because it contains an address of this process.
         if "callback" in code:
             return _Executable(lowered.compile(), result)
-        # The same code may be stored for a different entry: after an edit of the package that leaves this code as it
-        # was, or for arguments that differ only in names.
+        # The same code may be stored for another entry, because the package was edited elsewhere since then, or because
+        # arguments differ only in names.
         name = hashlib.sha256(repr((_without_names(code), _settings(), _machine())).encode()).hexdigest()
         num_outputs = len(jax.tree.leaves(lowered.out_info))
         payload = _read(entry.parent / name)
@@ -223,7 +223,7 @@ def _pickle(x: Any) -> bytes:
     """Pickle an object so that equal objects give equal bytes. **Raises:** `_ForeignCodeError`."""
     file = io.BytesIO()
     pickler = _Pickler(file)
-    # Turn off the memo, with which two equal objects give different bytes than the same object twice.
+    # Turn off the memo. With it, two equal objects give other bytes than the same object twice.
     pickler.fast = True
     try:
         pickler.dump(x)
@@ -233,9 +233,9 @@ def _pickle(x: Any) -> bytes:
 
 
 def _without_names(code: str) -> str:
-    """Return lowered code with numbers in place of functions' names, in order of appearance.
+    """Replace the names of functions in lowered code by numbers, in order of appearance.
 
-    JAX's names of the functions depend on what the process lowered before.
+    The names depend on what the process lowered before.
     """
     numbers: dict[str, int] = {}
 
@@ -246,7 +246,7 @@ def _without_names(code: str) -> str:
 
 
 def _compile_uncached(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
-    """Compile without JAX's cache, as programs from this cache cannot be serialized completely on a CPU."""
+    """Compile without JAX's cache. On a CPU, a program from this cache cannot be serialized completely."""
     with _compile_lock:
         was_enabled = jax.config.values["jax_enable_compilation_cache"]
         jax.config.update("jax_enable_compilation_cache", False)
@@ -289,10 +289,7 @@ def _read(path: Path) -> bytes | None:
 
 
 def _write(path: Path, data: bytes) -> None:
-    """Write a file atomically, so that other processes never read a part of it.
-
-    Warn if it cannot be written, for example on a full disk.
-    """
+    """Write a file atomically, so that other processes never read a part of it. Warn if this fails."""
     packed = zlib.compress(data, 1)
     part = path.with_name(f"{path.name}.{uuid.uuid4().hex}")
     try:

@@ -9,9 +9,10 @@ from tqdm import tqdm
 def progress_bar(
     items: Iterable[Any] | None = None, enabled: bool = True, leave: bool = False, **settings: Any
 ) -> "tqdm[Any]":
-    """Return a progress bar over `items` or up to `total`, on terminals only, with tqdm's `settings`.
+    """Return tqdm's progress bar over `items`, which is shown on terminals only.
 
     - `leave`: whether the bar stays on the screen once it is full.
+    - `settings`: further arguments of tqdm, such as `total`, the number of items.
     """
     # The bar shows no remaining time. The first step compiles, so the estimate would be poor.
     bar_format = "{desc}: {n_fmt} of {total_fmt} |{bar:20}| {elapsed}"

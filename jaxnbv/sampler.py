@@ -43,7 +43,7 @@ from jaxnbv.surfaces import (
 )
 from jaxnbv.surfaces.known_shapes import short_ranged
 
-# How far the object may continue beyond a box that cuts it, in scene units: 8 % of the longest side.
+# How far the object may continue beyond a box that cuts it, in scene units. It is 8 % of the longest side, 2.5.
 _MARGIN = 0.2
 
 MODELS = ("screened", "paper")
@@ -68,9 +68,9 @@ class SurfaceSampler(eqx.Module):
     - `model`: the prior over surfaces.
     - `grid`: the grid on which samples are evaluated and scanned, and on which empty space is stored.
     - `num_samples`: number of posterior samples per step.
-    - `carving`: removes sampled surface from space that was seen to be empty, and from outside a volume. A model that
-      uses empty space, such as `ScreenedSPSR`, is also conditioned on it. With None, nothing is removed, empty space is
-      not used, and samples depend only on the cloud D, as in the paper.
+    - `carving`: removes sampled surface from space that was seen to be empty, and from outside a volume. Some models,
+      such as `ScreenedSPSR`, are also conditioned on the empty space. With None, nothing is removed, empty space is not
+      used, and samples depend only on the cloud D, as in the paper.
 
     No sample extends into a known obstacle, with or without carving. Methods accept `Observations` on the same grid, or
     a `PointCloud`.
@@ -110,8 +110,8 @@ class SurfaceSampler(eqx.Module):
         - `quick`: use fewer frequencies.
         - `volume`: by default a cube about the origin whose sides are `longest_side`. A volume that you pass may cut
           the object.
-        - `solid`: leave out `EmptySpace`, which assumes that unseen space next to empty space is likely to be empty
-          too. This does not hold for a body whose hidden side is as large as its visible side, such as the pyramid.
+        - `solid`: leave out `EmptySpace`, which assumes that unseen space next to empty space is probably empty too.
+          This assumption is wrong for a body whose hidden side is as large as its visible side, such as the pyramid.
 
         **Raises:** `ValueError` for an unknown name, or a longest side that is not positive.
         """
@@ -130,9 +130,10 @@ class SurfaceSampler(eqx.Module):
 
     @own_settings()
     def with_bank(self, bank: ShapeBank, poses: ShapePoses) -> "SurfaceSampler":
-        """Return a copy whose prior is `KnownShapes`: a bank, and the current model for "none of these".
+        """Return a copy whose prior is `KnownShapes`, with the current model for "none of these".
 
-        Shapes are registered within the carving's volume, or within `Box()` if there is no carving.
+        - `bank`, `poses`: the known shapes, and the placements that are possible. Shapes are registered within the
+          carving's volume, or within `Box()` if there is no carving.
         """
         box = Box() if self.carving is None else bounding_box(self.carving.volume)
         longest_side = float(np.max(box.high - box.low))
@@ -150,7 +151,7 @@ class SurfaceSampler(eqx.Module):
 
     @own_settings()
     def within(self, volume: Box) -> "SurfaceSampler":
-        """Return a copy in which this box replaces every default volume. The box may cut the object."""
+        """Return a copy in which this box replaces every volume that is `Box()`. The box may cut the object."""
 
         def replace(leaf):
             if isinstance(leaf, OutsideBoundary):
@@ -187,7 +188,7 @@ class SurfaceSampler(eqx.Module):
         check_key(key)
         check_type(posterior, SurfacePosterior | None, "the posterior")
         observations = self.adapt(observations)
-        # The posterior is a separate program. So callers that also use the posterior do not compile it twice.
+        # The posterior is a separate program, so callers that also use the posterior do not compile it twice.
         posterior = self.posterior(observations) if posterior is None else posterior
         surfaces = _sample(self, observations, key, posterior)
         if not is_traced(surfaces):
@@ -213,7 +214,7 @@ class SurfaceSampler(eqx.Module):
     def carve(
         self, observations: Observations | PointCloud, values: Float[Array, "*s g g g"]
     ) -> Float[Array, "*s g g g"]:
-        """Make values positive where the object cannot be: at empty nodes, outside the volume, in obstacles.
+        """Make values positive where the object cannot be: at empty nodes, outside the volume and in obstacles.
 
         - `values`: f minus its level at the grid's nodes.
 
@@ -254,9 +255,9 @@ class SurfaceSampler(eqx.Module):
         """Return a mesh of the surface where the carved posterior mean equals its level (marching cubes).
 
         The mesh is in scene coordinates (its frame is the identity), with faces wound outward. Where nothing was
-        scanned, it shows the surface that the model predicts. Connected components with fewer than four points of the
-        cloud near them are left out, and a warning gives their number. If the surface leaves the grid, the mesh ends
-        there with an open edge.
+        scanned, the mesh shows the surface that the model predicts. Connected components with fewer than four points of
+        the cloud near them are left out with a warning. If the surface leaves the grid, the mesh has an open edge
+        there.
 
         **Raises:** `ValueError` if the mean equals its level nowhere in the grid, and whenever
         `SurfaceSampler.posterior` raises it.

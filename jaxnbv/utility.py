@@ -1,4 +1,4 @@
-"""Base classes of utilities and of answers to a task, and names and units of maximised values."""
+"""Base classes of utilities and of a task's answers, and the names and units of maximised values."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -20,7 +20,7 @@ _POWERS = {1: "", 2: "²", 3: "³"}
 class Quantity(eqx.Module):
     """The name, unit and meaning of a maximised value, for tables and captions.
 
-    - `name`, `unit`: in words. The unit leaves out the power of length, and is empty if there is no other unit.
+    - `name`, `unit`: in words. `unit` leaves out length, see `length_power`, and may be empty.
     - `meaning`: the rest of a caption that begins with "Value:".
     - `smooth`: whether interpolation between the values of two candidates makes sense.
     - `length_power`: power of length in the unit (2 for an area).
@@ -39,7 +39,7 @@ class Quantity(eqx.Module):
 
 
 class Answer(eqx.Module):
-    """The answer of a cloud D to the question of a task: named numbers. `jaxnbv.viz` puts them into words.
+    """The answer to a task's question, given a cloud: named numbers. `jaxnbv.viz` puts them into words.
 
     - `form`: format of a value, for `str.format`.
     """
@@ -69,7 +69,7 @@ class Utility(eqx.Module):
 
     @abstractmethod
     def __call__(self, cloud: PointCloud) -> Float[Array, ""]:
-        """Return the utility of a cloud, by JAX operations. Rows whose mask is False must be left out."""
+        """Compute the utility of a cloud by JAX operations. Rows whose mask is False must be left out."""
 
     @property
     def name(self) -> str:
@@ -91,13 +91,13 @@ class Utility(eqx.Module):
         return None
 
     def answer_values(self, cloud: PointCloud) -> Float[Array, " n"] | None:
-        """Return the values of `answer` by JAX operations; None without an answer, or if that is impossible."""
+        """Return the values of `answer`; None if there is no answer, or if JAX operations cannot compute it."""
         return None
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> Answer | None:
-        """Return the correct answer for the true surface `scene`; None if it is `answer` of this `cloud`.
+        """Return the correct answer for the true surface `scene`; None if `answer(cloud)` is the correct answer.
 
-        - `cloud`: points on all of the surface.
+        - `cloud`: points on the whole surface.
         """
         return None
 
@@ -123,9 +123,9 @@ class FunctionUtility(Utility):
 
 
 def plain_function(value: Any, name: str, example: str = "") -> Callable[..., Any]:
-    """Return the value, an argument called `name`, if it is a function.
+    """Check that the value of the argument called `name` is a function, and return the value.
 
-    **Raises:** `ValueError` for anything else, including a class.
+    **Raises:** `ValueError` for anything else, including a class. The message contains the text `example`.
     """
     is_function = callable(value) and not isinstance(value, type)
     require(is_function, f"{name} is {short_text(value)}: give one{example}, or a function of a cloud")
@@ -140,7 +140,7 @@ def as_utility(value: Any) -> Utility:
     return value if isinstance(value, Utility) else FunctionUtility(plain_function(value, "the utility"))
 
 
-# A converter accepts plain functions too, which mypy cannot see.
+# Fields of this type have a converter for plain functions. mypy does not know about converters.
 if TYPE_CHECKING:
     AnyUtility: TypeAlias = Any
 else:

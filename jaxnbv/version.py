@@ -1,4 +1,4 @@
-"""The version of the installed distribution, and the versions of JAX that it accepts."""
+"""The version of the installed package, and a check of the version of JAX."""
 
 import importlib.metadata
 
@@ -8,9 +8,9 @@ __version__ = importlib.metadata.version("jaxnbv")
 
 
 def check_jax(jaxlib_version: str) -> None:
-    """Refuse a version of jaxlib that the package excludes, but a later `pip install` may install.
+    """Check that the package supports this version of jaxlib. A later `pip install` may have changed it.
 
-    **Raises:** `ImportError` with the accepted versions.
+    **Raises:** `ImportError` with the supported versions.
     """
     requirements = map(Requirement, importlib.metadata.requires("jaxnbv") or ())
     specifier = next(requirement.specifier for requirement in requirements if requirement.name == "jax")
