@@ -1,6 +1,6 @@
 """Categories and parts of ShapeNet-part (Yi et al. 2016), in the order of the published networks.
 
-The files of the data set only number the fifty parts. We chose the names of the parts here to describe them.
+The data set only numbers its fifty parts. The names of the parts are our own.
 """
 
 from typing import NamedTuple
@@ -57,5 +57,5 @@ def category_index(name: str) -> int:
 
 
 def part_mask() -> Bool[np.ndarray, "categories parts"]:
-    """Return a mask of the parts (out of fifty) that belong to each of the sixteen categories."""
+    """Return a mask that says which of the fifty parts belong to each of the sixteen categories."""
     return np.array([[label in category.labels for label in range(NUM_PARTS)] for category in CATEGORIES])

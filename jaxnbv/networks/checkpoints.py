@@ -1,7 +1,7 @@
 """Files of networks: published PointNet++ checkpoints, and the files of jaxnbv's own networks.
 
-A file of a network of jaxnbv holds the network's arrays. Their keys are attribute paths such as `pattern.pair.weight`.
-The metadata of the file hold the class of the network and the arguments of its constructor.
+The file of an own network holds the network's arrays, keyed by attribute path, such as `pattern.pair.weight`. The
+metadata of the file hold the network's class and the arguments of its constructor.
 """
 
 import functools
@@ -34,9 +34,8 @@ _KINDS: dict[str, type] = {kind.__name__: kind for kind in (InvariantClassifier,
 def load_checkpoint(path: str | Path) -> Network:
     """Load the network in a PyTorch (.pth, .pt) or .safetensors file.
 
-    The network is a classifier or a part segmenter: PointNet++ as published, or a network of jaxnbv that
-    `save_checkpoint` wrote. No code in the file is run, and PyTorch is not needed. Wrap the network in
-    `CloudClassifier` or `CloudSegmenter`.
+    The network is a classifier or a part segmenter: PointNet++ as published, or a network that `save_checkpoint` wrote.
+    No code in the file is run, and PyTorch is not needed. Wrap the network in `CloudClassifier` or `CloudSegmenter`.
 
     **Raises:** `ValueError` if the file has a different suffix, is missing or damaged, or if its tensors fit none of
     these networks.
@@ -80,7 +79,7 @@ def _read(path: str | Path) -> tuple[_Tensors, Mapping[str, str]]:
 
 
 def _blank_network(text: str) -> Any:
-    """Make a network of jaxnbv with shapes in place of arrays, given the text in a file's metadata."""
+    """Make a network of jaxnbv with shapes in place of arrays, from the text in a file's metadata."""
     try:
         arguments = json.loads(text)
         kind = _KINDS[arguments.pop("kind")]

@@ -23,7 +23,7 @@ class CloudClassifier(Classifier):
     - `num_points`: number of points that the network gets, selected by farthest point sampling. A smaller cloud is
       padded with rows whose mask is False.
     - `scale`: network units per scene unit.
-    - `classes`: names of the classes; default: the names that the network has, if any.
+    - `classes`: names of the classes, by default `network.classes` if there are any.
 
     **Raises:** `ValueError` if `num_points` or `scale` is not positive, or if the network segments parts.
     """
@@ -105,13 +105,15 @@ class CloudSegmenter(Segmenter):
     def __call__(self, cloud: PointCloud) -> Float[Array, "num_points parts"]:
         """Compute the part probabilities at the points that the network gets, see `num_points`.
 
-        The network's probabilities are conditioned on the parts of the category. They are zero for parts of other
-        categories and in rows whose mask is False.
+        They are zero for parts of other categories and in rows whose mask is False. In other rows they sum to one.
         """
         return self._probabilities(farthest_point_subsample(cloud, self.num_points))
 
     def predict(self, cloud: PointCloud) -> tuple[PointCloud, Int[Array, " num_points"]]:
-        """Return the network's input points, in scene coordinates, and their likeliest parts; -1 if masked."""
+        """Return the points that the network gets, in scene coordinates, and the most probable part of each.
+
+        The part is -1 in rows whose mask is False.
+        """
         inputs = farthest_point_subsample(cloud, self.num_points)
         labels = jnp.argmax(self._probabilities(inputs), axis=-1).astype(jnp.int32)
         return inputs, jnp.where(inputs.mask, labels, -1)

@@ -19,11 +19,11 @@ _NUM_CENTERS, _NUM_SELECTED = 384, 320
 class PairLevel(eqx.Module):
     """One level of grouping: the features of each centre, computed from the neighbours in its group.
 
-    A perceptron takes the pair features of centre and neighbour, and the neighbour's own features if there are any. The
-    features of the centre are the maximum of its outputs over the neighbours. The pair features of a centre with
-    position x_i and normal n_i and a neighbour with x_j and n_j are (|d|^2, n_i . d, n_j . d, n_i . n_j) with
-    d = (x_j - x_i) / radius. These are the point-pair features of Drost et al. (2010) without the square root and the
-    arc cosines, so derivatives exist everywhere.
+    A perceptron takes the pair features of a centre and a neighbour, and the neighbour's own features if there are any.
+    The features of the centre are the maximum of the perceptron's outputs over the neighbours. The pair features of a
+    centre with position x_i and normal n_i and a neighbour with x_j and n_j are (|d|^2, n_i . d, n_j . d, n_i . n_j)
+    with d = (x_j - x_i) / radius. These are the point-pair features of Drost et al. (2010) without the square root and
+    the arc cosines, so derivatives exist everywhere.
 
     - `radius`: radius of a group, in units of the points.
     - `groups`: intended number of centres. The caller chooses the centres.
@@ -77,9 +77,9 @@ class Focus(eqx.Module):
     """A network that finds the cue: the points of an object that determine its class.
 
     For example, the cargo is the cue for the class of a truck. The network is invariant under rotations and
-    translations, and has about 12,000 parameters. It computes features of each point's neighbourhood, and groups them
-    around farthest point samples. It interpolates the features of the groups back to the points, and applies a
-    perceptron to both kinds of features.
+    translations, and has about 12,000 parameters. It computes features of each point's neighbourhood, groups them
+    around farthest point samples, and interpolates the features of the groups back to the points. A perceptron then
+    takes both kinds of features.
     """
 
     edge: PairLevel
@@ -95,7 +95,7 @@ class Focus(eqx.Module):
     def __call__(
         self, points: Float[Array, "n 3"], normals: Float[Array, "n 3"], mask: Bool[Array, " n"]
     ) -> Float[Array, " n"]:
-        """Compute the log-odds that each point is on the cue. They mean nothing in rows whose mask is False."""
+        """Compute the log-odds that each point is part of the cue. Ignore rows whose mask is False."""
         edges = self.edge((points, normals), (points, normals, None), mask)
         order = farthest_point_indices(points, mask, self.around.groups)
         around = self.around((points[order], normals[order]), (points, normals, edges), mask)
@@ -106,9 +106,9 @@ class Focus(eqx.Module):
     def select(
         self, points: Float[Array, "n 3"], normals: Float[Array, "n 3"], mask: Bool[Array, " n"]
     ) -> tuple[Float[Array, "few 3"], Float[Array, "few 3"], Bool[Array, " few"]]:
-        """Select the first 320 points that are on the cue with a probability above 0.5.
+        """Select the first 320 points that are part of the cue with a probability above 0.5.
 
-        Returns the points, their normals and their mask. If the points are in farthest point order, the selected points
+        Returns the points, their normals and their mask. If `points` are in farthest point order, the selected points
         are farthest point samples of the cue.
         """
         is_on_cue = mask & (self(points, normals, mask) > 0.0)

@@ -9,7 +9,7 @@ of coarse points y_j at more points x,
 
     f(x) = sum_j w_j f_j / sum_j w_j,   w_j = 1 / (|x - y_j|^2 + 1e-8),   over the three nearest y_j.
 
-Weights are for inference: batch normalisation is then a fixed affine map, and is merged into the layer before it.
+At inference, batch normalisation is a fixed affine map. It is merged into the weights of the layer before it.
 """
 
 import functools
@@ -23,7 +23,7 @@ from jaxnbv.checks import require
 from jaxnbv.geometry.farthest_points import farthest_point_indices
 
 _WORD_BITS = 32
-# Keeps the weight finite if a point and a coarse point coincide. In squared units of the points, as published.
+# Keeps w_j finite if a point and a coarse point coincide. The published value, in squared units of the points.
 _SOFTENING = 1e-8
 
 
@@ -53,12 +53,12 @@ class PooledMLP(eqx.Module):
     layers: tuple[Linear, ...]
 
     def lift(self, points: Float[Array, "n 3"], features: Float[Array, "n inputs"] | None) -> Float[Array, "n outputs"]:
-        """Apply the first layer without its bias to each point. All groups with a point share its result."""
+        """Apply the first layer, without its bias, once to each point, for all groups that contain the point."""
         inputs = points if features is None else jnp.concatenate([points, features], axis=-1)
         return product(inputs, self.layers[0].weight)
 
     def pool(self, lifted: Float[Array, "*groups members inputs"]) -> Float[Array, "*groups outputs"]:
-        """Apply what follows `lift` to its results: first bias and rectifier, the other layers, the maximum."""
+        """Apply the rest to the results of `lift`: first bias and rectifier, the other layers, the maximum."""
         hidden = jax.nn.relu(lifted + self.layers[0].bias)
         for layer in self.layers[1:-1]:
             hidden = jax.nn.relu(layer(hidden))
@@ -130,8 +130,9 @@ def ball_query(
 ) -> Int[Array, "m count"]:
     """Return the indices of the first `count` rows within `radius` of each centre.
 
-    A point at exactly `radius` is in the ball. If a ball has fewer points, its first index is repeated. If it has no
-    point, all its indices are the first row whose mask is True. `points[index]` is differentiable.
+    Rows whose mask is False are ignored. A point at exactly `radius` is in the ball. If a ball has fewer points, its
+    first index is repeated. If it has no point, all its indices are the first row whose mask is True. `points[index]`
+    is differentiable.
 
     **Raises:** `ValueError` if `count` < 1.
     """
@@ -148,7 +149,7 @@ def _positions_of_true(flags: Bool[Array, "m n"], count: int) -> Int[Array, "m c
 
     If a row has fewer true entries, the remaining columns are at least n. Each row is packed into words of 32 bits. Bit
     counts give the word that holds the k-th true entry, and five bisections of this word give the bit. This takes one
-    pass over the flags. Sorting the columns would take many.
+    pass over the flags, but sorting the columns would take many.
     """
     flags = jnp.pad(flags, ((0, 0), (0, -flags.shape[1] % _WORD_BITS))).reshape(len(flags), -1, _WORD_BITS)
     bit = jnp.left_shift(jnp.uint32(1), jnp.arange(_WORD_BITS, dtype=jnp.uint32))
@@ -176,10 +177,10 @@ def _bit_count(words):
 def interpolate(
     points: Float[Array, "n 3"], coarse: Float[Array, "m 3"], features: Float[Array, "m f"]
 ) -> Float[Array, "n f"]:
-    """Interpolate features at each point from the three nearest coarse points.
+    """Interpolate features at each point from the three nearest coarse points, or from all if there are fewer.
 
-    If there are fewer than three coarse points, all of them are used. Weights are inverse squared distances. The result
-    is differentiable in all arguments. The derivative ignores that the nearest points may change.
+    Weights are inverse squared distances. The result is differentiable in all arguments. The derivative ignores that
+    the nearest points may change.
     """
     index, is_valid = _nearest(points, coarse)
     squared = jnp.sum((points[:, None] - coarse[index]) ** 2, axis=-1)
@@ -189,7 +190,7 @@ def interpolate(
 
 
 def _nearest(points: Float[Array, "n 3"], coarse: Float[Array, "m 3"]) -> tuple[Int[Array, "n 3"], Bool[Array, "n 3"]]:
-    """Return the rows of the three nearest coarse points of each point, and whether each row exists.
+    """Return the rows of the three nearest coarse points of each point, and whether there is such a row.
 
     On a CPU this loop over the coarse points is two to three times as fast as `jax.lax.top_k`.
     """

@@ -9,14 +9,14 @@ from typing import Any
 from jaxnbv.checks import require
 
 _PUTS, _GETS = ("PUT", "BINPUT", "LONG_BINPUT"), ("GET", "BINGET", "LONG_BINGET")
-# Operations that modify the first object that they take from the stack and put this object back.
+# Operations that take objects from the stack, modify the first of them, and put it back.
 _CHANGES = ("APPEND", "APPENDS", "SETITEM", "SETITEMS", "ADDITEMS", "BUILD")
 # Python hashes nested tuples by recursion without a depth limit, which could overflow the C stack.
 _MAX_DEPTH = 500
 
 
 def skip_pickle(file: BytesIO | mmap.mmap, size: int) -> None:
-    """Check the next pickle in a file and move the file past it, without creating the pickle's objects.
+    """Check the next pickle in a file and advance the file past the pickle, without creating its objects.
 
     - `size`: size of the file in bytes.
 

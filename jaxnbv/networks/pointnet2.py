@@ -68,7 +68,7 @@ class PointNet2Classifier(eqx.Module):
     """Classifier of a cloud: set abstractions, a PointNet over the last centres, and a perceptron.
 
     The object must be centred and inside the unit sphere, as in training. For many clouds use `vmap` or `lax.map`. On a
-    CPU `lax.map` is two to three times as fast, since the features of one cloud stay in the cache. The result is
+    CPU `lax.map` is two to three times as fast, because the features of one cloud stay in the cache. The result is
     reverse-mode differentiable in points and normals. The derivative ignores changes in the sampling and grouping of
     points.
 
@@ -91,9 +91,9 @@ class PointNet2Classifier(eqx.Module):
     ) -> Float[Array, " classes"]:
         """Compute the log-probabilities of the classes for one cloud. Without a mask, all rows are points.
 
-        Rows whose mask is False do not affect the result. The order of the other rows does: the first row is the first
-        centre, and a ball with too many points keeps only its first rows. A cloud without points is treated as one
-        point at the origin.
+        Rows whose mask is False do not affect the result. The order of the other rows affects it: the first row is the
+        first centre, and a ball with too many points keeps only its first rows. A cloud without points is treated like
+        a single point at the origin.
 
         **Raises:** `ValueError` if points and normals are not both (n, 3), or there are no rows.
         """
@@ -107,10 +107,10 @@ class PointNet2Classifier(eqx.Module):
 class PointNet2PartSegmenter(eqx.Module):
     """Part segmenter of a cloud for an object of known category.
 
-    Set abstractions reduce the cloud to one vector, feature propagations interpolate back to the points, and a
-    perceptron follows. The object must be centred and inside the unit sphere, as in training. The result is
-    reverse-mode differentiable in points and normals. The derivative ignores changes in the sampling, grouping and
-    neighbours of points.
+    Set abstractions reduce the cloud to one vector, feature propagations carry it back to the points, and a perceptron
+    follows. The object must be centred and inside the unit sphere, as in training. The result is reverse-mode
+    differentiable in points and normals. The derivative ignores changes in the sampling, grouping and neighbours of
+    points.
 
     - `whole`: the PointNet over the coordinates and features of the last level's centres.
     - `propagations`: the feature propagations, the coarsest level first.
@@ -145,8 +145,7 @@ class PointNet2PartSegmenter(eqx.Module):
         """Compute the log-probabilities of the parts of all categories, at each point.
 
         Rows whose mask is False do not affect the other rows, and their own values have no meaning. The order of the
-        other rows affects the result: the first row is the first centre, and a ball with too many points keeps only its
-        first rows.
+        other rows affects the result, see `PointNet2Classifier`.
 
         - `category`: index of the category, which may be traced.
 
@@ -173,9 +172,9 @@ class PointNet2PartSegmenter(eqx.Module):
 class CompactPartSegmenter(eqx.Module):
     """Small part segmenter: two set abstractions, a PointNet over all centres, and three propagations.
 
-    The segmenter has about 100,000 parameters. Absolute coordinates are features too, so all objects must be upright
-    and face the direction of ShapeNet's objects. Points need normals. The result is reverse-mode differentiable in
-    points and normals. The derivative ignores changes in the sampling and grouping of points.
+    The segmenter has about 100,000 parameters. Absolute coordinates are features, so all objects must be upright and
+    face the same direction as ShapeNet's objects. The result is reverse-mode differentiable in points and normals. The
+    derivative ignores changes in the sampling and grouping of points.
     """
 
     fine: SetAbstraction

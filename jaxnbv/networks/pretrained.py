@@ -20,8 +20,8 @@ def pretrained_classifier(
 
     - `name`: "pyramid", "truck" or "household".
     - `longest_side`: longest side of the object's box, in scene units.
-    - `num_points`: number of input points; default: as in training. With half as many points the classifier is twice as
-      fast and a little less accurate.
+    - `num_points`: number of input points, by default the number used in training. With half as many points the
+      classifier is twice as fast and a little less accurate.
 
     **Raises:** `ValueError` if there is no classifier with this name, or if `longest_side` or `num_points` is not
     positive.
@@ -48,10 +48,10 @@ def part_segmenter(category: str | int, num_points: int = 2048, longest_side: fl
 
 
 def network_scale(network: Network, longest_side: float = TRAINED_SIDE) -> float:
-    """Return network units per scene unit, for objects whose box has this longest side (scene units).
+    """Return network units per scene unit, for objects whose box has this longest side in scene units.
 
-    `InvariantClassifier` expects objects with a longest side of 2.5. The other networks expect objects that fill the
-    unit sphere or its bounding box.
+    `InvariantClassifier` expects objects with a longest side of 2.5. The other networks expect objects with a longest
+    side of 2, which fill the unit sphere or its bounding box.
 
     **Raises:** `ValueError` if `longest_side` is not positive.
     """

@@ -7,10 +7,11 @@
     fp3, fp2, fp1    mlp_convs.<layer>, mlp_bns.<layer>          the part segmenter's feature propagations
     conv1, bn1, conv2                                            its perceptron
 
-The shapes of the tensors determine the channels, layers, classes, parts and the use of normals. The radii are the
-published ones, for networks with one radius per level or with several. Batch normalisation is merged into the weights W
-and the bias b of a layer: W' = W g / sqrt(v + eps), b' = (b - m) g / sqrt(v + eps) + h, with the scale g, the shift h,
-the running mean m and the running variance v of the normalisation, and eps = 1e-5.
+The shapes of the tensors give the numbers of channels, layers, classes and parts, and say whether normals are used. The
+radii are not stored, so they are those of the published networks with one or with several radii per level. Batch
+normalisation is merged into the weights W and the bias b of a layer: W' = W g / sqrt(v + eps) and
+b' = (b - m) g / sqrt(v + eps) + h, with the scale g, the shift h, the running mean m and the running variance v of the
+normalisation, and eps = 1e-5.
 """
 
 from collections.abc import Mapping
@@ -30,7 +31,7 @@ _EPSILON = 1e-5
 def published_network(tensors: Tensors) -> PointNet2Classifier | PointNet2PartSegmenter:
     """Make the network of these tensors: a part segmenter if there are propagations, else a classifier.
 
-    **Raises:** `ValueError`, which names the tensor, if one is missing, unexpected, of a wrong shape or not finite.
+    **Raises:** `ValueError` if a tensor is missing, unexpected, of a wrong shape or not finite. The error names it.
     """
     state = _State(tensors)
     segments = any(name.startswith("fp") for name in tensors)
@@ -68,9 +69,9 @@ def _part_segmenter(state: "_State") -> PointNet2PartSegmenter:
 def _encoder(
     state: "_State", scales: tuple[tuple[Level, ...], tuple[Level, ...]], kinds: dict[int, str]
 ) -> tuple[tuple[SetAbstraction, ...], PooledMLP, list[int]]:
-    """Return set abstractions, the PointNet over all points, and widths of points' and levels' features.
+    """Return set abstractions, the PointNet over all points, and feature widths (points, then each level).
 
-    - `scales`: sizes of the levels for networks with one radius per level, and with several.
+    - `scales`: sizes of the levels for a network with one radius per level, and for a network with several.
     - `kinds`: allowed numbers of inputs, and the meaning of each.
     """
     is_multi_scale = "sa1.conv_blocks.0.0.weight" in state.tensors
@@ -88,7 +89,7 @@ def _encoder(
 
 
 class _State:
-    """Tensors keyed by name, with checks of their shapes, and names of the tensors not used so far."""
+    """Tensors keyed by name, with checks of their shapes, and the names of the tensors not used so far."""
 
     def __init__(self, tensors: Tensors):
         self.tensors = {name: array for name, array in tensors.items() if not name.endswith("num_batches_tracked")}

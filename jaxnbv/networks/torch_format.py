@@ -1,8 +1,8 @@
 """Reads the tensors of a PyTorch file, without PyTorch and without running code from the file.
 
-A `.pth` file holds a pickle, which is a program, and the raw bytes of the arrays. This reader knows only the names that
-a pickle needs for tensors and dictionaries. Any other name resolves to an object that does nothing. Nothing is
-imported. Two layouts are supported: the zip archive since PyTorch 1.6 (`data.pkl`, `data/0`, `data/1`, ...), and the
+A `.pth` file holds a pickle, which is a program, and the raw bytes of the arrays. This reader imports nothing. It knows
+only the names that a pickle needs for tensors and dictionaries, and replaces any other name by an object that does
+nothing. Two layouts are supported: the zip archive since PyTorch 1.6 (`data.pkl`, `data/0`, `data/1`, ...), and the
 older stream of pickles followed by the arrays.
 """
 
@@ -24,7 +24,7 @@ import numpy as np
 from jaxnbv.checks import InputError, require
 from jaxnbv.networks.pickle_bounds import skip_pickle
 
-# Values are names of types, not types, since a pickle could modify a type, but cannot modify a string.
+# Values are names of types instead of types, because a pickle could modify a type, but cannot modify a string.
 _TYPES = {
     "DoubleStorage": "float64",
     "FloatStorage": "float32",
@@ -47,7 +47,7 @@ def read_torch_tensors(path: str | Path) -> dict[str, np.ndarray]:
     """Read the tensors of a model, keyed by name, from a file that `torch.save` wrote.
 
     The file holds a state dictionary, or a training checkpoint with a state dictionary under `model_state_dict` or
-    `state_dict`. Names in models that were trained on several devices have the prefix `module.`, which is removed.
+    `state_dict`. If all names begin with `module.`, as after training on several devices, this prefix is removed.
 
     **Raises:** `ValueError` if the file is missing, damaged, not from PyTorch, or has no state dictionary.
     """
@@ -83,7 +83,7 @@ def _state_dictionary(content: Any) -> dict[str, np.ndarray]:
 
 
 def _read_archive(file: BufferedIOBase, size: int) -> Any:
-    """Read a zip archive. It has one folder with data.pkl, the arrays as data/<key>, and the byte order."""
+    """Read a zip archive: a folder with data.pkl, the arrays as data/<key>, and the byte order."""
     with zipfile.ZipFile(file) as archive:
         unpacked_size = sum(entry.file_size for entry in archive.infolist())
         require(
@@ -103,10 +103,10 @@ def _read_archive(file: BufferedIOBase, size: int) -> Any:
 
 
 def _read_stream(file: BufferedIOBase, size: int) -> Any:
-    """Read the layout before PyTorch 1.6.
+    """Read a stream of pickles, the layout before PyTorch 1.6.
 
     The file has a magic number, the protocol, the system, the content, the keys, and then the count and the bytes of
-    each array. The arrays come last, so the tensors are first made as views of empty arrays, which are then filled.
+    each array. The arrays come last, so the tensors are first made as views of zeros, which are then overwritten.
     """
     storages: dict[str, np.ndarray] = {}
 
@@ -158,12 +158,12 @@ class _TensorUnpickler(pickle.Unpickler):
         return _FUNCTIONS.get((module, name), _Placeholder)
 
     def persistent_load(self, identifier: Any) -> np.ndarray:
-        """Return the storage with identifier ('storage', type, key, device, count). Older files append None."""
+        """Return the storage of an identifier ('storage', type, key, device, count, and None in older files)."""
         _, kind, key, _, count, *_ = identifier
         return self._storage(key, kind, count)
 
     def _dictionary(self, items: Any = ()) -> "_Dictionary":
-        """Copy items into a dictionary, unless all copies together have more items than the file has bytes."""
+        """Return a dictionary of the items. All together may have at most as many items as the file has bytes."""
         self._items -= len(items)
         require(self._items >= 0, "copies the same dictionary over and over: it is damaged")
         return _Dictionary(items)
@@ -177,7 +177,7 @@ class _Dictionary(OrderedDict):
 
 
 class _Placeholder:
-    """Stands for each class or function that a pickle names and that is not allowed. It does nothing."""
+    """Replacement for a class or function that a pickle names but may not use. It does nothing."""
 
     def __new__(cls, *_: Any) -> "_Placeholder":
         return super().__new__(cls)
