@@ -1,6 +1,6 @@
-"""The sensor: a pinhole depth camera, its rays and its limits.
+"""A pinhole depth camera: its pixels, its rays, and the limits of what it measures.
 
-OpenCV convention: in the camera's own frame x points right, y down and z forward, along the view.
+In the camera's frame, x points right, y down and z forward (OpenCV's convention).
 """
 
 import dataclasses
@@ -21,17 +21,17 @@ from jaxnbv.programs import program
 _Points = TypeVar("_Points", Float[Array, "*n 2"], Float[np.ndarray, "*n 2"])
 # Skew below this fraction of fx counts as zero.
 _MAX_SKEW = 1e-6
-# Depth cameras have no rays more than 70 degrees off the axis (`_MAX_TANGENT` is the tangent). A principal point may be
-# the centre of an image if it is off by at most `_MAX_CENTER_OFFSET` times half the width and half the height.
+# `_MAX_TANGENT`: no ray of a depth camera is more than 70 degrees off the axis. `_MAX_CENTER_OFFSET`: a principal point
+# counts as the centre of an image if it is off by at most this fraction of half the width and of half the height.
 _MAX_TANGENT, _MAX_CENTER_OFFSET = math.tan(math.radians(70.0)), 0.2
 # A principal point at this fraction or more of both the width and the height certainly belongs to a larger image.
 _MAX_CENTER_FRACTION = 0.96
 
 
 def _limit(depth: Any) -> Any:
-    """Convert a limit of the camera's range to an array, so that compiled programs run for any limit.
+    """Convert a limit of the camera's range to an array, so that one compiled program runs for any limit.
 
-    A missing limit stays 0.0 or None, so that programs can branch on it.
+    If there is no limit, the value stays 0.0 or None, so that programs can branch on it.
     """
     is_number = isinstance(depth, int | float) and not isinstance(depth, bool) and depth != 0
     return np.float64(depth) if is_number else depth
@@ -40,15 +40,17 @@ def _limit(depth: Any) -> Any:
 class Camera(eqx.Module):
     """A pinhole depth camera. The centres of pixels are at 0.5, 1.5, ... from the image's top left corner.
 
-    - `fov`: vertical field of view in radians, within (0, pi), as if the principal point were at the image's centre.
+    - `fov`: 2 atan(height / (2 fy)) for a vertical focal length of fy pixels, in radians within (0, pi). This is the
+      vertical field of view if the principal point is the image's centre.
     - `height`, `width`: number of rows and columns of pixels. One ray goes through the centre of each pixel.
     - `aspect`: horizontal focal length divided by vertical focal length, both in pixels; 1 for square pixels.
     - `center`: the principal point, as fractions of the width and the height.
-    - `nearest`, `farthest`: the sensor measures depths between these limits, along the viewing direction and in scene
+    - `nearest`, `farthest`: least and greatest depth that the sensor measures, along the viewing direction, in scene
       units. `nearest=0` and `farthest=None` mean no limit. A hit nearer than `nearest` is invalid. A ray without a hit
-      up to `farthest` is missed, so it is empty up to `farthest`.
+      up to `farthest` counts as a miss: the space along it is empty up to `farthest`.
     - `max_incidence`: largest angle between a ray and the normal of a measured hit, in radians within (0, pi/2].
-    - `distortion`: coefficients, see `from_intrinsics`. The rays have none, since `PointCloud.from_depth` undoes it.
+    - `distortion`: OpenCV's coefficients, see `from_intrinsics`. The rays do not use them, because
+      `PointCloud.from_depth` removes the distortion of an image.
 
     The defaults are the paper's: 30 degrees, 50 x 50 pixels, no limits.
 
@@ -105,8 +107,8 @@ class Camera(eqx.Module):
         - `nearest`, `farthest`, `max_incidence`: see `Camera`.
         - `distortion`: OpenCV's coefficients k1, k2, p1, p2[, k3[, k4, k5, k6]].
 
-        **Raises:** `ValueError` for a matrix of another form (such as with skew) or certainly for another image size,
-        for a wrong number of coefficients, or for coefficients that map two points to the same pixel.
+        **Raises:** `ValueError` for a matrix of another form (for example with skew), a matrix that is certainly for
+        another image size, a wrong number of coefficients, or coefficients that map two points to the same pixel.
         """
         intrinsics = as_numbers(matrix, "the intrinsic matrix", np.float64)
         require(intrinsics.shape == (3, 3), f"the intrinsic matrix has shape {intrinsics.shape}: give one of (3, 3)")
@@ -142,7 +144,7 @@ class Camera(eqx.Module):
 
     @checked
     def strided(self, stride: int) -> "Camera":
-        """Return the camera whose image is every `stride`-th row and column, starting at `stride // 2`.
+        """Return the camera of an image's every `stride`-th row and column, starting at `stride // 2`.
 
         **Raises:** `ValueError` for a stride that is below one or leaves no pixel.
         """
@@ -190,7 +192,7 @@ class Camera(eqx.Module):
         return jnp.asarray(directions, dtype=jnp.result_type(float))
 
     def to_pixels(self, plane_points: _Points) -> _Points:
-        """Convert points (x, y) of the plane z = 1 to (column, row). The first pixel's centre is (0.5, 0.5)."""
+        """Convert points (x, y) of the plane z = 1 to pixels (column, row), the first centred at (0.5, 0.5)."""
         (fx, fy), (cx, cy) = self.focal_lengths, self.center
         scale, offset = np.array([[fx, fy], [cx * self.width, cy * self.height]], plane_points.dtype)
         return plane_points * scale + offset
@@ -205,12 +207,12 @@ class Camera(eqx.Module):
 
 
 def _check_image_size(matrix: np.ndarray, height: int, width: int, center: tuple[float, float]) -> None:
-    """Warn if a matrix's principal point is probably the centre of an image of a different size.
+    """Warn if an intrinsic matrix is probably for an image of another size, judged by its principal point.
 
     - `center`: the principal point, as fractions of the width and the height.
 
-    **Raises:** `ValueError` instead of the warning if the principal point is at the corner of the given image or beyond
-    it, or if it lies outside the image and the image would extend more than 70 degrees off the axis.
+    **Raises:** `ValueError` instead of the warning if the principal point is at the image's lower right corner or
+    beyond it. Also if it lies outside the image and the image would extend more than 70 degrees off the axis.
     """
     (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
     tangent_x, tangent_y = (

@@ -28,7 +28,7 @@ from jaxnbv.geometry.farthest_points import farthest_point_indices
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.volume import Box
 
-# Largest number of rows that an index of 32 bits can count. A planner cannot hold nearly that many in memory.
+# Largest number of rows that a 32-bit index can count, far more than fit in memory.
 _MAX_ROWS = 2**31 - 1
 _MAX_NORMAL_LENGTH = 10.0
 
@@ -36,16 +36,16 @@ _MAX_NORMAL_LENGTH = 10.0
 class PointCloud(eqx.Module):
     """Points with normals (the paper's cloud D), in arrays with a fixed number of rows.
 
-    The number of rows is the cloud's capacity. Rows whose mask is False are empty, and their points and normals are
-    zero. Leading axes make a batch of clouds.
+    The number of rows is the cloud's capacity. A row is filled if its mask is True. Else it is empty, and its point and
+    normal are zero. Leading axes make a batch of clouds.
 
     - `points`: positions, in scene units unless stated otherwise.
     - `normals`: unit outward normals.
     - `mask`: whether each row holds a point.
     - `missed`: for a sensor's scan, which has one row per pixel, whether each ray met nothing and so crossed only empty
       space. A row that is neither filled nor missed is invalid. None for a cloud that is not a sensor's image.
-    - `sight`: for a sensor's scan, the distance from the camera to the hit of each ray, in units of the points, even if
-      the hit is not a point of the cloud; infinite without a hit. None if unknown.
+    - `sight`: for a sensor's scan, the distance that the camera measured along each ray, in units of the points, even
+      if the hit is not a point of the cloud; infinite if it measured none. None if unknown.
     """
 
     points: Float[Array, "*batch n 3"] = eqx.field(converter=native)
@@ -76,7 +76,7 @@ class PointCloud(eqx.Module):
     ) -> "PointCloud":
         """Build a cloud from points and outward normals, padded to `capacity` rows.
 
-        Normals are scaled to unit length. A `UserWarning` is given if the length of a normal changes by more than 1 %.
+        Normals are scaled to unit length, with a `UserWarning` if the length of one changes by more than 1 %.
 
         - `capacity`: number of rows, by default the number of points.
 
@@ -136,7 +136,7 @@ class PointCloud(eqx.Module):
     ) -> "PointCloud":
         """Convert a depth image to a cloud in the coordinates of the pose, with one row per pixel, row by row.
 
-        Each pixel is a point, missed, or invalid:
+        Each pixel is a point, missed or invalid (see `PointCloud.missed`):
 
         - A pixel of +infinity (its ray met nothing in the whole scene) or beyond the camera's range is missed.
         - A pixel that is zero, negative, NaN or below the camera's range is invalid: it gives no information.
@@ -144,18 +144,18 @@ class PointCloud(eqx.Module):
           that fills far more pixels than any value near it and lies beyond the camera's range or well beyond the box.
           The second kind gives a `UserWarning`.
 
-        Distortion is undone first (`Camera.from_intrinsics`). Then a plane is fitted to the pixels around each pixel
-        that lie on the same surface. Their window grows with the noise (`geometry/plane_fit.py`). The plane gives the
-        point and its normal, which points towards the camera. A pixel is invalid if its neighbours do not define a
-        plane, or if six of its eight neighbours disagree with it, since sensors mix the depths of two surfaces at
-        edges. If an image has gaps between its valid pixels, such as a lidar's, planes are fitted to one pixel per
-        block of the gap's size. Each point still lies on the ray of its own pixel.
+        First, the camera's distortion is removed. Then a plane is fitted to each pixel and to the pixels around it that
+        lie on the same surface, within a window that grows with the noise (`geometry/plane_fit.py`). The plane gives
+        the point and its normal, which points towards the camera. A pixel is invalid if its neighbours do not define a
+        plane. It is also invalid if at least six of its eight neighbours differ from it by more than noise, because
+        sensors mix the depths of two surfaces at edges. If the valid pixels have gaps between them, as in a lidar's
+        image, planes are fitted to one pixel per block of the gap's size. Each point lies on the ray of its own pixel.
 
         - `depth`: depths along the camera's forward axis. The noise of integer depths is at least their rounding.
-        - `depth_scale`: units of the pose (also of the camera's range and the box) per unit of depth, such as 0.001 for
-          an image in millimetres and a pose in metres.
+        - `depth_scale`: factor from the unit of `depth` to the unit of the pose, of the camera's range and of the box,
+          such as 0.001 for an image in millimetres and a pose in metres.
         - `stride`: keep every `stride`-th row and column, as `camera.strided` does. Planes are fitted to all pixels.
-        - `box`: keep only points inside. A ray that hits behind the box is missed, one that hits before it is invalid.
+        - `box`: keep only points inside. A hit behind the box makes its ray missed, a hit in front makes it invalid.
 
         **Raises:** `ValueError` if the image's shape differs from the camera's, all depths are outside the camera's
         range, the box is behind the camera, or depths and the distance of the box differ by orders of magnitude.
@@ -205,7 +205,7 @@ class PointCloud(eqx.Module):
 
 
 def some_rows(cloud: PointCloud, count: int) -> Int[Array, " count"]:
-    """Return `count` evenly spaced indices of filled rows, repeated if there are fewer, and 0 if none."""
+    """Return the indices of `count` evenly spaced filled rows, which repeat if too few rows are filled."""
     order = jnp.argsort(~cloud.mask, stable=True)
     return order[(jnp.arange(count) * cloud.count) // count]
 
@@ -217,11 +217,11 @@ def check_single(cloud: PointCloud, name: str = "the cloud") -> None:
 
 
 def check_oriented(cloud: PointCloud, name: str, limit: float, unit: bool = True) -> None:
-    """Check that a concrete cloud has points within the scene and normals of valid lengths.
+    """Check that a cloud (not traced by JAX) has points within the scene and normals of valid lengths.
 
     - `limit`: largest magnitude of a coordinate, in scene units.
-    - `unit`: whether normals must have unit length (to 1 %). If not, lengths up to 10 are allowed, since a model may be
-      conditioned on prior samples, whose normals do not have unit length.
+    - `unit`: whether normals must have unit length (to 1 %). If not, lengths up to 10 are allowed, because a model may
+      be conditioned on prior samples, whose normals do not have unit length.
 
     **Raises:** `ValueError` for an empty cloud, an entry that is not finite, or an invalid normal or point.
     """
@@ -280,7 +280,7 @@ def farthest_point_subsample(cloud: PointCloud, count: int) -> PointCloud:
 @own_settings()
 @functools.partial(jax.jit, static_argnames="capacity")
 def limit_capacity(cloud: PointCloud, capacity: int) -> PointCloud:
-    """Return the cloud with `capacity` rows, filled rows first. Farthest point sampling thins it.
+    """Return the cloud with `capacity` rows, filled rows first. Farthest point sampling drops the excess.
 
     **Raises:** `ValueError` if `capacity` < 1.
     """
@@ -298,7 +298,7 @@ def limit_capacity(cloud: PointCloud, capacity: int) -> PointCloud:
 
 
 def _take(cloud: PointCloud, rows: Int[Array, " m"]) -> PointCloud:
-    """Return a cloud of these rows. Rows beyond the number of the cloud's points are empty."""
+    """Return a cloud of the given rows, of which the first `cloud.count` are filled and the others empty."""
     is_filled = jnp.arange(len(rows)) < cloud.count
     points, normals = (jnp.where(is_filled[:, None], array[rows], 0.0) for array in (cloud.points, cloud.normals))
     return PointCloud(points, normals, is_filled)

@@ -19,11 +19,11 @@ from jaxnbv.geometry.volume import Box, ray_interval
 from jaxnbv.programs import program
 
 Rows = tuple[Float[Array, "n 3"], Float[Array, "n 3"], Bool[Array, " n"], Bool[Array, " n"], Float[Array, " n"]]
-# The units are right if at least the fraction `_MIN_FRACTION` of the depths is within a factor of `_MAX_DEPTH_RATIO` of
-# the box's depths.
+# The units count as right if at least the fraction `_MIN_FRACTION` of the depths is within a factor of
+# `_MAX_DEPTH_RATIO` of the box's depths.
 _MAX_DEPTH_RATIO, _MIN_FRACTION = 20.0, 1e-3
-# A value beyond the box's greatest depth times this factor may be a sentinel ("not measured"). The surface that the
-# object stands on is nearer than that.
+# A value may be a sentinel ("not measured") if it exceeds the box's greatest depth by this factor. The surface that the
+# object stands on is nearer.
 _SENTINEL_DEPTH_RATIO = 1.1
 
 
@@ -34,7 +34,7 @@ class NothingInside(UserWarning):
 def points_of_depth(
     depth: Real[AnyArray, "height width"], camera: Camera, pose: Pose, scale: float, stride: int, box: Box | None
 ) -> Rows:
-    """Compute the fields points, normals, mask, missed and sight of the cloud of `PointCloud.from_depth`.
+    """Return the points, normals, mask, missed and sight of the cloud that `PointCloud.from_depth` makes.
 
     **Raises:** `ValueError` for a scale that is not positive, a batch of poses, a stride that is below one or leaves no
     pixel, or for the same reasons as `from_depth`.
@@ -86,9 +86,10 @@ def _points_and_normals(
     rounding: Float[Array, ""],
     block_side: int,
 ) -> tuple[Rows, Float[Array, " n"]]:
-    """Return the cloud's rows, and a lower bound on the depth around each row's pixel (-inf without a depth).
+    """Return the cloud's rows, and a lower bound on the depth around each pixel (-inf if it has no depth).
 
     - `rounding`: standard deviation of the rounding of depths.
+    - `block_side`: see `fit_planes`.
     """
     rows, strided_camera = slice(stride // 2, None, stride), camera.strided(stride)
     samples = _strided_samples(depth, jnp.isfinite(depth) & (depth > 0), stride, block_side)[0]
@@ -113,7 +114,7 @@ def _points_and_normals(
 def _in_box(
     points: Float[Array, "n 3"], nearest: Float[Array, " n"], box: Box, camera: Camera, pose: Pose, stride: int
 ) -> tuple[Bool[Array, " n"], Bool[Array, " n"]]:
-    """Return whether each point lies in a box, and whether each ray was measured beyond the box.
+    """Return whether each point lies in a box, and whether each ray went past the box before it hit.
 
     - `nearest`: see `_points_and_normals`.
     """
@@ -128,7 +129,7 @@ def _strided_samples(
 
     1. depth of the block's sample.
     2. whether the block has a sample.
-    3. lower bound on the depth: the least of the samples in this block and, if `block_side` > 1, the eight around it.
+    3. lower bound on the depth: the least sample of the block and, if `block_side` > 1, of the eight around it.
     """
     samples, is_sample, _ = block_samples(depth, valid, block_side)
     nearest = jnp.where(is_sample, samples, jnp.inf)
@@ -140,7 +141,7 @@ def _strided_samples(
 
 
 def _depth_behind(box: Box, camera: Camera, pose: Pose) -> Float[Array, " n"]:
-    """Return the depth at which each ray leaves a box; minus infinity for a ray that misses the box."""
+    """Return the depth at which each ray leaves a box; -inf for a ray that misses the box."""
     directions = jnp.matmul(camera.pixel_directions(), pose.rotation.T, precision="highest")
     enter, leave = ray_interval(list(pose.position), list(directions.T), box.low, box.high)
     return jnp.where(leave > jnp.maximum(enter, 0.0), leave, -jnp.inf)
@@ -180,8 +181,8 @@ def _depth_range(box: Box, pose: Pose) -> tuple[float, float]:
 def _check_units(depth: Float[np.ndarray, " valid"], camera: Camera, depth_range: tuple[float, float] | None) -> None:
     """Check that the measured depths can be in the units of the camera's range and of the box.
 
-    **Raises:** `ValueError` if all depths are nearer or all are farther than the camera's range, or if fewer than 0.1 %
-    of those in the range are within a factor of 20 of the box's depths. The others may be background or glare.
+    **Raises:** `ValueError` if all depths are nearer or all are farther than the camera's range, or if more than 99.9 %
+    of the depths in the range differ from the box's by a factor above 20. A smaller share may be background or glare.
     """
     if not len(depth):
         return

@@ -1,4 +1,4 @@
-"""Estimation of each pixel's noise in a depth image. The noise grows with the distance and depends on the material."""
+"""Estimation of each pixel's noise in a depth image, which depends on the distance and the material."""
 
 import functools
 import math
@@ -13,8 +13,8 @@ from jaxtyping import Array, Bool, Float, Shaped
 # noise of a pixel is estimated from its tile and the eight around it, at its depth step and the two steps beside it.
 _MAX_TILES, _MIN_TILE_SIZE = 40, 8
 _DEPTH_STEP, _DEPTH_STEPS = math.log(1.1), 48
-# Third differences, divided by the depth, are counted in a histogram whose bins are powers of two from this value on.
-# The largest differences come from edges.
+# Third differences, divided by the depth, are counted in `_LEVELS` bins. The first bin ends at `_MIN_DIFFERENCE`, and
+# each later bin ends at twice the end of the bin before it. Larger differences come from edges and are not counted.
 _MIN_DIFFERENCE, _LEVELS = 1e-5, 16
 _MIN_COUNT = 16
 # Median magnitude of the third difference of independent normal errors, divided by the standard deviation of one error.
@@ -26,11 +26,11 @@ def depth_noise(
 ) -> Float[Array, "h w"]:
     """Return the standard deviation of each pixel's noise and rounding, in units of the depth.
 
-    The result is at least `min_noise`. It is computed from the median magnitude of the third differences of depth along
-    rows and columns, which are mostly noise on a smooth surface. The median is over the first of three sets that has at
-    least 16 differences: those near the pixel at a similar depth, those in the whole image at a similar depth, or all.
-    If at least half but at most three quarters of the differences are zero, depths are rounded to steps, and the size
-    of the steps is computed from the other differences.
+    The noise is estimated from the median magnitude of third differences of depth along rows and columns, which are
+    mostly noise on a smooth surface. The differences are taken from near the pixel at a similar depth. If there are
+    fewer than 16, they are taken from the whole image at a similar depth or, if there are still fewer, at any depth. If
+    between half and three quarters of the differences are zero, the depths are rounded to steps, and the median is over
+    the other differences. The result is at least `min_noise`.
     """
     tile = max(-(-max(depth.shape) // _MAX_TILES), _MIN_TILE_SIZE)
     tiles = tuple(-(-size // tile) for size in depth.shape)
@@ -41,8 +41,8 @@ def depth_noise(
     cell = row, column, step
     counts = jnp.zeros((*tiles, _DEPTH_STEPS, _LEVELS), depth.dtype)
     for axis in (0, 1):
-        # The differences use every second pixel. The errors of direct neighbours are correlated, since sensors smooth
-        # their images.
+        # Differences use every second pixel, because sensors smooth their images and so correlate the errors of direct
+        # neighbours.
         a, b, c, d = (_group_member(depth, axis, index) for index in range(4))
         is_smooth = functools.reduce(operator.and_, (_group_member(valid, axis, index) for index in range(4)))
         # Pixels beside an edge are left out, since they mix a near and a far surface.
@@ -70,7 +70,7 @@ def _median(counts: Float[Array, "*n levels"]) -> Float[Array, "*n"]:
     """Return the median of a histogram whose bins are powers of two; zero for an empty histogram.
 
     The median is interpolated linearly within its bin. The first bin holds numbers that are nearly zero. If it holds
-    between a half and three quarters of all numbers, depths are rounded to steps, and the bin is left out.
+    between half and three quarters of all numbers, the depths are rounded to steps, and this bin is left out.
     """
     zeros = counts[..., 0] / jnp.maximum(jnp.sum(counts, axis=-1), 1.0)
     counts = counts.at[..., 0].multiply((zeros < 0.5) | (zeros > 0.75))

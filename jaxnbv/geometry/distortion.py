@@ -1,7 +1,7 @@
 """OpenCV's lens distortion with 4, 5 or 8 coefficients (Brown 1971), and its removal from images.
 
-A lens shows a point (X, Y, Z) of the camera's frame at (x', y') in the plane Z = 1. With (x, y) = (X / Z, Y / Z),
-r^2 = x^2 + y^2 and the radial part g of the distortion, this image point is
+A lens shows a point (X, Y, Z) of the camera's frame at the point (x', y') of the plane Z = 1. With x = X / Z, y = Y / Z
+and r^2 = x^2 + y^2,
 
     x' = x g + 2 p1 x y + p2 (r^2 + 2 x^2),    y' = y g + p1 (r^2 + 2 y^2) + 2 p2 x y,
     g = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)
@@ -49,7 +49,10 @@ def undistort_points(
 def pixels_of(
     plane_points: Float[AnyArray, "*n 2"], matrix: Float[AnyArray, "3 3"], coefficients: tuple[float, ...]
 ) -> tuple[Float[AnyArray, "*n"], Float[AnyArray, "*n"]]:
-    """Return the column and row in pixels at which a lens shows each point of the plane Z = 1."""
+    """Return the column and row at which a lens shows each point of the plane Z = 1.
+
+    - `matrix`: intrinsic matrix in pixels.
+    """
     x, y = distort_points(plane_points[..., 0], plane_points[..., 1], coefficients)
     return x * matrix[0, 0] + matrix[0, 2], y * matrix[1, 1] + matrix[1, 2]
 
@@ -82,12 +85,13 @@ def undistort_image(
     matrix: Float[Array, "3 3"],
     coefficients: tuple[float, ...],
 ) -> tuple[Float[Array, "h w"], Bool[Array, "h w"]]:
-    """Return the depth image without distortion, and whether each ray of the new image met nothing.
+    """Return a depth image with its distortion removed, and whether each ray of the new image met nothing.
 
-    Each pixel of the new image is interpolated between the four nearest pixels of the distorted image, linearly in
-    inverse depth, or has the depth of the nearest if they are not on one surface. It is 0 outside the distorted image.
+    Each new depth is interpolated linearly in 1 / depth between the four nearest pixels of the distorted image. If they
+    are not on one surface, the new depth is that of the nearest. It is 0 outside the distorted image.
 
-    - `depth`, `missed`: the distorted image, in which valid depths are positive and finite.
+    - `depth`: the distorted image, in which valid depths are positive and finite.
+    - `missed`: whether each ray of the distorted image met nothing.
     - `plane_points`: positions of the new image's pixels in the plane Z = 1.
     - `matrix`: intrinsic matrix of both images.
     """

@@ -37,18 +37,18 @@ def farthest_point_indices(points: Float[Array, "n d"], mask: Bool[Array, " n"],
 
 
 # These values take the place of distances for chosen and for empty rows. If the bits of floats are read as integers,
-# -1.0 is smaller than -2.0, and both are smaller than any distance. So a chosen row comes before an empty row.
+# -1.0 is smaller than -2.0, and both are smaller than any distance. So a chosen row is preferred to an empty row.
 _CHOSEN_DISTANCE, _EMPTY_DISTANCE = -2.0, -1.0
-# An array is first reduced elementwise across this many parts of it. On a CPU this is several times as fast as reducing
-# the whole array.
+# An array is cut into this many parts, which are first reduced elementwise to one part. On a CPU this is several times
+# as fast as reducing the whole array.
 _NUM_PARTS = 8
 
 
 def _first_of_largest(distance: Float[Array, " n"], rows: Int[Array, " n"]) -> Int[Array, ""]:
     """Return the argmax of `distance`, computed by comparing the bits of the floats as integers.
 
-    For floats that are not negative, the order of the bits is the order of the floats. On a CPU, a maximum of integers
-    followed by a minimum of row indices is several times as fast as `jnp.argmax`.
+    The bits of floats that are not negative are in the order of the floats. On a CPU, a maximum of integers and then a
+    minimum of row indices are several times as fast as `jnp.argmax`.
     """
     bits = jax.lax.bitcast_convert_type(distance, jnp.dtype(f"int{8 * distance.dtype.itemsize}"))
     largest = jnp.max(_reduce_parts(jnp.maximum, bits))

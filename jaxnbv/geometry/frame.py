@@ -25,7 +25,7 @@ from jaxnbv.geometry.volume import Box
 
 # Largest rounding of coordinates, in scene units: 1 % of the sensor noise.
 _MAX_ROUNDING = 1e-4
-# Rotation from world to scene for each upward axis of the world. The second row, the scene's y axis, is this axis.
+# Rotation from world to scene for each upward axis of the world. The second row is this axis, the scene's y axis.
 _UP_ROTATIONS = {
     "y": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
     "-y": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
@@ -62,7 +62,7 @@ class Frame(eqx.Module):
     def fit(cls, points: Float[AnyArray, "n 3"], longest_side: float = 2.5, up: str = "y") -> "Frame":
         """Return the frame that centres the bounding box of points (world) and scales its longest side.
 
-        - `longest_side`: length that the longest side of the bounding box gets, in scene units.
+        - `longest_side`: length of this side in the scene, in scene units.
 
         **Raises:** `ValueError` if there are no points, if all points coincide, or if a point is not finite.
         """
@@ -96,9 +96,9 @@ class Frame(eqx.Module):
     def to_scene(self, value):
         """Convert points (..., 3), a `PointCloud`, a `Pose`, a `Box` or a `Camera` from world to scene.
 
-        For a camera, only the limits of its range change. Clouds and poses have JAX's floating-point type, which rounds
-        coordinates far from the world's origin, such as map coordinates. In that case convert the arrays to the scene
-        first, and build clouds and poses from the result.
+        For a camera, only the limits of its range change. Clouds and poses have JAX's floating-point type, which is too
+        coarse for coordinates far from the world's origin, such as map coordinates. Convert such coordinates as NumPy
+        arrays of float64, and build clouds and poses from the result.
 
         **Raises:** `ValueError` for a cloud or a pose whose coordinates are rounded by more than 1e-4 scene units.
         """
@@ -133,7 +133,7 @@ class Frame(eqx.Module):
 
 
 def _apply(value, map_points, map_directions, scale: float):
-    """Convert a value by functions for points and directions, and a factor (`scale`) for lengths."""
+    """Convert a value by a function of points, a function of directions and a factor (`scale`) of lengths."""
     if isinstance(value, PointCloud | Pose):
         xp, arrays = jnp if is_traced(value) else np, on_host(value)
     if isinstance(value, PointCloud):

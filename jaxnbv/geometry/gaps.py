@@ -1,23 +1,27 @@
-"""Sampling of depth images that have gaps between valid pixels: from lidars, or aligned to a finer camera."""
+"""Sampling of depth images with gaps between valid pixels, such as those of a lidar.
+
+An image that was aligned to a camera with more pixels has gaps too.
+"""
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.ndimage import correlate
 
-# Sides of blocks that are tried. A side fits if the fraction of blocks with a valid pixel is at least
+# Sides of blocks to try, in pixels. A side fits if the fraction of blocks with a valid pixel is at least
 # `_MIN_FILLED_RATIO` times the fraction for blocks of four times the side.
 _SIDES, _MIN_FILLED_RATIO = (2, 3, 4, 6, 8, 12, 16, 24), 0.7
-# In an image without gaps, at least the fraction `_MIN_PLANE_FRACTION` of the valid pixels has enough valid pixels in
-# its 3 x 3 neighbourhood for a plane, that is, `_MIN_PLANE_PIXELS` with the pixel itself.
+# An image has no gaps if at least the fraction `_MIN_PLANE_FRACTION` of its valid pixels have enough neighbours for a
+# plane: `_MIN_PLANE_PIXELS` valid pixels in their 3 x 3 neighbourhood, themselves included.
 _MIN_PLANE_FRACTION, _MIN_PLANE_PIXELS = 0.8, 4
 
 
 def find_block_side(valid: Bool[np.ndarray, "h w"]) -> int:
-    """Return the smallest side for which square blocks of a depth image rarely lack a valid pixel.
+    """Return the smallest side, in pixels, of square blocks that rarely lack a valid pixel.
 
     The side is 1 if most valid pixels have enough neighbours for a plane, even if the image has holes. Otherwise blocks
-    contain a valid pixel about as often as blocks of four times the side. It is 8 if every eighth row is valid.
+    of this side contain a valid pixel about as often as blocks of four times the side. If only every eighth row is
+    valid, the side is 8.
     """
     num_valid = correlate(valid.astype(np.uint8), np.ones((3, 3), np.uint8), mode="constant")
     if not valid.any() or np.mean(num_valid[valid] >= _MIN_PLANE_PIXELS) >= _MIN_PLANE_FRACTION:

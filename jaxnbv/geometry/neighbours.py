@@ -16,8 +16,8 @@ _NUM_QUERIES = 256
 def nearest_squared_distance(x: Float[Array, "n 3"], cloud: PointCloud) -> Float[Array, " n"]:
     """Return min_j |x - y_j|^2 over the filled rows y_j of a cloud; infinite if the cloud is empty.
 
-    A loop runs over the rows of the cloud up to the last filled row, so memory is linear in the number of points x, and
-    empty rows at the end cost no time. Repeatedly differentiable in x and in the cloud's points.
+    Memory is linear in n. Rows after the last filled row cost no time. The result can be differentiated any number of
+    times, in x and in the cloud's points.
     """
     return _nearest_squared_distance(x, cloud.points, cloud.mask)
 
@@ -32,7 +32,7 @@ def spacing(cloud: PointCloud) -> Float[Array, ""]:
 
 
 def distance_to_others(cloud: PointCloud, rows: Int[Array, " r"]) -> Float[Array, " r"]:
-    """Return the distance from the point in each of these rows to the nearest other point, or infinity."""
+    """Return the distance from the point of each given row to the nearest other point; infinite if none."""
     offsets = cloud.points[rows, None] - cloud.points
     is_other = cloud.mask & (jnp.arange(cloud.capacity) != rows[:, None])
     return jnp.sqrt(jnp.min(jnp.where(is_other, jnp.sum(offsets**2, axis=-1), jnp.inf), axis=1))

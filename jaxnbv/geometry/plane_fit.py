@@ -1,16 +1,17 @@
 """Planes that are fitted to the neighbours of each pixel of a depth image, to reduce its noise.
 
-The inverse depth 1 / z of a plane is linear in (u, v), the point where a ray meets depth 1. For a pixel with depth z0
-at (u0, v0), a function with three coefficients a, b and c,
+On a plane, the inverse depth 1 / z is a linear function of the point (u, v) where a ray meets depth 1. For each pixel,
+with depth z0 at (u0, v0), the coefficients a, b and c of
 
-    z0 / z(u, v) = a + b (u - u0) + c (v - v0),     normal along  (b, c, a - b u0 - c v0)
+    z0 / z(u, v) = a + b (u - u0) + c (v - v0)
 
-is fitted by least squares to those pixels of a window that can belong to the same surface. If the pixels are a distance
-p apart on it and their depth has noise of standard deviation sigma, a slope fitted to (2 r + 1)^2 pixels has the error
+are fitted by least squares to the pixels of a window that can belong to the same surface. The plane's normal is along
+(b, c, a - b u0 - c v0). If neighbouring pixels are a distance p apart on the surface, and their depths have noise of
+standard deviation sigma, a slope that is fitted to a window of (2 r + 1)^2 pixels has a standard error of
 
     sqrt(3) sigma / (p r (2 r + 1)).
 
-The radius r of the window is the smallest one for which this error is below 2.5 degrees, and at most 10.
+The radius r of the window is the smallest for which this error is below 2.5 degrees, but at most 10.
 """
 
 import math
@@ -26,11 +27,11 @@ from jaxnbv.geometry.gaps import block_samples
 _MAX_RADIUS = 10
 _MAX_SLOPE_ERROR = math.radians(2.5)
 # A neighbour can be on the same surface if its depth differs from the pixel's by at most `_MAX_SLOPE` times their
-# distance across the image (a slope of 76 degrees), plus `_MAX_DEVIATIONS` standard deviations of the noise.
+# distance perpendicular to the axis (a slope of 76 degrees), plus `_MAX_DEVIATIONS` standard deviations of the noise.
 _MAX_SLOPE, _MAX_DEVIATIONS = 4.0, 6.0
 _MIN_PIXELS = 4
-# Noise makes two pixels of one surface differ by less than `_MAX_DIFFERENCE` standard deviations of a pixel's noise in
-# most cases. A pixel that differs by more from over five of its eight neighbours mixes a near and a far surface.
+# The depths of two pixels of one surface rarely differ by more than `_MAX_DIFFERENCE` standard deviations of the noise.
+# A pixel that differs by more from over `_MAX_UNLIKE` of its eight neighbours mixes a near and a far surface.
 _MAX_DIFFERENCE, _MAX_UNLIKE = 3.0 * math.sqrt(2.0), 5
 
 
@@ -110,9 +111,9 @@ def fit_planes(
 
 
 def _radius(spacing: Float[Array, "k l"], sigma: Float[Array, "k l"]) -> Int[Array, "k l"]:
-    """Return the radius, up to `_MAX_RADIUS`, of the smallest window whose slope is accurate enough.
+    """Return the radius, up to `_MAX_RADIUS`, of the smallest window that gives an accurate slope.
 
-    - `spacing`, `sigma`: distance between neighbouring pixels on the surface, and standard deviation of their depth.
+    - `spacing`, `sigma`: distance between neighbouring pixels on the surface, and standard deviation of their depths.
     """
     radii = jnp.arange(1, _MAX_RADIUS + 1)
     error = math.sqrt(3.0) * sigma[..., None] / (spacing[..., None] * radii * (2 * radii + 1))

@@ -62,7 +62,8 @@ class Pose(eqx.Module):
         - `convention`: "opencv" for cameras that look along +z with y down, or "opengl" (also used by Blender and NeRF)
           for cameras that look along -z with y up.
 
-        **Raises:** `ValueError` for an unknown convention, a last row other than (0, 0, 0, 1), or as `Pose` does.
+        **Raises:** `ValueError` for an unknown convention, a last row other than (0, 0, 0, 1), or a pose that `Pose`
+        refuses.
         """
         axes = _axes(convention)
         matrices = as_floats(matrix, "the matrix of a pose")
@@ -137,7 +138,7 @@ def rigid_matrices(
 ) -> tuple[Float[np.ndarray, "n 4 4"], Bool[np.ndarray, " n"]]:
     """Return matrices [[R, t], [0, 1]] with R made orthonormal, and whether each is a rigid motion.
 
-    R may be rounded to three digits. Other matrices are returned unchanged.
+    R may be rounded to three digits. Matrices that are not rigid motions are returned unchanged.
     """
     is_rigid = np.isfinite(matrices).all(axis=(1, 2)) & (_rotation_error(matrices[:, :3, :3]) <= _MAX_ROUNDING)
     is_rigid &= (np.abs(matrices[:, 3] - [0.0, 0.0, 0.0, 1.0]) < 1e-6).all(axis=1)
@@ -225,9 +226,9 @@ def _look_rotation(
 
 @checked
 def fibonacci_sphere(count: int, radius: float = 1.0, min_elevation: float = -0.5 * math.pi) -> Float[Array, "count 3"]:
-    """Return `count` almost evenly spaced points, the spherical Fibonacci lattice (Gonzalez 2010).
+    """Return `count` almost evenly spaced points on a sphere, the Fibonacci lattice (Gonzalez 2010).
 
-    - `min_elevation`: least elevation of the points above the plane y = 0, in radians, by default of the whole sphere.
+    - `min_elevation`: least elevation of the points above the plane y = 0, in radians. The default is the whole sphere.
 
     **Raises:** `ValueError` if `count` < 1, `radius` <= 0 or the elevation is not within [-pi/2, pi/2).
     """

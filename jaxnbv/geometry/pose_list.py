@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxnbv.geometry.pose import Pose
 
-# Two poses count as the same view if their positions (scene units) and their viewing directions differ by less.
+# Two poses count as the same view if their positions (scene units) and viewing directions differ by less than this.
 _MAX_DIFFERENCE = 1e-3
 
 
@@ -49,7 +49,7 @@ class PoseList(eqx.Module):
         return jnp.any(is_same_view(poses[:, None], self.rows[None]) & self.is_filled, axis=1)
 
     def distance(self, poses: Pose) -> Float[Array, " poses"]:
-        """Return the distance from each pose of a batch to the nearest in the list; infinite without one."""
+        """Return each pose's distance to the nearest pose of the list; infinite if the list is empty."""
         distance = jnp.linalg.norm(poses.position[:, None] - self.rows.position[None], axis=-1)
         return jnp.min(jnp.where(self.is_filled, distance, jnp.inf), axis=1)
 

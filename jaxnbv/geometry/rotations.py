@@ -64,8 +64,8 @@ def rotation_to_6d(rotation: Float[AnyArray, "*batch 3 3"]) -> Float[Array, "*ba
 def rotation_from_6d(columns: Float[AnyArray, "*batch 6"]) -> Float[Array, "*batch 3 3"]:
     """Return the rotation for a pair of vectors (a, b), the 6-D representation of Zhou et al. (2019).
 
-    Its columns are b_1 = a / |a|;  b_2 = b - (b_1 . b) b_1, normalised;  b_3 = b_1 x b_2. Every pair (a, b) gives a
-    rotation. If a is zero, the x axis replaces a. If b is zero or parallel to a, a coordinate axis replaces b.
+    The columns of the rotation are c_1 = a / |a|;  c_2 = b - (c_1 . b) c_1, normalised;  c_3 = c_1 x c_2. Every pair
+    gives a rotation. If a is zero, the x axis replaces a. If b is zero or parallel to a, a coordinate axis replaces b.
     """
     columns = jnp.asarray(columns, dtype=jnp.result_type(float))
     first = normalise(columns[..., :3], jnp.asarray([1.0, 0.0, 0.0], columns.dtype))
@@ -81,7 +81,7 @@ def rotation_from_6d(columns: Float[AnyArray, "*batch 6"]) -> Float[Array, "*bat
 def rotation_between(
     start: Float[AnyArray, "*batch 3"], end: Float[AnyArray, "*batch 3"]
 ) -> Float[Array, "*batch 3 3"]:
-    """Return the smallest rotation (for opposite vectors, one of them) from one unit vector to another."""
+    """Return the smallest rotation from one unit vector to another, or one of many if they are opposite."""
     start, end = jnp.asarray(start), jnp.asarray(end)
     halfway = normalise(start + end, _any_orthogonal(start), _rounding(start))
     # The sum of nearly opposite vectors has lost digits, but their difference has not. The exact sum is orthogonal to
@@ -113,7 +113,7 @@ def normalise(
 
 
 def _rounding(unit: Float[Array, "*batch n"]) -> float:
-    """Return the length, well above its rounding, below which a sum of unit vectors has no direction."""
+    """Return the length below which rounding may hide the direction of a sum of unit vectors."""
     return 16.0 * float(jnp.finfo(unit.dtype).eps)
 
 

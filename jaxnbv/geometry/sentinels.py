@@ -1,4 +1,4 @@
-"""Detection of sentinels, values such as 65535 or 2047 in a depth image that mean "not measured"."""
+"""Detection of sentinels: values of a depth image, such as 65535 or 2047, that mean "not measured"."""
 
 import warnings
 
@@ -17,11 +17,12 @@ def sentinel_pixels(image: Real[np.ndarray, "h w"], max_depth: float) -> Bool[np
     """Return, for each pixel, whether it holds a sentinel: a value that means "not measured".
 
     Sentinels are the largest value of an integer type and, with a `UserWarning`, a value beyond `max_depth` that fills
-    far more pixels than any similar value. A value of all measured pixels is no sentinel: the image may show a wall.
+    far more pixels than any similar value. A value that all measured pixels have is not a sentinel, because the image
+    may show a wall.
 
     - `image`: depths in any units.
-    - `max_depth`: the largest relevant depth, in the image's units. If it is infinite (unknown), the latter must be
-      more than twice any other value.
+    - `max_depth`: the largest relevant depth, in the image's units. If it is infinite (unknown), a sentinel of the
+      second kind must be more than twice any other value.
     """
     is_integer = np.issubdtype(image.dtype, np.integer)
     is_largest = image == np.iinfo(image.dtype).max if is_integer else np.zeros(image.shape, bool)

@@ -12,11 +12,11 @@ from jaxnbv.checks import AnyArray
 def on_tensor_grid(
     function: Callable[[Float[Array, "n 3"]], Shaped[Array, "*s n"]], axis: Float[AnyArray, " g"]
 ) -> Shaped[Array, "*s g g g"]:
-    """Return a function's values at the nodes of a cubic grid with coordinates `axis` along each axis."""
+    """Return a function's values at the nodes of a cubic grid, whose x, y and z coordinates are `axis`."""
     axis = jnp.asarray(axis)
     y, z = jnp.meshgrid(axis, axis, indexing="ij")
 
-    # One x coordinate at a time saves memory.
+    # To save memory, evaluate the nodes of one x coordinate at a time.
     def slab(x):
         return function(jnp.stack([jnp.full_like(y, x), y, z], axis=-1).reshape(-1, 3))
 

@@ -22,7 +22,7 @@ It is negative inside the volume and positive outside, and its magnitude is at m
 """
 
 _BISECTIONS = 40
-# A radius that exceeds the distance from the origin to the corners of the cube that holds all scenes, in scene units.
+# All scenes lie within this distance of the origin, in scene units.
 _OUTER_RADIUS = 3.0
 
 
@@ -60,14 +60,14 @@ class Box(eqx.Module):
         return f"from {low} to {high}"
 
     def widened(self, margin: float) -> "Box":
-        """Return the box with its faces moved outward by a length, except the lower face (y is up).
+        """Return the box with all faces but the lower one (y is up) moved outward by `margin`.
 
-        The surface that the object stands on is below the lower face.
+        The lower face stays, because the surface that the object stands on is below it.
         """
         return Box(self.low - np.array([margin, 0.0, margin]), self.high + margin)
 
     def shares_beyond(self, points: Float[np.ndarray, "n 3"], margin: float) -> dict[str, float]:
-        """Return the fraction of points that are more than `margin` beyond each face, such as "+x"."""
+        """Return, keyed by face ("+x", ...), the fraction of points more than `margin` beyond the face."""
         if len(points) == 0:
             return {}
         is_beyond = {"-": points < self.low - margin, "+": points > self.high + margin}
@@ -112,7 +112,7 @@ def ray_interval(
 def boundary_points(volume: Volume, count: int, level: float = 0.0) -> Float[Array, "count 3"]:
     """Return points where `count` evenly spread rays from the origin cross the boundary of a volume.
 
-    The points (any, if a ray has several) are found by bisection between the origin and a sphere beyond the scene.
+    Bisection between the origin and a sphere beyond the scene finds one crossing on each ray, which may have several.
 
     - `level`: value of the volume's function at the returned points, in scene units; positive for points outside.
     """
