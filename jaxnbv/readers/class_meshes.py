@@ -27,7 +27,7 @@ _SYNSETS = {category.name: category.synset for category in CATEGORIES}
 
 
 class MeshFile(NamedTuple):
-    """A mesh file, with the class index, the name and the upward axis (see `Frame`) of its object."""
+    """A mesh file, with the class index (`label`), name and upward axis (see `Frame`) of its object."""
 
     label: int
     name: str
@@ -54,8 +54,8 @@ def class_meshes(folder: str | Path, classes: Sequence[str]) -> tuple[MeshFile, 
 
     The list has the first object of each class, then the second of each, and so on. Labels are indices in `classes`.
     Classes without a folder are skipped, and so are folders that match none of `classes`. The name of a folder may have
-    underscores instead of spaces. The files of a class determine its layout: ModelNet, OmniObject3D, ShapeNet, or any
-    other layout. For ShapeNet, whose folders have numbers as names, `classes` may have the names or the numbers. If a
+    underscores instead of spaces. The files in a class's folder show which layout it has: ModelNet, OmniObject3D,
+    ShapeNet, or any other. ShapeNet's folders have numbers as names, but `classes` may have the names instead. If a
     class has a folder `test`, only the meshes in this folder are listed.
 
     **Raises:** `ValueError` if there is no such folder, if no class has a folder, if the folder of a class has no mesh,

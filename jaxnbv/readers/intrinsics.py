@@ -31,8 +31,8 @@ def stored_intrinsics(folder: Path) -> Float[np.ndarray, "3 3"] | None:
     """Read the 3 x 3 matrix from a file of intrinsics (.txt or .json) in a folder or its parent.
 
     Returns None if there is no such file. A file in the folder is preferred to a file in its parent. A text file holds
-    a 3 x 3 or 4 x 4 matrix, or fx, fy, cx, cy, or is BundleFusion's `info.txt`. A JSON file has Open3D's format, holds
-    the four numbers with their names as keys, or holds only the matrix.
+    a 3 x 3 or 4 x 4 matrix, or fx, fy, cx, cy, or is BundleFusion's `info.txt`. A JSON file has Open3D's format, or
+    holds fx, fy, cx, cy with these keys, or only the matrix.
 
     **Raises:** `ValueError` if the file has none of these formats.
     """

@@ -1,4 +1,4 @@
-"""Finds pixels of a recording that show the camera's own mount, such as a gripper. The mount moves with the camera."""
+"""Finds pixels of a recording that show the camera's own mount, such as a gripper, which moves with the camera."""
 
 from collections.abc import Callable
 
@@ -12,11 +12,11 @@ from jaxnbv.geometry.camera import Camera
 
 # Numbers of frames to compare, of frames that must show the mount, and of blocks along an image's longer side.
 _NUM_FRAMES, _MIN_FRAMES, _NUM_BLOCKS = 16, 4, 80
-# Relative difference up to which depths count as equal: those of a block in all frames, of a point in two frames.
+# Relative differences up to which depths count as equal: of a block in all frames, and of a point in two frames.
 _BLOCK_TOLERANCE, _POINT_TOLERANCE = 0.02, 0.05
 # Neighbouring blocks belong to the same component if their depths differ by at most this factor.
 _MAX_DEPTH_RATIO = 1.1
-# A component of the mount has a higher ratio of frames that see through its place to frames that see surface there.
+# For a component of the mount, more than this many frames see through its place for each frame that sees surface there.
 _MIN_DEEPER_RATIO = 4
 
 
@@ -28,10 +28,9 @@ def own_parts(
 ) -> Float[np.ndarray, "h w"]:
     """Return, for each pixel, the depth up to which it shows the camera's mount; zero where it does not.
 
-    Depths are in units of the images. Most frames show the mount at the same pixels and at the same depth. Frames from
-    other poses look through the place in the world where the mount was during one frame, and see something deeper. A
-    vase in the middle of an orbit also has nearly equal depths in all frames, but all frames see the vase at the same
-    place in the world.
+    Depths are in units of the images. Most frames show the mount at the same pixels and at the same depth. It moves
+    with the camera: where it was during one frame, frames from other poses see something deeper. A vase in the middle
+    of an orbit also has nearly equal depths in all frames, but all frames see the vase at the same place in the world.
 
     - `image`, `matrices`: as in `depth_unit`.
     - `scale`: length of a unit of the images in world units.
@@ -72,7 +71,7 @@ def _is_mount(
 ) -> Bool[np.ndarray, "k l"]:
     """Return a mask of the connected components of `candidate_depth` that other frames see through.
 
-    - `candidate_depth`: depths of the blocks with the same depth in most frames, in world units; zero elsewhere.
+    - `candidate_depth`: depth of each block that has the same depth in most frames, in world units; zero elsewhere.
     - `depths`: depths of the blocks in each frame, in world units.
     - `side`: length of a block's side in pixels.
     """
@@ -84,7 +83,7 @@ def _is_mount(
     block_depths = candidate_depth[row, column]
     points = block_depths[:, None] * rays
     num_deeper, num_equal = np.zeros(count), np.zeros(count)
-    # Use bounds of the depths around a block, since the surface may be slanted and the point anywhere in the block.
+    # Use bounds of the depths around a block, because its surface may be slanted and the point anywhere in the block.
     window = (1, 3, 3)
     least = minimum_filter(np.where(depths > 0, depths, np.inf), window)
     greatest = maximum_filter(depths, window)

@@ -39,7 +39,7 @@ _ASK_UNIT = (
 
 
 class _StoredRecording(NamedTuple):
-    """Image files of a recording, camera-to-world matrices, and intrinsics and length unit if stored."""
+    """Image files of a recording, camera-to-world matrices, and intrinsics and length unit if they are stored."""
 
     files: list[Path]
     matrices: Float[np.ndarray, "n 4 4"]
@@ -57,21 +57,20 @@ class RecordedFrames:
         - `frames.json`: `{"intrinsics": 3 x 3, "depth_scale": 0.001, "frames": [{"depth": FILE, "pose": 4 x 4}, ...]}`,
           with file names relative to the folder, and poses from camera to world in OpenCV's axes. `intrinsics` and
           `depth_scale` may be left out.
-    - `up`: upward direction in the world. If given, the world is rotated: the upward direction becomes z, and the
-      former x axis has y = 0.
+    - `up`: upward direction in the world. If given, the world is rotated so that this direction becomes z, and the
+      former x axis lies in the plane y = 0.
     - `intrinsics`: intrinsics of the depth camera in pixels: a 3 x 3 matrix, or fx, fy, cx, cy. By default they are
       read from `frames.json`, or from a file in the folder or its parent: `camera-intrinsics.txt` (3 x 3) or a similar
       file of 3DMatch, ScanNet, ETH3D, BundleFusion or Open3D. The formats 7-Scenes and TUM RGB-D do not store
       intrinsics.
     - `depth_scale`: length of the images' unit in the unit of the poses, for example 1/5000. By default it is read from
-      `frames.json`, or chosen from the common units (1/1000, 1/5000, 1/10000, ...): with the right unit, frames that
-      show the same surface agree.
+      `frames.json`, or chosen from the common units (1/1000, 1/5000, 1/10000, ...) so that frames that show the same
+      surface agree.
 
-    `camera` is the sensor, and `matrices` (n, 4, 4) are its poses in world units, with OpenCV's axes. `depth_scale`
-    times an image is in world units. To add frame i to a session, call
-    `session.add(frames.depth(i), frames.matrices[i], frames.depth_scale)`. Frames without a valid pose (not finite,
-    zeros, or no rotation) are left out with a `UserWarning`. Pixels that show the camera's own mount, such as a
-    gripper, are also left out with a `UserWarning`.
+    `camera` is the sensor, and `matrices` (n, 4, 4) are its poses in world units, with OpenCV's axes. To add frame i to
+    a session, call `session.add(frames.depth(i), frames.matrices[i], frames.depth_scale)`. Frames without a valid pose
+    (not finite, zeros, or no rotation) are left out with a `UserWarning`, and so are pixels that show the camera's own
+    mount, such as a gripper.
 
     **Raises:** `ValueError` if the folder has none of these formats, or is incomplete or damaged, if there are no
     intrinsics, if the frames do not determine the unit, or if most poses are invalid.
@@ -122,12 +121,12 @@ class RecordedFrames:
         return len(self.files)
 
     def depth(self, index: int) -> UInt16[np.ndarray, "height width"]:
-        """Return a depth image in the unit of the images, 0 where nothing of the scene was measured.
+        """Return a depth image in units of `depth_scale`, 0 where nothing but the camera's mount was measured.
 
         **Raises:** `ValueError` for an index out of range, or an image that cannot be read or is not a depth image.
         """
         pixels = self._stored(index)
-        # An image whose size differs from the first image's is returned as it is: the session raises an error for it.
+        # An image that is not as large as the first is returned unchanged, because the session raises an error for it.
         is_own = pixels <= self._own_parts if pixels.shape == self._own_parts.shape else False
         return np.where(is_own, 0, pixels).astype(np.uint16)
 

@@ -1,4 +1,4 @@
-"""Reads the label images or masks of a recording, which say which object each pixel shows."""
+"""Reads the label images or masks of the objects in a recording."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ class Segmentation:
 
     - a label image with the frame's name and an object number in each pixel, zero for none: `000012.png` for
       `000012.png`;
-    - a mask for each object, named by frame and object, not zero where the object is seen: `000012.cup.png` or
+    - a mask for each object, nonzero where the object is seen, with the names of frame and object: `000012.cup.png` or
       `000012_cup.png`.
 
     **Raises:** `ValueError` if there is no such folder, or if the folder has no image for any frame.
@@ -70,7 +70,10 @@ def _stem(file: Path) -> str:
 
 
 def _frame_files(stem: str, files: dict[str, Path]) -> dict[str, Path]:
-    """Return the masks of a frame keyed by object name, or its label image with the key "". `files`: keyed by stem."""
+    """Return the masks of a frame, keyed by object name, or its label image with the key "".
+
+    - `stem`, `files`: the frame's file name without ending, and all image files, keyed by such names.
+    """
     if stem in files:
         return {"": files[stem]}
     return {

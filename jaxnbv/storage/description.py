@@ -48,8 +48,8 @@ def describe(obj: Any, arrays: dict[str, np.ndarray] | None = None, path: str = 
     - `arrays`: a dictionary to fill with the contents of the large arrays, keyed by hash.
     - `path`: path of `obj` in a larger configuration, such as "planner.search", for error messages.
 
-    **Raises:** `ValueError` if the state of an object cannot be described, or the source of a function cannot be read,
-    and the object or function has no `version`. The error names its path.
+    **Raises:** `ValueError` for an object whose state cannot be described, or a function whose source cannot be read,
+    unless it has a `version`. The error names its path.
     """
     return _Describer({} if arrays is None else arrays).describe(obj, path)
 
@@ -65,7 +65,7 @@ def fields_of(kind: type) -> Sequence[str]:
 
 
 class _Describer:
-    """State of one call of `describe`. If an object contains itself, the inner one becomes a reference."""
+    """State of one call of `describe`. If an object contains itself, a reference stands for the inner one."""
 
     def __init__(self, arrays: dict[str, np.ndarray]):
         self.arrays = arrays
@@ -94,8 +94,8 @@ class _Describer:
         try:
             return self._describe_object(obj, kind, path)
         finally:
-            # Only code is described once per call. Equal containers are described alike, whether or not they are the
-            # same object.
+            # Only functions and classes are described once per call and then by reference. Other equal objects have
+            # equal descriptions, whether or not they are the same object.
             if not isinstance(obj, FunctionType | type):
                 del self.visited[id(obj)]
 
@@ -170,7 +170,7 @@ class _Describer:
         return {name: self.describe(value, f"{path}.{name}".lstrip(".")) for name, value in values.items()}
 
     def _describe_function(self, function: FunctionType, path: str) -> dict[str, Any]:
-        """Describe all that a function's result depends on, except definitions of installed packages."""
+        """Describe everything that a function's result depends on, except definitions of installed packages."""
         is_user_code = not is_installed(function.__globals__.get("__name__"))
         parts = {"defaults": (function.__defaults__, function.__kwdefaults__), "closure": closure(function)}
         if is_user_code:
@@ -180,7 +180,7 @@ class _Describer:
         return source | self._without_arrays(parts, path)
 
     def _without_arrays(self, parts: dict[str, Any], path: str) -> dict[str, Any]:
-        """Describe the parts of a function or class. Arrays are not stored: `rebuild` looks up code by name."""
+        """Describe the parts of a function or class, without storing arrays. `rebuild` finds it by its name."""
         arrays, self.arrays = self.arrays, {}
         try:
             return self._describe_values(parts, path)

@@ -19,7 +19,7 @@ from jaxnbv.scanning.triangle_rays import tracer
 from jaxnbv.storage.files import PARTS, make_folder, write_text, write_whole
 
 _LOCK = ".lock"
-# File of the large arrays of the configuration.
+# Name of the file with the large arrays of the configuration.
 ARRAYS = "arrays.npz"
 # Largest size of a file of arrays after unpacking, in bytes. Sixteen million rays fit, far more than a camera has.
 MAX_ARRAY_BYTES = 2**29
@@ -27,7 +27,7 @@ _MAX_TEXT_LENGTH = 60
 
 
 def software() -> dict[str, str]:
-    """Return the versions of the packages that can change the numbers of results."""
+    """Return the versions of the packages on which results depend."""
     names = ("jaxnbv", "jax", "jaxlib", "equinox", "optax", "optimistix", "numpy", "trimesh", tracer())
     return {name: importlib.metadata.version(name) for name in names}
 
@@ -40,12 +40,12 @@ def num_threads() -> int:
 
 
 def versions() -> dict[str, Any]:
-    """Return the software, device and threads of this process, which change the last bits of results."""
+    """Return the software, device and threads of this process, on which the last bits of results depend."""
     return software() | {"device": jax.devices()[0].device_kind, "cores": num_threads()}
 
 
 def differences(stored: Any, current: Any, name: str = "") -> list[str]:
-    """Return a text for each entry that differs between two descriptions, which starts with its path."""
+    """Return one text for each entry that differs between two descriptions. It begins with the entry's path."""
     if isinstance(stored, dict) and isinstance(current, dict):
         keys = list(dict.fromkeys([*stored, *current]))
         nested = (differences(stored.get(key), current.get(key), f"{name}.{key}".lstrip(".")) for key in keys)
@@ -97,9 +97,9 @@ def write_arrays(file: Path, arrays: Mapping[str, np.ndarray]) -> None:
 def read_arrays(file: Path, remedy: str, check: Callable[[dict[str, np.ndarray]], None]) -> dict[str, np.ndarray]:
     """Read the arrays of a .npz file, keyed by name.
 
-    - `check`: a function that raises any error if the arrays differ from those that were written.
+    - `check`: a function that raises any error if the arrays differ from the written arrays.
 
-    **Raises:** `ValueError` with the text `remedy` if the file is damaged.
+    **Raises:** `ValueError` with the text `remedy` if the file is missing or damaged.
     """
     try:
         if not file.is_file():
@@ -118,7 +118,7 @@ def read_arrays(file: Path, remedy: str, check: Callable[[dict[str, np.ndarray]]
 
 
 def read_record(folder: Path, kind: str, remedy: str) -> dict[str, Any]:
-    """Read the record of a folder, the file `kind`.json: a dictionary with the key "config".
+    """Read the record of a folder, a dictionary with the key "config", from the file `kind`.json.
 
     **Raises:** `ValueError` with the text `remedy` if there is no record, or if the record has no configuration.
     """
@@ -187,7 +187,7 @@ class ResultFolder:
             yield
 
     def set_versions(self, versions: dict[str, Any]) -> None:
-        """Set the versions of the process that computes new results. Warns if they differ from the record."""
+        """Set the versions with which new results are computed. Warns if they differ from the record."""
         self.versions = versions
         if not self.is_bound:
             return
@@ -203,7 +203,7 @@ class ResultFolder:
         """Write the record and its arrays, if they are not there yet. Called before the first result."""
         if not self.is_bound:
             record = {"format": self.format, "config": self.config, "versions": self.versions}
-            # Write the record first, since arrays without a record would belong to no configuration.
+            # Write the record first, because arrays without a record would belong to no configuration.
             write_text(self.path / f"{self.kind}.json", json.dumps(record, indent=2))
             if self.arrays:
                 write_arrays(self.path / ARRAYS, self.arrays)

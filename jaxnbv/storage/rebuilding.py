@@ -36,8 +36,8 @@ def rebuild(description: Any, arrays: Mapping[str, np.ndarray], path: str) -> An
     constructor is called.
 
     - `arrays`: contents of the large arrays, keyed by hash, from `describe`.
-    - `path`: path for error messages, such as "planner". Its first name is the argument of `load` that can replace the
-      configuration.
+    - `path`: path of the configuration for error messages, such as "planner". Its first name is also the argument with
+      which a caller of `load` can replace the configuration.
 
     **Raises:** `ValueError` if a part cannot be rebuilt, or has changed since it was described. The error names the
     part's path.
@@ -156,7 +156,7 @@ class _Rebuilder:
         return obj
 
     def _lookup_code(self, name: str, path: str) -> Any:
-        """Look up a function, or the class of a record or of a NumPy scalar, by its name.
+        """Look up by its name a function, or the class of a dataclass, named tuple or NumPy scalar.
 
         **Raises:** `ValueError` for other classes, and for functions of packages that may have side effects.
         """

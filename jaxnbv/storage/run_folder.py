@@ -1,10 +1,10 @@
 """The folder of an episode or a session, written step by step.
 
 episode.json      the configuration (planner, scene, noise, first pose, seed) and the versions of the software
-arrays.npz        large arrays of the configuration (weights of networks, meshes), by SHA-256 of their bytes, if any
+arrays.npz        large arrays of the configuration, if any (weights of networks, meshes), keyed by their SHA-256
 view_00.npz       pose and scan of the first view; view_01.npz and so on also hold the search's proposal: candidates,
                   their values, and the trajectories of a gradient search
-end_00.npz        the reason why a rule ended the episode, and the number of views
+end_00.npz        the reason why a stop rule ended the episode, and the number of views
 cloud.ply         the points of the cloud, in world units, once the episode is complete
 
 session.json      the configuration (planner, sensor, box, upward axis) and the versions of the software
@@ -48,10 +48,10 @@ _MODULES = {
 class RunFolder(ResultFolder):
     """The folder of an episode or a session: a record of the configuration, and numbered files of arrays.
 
-    The checksum of each file is checked when the file is read.
+    Each file has a checksum, which is checked when the file is read.
 
     - `kind`: "episode" or "session".
-    - `config`: parts of the configuration, keyed by name. `RunFolder` describes them as JSON.
+    - `config`: parts of the configuration, keyed by name. The record has their descriptions, see `describe`.
 
     **Raises:** `ValueError` if the folder holds results of a different configuration, or other files.
     """
@@ -88,7 +88,7 @@ class RunFolder(ResultFolder):
         return len(names)
 
     def file(self, name: str, index: int) -> Path:
-        """Return the path of the file with a name and an index."""
+        """Return the path of the file with this name and index."""
         return self.path / f"{name}_{index:02d}.npz"
 
     def write(self, name: str, index: int, **parts: Any) -> None:
@@ -130,7 +130,7 @@ class RunFolder(ResultFolder):
 def ply_of(cloud: PointCloud) -> bytes:
     """Return the content of a binary PLY file with points and normals."""
     points, normals = cloud.to_numpy()
-    # Use a mesh without faces, since trimesh's point clouds have no normals.
+    # Use a mesh without faces, because trimesh's point clouds have no normals.
     mesh = trimesh.Trimesh(points, vertex_normals=normals, process=False)
     return trimesh.exchange.ply.export_ply(mesh, vertex_normal=True)
 
@@ -143,7 +143,7 @@ def _checksum(arrays: dict[str, np.ndarray]) -> str:
 
 
 def _parts(arrays: dict[str, Any]) -> dict[str, Any]:
-    """Return the modules and arrays of a file by name, from arrays with keys such as "scan.points"."""
+    """Return the modules and arrays of a file, keyed by name, from arrays with keys such as "scan.points"."""
     parts: dict[str, Any] = {}
     for name, array in arrays.items():
         part, _, rest = name.partition(".")
