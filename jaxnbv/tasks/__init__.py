@@ -1,4 +1,4 @@
-"""Tasks. Each file has a task's utility or acquisition, and the task's answer."""
+"""Tasks. Each file has the utility or acquisition of a task, and the task's answer."""
 
 from jaxnbv.tasks.classification import ClassAcquisition as ClassAcquisition
 from jaxnbv.tasks.classification import Classifier as Classifier

@@ -51,20 +51,20 @@ class FunctionClassifier(Classifier):
 
     function: Callable[[PointCloud], Float[Array, " classes"]]
 
-    # The result is checked in `Acquisition.check`, whose error can name the function.
+    # `ClassAcquisition` checks the result.
     def __call__(self, cloud: PointCloud) -> Any:
         return self.function(cloud)
 
 
 def as_classifier(value: Any) -> Classifier:
-    """Wrap a plain function as a classifier, or return a classifier unchanged.
+    """Return a classifier unchanged, or a plain function wrapped as a classifier.
 
     **Raises:** `ValueError` for anything else.
     """
     return value if isinstance(value, Classifier) else FunctionClassifier(plain_function(value, "the classifier"))
 
 
-# A converter accepts plain functions too, which mypy cannot see.
+# Fields of this type have a converter for plain functions. mypy does not know about converters.
 if TYPE_CHECKING:
     AnyClassifier: TypeAlias = Any
 else:
@@ -81,7 +81,7 @@ def cross_entropy(
 ) -> Float[Array, "*batch"]:
     """Return the cross-entropy -sum_c p_c log q_c in nats, from log-probabilities.
 
-    The result is finite, because log q_c is clipped from below at the logarithm of the smallest positive float.
+    The result is finite, because log q_c is clipped from below at the logarithm of the smallest normal float.
     """
     least = jnp.log(jnp.finfo(log_p.dtype).tiny)
     return -jnp.sum(jnp.exp(log_p) * jnp.maximum(log_q, least), axis=-1)
@@ -111,7 +111,7 @@ class ClassAcquisition(Acquisition):
         """Return the value of a scan in nats, from the log-probabilities before and after the scan is added."""
 
     def score(self, context: Context, view: ImaginedView) -> Float[Array, "*values"]:
-        """Return the result of `compare` for the cloud without and with the scan; zero for an empty scan."""
+        """Return the result of `compare` for the cloud without and with the scan. It is zero for an empty scan."""
         cloud, log_p = context
         return zero_if_empty(view.scan, self.compare(log_p, self._log_p(concatenate(cloud, view.scan))))
 
@@ -129,7 +129,7 @@ class ClassAcquisition(Acquisition):
         return jnp.exp(context_of(self, cloud)[1])
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> "ClassAnswer | None":
-        """Return the scene's class as an answer; None without a label, or if the classifier lacks the class."""
+        """Return the scene's class as an answer; None if it is unknown to the scene or the classifier."""
         label = scene.class_label
         if label is None:
             return None
@@ -137,7 +137,7 @@ class ClassAcquisition(Acquisition):
         return ClassAnswer(names, np.eye(len(names))[int(label)]) if 0 <= int(label) < len(names) else None
 
     def check(self, cloud: PointCloud) -> None:
-        """Raise `ValueError` unless the classifier returns a log-probability for each of its classes."""
+        """Raise `ValueError` unless the classifier returns one log-probability for each class."""
         log_p = context_of(self, cloud)[1]
         require(len(log_p) >= 2, f"the classifier's answer has shape {jnp.shape(log_p)}: {_LOG_P}")
         total = float(jnp.sum(jnp.exp(log_p)))
@@ -156,7 +156,8 @@ class ClassAcquisition(Acquisition):
 class CrossEntropy(ClassAcquisition):
     """Cross-entropy -sum_c p_c^(t) log p_c^(t+1) of the class probabilities before and after a scan.
 
-    This is the paper's alpha^(CE). p^(t) are the probabilities given the cloud D, p^(t+1) those with a simulated scan.
+    This is the paper's alpha^(CE). p^(t) are the probabilities given the cloud D, and p^(t+1) the probabilities given D
+    and a simulated scan.
 
     - `classifier`: a `Classifier`, or a function from a cloud to log-probabilities.
     - `num_points`: number of points to which D is thinned by farthest point sampling, once for each proposal.
@@ -192,7 +193,7 @@ class MixedEntropy(ClassAcquisition):
     """Cross-entropy while the class is uncertain, then reduction of entropy, as in the authors' code.
 
     - `classifier`, `num_points`: see `CrossEntropy`.
-    - `threshold`: the value is that of `CrossEntropy` if the entropy before the scan, in nats, is above the threshold.
+    - `threshold`: entropy before the scan, in nats, above which the value is that of `CrossEntropy`.
     """
 
     threshold: float = eqx.field(static=True, default=0.75)

@@ -21,14 +21,14 @@ from jaxnbv.scanning.visibility import is_visible, spread_points
 from jaxnbv.sharding import on_cpu, shared_map
 from jaxnbv.utility import Quantity
 
-# Default size s of `NewSurface` in scene units, for observations without looks.
+# Default size s of `NewSurface` in scene units, for observations without `Looks`.
 _SIZE = 0.05
-# Number of points on each sample for `seen_share`. The result is then accurate to a percent.
+# Number of points on each sample for `seen_share`. This number makes the result accurate to a percent.
 _POINTS = 1024
 
 
 def _large_batch() -> int:
-    # Scores of new surface are cheap to compute.
+    # The scores of `Coverage` and `NewSurface` are cheap to compute.
     return 128 if on_cpu() else 2048
 
 
@@ -58,9 +58,9 @@ class Coverage(Acquisition):
 
 
 class Newness(eqx.Module):
-    """Newness of surface at a point, given the observations.
+    """A function from points to the newness of the surface there, given the observations.
 
-    - `distances`: distance field to all hits of earlier views, or to the cloud for observations without `Looks`.
+    - `distances`: distance to the nearest hit of earlier views, or to the nearest point of the cloud without `Looks`.
     - `size`: the length s of `NewSurface`, in scene units.
     """
 
@@ -81,12 +81,13 @@ class NewSurface(Acquisition):
     `Looks`. A hit x counts as seen if d(x) <= s, as new if d(x) >= 2 s, and in part in between. a(x) is the area of the
     pixel on the surface: omega is the pixel's solid angle, r the distance from the camera, and cos the cosine of the
     angle of incidence, clipped to at least 0.5. Rays of one scan do not overlap, so no surface counts twice. In the
-    paper's `Coverage`, near surfaces, which fill more pixels, or a single far point may dominate. Here neither does.
+    paper's `Coverage`, near surfaces may dominate because they fill more pixels, and so may a single far point. Here
+    neither does.
 
-    Use a search over candidates. `NewSurface` is differentiable in the pose wherever `Coverage` is, but most of the
-    gain comes from jumps of rays, which the derivative leaves out.
+    Use a search over candidates. `NewSurface` is differentiable in the pose wherever `Coverage` is, but most of its
+    gain comes from rays that jump to a different surface, which the derivative ignores.
 
-    - `size`: the length s, in scene units also in sessions. The default is the spacing of the grid of `Looks`. A
+    - `size`: the length s in scene units, even in sessions. The default is the spacing of the grid of `Looks`. A
       smaller size is raised to this spacing.
 
     For observations without `Looks`, such as a single cloud, or if 2 s exceeds `Looks.reach`, d(x) is the distance to
@@ -112,7 +113,7 @@ class NewSurface(Acquisition):
         return Newness(DistanceField.of(cloud, 2.0 * size), size)
 
     def score(self, context: Newness, view: ImaginedView) -> Float[Array, ""]:
-        """Return the new area in one scan, in squared scene units. It is zero for an empty scan."""
+        """Return the new area in one scan, in squared scene units."""
         return jnp.sum(pixel_area(view.scan, view.camera, view.pose, STEEP) * context(view.scan.points))
 
     @property
@@ -141,9 +142,9 @@ def seen_share(
 ) -> Float[Array, ""]:
     """Return the fraction of the visible area that earlier views have seen.
 
-    The visible area is the area of the sampled surfaces that is visible from `poses`. A point has been seen if its
-    newness is zero. For observations with `Looks`, it must also be visible from an earlier view, because a point near a
-    measured point may still be hidden behind an edge.
+    The visible area is the part of the sampled surfaces that is visible from `poses`. A point has been seen if its
+    newness is zero. For observations with `Looks`, the point must also be visible from an earlier view, because it may
+    be hidden behind an edge although a point near it was measured.
 
     - `surfaces`: posterior samples, along a leading axis.
     - `views`: poses of the views so far.

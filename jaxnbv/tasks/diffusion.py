@@ -26,7 +26,7 @@ _NEIGHBOURS = 30
 
 
 def _array(source) -> AnyArray:
-    # Arrays other than JAX's are converted to NumPy, because worker processes cannot use JAX's devices.
+    # Anything but a JAX array becomes a NumPy array, because worker processes cannot use JAX's devices.
     return source if isinstance(source, Array) else as_numbers(source, "the heat source")
 
 
@@ -34,7 +34,7 @@ class HeatProblem(eqx.Module):
     """A body of uniform temperature, heated near a point: the paper's du/dt = Delta u + f, u(0) = u0.
 
     - `source`, `radius`: centre and radius of a ball, in scene coordinates. The heating f is `power` in the ball and
-      zero elsewhere, smoothed at the rim, see `heating`. A body without a point in the ball is not heated.
+      zero elsewhere, smoothed at the rim, see `heating`. A body that does not reach the ball is not heated.
     - `power`: value of f, in degrees per unit of time. The diffusivity is one squared scene unit per unit of time.
     - `duration`, `steps`: time of heating T, and number of steps of implicit Euler, each of length h = T / steps.
     - `initial`: initial temperature u0, in degrees.
@@ -63,16 +63,16 @@ class HeatProblem(eqx.Module):
 
     @property
     def highest(self) -> float:
-        """Upper bound of the temperature by the maximum principle, initial + duration * max(0, power)."""
+        """Upper bound of the temperature, initial + duration * max(0, power), by the maximum principle."""
         return self.initial + self.duration * max(0.0, self.power)
 
     def heating(self, points: Float[np.ndarray, "n 3"], areas: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         """Return the heating f at points: `power` times the fraction of a point's disc in the heated ball.
 
         The disc has the area of the point. The fraction is approximated by 1/2 + (radius - d) / (2 rho), clipped to
-        [0, 1], where d is the distance from the source and rho the radius of the disc. In the authors' code it is 0 or
-        1, which makes no difference for dense points. With 1,024 points on an object, the lowest temperatures of two
-        random samplings differ by a third with the authors' code, and by a tenth with fractions.
+        [0, 1], where d is the distance from the source and rho the radius of the disc. The authors' code uses only 0
+        and 1, which makes no difference for dense points. With 1,024 points on an object, the lowest temperatures of
+        two random samplings differ by a third with the authors' code, and by a tenth with fractions.
         """
         distance = np.linalg.norm(points - np.asarray(self.source, np.float64), axis=1)
         return self.power * np.clip(0.5 + 0.5 * (self.radius - distance) / np.sqrt(areas / np.pi), 0.0, 1.0)
@@ -100,7 +100,7 @@ class Temperature(NamedTuple):
     reached: Bool[np.ndarray, " n"]
 
     def coldest(self, reached_only: bool) -> int | None:
-        """Return the index of the first of the coldest (`reached`) points; None if there is no point."""
+        """Return the first index of the coldest of all points or only `reached` points; None if there are none."""
         candidates = np.flatnonzero(self.reached) if reached_only else np.arange(len(self.values))
         return int(candidates[np.argmin(self.values[candidates])]) if len(candidates) else None
 
@@ -122,7 +122,7 @@ def cloud_laplacian(points: Float[np.ndarray, "n 3"]) -> Laplacian:
 
 
 def mesh_laplacian(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Laplacian:
-    """Return the Laplacian of a mesh, even a non-manifold one. Heat flows across shared vertices."""
+    """Return the Laplacian of a mesh, which may be non-manifold. Heat flows across shared vertices."""
     return _assemble(lambda: optional("robust_laplacian").mesh_laplacian(vertices, faces), len(vertices))
 
 
@@ -219,7 +219,7 @@ def _solve(laplacian: Laplacian, points: np.ndarray, rows: np.ndarray, heat: Hea
 def refine(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], longest: float
 ) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]:
-    """Bisect edges until all are at most `longest` long, and return the new vertices and faces.
+    """Bisect edges until none is longer than `longest`, and return the new vertices and faces.
 
     An edge is bisected in all its triangles at once. The original vertices come first in the result. Triangles may
     become slivers, but this does not harm the Laplacian of Sharp and Crane.
@@ -245,7 +245,7 @@ def _split_faces(faces: np.ndarray, halves: np.ndarray) -> np.ndarray:
     - `halves`: index of the vertex at the midpoint of each edge (i, i + 1); -1 for an edge that is not bisected.
     """
     count = (halves >= 0).sum(axis=1)
-    # Rotate each triangle: one midpoint is then on the first edge, and two are on the first and second edges.
+    # Rotate each triangle, so that a single midpoint is on the first edge, and two are on the first two edges.
     first = np.where(count == 2, np.argmin(halves, axis=1) + 1, np.argmax(halves, axis=1))
     order = (first[:, None] + np.arange(3)) % 3
     (a, b, c), (x, y, z) = (np.take_along_axis(rows, order, axis=1).T for rows in (faces, halves))

@@ -1,4 +1,4 @@
-"""Heat diffusion: the coldest point of a body that is heated near one point."""
+"""Heat diffusion: where is a body coldest that is heated near one point?"""
 
 import math
 import multiprocessing
@@ -21,10 +21,10 @@ from jaxnbv.tasks.diffusion import HeatProblem, Temperature, cloud_temperature, 
 from jaxnbv.tasks.host import call_on_host
 from jaxnbv.utility import Answer, Quantity, Utility
 
-# Longest edge of the triangles for the true temperature, in scene units. At the default radius, the temperature is
-# within 2 % of its limit for fine triangles, and the computation takes seconds.
+# Longest edge of the triangles for the true temperature, in scene units. At the default radius, the temperature differs
+# by at most 2 % from its limit for fine triangles, and the computation takes seconds.
 _LONGEST_EDGE = 0.025
-# Idle time after which a worker exits. Workers should survive between two calls, while other results are computed.
+# Idle time after which a worker exits. It must be longer than the time between two calls.
 _IDLE_SECONDS = 120
 # Workers import JAX, but must not occupy the accelerator or use more than one core each.
 _WORKER_ENVIRONMENT = {"JAX_PLATFORMS": "cpu", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
@@ -37,11 +37,12 @@ class ColdestPoint(Utility):
     equation is solved outside JAX, so there is no gradient. Use a search over candidates, as in the paper. The values
     do not depend on the order of the points or the number of workers, not even in the last bit.
 
-    - `heat`: a `HeatProblem`, or only the source (3,) in scene coordinates, for the authors' other values. Problems
-      that differ only in the source share one compiled program.
+    - `heat`: a `HeatProblem`, or only its source (3,) in scene coordinates, with the authors' values for the rest.
+      Problems that differ only in the source share one compiled program.
     - `reached_only`: take the minimum only over points that are connected to a heated point. The paper takes it over
-      all points. If any is not connected to the source, that is the initial temperature, and no view can improve it.
-    - `workers`: number of processes that share the clouds, by default one for each core; 1 for this process.
+      all points. If a point is not connected to the source, the minimum is then the initial temperature, and no view
+      can improve it.
+    - `workers`: number of processes that share the clouds, by default one for each core. With 1, this process does all.
 
     **Raises:** `ValueError` for fewer than one worker, an invalid source, or an attempt to differentiate the utility.
     """
@@ -67,8 +68,8 @@ class ColdestPoint(Utility):
     def __call__(self, cloud: PointCloud) -> Float[Array, ""]:
         """Return the negative lowest temperature of one cloud, in degrees.
 
-        Under `vmap`, all clouds are computed in one call on the host. Without a point for the minimum, it is
-        `HeatProblem.highest`, an upper bound, so that any point of a later scan improves the utility.
+        Under `vmap`, all clouds are computed in one call on the host. If there is no point to take the minimum over,
+        `HeatProblem.highest` replaces the minimum, so that any point of a later scan improves the utility.
         """
         source = jnp.asarray(self.heat.source, cloud.points.dtype)
         # The source may be traced, so it is passed as an array together with the cloud.
@@ -113,8 +114,8 @@ def body_temperature(
 ) -> tuple[Float[np.ndarray, "n 3"], Temperature]:
     """Return points of a body, in scene coordinates, and the temperature at these points.
 
-    For a mesh, the points are the vertices after refinement, which is fine enough for the default heat problem. Heat
-    does not flow between components of a mesh that touch but share no vertices, but it does in a dense cloud of them.
+    For a mesh, the points are the vertices after refinement, which is fine enough for the default heat problem. If two
+    components touch but share no vertices, heat flows between them in a dense cloud, but not in a mesh.
     """
     if isinstance(body, PointCloud):
         points = np.asarray(body.to_numpy()[0], np.float64)
@@ -127,7 +128,7 @@ class Coldest(Answer):
     """The coldest point of a body. The answer's only value is the temperature there, in degrees.
 
     - `point`: the coldest point, in scene coordinates.
-    - `frame`: frame of the world in whose coordinates a text of the answer shows the point.
+    - `frame`: frame of the world in which texts of the answer give the point.
     """
 
     point: Float[np.ndarray, "3"] = eqx.field(default_factory=lambda: np.zeros(3))
@@ -154,5 +155,5 @@ def coldest_point(body: PointCloud | TriangleMesh, heat: HeatProblem, reached_on
     coldest = temperature.coldest(reached_only)
     if coldest is None:
         reason = f"none of its {len(points)} points is connected to the source" if len(points) else "it is empty"
-        raise InputError(f"the body has no coldest point, as {reason}: scan the heat source first")
+        raise InputError(f"the body has no coldest point, because {reason}: scan the heat source first")
     return Coldest(("coldest",), temperature.values[[coldest]], point=points[coldest])

@@ -21,8 +21,8 @@ class HostClassifier(Classifier):
     - `function`: function that returns the log-probabilities (b, num_classes) of b clouds, given their points
       (b, n, 3), unit normals (b, n, 3) and mask (b, n) as NumPy arrays. b is at most 128.
     - `version`: a text or number, such as "2026-11", that you change whenever the function changes. A stored run needs
-      a version unless the function's source code and all variables that it reads can be described. The weights of a
-      PyTorch model cannot be described.
+      a version, unless the function's source code and all variables that it reads can be described (see `describe`).
+      The weights of a PyTorch model cannot.
 
     **Raises:** `ValueError` for an attempt to differentiate the classifier. If the function fails or returns an array
     of the wrong shape, JAX raises a `RuntimeError` whose text contains the original message.
@@ -75,7 +75,8 @@ def call_on_host(
 ) -> Float[Array, "..."]:
     """Call a NumPy function with JAX arrays, also under `jit` and `vmap`, and return the result.
 
-    The function gets the arrays with a leading axis for the entries of a `vmap`, of length one outside `vmap`.
+    The function gets the arrays with an additional leading axis, over the entries of `vmap`. Its length is one outside
+    `vmap`.
 
     - `shape`: shape of the result for one entry. The result has the dtype of the first array.
     - `name`: name of the caller for error messages.
@@ -97,4 +98,4 @@ def call_on_host(
 @call_on_host.def_jvp
 def _call_on_host_jvp(primals, tangents):
     name = primals[2]
-    raise InputError(f"{name} has no derivative, as it runs outside JAX: use DiscreteSearch, or write it in JAX")
+    raise InputError(f"{name} has no derivative, because it runs outside JAX: use DiscreteSearch, or write it in JAX")

@@ -26,14 +26,14 @@ from jaxnbv.utility import Answer, Quantity
 _RESOLUTION = 64
 # Weight of the information about the part's pose, relative to the information about its name.
 _POSE_WEIGHT = 0.1
-# Three values for each ray: distance to the part, cosine of the angle of incidence, and whether the ray hits the part.
+# For each ray: distance to the part, cosine of the angle of incidence, and whether the ray hits the part.
 _Image: TypeAlias = tuple[Float[Array, "..."], Float[Array, "..."], Bool[Array, "..."]]
 
 
 class ImaginedParts(eqx.Module):
     """Context of the acquisition `Identify`: the hypotheses of a step, ready to be scanned.
 
-    - `weights`: probabilities of the hypotheses, which sum to one without "none of these".
+    - `weights`: probabilities of the hypotheses other than "none of these", scaled to sum to one.
     - `classes`: for each hypothesis, the name or group of its part as a one-hot row.
     - `tau`: scale of the distance between a measured point and the surface, in scene units, see `part_evidence`.
     """
@@ -54,9 +54,9 @@ class Identify(Acquisition):
     The sum is over the hypotheses h of a model with known parts (`KnownShapes` with a bank at true size). A hypothesis
     is a part with a pose, and w_h is its probability. c is the name of the part, H is entropy, and I(h | c) is the
     information about h that c does not contain. z_h is the depth image of h from the pose theta, and w_h' | z_h is the
-    probability of h' after this image. L is the misfit of two images, which the probabilities of the hypotheses also
-    use, see `part_evidence`. The images of all hypotheses are compared in pairs. The name has the larger weight,
-    because a search that first determines the pose needs more views to find the name.
+    probability of h' after this image. L is the misfit between two images, summed over rays and computed from
+    distances as in `part_evidence`. The name has the larger weight, because a search that first determines the pose
+    needs more views to find the name.
 
     - `pose`: whether to include the information about the pose.
     - `group`: a class name for each part of the bank, such as `[name.split("-")[0] for name in bank.names]`. Then c is
@@ -92,7 +92,7 @@ class Identify(Acquisition):
         return jax.nn.one_hot(jnp.asarray(numbers)[shapes], int(numbers.max()) + 1)
 
     def score(self, context: Any, view: ImaginedView) -> Float[Array, ""]:
-        """Raise `ValueError`: the value of a view needs the scans of all hypotheses."""
+        """Raise `ValueError`, because the value of a view depends on the scans of all hypotheses together."""
         raise InputError("Identify cannot score a single scan: use its sample_scores")
 
     def sample_scores(
@@ -103,7 +103,7 @@ class Identify(Acquisition):
         poses: Pose,
         barrier: Float[Array, "poses rays"] | None = None,
     ) -> Float[Array, "1 poses"]:
-        """Return the expected information of each pose, from the surfaces in the context, not `surfaces`."""
+        """Return the expected information of each pose. Ignores `surfaces`, and scans those in `context`."""
         at_once = samples_at_once(camera, poses)
         images = shared_map(_image, context.surfaces, camera, poses, barrier, at_once=at_once)
         by_pose = jax.tree.map(lambda rows: jnp.moveaxis(rows, 1, 0), images)
@@ -132,7 +132,8 @@ def weights_by_name(
 ) -> tuple[list[str], Float[np.ndarray, "*batch n"]]:
     """Return the names of a bank's parts in alphabetical order, and the weights in this order.
 
-    The last weight is that of "none of these", which has no name. `Identify(group=...)` gives the names of the groups.
+    The last weight, without a name, is that of "none of these". For `Identify(group=...)` the names are those of the
+    groups, and the weights of each group are added.
 
     - `weights`: `PartHypotheses.part_weights`, with any leading axes.
     """
@@ -171,9 +172,10 @@ def _information(images: _Image, context: ImaginedParts, camera: Camera) -> Floa
 
 
 def _misfits(image: _Image, others: _Image, tau: Float[Array, ""]) -> Float[Array, "h rays"]:
-    """Return each ray's misfit between the image of one hypothesis and those of all, at most `MAX_MISFIT`.
+    """Return, for each ray, the misfit between the image of one hypothesis and the images of all hypotheses.
 
-    It grows with the distance between the two surfaces along the ray, and is `MAX_MISFIT` if the ray hits only one.
+    The misfit grows with the distance between the two surfaces along the ray. It is at most `MAX_MISFIT`, and equal to
+    it if the ray hits only one of the surfaces.
     """
     (reach, _, hits), (expected, cosine, are_expected) = image, others
     both = hits & are_expected

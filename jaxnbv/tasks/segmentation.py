@@ -23,7 +23,7 @@ from jaxnbv.programs import program
 from jaxnbv.scanning import Surface
 from jaxnbv.utility import Answer, Quantity, Utility, default_batch_size, plain_function
 
-# Tolerance for sums of probabilities that have 32 bits or fewer.
+# Tolerance for probabilities and their sums, which have 32 bits or fewer.
 _SLACK = 1e-2
 
 
@@ -58,14 +58,14 @@ class FunctionSegmenter(Segmenter):
 
 
 def as_segmenter(value: Any) -> Segmenter:
-    """Wrap a plain function as a segmenter, or return a segmenter unchanged.
+    """Return a segmenter unchanged, or a plain function wrapped as a segmenter.
 
     **Raises:** `ValueError` for anything else.
     """
     return value if isinstance(value, Segmenter) else FunctionSegmenter(plain_function(value, "the segmenter"))
 
 
-# A converter accepts plain functions too, which mypy cannot see.
+# Fields of this type have a converter for plain functions. mypy does not know about converters.
 if TYPE_CHECKING:
     AnySegmenter: TypeAlias = Any
 else:
@@ -118,9 +118,9 @@ class SoftPartCount(Utility):
         return Quantity("expected gain in parts", "parts", meaning)
 
     def answer(self, cloud: PointCloud) -> "PartAnswer":
-        """Return the number of points that are predicted for each part.
+        """Return the number of points that are predicted to belong to each part.
 
-        The parts to show are the segmenter's named parts. Without names, they are all parts with a predicted point.
+        The parts to show are the segmenter's named parts. Without names, all parts that have a point are shown.
         """
         counts = np.asarray(self.answer_values(cloud), np.float64)
         part_names = self.segmenter.part_names
@@ -129,11 +129,11 @@ class SoftPartCount(Utility):
         return PartAnswer(names, counts, parts=parts, target=self.target)
 
     def answer_values(self, cloud: PointCloud) -> Float[Array, " parts"]:
-        """Return the number of points that are predicted for each part."""
+        """Return the number of points that are predicted to belong to each part."""
         return _counts(self.segmenter, cloud).astype(cloud.points.dtype)
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> "PartAnswer":
-        """Return the number of surface points of each part, by the scene's labels or else the segmenter.
+        """Return the number of surface points of each part, from the scene's labels or else the segmenter.
 
         The answer's `target` is 1, because a part with at least one point is present.
 
@@ -148,10 +148,10 @@ class SoftPartCount(Utility):
 
 
 class PartAnswer(Answer):
-    """Number of points that are predicted for each part.
+    """Number of points that are predicted to belong to each part.
 
     - `parts`: indices of the parts to show.
-    - `target`: number of points from which a part counts as found.
+    - `target`: smallest number of points with which a part counts as found.
     """
 
     form: str = "{:.0f}"
