@@ -1,4 +1,4 @@
-"""Study of identification: which known part the object is, and in which pose it lies."""
+"""Study of identification: which known part an object is, and in which pose it lies."""
 
 import dataclasses
 import math
@@ -42,19 +42,19 @@ from jaxnbv.viz.style import DEVIATION
 
 IDENTIFY, BY_NAME = "identify", "identify-name"
 _LONGEST_SIDE = 2.5
-# Sensor noise: 0.6 % of the size per coordinate of a point, six degrees for a normal.
+# Sensor noise: 0.6 % of the longest side in each coordinate of a point, and six degrees in a normal.
 _NOISE = SensorNoise(0.006 * _LONGEST_SIDE, 0.1)
 # Lowest elevation of the cameras around a table.
 _MIN_ELEVATION = math.radians(10.0)
-# A first view shows the part in at least this fraction of its pixels.
+# The part fills at least this fraction of a first view's pixels.
 _MIN_SHOWN_FRACTION = 0.01
 # Rows and columns of rays of an imagined scan.
 _RAYS = (28, 28)
-# Numbers of points on the surfaces of the true part and of the placed part, between which distances are measured.
+# Numbers of points on the true part and on the placed part between which distances are measured.
 _NUM_POINTS, _NUM_DENSE_POINTS = 500, 20_000
-# A pose is right if its error is below this fraction of the part's size.
+# A pose is right if its error is below this fraction of the part's longest side.
 _MAX_POSE_ERROR = 0.01
-# Names of parts whose weights are at least this fraction of the largest weight count as tied.
+# Names count as tied if their weights are at least this fraction of the largest weight.
 _TIE_RATIO = 0.99
 # Colour scale of distances to the true part, in scene units.
 _ERRORS = LogNorm(0.01, 0.5)
@@ -72,8 +72,8 @@ def _below(fraction: float) -> Any:
 class IdentificationStudy(Study):
     """Measures how well a method's views tell which known part the object is, and in which pose it lies.
 
-    All methods use the same bank and compute the weights of hypotheses in the same way. They differ only in the views
-    that they choose. The study has the settings of `Study`, and:
+    All methods use the same bank, and compute the weights of its hypotheses in the same way. They differ only in the
+    views that they choose. The study has the settings of `Study`, and:
 
     - `setup`: where the part lies, and how much of the part a view shows.
     - `meshes`: mesh files of the parts at true size. Without mesh files, the study uses sets of eight parts that look
@@ -134,7 +134,7 @@ class IdentificationStudy(Study):
         setup: Setup | None = None,
         **options: Any,
     ) -> dict[str, Study]:
-        """Return one study for `setup`, or for each setup if it is None, by the names of the setups.
+        """Return one study for each setup, or only for `setup` if it is given. Keys are names of setups.
 
         - `parts`: folder of meshes at true size; default: the shipped sets of parts that look alike.
 
@@ -150,7 +150,7 @@ class IdentificationStudy(Study):
 
     @property
     def num_scenes(self) -> int | None:
-        """None (unlimited), because each part can be placed in ever new poses."""
+        """None (unlimited), because a part can be placed in any number of poses."""
         return None
 
     @property
@@ -177,9 +177,9 @@ class IdentificationStudy(Study):
         return Scene(index, parts.bank.names[part], placed_part.mesh, placed_part)
 
     def sensor(self, scene: Scene) -> Sensor:
-        """Return a depth camera whose points, normals and ranges (distances along the rays) are noisy.
+        """Return a depth camera with noise on points, normals and ranges (distances along the rays).
 
-        Obstacles hide the part, and points on obstacles are removed from the scans.
+        Obstacles may hide the part, and points on obstacles are removed from the scans.
         """
         obstacles = scene.task.obstacles
 
@@ -193,7 +193,7 @@ class IdentificationStudy(Study):
         return int(scan.count) >= _MIN_SHOWN_FRACTION * self.camera.num_rays
 
     def sampler_of(self, scene: Scene) -> SurfaceSampler:
-        """Return a sampler whose bank holds the parts in scene units. If there is a table, they rest on it."""
+        """Return a sampler whose bank holds the parts in scene units. If there is a table, parts rest on it."""
         return self.sampler.with_bank(scene.task.bank, scene.task.poses)
 
     def planner_of(self, acquisition: Acquisition, search: Search, scene: Scene) -> Planner:
@@ -221,7 +221,7 @@ class IdentificationStudy(Study):
         return record["set"]
 
     def follow(self, scene: Scene, truth: _Truth, planner: Planner, episode: Iterator[Step]) -> Record:
-        """Record after each view the likeliest name, the true name's probability, and the pose's error."""
+        """Record the likeliest name, the probability of the true name, and the pose's error after each view."""
         views = [self._view_record(truth, step.observations.hypotheses) for step in episode]
         return {name: [view[name] for view in views] for name in views[0]}
 
@@ -230,7 +230,7 @@ class IdentificationStudy(Study):
         (task, points, diameter), bank = truth, hypotheses.bank
         weights = np.append(np.asarray(hypotheses.shape_weights), hypotheses.weights[-1])
         name_index, (part, placement) = int(np.argmax(weights)), hypotheses.most_likely
-        # Parts that the scans do not distinguish yet are tied. Otherwise their order in the bank would decide.
+        # Scans may not distinguish some names yet. Count these as tied, or else their order in the bank would decide.
         is_tied = weights >= _TIE_RATIO * weights.max()
         correctness = float(is_tied[task.part] / is_tied.sum())
         rotation, shift = np.asarray(placement.rotation, np.float64), np.asarray(placement.shift, np.float64)
@@ -248,7 +248,7 @@ class IdentificationStudy(Study):
         }
 
     def scene_picture(self, record: Record, methods: Sequence[str], pixels: int) -> ScenePicture:
-        """Return images of the most likely part after each view, coloured by its distance to the true part."""
+        """Return a picture of the likeliest part after each view, coloured by its distance to the true part."""
         task, runs, eye = self.scene(record["scene"]).task, record["methods"], opposite_direction(record)
         true_mesh = task.mesh
         tree = cKDTree(true_mesh.sample_points(jax.random.key(0), 10 * _NUM_DENSE_POINTS))

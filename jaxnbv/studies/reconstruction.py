@@ -50,8 +50,8 @@ def _distance_measure(name: str, title: str) -> Measure:
 class ReconstructionStudy(Study):
     """Measures the distance between the surface reconstructed from a method's cloud and the true surface.
 
-    The surface is reconstructed by screened Poisson, and as the posterior mean, which is meshed on the grid of the
-    samples and carved like them. Procedural objects come from the test split of `part_scene`.
+    There are two reconstructions: screened Poisson, and the posterior mean, which is meshed on the grid of the samples
+    and carved like the samples. Procedural objects come from the test split of `part_scene`.
     """
 
     title: ClassVar[str] = "Distances to the true surface after the last view"
@@ -95,7 +95,7 @@ class ReconstructionStudy(Study):
         return NewSurface() if method == "new-surface" else Coverage()
 
     def mesher(self, scene: Scene) -> Planner:
-        """Return the planner whose sampler reconstructs the surface for all methods, including the user's."""
+        """Return the planner whose sampler reconstructs the surface for every method, also the user's."""
         return self.planner("farthest", scene)
 
     def truth(self, scene: Scene) -> Float[np.ndarray, "n 3"]:
@@ -111,9 +111,9 @@ class ReconstructionStudy(Study):
     def follow(
         self, scene: Scene, truth: Float[np.ndarray, "n 3"], planner: Planner, episode: Iterator[Step]
     ) -> Record:
-        """Record the surface covered after each view, and the final errors of the reconstructions.
+        """Record the fraction of the surface covered after each view, and the final reconstruction errors.
 
-        The errors of the Poisson reconstruction are None if `pymeshlab` is not installed.
+        The errors of screened Poisson are None if `pymeshlab` is not installed.
         """
         views = [view for view, *_ in episode]
         mesher = self.mesher(scene)
@@ -132,9 +132,9 @@ class ReconstructionStudy(Study):
         return {"chamfer": distance.chamfer, **distance._asdict()}
 
     def scene_picture(self, record: Record, methods: Sequence[str], pixels: int) -> ScenePicture:
-        """Return images of each reconstruction after the last view, coloured by distance to the true surface.
+        """Return a picture of each reconstruction after the last view, coloured by distance to the truth.
 
-        **Raises:** `ValueError` if the record has a Poisson reconstruction but `pymeshlab` is not installed.
+        **Raises:** `ValueError` if the record has errors of screened Poisson but `pymeshlab` is not installed.
         """
         scene, runs = self.scene(record["scene"]), record["methods"]
         truth = cast(TriangleMesh, true_mesh(scene.surface))

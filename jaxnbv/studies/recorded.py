@@ -1,4 +1,4 @@
-"""Study of a recording: how much of a box the frames show that a method chooses one by one."""
+"""Study of a recording: how much of a box is shown by the frames that a method chooses."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -36,14 +36,14 @@ from jaxnbv.viz.style import GREY, INK, LINE, NEW
 
 NEW_AREA, COVERAGE, EVEN, ORACLE = "new surface", "coverage", "evenly spaced", "oracle"
 _VOXELS_ALONG_BOX = 80
-# A first view shows at least this fraction of the box's voxels.
+# Smallest fraction of the box's voxels that a first view shows.
 _MIN_SHOWN_FRACTION = 0.05
 # Rows and columns of rays of an imagined scan.
 _RAYS = (24, 32)
 
 
 class _UnknownSurface(Surface):
-    """Placeholder for the true surface of a recording."""
+    """Placeholder for the true surface of a recording, which is unknown."""
 
     in_jit: ClassVar[bool] = False
 
@@ -52,7 +52,7 @@ class _UnknownSurface(Surface):
 
 
 class FixedOrder(Baseline):
-    """Baseline that visits the candidates with the indices `order`, the first view's included."""
+    """Baseline that visits candidates in the order of the indices `order`, starting with the first view."""
 
     order: Int[Array, " views"] = eqx.field(kw_only=True)
 
@@ -63,7 +63,7 @@ class FixedOrder(Baseline):
 
 
 class MostNewVoxels(Baseline):
-    """Greedy oracle that chooses the frame with the most new voxels, which no chosen frame shows yet.
+    """Greedy oracle that chooses the frame with the most new voxels, those that no earlier frame shows.
 
     - `is_shown`: entry (i, j) is True if candidate i shows voxel j.
     """
@@ -81,9 +81,9 @@ class MostNewVoxels(Baseline):
 
 
 def _gain_over_oracle(record: Record, method: str) -> dict[int, float | None]:
-    """Return, for each later view, the ratio of a method's and the oracle's gain in voxels over view 1.
+    """Return a method's gain in voxels since view 1, divided by the oracle's gain, at each later view.
 
-    The ratio is None if the oracle has added no voxels. Without a run of the oracle, the result is {}.
+    The ratio is None if the oracle has gained no voxels. Without a run of the oracle, the result is {}.
     """
     if ORACLE not in record["methods"]:
         return {}
@@ -97,9 +97,7 @@ class RecordedStudy(Study):
     """Measures how much of a box is shown by the frames that a method chooses from a recording.
 
     The candidates are the recorded poses with their recorded scans. The first view is a random frame that shows at
-    least 5 % of the box's voxels. Scenes differ only in their first view.
-
-    It has the settings of `Study`, and:
+    least 5 % of the box's voxels. Scenes differ only in their first view. The study has the settings of `Study`, and:
 
     - `folder`, `up`, `intrinsics` (fx, fy, cx, cy), `depth_scale`: arguments of `RecordedFrames`.
     - `box`: the region of interest, in the recording's units.
@@ -143,7 +141,7 @@ class RecordedStudy(Study):
     def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
         """Return the study of one recording, under the name "". Voxels have 1/80 of the box's longest side.
 
-        - `options`: settings of `RecordedStudy`, but `box` is two corners as six numbers; default: `bounds_of`.
+        - `options`: settings of `RecordedStudy`, except that `box` is two corners as six numbers; default: `bounds_of`.
 
         **Raises:** `ValueError` if the model has known shapes, or if `options` holds `num_candidates`.
         """
@@ -195,7 +193,7 @@ class RecordedStudy(Study):
     def first_view(self, scene: Scene) -> int:
         """Return the index of a random frame that shows at least 5 % of the box's voxels.
 
-        Scenes start from different frames until all such frames have been used.
+        No two scenes start from the same frame until all such frames have been used.
 
         **Raises:** `ValueError` if there is no such frame.
         """
@@ -233,7 +231,7 @@ class RecordedStudy(Study):
         return {"frames": frames, "covered": is_shown.mean(axis=1).tolist()}
 
     def scene_picture(self, record: Record, methods: Sequence[str], pixels: int) -> ScenePicture:
-        """Return images of the voxels along the box's shortest side, with the path of the recorded camera."""
+        """Return a picture of the voxels, seen along the box's shortest side, and of the camera's path."""
         recording, runs = self.recording, record["methods"]
         plane_axes = np.sort(np.argsort(self.box.high - self.box.low)[1:])
         voxels, positions = recording.voxels[:, plane_axes], recording.camera_positions[:, plane_axes]

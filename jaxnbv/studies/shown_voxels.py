@@ -16,9 +16,9 @@ from jaxnbv.planning.images import stride_of
 from jaxnbv.progress import progress_bar
 from jaxnbv.readers.recorded import RecordedFrames
 
-# Number of frames that must show a voxel. A voxel that fewer frames show may be noise.
+# A voxel counts only if at least this number of frames show it. Others may be noise.
 _MIN_FRAMES = 3
-# Pixel stride with which the default box is computed, and the margin of the box as a fraction of its longest side.
+# For the default box: stride of the pixels that are used, and margin as a fraction of the box's longest side.
 _BOUNDS_STRIDE, _MARGIN = 16, 0.05
 
 
@@ -27,8 +27,7 @@ class Recording(NamedTuple):
 
     - `poses`: camera poses of the frames; `scans`: scans of the frames, cropped to the box; both in scene units.
     - `is_shown`: entry (i, j) is True if any pixel of frame i shows voxel j.
-    - `voxels`: centres of the voxels; `camera_positions`: positions of the frames' cameras; both in the recording's
-      units.
+    - `voxels`: centres of the voxels; `camera_positions`: positions of the cameras; both in the recording's units.
     """
 
     poses: Pose
@@ -39,7 +38,7 @@ class Recording(NamedTuple):
 
 
 def frame_of_box(box: Box) -> Frame:
-    """Return the frame that maps the recording's coordinates to the scene, with the box in the centre."""
+    """Return the frame that maps a recording's coordinates to scene coordinates, and centres the box."""
     return Frame.fit(np.array([box.low, box.high]), up="z")
 
 
@@ -60,11 +59,11 @@ def bounds_of(frames: RecordedFrames) -> list[float]:
 
 @functools.cache
 def read_recording(source: tuple[Any, ...], box: Box, voxel: float, scan_box: Box) -> Recording:
-    """Read a recording, once per process.
+    """Read a recording. The result is cached, so that a process reads each recording only once.
 
     - `source`: the arguments of `RecordedFrames`.
-    - `box`: the box whose voxels are counted; `voxel`: side of a voxel, both in the recording's units.
-    - `scan_box`: the box to which scans are cropped.
+    - `box`: the box whose voxels are counted; `scan_box`: the box to which scans are cropped; `voxel`: side of a voxel;
+      all in the recording's units.
 
     **Raises:** `ValueError` if no voxel of the box shows in three frames, and whenever `RecordedFrames` raises it.
     """
@@ -74,10 +73,10 @@ def read_recording(source: tuple[Any, ...], box: Box, voxel: float, scan_box: Bo
     zeros, is_point = jnp.zeros((count, 3)), jnp.zeros(count, bool)
     scans, cells_of_frames = [], []
     for index in progress_bar(range(len(frames)), desc="reading frames"):
-        # Use all pixels, although scans use every `stride`-th. Fewer pixels would miss voxels that the frame shows.
+        # Scans use every `stride`-th pixel. Use all pixels here, because fewer would miss voxels that the frame shows.
         points = _points(frames, index, 1)
         points = points[np.all((points >= box.low) & (points <= box.high), axis=1)]
-        # A frame without points in the box gives an empty scan. Its rays are not used for carving either.
+        # A frame without points in the box gives an empty scan, which does not carve either.
         scan = PointCloud(zeros, zeros, is_point, is_point, jnp.zeros(count))
         if len(points) > 0:
             image = frames.depth(index), frames.camera, poses[index], frames.depth_scale, stride
@@ -97,7 +96,7 @@ def read_recording(source: tuple[Any, ...], box: Box, voxel: float, scan_box: Bo
 
 
 def _points(frames: RecordedFrames, index: int, stride: int) -> Float[np.ndarray, "n 3"]:
-    """Return the points of a frame in world coordinates, from every `stride`-th pixel along each axis."""
+    """Return a frame's points in the recording's coordinates, from every `stride`-th row and column."""
     camera, matrix = frames.camera.strided(stride), frames.matrices[index]
     rows = slice(stride // 2, None, stride)
     depth = frames.depth_scale * frames.depth(index)[rows, rows].reshape(-1)

@@ -31,15 +31,15 @@ from jaxnbv.studies.sensors import PART_SETTING
 from jaxnbv.tasks import Coverage, Segmenter, SoftPartCount, part_counts
 from jaxnbv.viz.style import GREY, SERIES
 
-# A part is found once the segmenter assigns N_target points to it: values of N_target in the paper's Table 1, the
-# authors' N_target for the utility, and the number of points that the network gets, to which all these refer.
+# A part is found once the segmenter assigns N_target points to it. `TARGETS` are the values of N_target in the paper's
+# Table 1, `TARGET` is the authors' value for the utility. Both are for a network that gets `NETWORK_POINTS` points.
 TARGETS = (20, 40, 60, 80, 100)
 TARGET, NETWORK_POINTS = 60, 2048
 _BY_PARTS = ("discrete", "gradient-2dof", "gradient-6dof")
 _OTHERS = (*BASELINES, "coverage")
-# The width w of `NearestPart`, which is twice the standard deviation of the sensor noise.
+# The width w of `NearestPart`, twice the standard deviation of the sensor noise.
 _WIDTH = 0.02
-# Distance of an absent part, at which the part's probability and all derivatives are zero.
+# Distance of an absent part. It is so large that the part's probability and all derivatives are zero.
 _ABSENT_DISTANCE = 100.0
 # Number of points in pictures of the true surface.
 _NUM_DENSE_POINTS = 8000
@@ -52,11 +52,11 @@ class NearestPart(Segmenter):
 
         p_ic proportional to exp(-d_ic^2 / 2 w^2),   w = 0.02 scene units,
 
-    where d_ic is the distance of point i from the true part c. `of` pads the parts of each object to the same number,
-    so that all objects share one compilation.
+    where d_ic is the distance of point i from the true part c. Objects with the same number of parts share one
+    compilation, so `of` adds absent parts.
 
     - `distances`: distance of each node of `grid` from each part, interpolated linearly between nodes.
-    - `num_points`: number of points to segment, which farthest point sampling chooses.
+    - `num_points`: number of points to segment. Farthest point sampling chooses them from the cloud.
     """
 
     distances: Float[Array, "parts g g g"]
@@ -65,7 +65,7 @@ class NearestPart(Segmenter):
 
     @classmethod
     def of(cls, parts: MeshParts, max_parts: int, grid: Grid, num_points: int) -> "NearestPart":
-        """Make the oracle of a mesh. Absent parts are added until there are `max_parts` parts."""
+        """Make the oracle for the parts of a mesh, and add absent parts until there are `max_parts`."""
         distances = parts.distances(grid)
         padding = ((0, max_parts - len(distances)), (0, 0), (0, 0), (0, 0))
         return cls(jnp.pad(distances, padding, constant_values=_ABSENT_DISTANCE), grid, num_points)
@@ -77,7 +77,7 @@ class NearestPart(Segmenter):
         return jnp.where(subsample.mask[:, None], p, 0.0)
 
     def predict(self, cloud: PointCloud) -> tuple[PointCloud, Int[Array, " num_points"]]:
-        """Return the segmented points and the index of the part nearest to each; -1 in rows without a point."""
+        """Return the segmented points, and the index of the nearest part for each; -1 in rows without a point."""
         subsample = farthest_point_subsample(cloud, self.num_points)
         return subsample, jnp.where(subsample.mask, self.nearest(subsample.points), -1)
 
@@ -86,7 +86,7 @@ class NearestPart(Segmenter):
         return jnp.argmin(self.distances_at(points), axis=-1).astype(jnp.int32)
 
     def distances_at(self, points: Float[Array, "n 3"]) -> Float[Array, "n parts"]:
-        """Return the distance of each point from each part. Outside the grid, it is the value at the border."""
+        """Return the distance of each point from each part. Points outside the grid count as on its border."""
         coordinates = list((points.T + self.grid.half_extent) / self.grid.spacing)
 
         def interpolate(values):
@@ -101,7 +101,7 @@ PartSegmenter: TypeAlias = CloudSegmenter | NearestPart
 def discovery_time(counts: Int[np.ndarray, "views parts"], target: int) -> int | None:
     """Return the paper's T_discovery: the first view after which all parts have `target` points, or None.
 
-    - `counts`: number of points that are assigned to each part after each view. Views are counted from 1.
+    - `counts`: number of points assigned to each part after each view. The first view has the number 1.
     """
     is_complete: Bool[np.ndarray, " views"] = np.all(np.asarray(counts) >= target, axis=1)
     return int(np.argmax(is_complete)) + 1 if is_complete.any() else None
@@ -115,7 +115,7 @@ def _discovery_times(record: Record, method: str) -> dict[int, float]:
 
 
 def _all_parts_found(record: Record, method: str) -> dict[int, float]:
-    """Return, for each of `TARGETS`, 1.0 if all parts had as many points by the last view, else 0.0."""
+    """Return, for each of `TARGETS`, 1.0 if all parts have that many points by the last view, else 0.0."""
     return {target: float(time <= record["study_views"]) for target, time in _discovery_times(record, method).items()}
 
 
@@ -125,13 +125,13 @@ def _all_parts_found_by_view(record: Record, method: str) -> list[float]:
 
 
 class PartDiscoveryStudy(Study):
-    """Measures the number of views until a segmenter assigns enough points to every part of the object.
+    """Measures how many views it takes until a segmenter assigns enough points to every part.
 
     It has the settings of `Study`, and:
 
     - `imagined_rays`: rays along each side of an imagined scan. True scans have 64 x 64 rays.
-    - `num_points`: number of points that the segmenter gets of the cloud and an imagined scan together. The utility's
-      target number of points per part (N_target) is scaled in proportion to this number.
+    - `num_points`: number of points of the cloud joined with an imagined scan that the segmenter gets. The utility's
+      number of points per part (N_target) is scaled in proportion to this number.
     """
 
     title: ClassVar[str] = "Views until all parts are found"
@@ -167,7 +167,7 @@ class PartDiscoveryStudy(Study):
 
     @abstractmethod
     def segmenter_of(self, scene: Scene, num_points: int | None = None) -> PartSegmenter:
-        """Return the segmenter for a scene, which gets `num_points` points; default: as for an observed cloud."""
+        """Return the segmenter for a scene. It gets `num_points` points; default: as many as for a true cloud."""
 
     @abstractmethod
     def true_parts(self, scene: Scene, points: Float[Array, "n 3"]) -> Int[Array, " n"]:
@@ -198,7 +198,7 @@ class PartDiscoveryStudy(Study):
         return {"counts": counts}
 
     def scene_picture(self, record: Record, methods: Sequence[str], pixels: int) -> ScenePicture:
-        """Return images of the cloud, coloured by predicted part, over the true shape, until the episode ends."""
+        """Return a picture of the cloud after each view, coloured by predicted part, over the true shape."""
         scene, runs = self.scene(record["scene"]), record["methods"]
         parts, segmenter = np.asarray(self.truth(scene)), self.segmenter_of(scene)
         palette, point = [SERIES[part % len(SERIES)] for part in range(len(parts))], jnp.zeros((1, 3))

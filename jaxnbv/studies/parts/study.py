@@ -40,9 +40,9 @@ class PartMesh(eqx.Module):
 class MeshPartStudy(PartDiscoveryStudy):
     """Part discovery on mesh files, segmented by the oracle `NearestPart` in place of a network.
 
-    The utility counts all parts. The measures count only parts that can be found. A part can be found if the oracle
-    assigns at least 100 points (the largest N_target) to it when it segments the scans from all candidates together.
-    The study has the settings of `PartDiscoveryStudy`, and:
+    The utility counts all parts. The measures count only parts that can be found: the oracle assigns at least 100
+    points (the largest N_target) to such a part when it segments the scans from all candidates together. The study has
+    the settings of `PartDiscoveryStudy`, and:
 
     - `meshes`: mesh files whose nodes are parts.
     - `room`: largest number of parts of any mesh.
@@ -63,7 +63,7 @@ class MeshPartStudy(PartDiscoveryStudy):
 
     @classmethod
     def files_in(cls, folder: str | Path) -> tuple[MeshFile, ...]:
-        """Return the meshes that have at least two nodes, one from each subfolder in turn.
+        """Return the meshes that have at least two nodes, alternating between the subfolders.
 
         The name of a mesh includes the name of its subfolder.
 
@@ -128,7 +128,7 @@ class PartStudy(PartDiscoveryStudy):
     def configured(
         cls, model: str, views: int, quick: bool, meshes: str | Path | None = None, **options: Any
     ) -> dict[str, Study]:
-        """Return the study under the name "". With a folder of `meshes`, it is a `MeshPartStudy`."""
+        """Return the study under the name "". It is a `MeshPartStudy` if `meshes` names a folder."""
         if meshes is not None:
             return MeshPartStudy.configured(model, views, quick, meshes=meshes, **options)
         return super().configured(model, views, quick, segmenter=part_segmenter(category=0), **options)

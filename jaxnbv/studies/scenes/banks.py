@@ -16,8 +16,8 @@ from jaxnbv.surfaces import ShapeBank
 class BankRecipe(NamedTuple):
     """Defines the shapes of a bank of known shapes.
 
-    - `kinds`: names of the kinds of shapes. Shape i is of kind `kinds[i % len(kinds)]`.
-    - `shape`: function from i to shape i, which is not rotated at random.
+    - `number`: number of shapes; `kinds`: names of their kinds. Shape i is of kind `kinds[i % len(kinds)]`.
+    - `shape`: function from i to shape i, without a random rotation.
     """
 
     number: int

@@ -1,4 +1,4 @@
-"""Objects of several classes. The part of an object's surface that tells its class is called the cue."""
+"""Objects of several classes. The cue is the part of an object's surface that tells its class."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -22,7 +22,7 @@ from jaxnbv.studies.scenes.labelled import LabelledSolid
 
 
 class ClassObject(SignedDistance):
-    """Base class of solids that belong to one of several classes, which has the index `label`."""
+    """Base class of solids that belong to one of several classes. `label` is the index of the class."""
 
     label: eqx.AbstractVar[Int[Array, ""]]
 
@@ -33,8 +33,7 @@ class ClassObject(SignedDistance):
     def on_cue(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[Array, "*n"]:
         """Return whether each point of the surface lies on the cue. The base class always returns True.
 
-        - `x`: points on the surface without noise (scene units).
-        - `tolerance`: largest distance from the cue, in scene units.
+        - `x`: points on the surface without noise; `tolerance`: largest distance from the cue; both in scene units.
         """
         return jnp.ones(x.shape[:-1], bool)
 
@@ -42,7 +41,7 @@ class ClassObject(SignedDistance):
 class SolidObject(ClassObject):
     """A solid made of labelled primitives, in scene coordinates. Labels above 0 mark the cue.
 
-    The solid, called with points, returns bounds of their signed distances, as `LabelledSolid` does.
+    Called with points, it returns lower bounds of their signed distances, like a `LabelledSolid`.
     """
 
     solid: LabelledSolid
@@ -63,9 +62,9 @@ class ClassSet(NamedTuple):
 
 
 class ClassMesh(eqx.Module):
-    """A mesh that belongs to one of several classes, which has the index `label`.
+    """A mesh that belongs to one of several classes. `label` is the index of the class.
 
-    - `cue`: the triangles of `mesh` that are the cue (they tell the class); default: all triangles.
+    - `cue`: the triangles of `mesh` that tell the class; default: all triangles.
     """
 
     mesh: TriangleMesh
@@ -89,7 +88,7 @@ def surface_of(class_object: ClassObject | ClassMesh) -> Surface:
 def scan_cue(
     class_object: ClassObject | ClassMesh, camera: Camera, poses: Pose
 ) -> tuple[Int[Array, " poses"], PointCloud]:
-    """Return how many rays of each pose hit the cue (the part that tells the class), and noiseless scans."""
+    """Return the number of each pose's rays that hit the cue, and noiseless scans from the poses."""
     run = _scan_cue if isinstance(class_object, ClassMesh) else _scan_cue_compiled
     return run(class_object, camera, poses)
 

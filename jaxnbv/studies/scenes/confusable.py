@@ -1,4 +1,4 @@
-"""Sets of eight parts that look alike. The parts of a set differ in one feature, which few views show.
+"""Sets of eight parts that look alike. The parts of a set differ in one feature that few views show.
 
 Lengths are in scene units. Along each axis, all parts lie between -1.35 and 1.35.
 """
@@ -19,21 +19,21 @@ from jaxnbv.scanning.sdf import Cuboid, Cylinder, Sampled, SignedDistance
 from jaxnbv.surfaces import ShapeBank
 
 PARTS_OF_SET = 8
-# The smallest feature (0.12) is larger than two spacings of the bank's grid. The grid of the meshes is finer.
+# Walls, handles and ribs are at least 0.09 thick, about two cells of the bank's grid. The grid of the meshes is finer.
 _BANK_GRID, _MESH_GRID = Grid(64, 1.5), Grid(100, 1.4)
 # Smallest distance between a part and the faces of the bank's grid.
 _PADDING = 0.15
-# The pocket of the housing: x of its centre, height of its floor, and height of the floor of housings with holes, which
-# a deep floor would hide.
+# The pocket of a housing: x of its centre, y of its floor, and y of the floor if it has holes. A deep floor would hide
+# the holes.
 _POCKET_X, _POCKET_FLOOR, _SHALLOW_FLOOR = 0.15, 0.05, 0.45
-# Places in the pocket: x and z relative to its centre.
+# Places in the pocket: x and z relative to the pocket's centre.
 _SIDES = [(-0.25, 0.0), (0.25, 0.0), (0.0, 0.15), (0.0, -0.15)]
 
 
 def _housing(side: float = 1.0, floor: float = _POCKET_FLOOR) -> SignedDistance:
-    """Make a block with a deep pocket, open above, and a notch at a corner, which breaks the symmetry.
+    """Make a block with a pocket that is open above, and a notch at a corner that breaks the symmetry.
 
-    - `side`: 1, or -1 for the mirror image; `floor`: height of the pocket's floor.
+    - `side`: 1, or -1 for the mirror image; `floor`: y of the pocket's floor.
     """
     pocket = Cuboid([0.42, 0.7, 0.3]).translate([side * _POCKET_X, floor + 0.7, 0.0])
     notch = Cuboid([0.2, 0.2, 0.2]).translate([side * 0.75, -1.25, 0.55])
@@ -165,7 +165,7 @@ def confusable_solids(name: str) -> list[SignedDistance]:
 
 @functools.cache
 def confusable_meshes(name: str) -> tuple[TriangleMesh, ...]:
-    """Return the parts of a set of `CONFUSABLE_SETS` as meshes, whose edges are rounded by about 0.03."""
+    """Return the parts of a set of `CONFUSABLE_SETS` as meshes. Their edges are rounded by about 0.03."""
     values = [np.array(_values(solid, _nodes(_MESH_GRID))) for solid in confusable_solids(name)]
     triangles = [level_triangles(rows, _MESH_GRID) for rows in values]
     return tuple(TriangleMesh(mesh[0], mesh[1], Frame()) for mesh in triangles if mesh is not None)
@@ -175,7 +175,7 @@ def confusable_meshes(name: str) -> tuple[TriangleMesh, ...]:
 def confusable_bank(name: str) -> ShapeBank:
     """Return the parts of a set of `CONFUSABLE_SETS` as a bank at true size.
 
-    The bank stores signed distances on a grid, because a tree of set operations takes minutes to compile in a search.
+    The bank stores signed distances on a grid, because a search with set operations takes minutes to compile.
     """
     nodes = _nodes(_BANK_GRID)
     low, spacing = np.full(3, -_BANK_GRID.half_extent), _BANK_GRID.spacing

@@ -1,6 +1,6 @@
 """Options of studies for the size and position of an object and for its first view.
 
-The command line offers these options, so this module does not import JAX.
+This module does not import JAX, because the command line imports it for its help.
 """
 
 from enum import StrEnum

@@ -39,7 +39,7 @@ def heat_scene(index: int, is_rotated: bool = True) -> HeatScene:
     """Return the heated scene with this index. Its kind of object is `HEAT_OBJECTS[index % 4]`.
 
     Proportions and heat source are random. If `is_rotated`, the object is also rotated about y by a random angle.
-    Indices from `FIRST_TRAINING` on are reserved for training, so reported results never include them.
+    Indices from `FIRST_TRAINING` on are for training only. Reported results do not include them.
 
     **Raises:** `ValueError` if the index is negative.
     """
@@ -66,8 +66,8 @@ def source_view(scene: HeatScene, key: PRNGKeyArray, num_candidates: int = 100, 
     return poses[int(jax.random.choice(key, indices))]
 
 
-# Each function below returns the primitives of an object, of which the first is heated, and the position of the heat
-# source, in the frame of the first primitive and in units of its half sizes.
+# Each function below returns the primitives of an object, and the heat source's position on the first primitive, in the
+# frame of this primitive and in units of its half sizes.
 
 
 def _on_top(rng):

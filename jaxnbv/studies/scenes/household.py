@@ -12,7 +12,7 @@ from jaxnbv.studies.scenes.labelled import assemble, generator
 from jaxnbv.studies.scenes.parts import furniture
 from jaxnbv.studies.scenes.splits import Split, scene_key
 
-# Labels above 0 mark what tells an object's class, which here is the whole object.
+# Labels above 0 mark the cue, which tells an object's class. Here it is the whole object.
 ball, bar, box, ring, rod = (
     partial(make, 1) for make in (labelled.ball, labelled.bar, labelled.box, labelled.ring, labelled.rod)
 )

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from jaxnbv.checks import require
 from jaxnbv.scanning.sdf import UNUSED, LabelledSolid
 
-# Number of slots for primitives in a solid. Larger solids have a multiple of it.
+# Number of slots for primitives in a solid. Larger solids have a multiple of this number.
 CAPACITY = 24
 
 _IDENTITY = np.eye(3)
@@ -25,7 +25,7 @@ _IDENTITY = np.eye(3)
 
 @dataclasses.dataclass(frozen=True)
 class Primitive:
-    """One primitive of a `LabelledSolid` (which explains the fields), as NumPy arrays on the host."""
+    """One primitive of a `LabelledSolid`, as NumPy arrays on the host. See there for the fields."""
 
     label: int
     centre: np.ndarray
@@ -42,7 +42,7 @@ class Primitive:
         if not self.revolved:
             reach = np.abs(self.rotation) @ inner + self.rounding
             return self.centre + np.stack([-reach, reach])
-        # Take both directions of each coordinate axis in the plane of the swept rectangle, and then apply the slant.
+        # Project both directions of each coordinate axis onto the plane of the swept rectangle, and apply the slant.
         up = np.stack([-self.rotation[:, 1], self.rotation[:, 1]])
         out = np.sqrt(np.maximum(1.0 - up**2, 0.0))
         up = up + self.slant * out
@@ -64,8 +64,8 @@ def box(label: int, centre, half_size, rounding: float = 0.02, axis_angle: tuple
 def bar(label: int, start, end, half_width: float, half_depth: float, rounding: float = 0.02) -> Primitive:
     """Return a box with rounded edges that extends from `start` to `end`.
 
-    - `half_width`: half the size across the bar along the horizontal direction (z if the bar is upright).
-    - `half_depth`: half the size along the other direction across the bar.
+    - `half_width`: half the bar's size in the horizontal direction across it (z if the bar is upright).
+    - `half_depth`: half the bar's size in the other direction across it.
     """
     start, end = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
     half_size = np.array([half_depth, 0.5 * np.linalg.norm(end - start), half_width])
@@ -96,7 +96,7 @@ def ring(
 
 
 def rod(label: int, start, end, radius: float, end_radius: float | None = None, rounding: float = 0.02) -> Primitive:
-    """Return a rod or cone with flat ends. Its radius changes linearly to `end_radius`, if given."""
+    """Return a rod with flat ends. If `end_radius` is given, the radius changes linearly to it."""
     start, end = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
     length = float(np.linalg.norm(end - start))
     end_radius = radius if end_radius is None else end_radius
@@ -187,5 +187,5 @@ def union(primitives: list[Primitive], capacity: int = CAPACITY) -> LabelledSoli
 
 
 def generator(key) -> np.random.Generator:
-    """Return a NumPy random generator seeded by a JAX key, for objects that are built on the host."""
+    """Return a NumPy generator seeded by a JAX key, for objects that are built on the host."""
     return np.random.default_rng(np.asarray(jax.random.key_data(key)))

@@ -27,10 +27,10 @@ _BUILDERS = {
     "table": furniture.table,
 }
 
-# In the order of `networks.CATEGORIES`.
+# The names have the order of `networks.CATEGORIES`.
 PART_CATEGORIES = tuple(_BUILDERS)
 
-# All objects face along x, as in ShapeNet, up to this rotation about the y axis.
+# Objects face along x, as in ShapeNet, and are then rotated about y by at most this angle.
 _MAX_ROTATION = np.radians(10.0)
 
 
@@ -47,11 +47,11 @@ class PartScene(eqx.Module):
 
 
 def part_scene(split: Split, index: int) -> PartScene:
-    """Return the scene with this index in a split, which holds a random object with labelled parts.
+    """Return the scene with this index in a split. It holds a random object with labelled parts.
 
     The category is `PART_CATEGORIES[index % 13]`. The object stands upright along y and faces x to within 10 degrees.
-    Its bounding box is centred and has longest side 2.5. No part is thinner than 0.05. The object is built on the host,
-    so the function does not run under `jit`.
+    Its bounding box is centred and has longest side 2.5. No part is thinner than 0.05. The function does not run under
+    `jit`, because it builds the object on the host.
 
     **Raises:** `ValueError` if the index is negative.
     """

@@ -1,4 +1,4 @@
-"""Known parts placed in a scene: rotated at random, or resting on a table with or without a box on it."""
+"""Known parts placed in a scene: in a random rotation, or resting on a table, perhaps beside a box."""
 
 import dataclasses
 import functools
@@ -20,10 +20,10 @@ from jaxnbv.studies.scenes.framing import Setup
 from jaxnbv.surfaces import FreeRotation, Resting, ShapeBank, ShapePoses
 
 _LONGEST_SIDE = 2.5
-# The box beside a part, in scene units: gap between box and part, half the thickness of the box, and length by which
-# the box extends beyond the part.
+# The box beside a part, in scene units: gap between box and part, half the box's thickness, and length by which the box
+# extends beyond the part.
 _GAP, _HALF_THICKNESS, _OVERHANG = 0.3, 0.15, 0.2
-# Seed of the order of parts, which does not depend on the seed of the study.
+# Seed of the order in which scenes use the parts. It does not depend on the study's seed.
 _ORDER_SEED = 123
 
 
@@ -45,8 +45,8 @@ class Parts:
     def choose(self, index: int) -> int:
         """Return the index of the part for the scene with this index.
 
-        Scenes with an even index use one half of the parts, scenes with an odd index the other half. In each half,
-        every part is used once before any part repeats.
+        Scenes with even indices use one half of the parts, and scenes with odd indices the other half. In each half,
+        no part repeats until all have been used.
         """
         half = np.random.default_rng(_ORDER_SEED).permutation(len(self.meshes))[index % 2 :: 2]
         return int(half[index // 2 % len(half)])
@@ -71,7 +71,7 @@ def parts_in(files: tuple[MeshFile, ...]) -> Parts:
 
 
 def confusable_parts(index: int) -> tuple[str, Parts, int]:
-    """Return name and parts of the set `CONFUSABLE_SETS[index % 10]`, and the part of scene `index`."""
+    """Return name and parts of the set `CONFUSABLE_SETS[index % 10]`, and the index of the scene's part."""
     cycle, set_index = divmod(index, len(CONFUSABLE_SETS))
     name = CONFUSABLE_SETS[set_index]
     order = np.random.default_rng(_ORDER_SEED + set_index).permutation(PARTS_OF_SET)
@@ -81,10 +81,10 @@ def confusable_parts(index: int) -> tuple[str, Parts, int]:
 class PlacedPart(eqx.Module):
     """A part placed in a scene. Its bounding box is centred and has longest side 2.5.
 
-    - `part`: index of the part in the bank; `parts`: all parts that the object may be, at true size.
+    - `part`: index of the part in `parts`; `parts`: all parts that the object may be, at true size.
     - `scale`: scene units per unit of the parts' coordinates.
     - `rotation`, `shift`: the placement. A point u of the part is placed at rotation (scale u) + shift.
-    - `obstacles`: a table, with or without a box on it; None for no obstacles.
+    - `obstacles`: a table, perhaps with a box on it; None for no obstacles.
     """
 
     part: int = eqx.field(static=True)
@@ -110,13 +110,13 @@ class PlacedPart(eqx.Module):
         return self.placed_mesh(self.part, self.rotation, self.shift)
 
     def placed_mesh(self, part: int, rotation: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"]) -> TriangleMesh:
-        """Return the mesh of any part of the bank with a given placement, in scene coordinates."""
+        """Return the mesh, in scene coordinates, of the part with this index at a given placement."""
         mesh = self.parts.meshes[part]
         return TriangleMesh(self.scale * mesh.vertices @ np.asarray(rotation).T + shift, mesh.faces, Frame())
 
 
 def place_part(parts: Parts, part: int, setup: Setup, key: PRNGKeyArray) -> PlacedPart:
-    """Place a part in a random rotation, or on a table in a random stable pose if the setup has a table."""
+    """Place a part in a random rotation or, if the setup has a table, in a random stable pose on it."""
     random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     vertices = parts.meshes[part].vertices
     rotation = _resting(vertices, random) if setup.is_resting else Rotation.random(rng=random).as_matrix()
@@ -138,7 +138,7 @@ def _resting(vertices: Float[np.ndarray, "v 3"], random: np.random.Generator) ->
 
 
 def _obstacles(half: Float[np.ndarray, "3"], has_box: bool, random: np.random.Generator) -> Obstacles:
-    """Return a table below a part of these half sizes, with or without a box that hides half a side."""
+    """Return a table below a part of these half sizes and, if asked, a box that hides half of one side."""
     table = HalfSpace(np.array([0.0, -half[1], 0.0]), np.array([0.0, 1.0, 0.0]))
     if not has_box:
         return Obstacles((table,))

@@ -1,4 +1,4 @@
-"""Synthetic pyramids of five classes, which differ only in a pattern imprinted on the base."""
+"""Procedural pyramids of five classes. Only a pattern imprinted on the base tells the class."""
 
 import functools
 
@@ -14,7 +14,7 @@ from jaxnbv.studies.scenes.splits import Split, scene_key
 
 
 class Pyramid(ClassObject):
-    """A pyramid in scene coordinates. The pattern on its base, of `PATTERNS`, tells its class."""
+    """A pyramid in scene coordinates. Its class is the pattern on its base, one of `PATTERNS`."""
 
     solid: ImprintedPyramid
     label: Int[Array, ""]
@@ -37,8 +37,8 @@ def pyramid_scene(
     """Return the pyramid with this index in a split. Its class is `PATTERNS[index % 5]`.
 
     The height of the pyramid and the size, position, rotation and depth of its pattern are random. The pyramid is
-    centred in the scene. It has a random rotation if `is_rotated`, else it is upright along z. Both framings give one
-    pyramid in two sizes. The function runs under `jit` and `vmap`.
+    centred in the scene. It has a random rotation if `is_rotated`, else it is upright along z. The two framings give
+    the same pyramid in two sizes. The function runs under `jit` and `vmap`.
 
     **Raises:** `ValueError` if the index is negative.
     """

@@ -1,4 +1,4 @@
-"""Splits of procedural scenes into training, validation and test sets, and the random keys of scenes."""
+"""Splits of procedural scenes (training, validation and test), and the random keys of scenes."""
 
 from enum import StrEnum
 

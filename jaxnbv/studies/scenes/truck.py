@@ -13,7 +13,7 @@ from jaxnbv.studies.scenes.household import BUILDERS, HOUSEHOLD
 from jaxnbv.studies.scenes.labelled import CAPACITY, Primitive, bounds, fit, generator, move, rotation_about, union
 from jaxnbv.studies.scenes.splits import Split, scene_key
 
-# The truck does not tell the class. Primitives of the cargo have labels above 0.
+# Primitives of the truck have the label 0, because only the cargo tells the class.
 box, rod = (partial(make, 0) for make in (labelled.box, labelled.rod))
 
 
@@ -42,7 +42,7 @@ def placement_on_bed(
 ) -> tuple[float, Float[np.ndarray, "3"]]:
     """Return a scale and a shift that place a cargo at a random position on the floor of a bed.
 
-    The scale is a random 85 to 95 % of the largest scale at which the cargo fits into the space above the bed.
+    The scale is 85 to 95 %, chosen at random, of the largest scale at which the cargo fits above the bed.
 
     - `bed`, `cargo`: bounding boxes (lowest and highest corner) of the space above the bed and of the cargo.
     """

@@ -12,17 +12,17 @@ from jaxnbv.studies.scenes.class_object import ClassMesh
 from jaxnbv.studies.scenes.labelled import generator, rotation_about
 from jaxnbv.studies.scenes.truck import placement_on_bed, random_rotation
 
-# Number of rows and of columns of rays that are traced down onto the truck.
+# A grid with this number of rows and of columns of rays is traced down onto the truck.
 _NUM_LINES = 96
-# Fractions of a truck's height: lowest and highest possible floor of a bed, and range of heights within one floor.
+# Fractions of a truck's height: lowest and highest floor of a bed, and largest range of heights within one floor.
 _MIN_FLOOR, _MAX_FLOOR, _MAX_UNEVENNESS = 0.15, 0.85, 0.02
 
 
 def bed_of(truck: TriangleMesh) -> Float[np.ndarray, "2 3"]:
     """Return the lowest and highest corner of the space above a truck's bed, in scene coordinates.
 
-    The truck must be upright. The floor of the bed is the largest level, axis-aligned rectangle that is visible from
-    above between 15 and 85 % of the truck's height. The space above the bed ends at the height of the truck's top.
+    The truck must be upright. The floor of the bed is the largest level, axis-aligned rectangle between 15 and 85 % of
+    the truck's height that is visible from above. The space above the bed ends at the height of the truck's top.
 
     **Raises:** `ValueError` if no such rectangle covers 10 % of the truck's bounding rectangle as seen from above.
     """
