@@ -142,7 +142,7 @@ class Loop:
         return loop
 
     def with_clutter(self, clutter: SignedDistance | None) -> "Loop":
-        """Return a copy whose planner's obstacles contain this clutter (scene units) instead of the present one."""
+        """Return a copy in which `clutter` (scene units) replaces the clutter among the planner's obstacles."""
         assert self.planner.obstacles is not None
         loop = copy.copy(self)
         # tree_at skips the planner's checks, which take time and passed when the planner was created.

@@ -42,12 +42,12 @@ class PartsFound(StopRule):
             "the segmenter has no names for its parts: give the parts to find as PartsFound(parts=('part 0', ...))",
         )
         unknown_names = [name for name in self.parts or () if names and name not in names]
-        require(not unknown_names, f"the segmenter knows no part {unknown_names[:1]}: give some of {', '.join(names)}")
+        require(not unknown_names, f"the segmenter has no part {unknown_names[:1]}: give some of {', '.join(names)}")
 
     def after(self, context: StopContext) -> str | None:
         answer = context.planner.acquisition.answer(context.observations.cloud)
         if not isinstance(answer, PartAnswer):
-            raise InputError("the acquisition's answer has no parts: PartsFound needs that of SoftPartCount")
+            raise InputError("the acquisition's answer has no parts: PartsFound needs the answer of SoftPartCount")
         counts = dict(zip(answer.names, answer.values.tolist(), strict=True))
         names = self.parts or tuple(answer.names[index] for index in answer.parts)
         if any(counts.get(name, 0) < self.points for name in names):

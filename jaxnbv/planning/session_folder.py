@@ -35,7 +35,7 @@ class SessionFolder:
             require(
                 self.num_images == num_images,
                 f"{self._folder.path} holds {self.num_images} images, but this session knows {num_images}: another "
-                "process has added some; make the session again, which reads them",
+                "process has added some; make the session again to read them",
             )
             yield self
 

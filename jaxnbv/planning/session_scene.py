@@ -28,7 +28,7 @@ def usual_planner() -> Planner:
 
 
 def box_of(corners) -> Box:
-    """Convert two corners to a `Box`. A `Box` is returned as it is. **Raises:** `ValueError` for anything else."""
+    """Convert two corners, or a `Box`, to a `Box`. **Raises:** `ValueError` for anything else."""
     if isinstance(corners, Box):
         return corners
     require(np.shape(corners) == (2, 3), f"the box is {short_text(corners)}; give two corners, (low, high), or a Box")

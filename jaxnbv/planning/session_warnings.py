@@ -89,7 +89,7 @@ def warn_of_mount(alignment: Alignment) -> None:
 
 
 def warn_of_inside(box: Box, cameras: Float[np.ndarray, "n 3"], candidates: Float[np.ndarray, "m 3"]) -> None:
-    """Warn if the last camera is the first one inside the box, while all candidates are outside (world units)."""
+    """Warn if the last camera is the first inside the box, and all candidates are outside (world units)."""
     low, high = box.low, box.high
     is_inside, any_inside = (np.all((x > low) & (x < high), axis=1) for x in (cameras, candidates))
     if is_inside[-1] and is_inside.sum() == 1 and not any_inside.any():

@@ -1,7 +1,7 @@
-"""Stop rules: conditions that end an episode, checked after each view and for each proposed view.
+"""Stop rules: conditions that end an episode, checked after each view or before a proposed view.
 
-Rules are combined with `|`. The episode ends as soon as one rule holds. In a simulation, world units are scene units.
-`ValueBelow`, and `Budget` with a cost, also check the proposed view. `planning/part_rules.py` has rules about parts.
+The operator `|` combines rules, so that the episode ends as soon as one of them holds. In a simulation, world units are
+scene units. Rules about known or segmented parts are in `planning/part_rules.py`.
 """
 
 import dataclasses
@@ -33,7 +33,7 @@ class StopContext:
     - `poses`: poses of the views so far, in scene coordinates.
     - `seconds`: time since the first view that this process added.
     - `key`: random key of the posterior samples for the next view.
-    - `surfaces`: function that returns these samples. They are drawn once, and the search uses the same samples.
+    - `surfaces`: function that returns the posterior samples. They are drawn once, and the search uses them too.
     - `frame`: frame of the user's world. Values and costs are in units of this world.
     """
 
@@ -100,7 +100,7 @@ class AnyOf(StopRule):
 
 
 def checked_reason(rule: StopRule, reason: str | None) -> str | None:
-    """Return the reason that a rule returned.
+    """Return the `reason` that a rule returned, after a check.
 
     **Raises:** `ValueError` unless the reason is a non-empty string or None.
     """
@@ -115,8 +115,8 @@ def checked_reason(rule: StopRule, reason: str | None) -> str | None:
 class Sure(StopRule):
     """Stop once the most probable class has at least a given probability.
 
-    It must also have this probability given each of several random halves of the cloud D, because a classifier may be
-    sure of a single cloud by chance.
+    The class must also have this probability given each of several random halves of the cloud D, because a classifier
+    may be sure of a single cloud by chance.
 
     - `probability`: smallest probability at which to stop, within (0, 1).
     - `num_resamplings`: number of random halves.
@@ -177,7 +177,7 @@ class Covered(StopRule):
 
     - `share`: fraction of the area at which to stop, within (0, 1].
     - `size`: surface within this distance of measured surface counts as seen, in world units (`NewSurface.size`). The
-      default is the size of the acquisition if this is a `NewSurface`, otherwise that of `NewSurface()`.
+      default is the acquisition's size if the acquisition is a `NewSurface`, otherwise that of `NewSurface()`.
 
     **Raises:** `ValueError` for a `share` outside (0, 1], or a size that is not positive.
     """
@@ -205,7 +205,7 @@ def expected_coverage(context: StopContext, new_surface: NewSurface) -> float:
     The visible area is the area of the posterior samples that is visible from any candidate, see `seen_share`. Sampled
     surface that an earlier view should have measured but did not is left out.
 
-    - `new_surface`: acquisition that decides which surface is not seen yet.
+    - `new_surface`: acquisition that determines which surface is new.
     """
     planner, observations, surfaces = context.planner, context.observations, context.surfaces()
     if observations.looks is not None and not planner.acquisition.measurable_only:

@@ -26,7 +26,7 @@ _NUM_PLANES, _NUM_COUNTED = 1000, 3000
 class _Points(NamedTuple):
     """Points of an image relative to the middle of a box, with normals and weights.
 
-    - `is_near_box`: mask of the points in, under, above or close beside the box.
+    - `is_inside`, `is_near_box`: masks of the points in the box, and of points in, under, above or close beside it.
     - `weights`: weights that decrease with the horizontal distance from the middle of the box.
     """
 
@@ -43,10 +43,10 @@ class _Points(NamedTuple):
 def table_under(cloud: PointCloud, box: Box) -> Obstacles | None:
     """Return the table under an object as an obstacle; None if no table is detected.
 
-    The obstacle is the half space below the table's plane. Its margin is the default margin, or three standard
-    deviations of the table points' heights over the plane if this is larger. RANSAC (Fischler and Bolles 1981) draws
-    planes through random triples of points, mostly close to the box. Among the planes that can be a table, the one with
-    the most points outside the box is used. A plane can be a table if it satisfies four conditions:
+    The obstacle is the half space below the table's plane. Its margin is the default margin or three standard
+    deviations of the table points' distances from the plane, whichever is larger. RANSAC (Fischler and Bolles 1981)
+    draws planes through random triples of points, mostly close to the box. Among the planes that can be a table, the
+    plane with the most points outside the box is used. A plane can be a table if it satisfies four conditions:
 
     - It is level to within 30 degrees, so it is not a wall.
     - At the middle of the box it is below the top, and at most a quarter of the box's longest side below the bottom.
@@ -54,7 +54,7 @@ def table_under(cloud: PointCloud, box: Box) -> Obstacles | None:
     - Of the points in, under, above and close beside the box, at least as many are on the plane as below it. So it is
       not the edge of something in the air.
 
-    The box around the object, and the cloud of the whole image, are in scene coordinates with y up.
+    - `cloud`, `box`: the cloud of the whole image, and a box around the object, in scene coordinates (y is up).
     """
     low, high = box.low, box.high
     side, middle = float((high - low).max()), 0.5 * (low + high)
@@ -113,7 +113,7 @@ def _best_plane(image: _Points, lowest: float, highest: float) -> tuple[Float[np
     )
     if len(rows) < _MIN_POINTS:
         return None
-    # A random subset, drawn by weight, represents all points.
+    # To save time, planes are compared on a random subset of the points, drawn by weight.
     weights = image.weights / image.weights.sum()
     subset = image.select(rng.choice(len(weights), min(len(weights), _NUM_COUNTED), replace=False, p=weights))
     triples = rng.choice(rows, (_NUM_PLANES, 3), p=weights[rows] / weights[rows].sum())

@@ -54,7 +54,7 @@ arc_length = ArcLength()
 
 
 class WorldCost(eqx.Module):
-    """Cost function of scene poses, which converts them to world poses for the cost function `of`.
+    """Cost function that converts scene poses to world poses, and passes them to the cost function `of`.
 
     An `ArcLength` without a centre uses the middle of the scene.
     """
@@ -101,12 +101,12 @@ class ValuePerCost(eqx.Module):
         return values / (self.fixed + jnp.where(observations.num_views > 0, cost, 0.0))
 
     def in_world(self, frame: Frame) -> "ValuePerCost":
-        """Return a copy for scene poses, whose cost function still gets world poses."""
+        """Return a copy for scene poses, whose cost function gets the world poses."""
         of = self.of.of if isinstance(self.of, WorldCost) else self.of
         return dataclasses.replace(self, of=WorldCost(of, frame))
 
     def quantity(self, value: Quantity) -> Quantity:
-        """Return the quantity of values per cost, given that of the values alone."""
+        """Return the quantity of values per cost, given the quantity of the values."""
         meaning = f"{value.meaning.rstrip('.')}, over the cost of going there."
         unit = f"{value.unit or ('' if value.length_power else value.name)} per unit of cost".lstrip()
         return dataclasses.replace(value, name=f"{value.name} per cost", unit=unit, meaning=meaning)

@@ -17,7 +17,7 @@ from jaxnbv.search.problem import Problem
 from jaxnbv.search.proposal import Proposal
 from jaxnbv.utility import Quantity
 
-# A converter accepts numbers and poses too, which mypy cannot see.
+# mypy cannot see that a converter also accepts numbers and poses.
 if TYPE_CHECKING:
     AnyCandidates: TypeAlias = Any
 else:
@@ -48,7 +48,7 @@ class Search(eqx.Module):
         return acquisition.quantity
 
     def poses_around(self) -> Pose:
-        """Return poses around the object. Surface that one of them sees counts as visible."""
+        """Return poses around the object. Surface that any of them sees counts as visible."""
         return SphereCandidates().poses()
 
     def upper_half(self) -> "Search":
@@ -104,7 +104,7 @@ class CandidateSearch(Search):
 
     @abstractmethod
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
-        """Propose one of the candidates, by their scores from `score` or at random by the key."""
+        """Propose a candidate, given the scores from `score`, or at random from the key."""
 
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
         candidates = self.candidates.poses()
@@ -137,8 +137,7 @@ def best_unvisited(
 ) -> Proposal:
     """Propose the candidate with the highest value among those that `problem` does not exclude.
 
-    - `tie`: relative difference up to which values count as equal, and the first is proposed. The default exceeds the
-      rounding error that depends on the order of a sum.
+    - `tie`: relative difference up to which values tie, and the first is proposed. The default exceeds rounding errors.
     - `scores`: scores whose means are `values`, for the proposal's standard errors.
     """
     values = jnp.where(problem.is_excluded(candidates), -jnp.inf, values)
@@ -153,10 +152,10 @@ def best_unvisited(
 
 
 def best_or_farthest(problem: Problem, candidates: Pose, scores: Float[Array, "samples candidates"]) -> Proposal:
-    """Propose the best candidate or, among those tied with it, the one farthest from earlier cameras.
+    """Propose the best candidate or, among candidates tied with it, the farthest from earlier cameras.
 
-    The distance matters only if a second view from the same pose gains nothing (`Acquisition.gains_once`), and if there
-    is no cost, because a cost already favours near candidates.
+    The distance counts only if a second view from the same pose gains nothing (`Acquisition.gains_once`), and if there
+    is no cost, because a cost favours near candidates.
     """
     proposal = best_unvisited(problem, candidates, jnp.mean(scores, axis=0), scores=scores)
     if not problem.acquisition.gains_once or problem.cost is not None:
@@ -168,7 +167,7 @@ def best_or_farthest(problem: Problem, candidates: Pose, scores: Float[Array, "s
 
 
 def preferred(proposal: Proposal, preference: Float[Array, " candidates"]) -> Proposal:
-    """Change a proposal to the tied candidate (not an excluded one) of the highest `preference`."""
+    """Change a proposal to the candidate of highest `preference` among those that tie with the best."""
     is_tied, errors = proposal.tied_with_best(), proposal.standard_errors
     assert is_tied is not None
     assert errors is not None

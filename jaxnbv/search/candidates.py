@@ -32,7 +32,7 @@ class Candidates(eqx.Module):
         """Return the poses (count,). Every call returns the same poses."""
 
     def upper_half(self) -> "Candidates":
-        """Return the upper half if the candidates are a whole sphere; otherwise the candidates themselves."""
+        """Return the upper half of candidates on a whole sphere; other candidates are returned unchanged."""
         return self
 
     def where(self, allowed: Callable[[Pose], Bool[AnyArray, ""] | bool]) -> "GivenPoses":
@@ -154,7 +154,7 @@ def _check_positions(count: int, nearest: float, farthest: float, up: tuple[floa
 
 
 def _look_at_origin(positions: Float[Array, "n 3"], up: tuple[float, float, float]) -> Pose:
-    """Return poses that look at the origin, at `positions` after a rotation that maps the y axis to `up`."""
+    """Rotate `positions` so that the y axis maps to `up`, and return poses there that look at the origin."""
     axis = jnp.asarray(up, positions.dtype)
     if up[0] or up[2] or up[1] < 0:
         rotation = rotation_between(jnp.asarray([0.0, 1.0, 0.0], positions.dtype), axis / jnp.linalg.norm(axis))
@@ -163,7 +163,7 @@ def _look_at_origin(positions: Float[Array, "n 3"], up: tuple[float, float, floa
 
 
 def as_candidates(value: object) -> Candidates:
-    """Return candidates unchanged, or `SphereCandidates` of a number, or `GivenPoses` of a batch.
+    """Return `value` as candidates: `SphereCandidates` for a number, `GivenPoses` for a batch of poses.
 
     **Raises:** `ValueError` for any other value, and for the same reasons as `SphereCandidates` and `GivenPoses`.
     """

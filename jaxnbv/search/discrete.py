@@ -1,4 +1,4 @@
-"""Discrete search over candidates (the paper's Algorithm 1), and a variant with a second acquisition."""
+"""Discrete search over candidates (the paper's Algorithm 1), and a variant with two acquisitions."""
 
 from typing import ClassVar
 
@@ -19,8 +19,8 @@ class DiscreteSearch(CandidateSearch):
 
     If a second view from the same pose gains nothing (`Acquisition.gains_once`, as for `NewSurface`), it proposes the
     tied candidate that is farthest from the earlier cameras. A candidate is tied if its value differs from the best by
-    at most two standard errors of the difference, plus the mean value expected at visited poses. The true value there
-    is zero, so this mean is an error, and may be as large at other poses.
+    at most two standard errors of the difference, plus the mean value expected at visited poses. Since the true value
+    at visited poses is zero, this mean is an error, which may be as large at other poses.
     """
 
     uses_samples: ClassVar[bool] = True
@@ -30,7 +30,7 @@ class DiscreteSearch(CandidateSearch):
 
 
 class TieBreakSearch(CandidateSearch):
-    """Search with two acquisitions, in which the second decides between candidates that tie in the first.
+    """Search with two acquisitions, where the second decides between candidates that tie in the first.
 
     Until a view has shown the relevant part of the object, the samples do not contain it either. The values of the
     first acquisition are then mostly noise, and their maximum is a random view. Candidates are tied if their values

@@ -23,7 +23,7 @@ from jaxnbv.search.problem import Problem
 from jaxnbv.search.proposal import Proposal, Trajectories
 from jaxnbv.search.traceable import check_traceable
 
-# Penalty per scene unit by which a pose violates the clearance, as a multiple of the range of the candidates' values.
+# Penalty for each scene unit by which a pose violates the clearance, as a multiple of the range of candidates' values.
 _PENALTY = 10.0
 
 
@@ -34,16 +34,16 @@ class GradientSearch(Search):
     - `space`: pose space to use in place of `dof`, for example `ConstrainedPoses()`.
     - `num_starts`: number of starts, the candidates with the highest values.
     - `iterations`: number of steps from each start. Each step evaluates the acquisition and its gradient once.
-    - `learning_rate`: learning rate of Adam, in the units of the parameters: roughly radians, or scene units.
-    - `num_candidates`: number of candidates, which are evaluated first. They are spread evenly over the space, and
-      rotated at random together. If the number equals `num_starts`, every candidate is a start.
+    - `learning_rate`: learning rate of Adam, in the units of the parameters (roughly radians or scene units).
+    - `num_candidates`: number of candidates, which are evaluated first. They are spread evenly over the space, and all
+      rotated by the same random rotation. If the number equals `num_starts`, every candidate is a start.
     - `solver`: Optimistix minimiser to use in place of Adam, for example `optimistix.BFGS(rtol=1e-4, atol=1e-4)`. The
       objective is scaled such that its differences are of order 1.
     - `candidates`: your own candidates to use in place of `num_candidates`. These are not rotated.
 
     The default numbers of starts and steps and the default learning rate are the paper's. The paper starts from six
     random views without evaluating other candidates first, and returns the best final value. `num_candidates=6` is
-    closest to it. Differentiation stores intermediate results for all starts and samples: gigabytes with PointNet++.
+    closest to it. Differentiation stores intermediate results for all starts and samples, gigabytes with PointNet++.
 
     **Raises:** `ValueError` for a `dof` other than 2 or 6, for both `dof` and `space`, fewer candidates than starts, no
     starts or iterations, or a learning rate that is not positive. A `Planner` with this search also raises it for an
@@ -96,7 +96,7 @@ class GradientSearch(Search):
 
     @property
     def minimiser(self) -> optx.AbstractMinimiser:
-        """The minimiser that is used: `solver`, or else Adam."""
+        """The minimiser: `solver` if given, otherwise Adam."""
         if self.solver is not None:
             return self.solver
         # Zero tolerances are never met, so all iterations run.
@@ -181,8 +181,8 @@ class GradientSearch(Search):
 class HybridSearch(GradientSearch):
     """Discrete search, followed by gradient ascent from the best candidates.
 
-    This is a `GradientSearch` with fewer and longer steps from fewer starts by default. Its candidates are not rotated.
-    On the sphere they are those of a `DiscreteSearch`, so the value is at least the best value of that search.
+    This is a `GradientSearch` whose defaults are fewer starts and fewer, longer steps. Its candidates are not rotated.
+    On the sphere they are the candidates of a `DiscreteSearch`, so the value is at least that search's best value.
     """
 
     rotates_candidates: ClassVar[bool] = False

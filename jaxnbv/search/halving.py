@@ -23,9 +23,9 @@ _NO_RANK = np.iinfo(np.int32).max
 class HalvingSearch(CandidateSearch):
     """Successive halving over candidates (Karnin et al. 2013), a faster `DiscreteSearch`.
 
-    All candidates are scored on the first few posterior samples. Each later round keeps the better half of them, and
-    doubles the number of samples on which they were scored, until all samples are used. For 16 samples and
-    `num_first_samples=2`, that is 5 samples on average. The proposal may differ from that of `DiscreteSearch`.
+    All candidates are scored on the first few posterior samples. Each later round keeps the better half, and doubles
+    the number of samples on which they are scored, until all samples are used. For 16 samples and
+    `num_first_samples=2`, a candidate is scored on 5 samples on average. The result may differ from `DiscreteSearch`.
 
     - `num_first_samples`: number of posterior samples on which every candidate is scored.
     """
@@ -35,9 +35,7 @@ class HalvingSearch(CandidateSearch):
 
     def __check_init__(self):
         check_fields(self)
-        require(
-            self.num_first_samples >= 1, f"num_first_samples is {self.num_first_samples}; candidates need at least one"
-        )
+        require(self.num_first_samples >= 1, f"num_first_samples is {self.num_first_samples}; it must be at least 1")
 
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
         candidates = self.candidates.poses()
@@ -48,7 +46,7 @@ class HalvingSearch(CandidateSearch):
         return self._halve(problem, candidates, score)
 
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
-        """Propose the best candidate of the last round. Others have the value and error of their last round."""
+        """Propose the best candidate of the last round. Others keep the values of their own last round."""
         return self._halve(problem, candidates, lambda rows, sample: scores[0, sample][rows])
 
     def _halve(self, problem: Problem, candidates: Pose, score: Callable) -> Proposal:
@@ -56,7 +54,7 @@ class HalvingSearch(CandidateSearch):
         zeros = jnp.zeros(count, candidates.position.dtype)
 
         def rank(state, num_left):
-            """Return the order with its first `num_left` candidates sorted by their means, and all means so far."""
+            """Return the order, with its first `num_left` candidates sorted by mean score, and all mean scores."""
             order, totals, num_scored = state
             values = jnp.where(is_excluded, -jnp.inf, totals / jnp.maximum(num_scored, 1))
             ranked_values = jnp.where(jnp.arange(count) < num_left, values[order], -jnp.inf)
@@ -86,7 +84,7 @@ class HalvingSearch(CandidateSearch):
         )
 
     def _blocks(self, num_samples: int) -> tuple["_Block", int]:
-        """Return the blocks of all rounds, all of one size, and the number of candidates in the last round."""
+        """Return the blocks of all rounds, of equal size, and the number of candidates in the last round."""
         rounds: list[tuple[int, range]] = []
         num_left, num_scored = self.candidates.count, 0
         while num_scored < num_samples:
@@ -110,8 +108,8 @@ class _Block(NamedTuple):
     """Candidates that are scored together on one posterior sample.
 
     - `num_left`: number of candidates that are still in the search.
-    - `sorts`: whether to order these by their mean scores so far before this block is scored.
-    - `ranks`: positions in this order of the candidates to score; `_NO_RANK` for an unused entry.
+    - `sorts`: whether to sort these candidates by their mean scores before this block is scored.
+    - `ranks`: positions, in the sorted order, of the candidates to score; `_NO_RANK` for an unused entry.
     """
 
     sorts: Bool[np.ndarray, "*blocks"]

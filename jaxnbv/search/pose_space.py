@@ -27,7 +27,7 @@ class PoseSpace(eqx.Module):
 
     @abstractmethod
     def candidates(self, count: int, key: PRNGKeyArray | None) -> Pose:
-        """Return `count` poses, spread evenly over the space. A key rotates all by a random rotation."""
+        """Return `count` poses spread evenly over the space, rotated at random together if there is a key."""
 
     @abstractmethod
     def retract(self, start: Pose, parameters: Float[Array, " parameters"]) -> Pose:
@@ -45,7 +45,8 @@ class SpherePoses(PoseSpace):
     """2-DOF poses on a sphere of `radius` (scene units) about the origin, all looking at the origin.
 
     The parameters (3,) are added to the unit vector from the origin to the start, and the sum is normalised. The camera
-    turns to the origin by the smallest rotation, without a singularity at the poles. Other starts move to the sphere.
+    turns to the origin by the smallest rotation, without a singularity at the poles. A start off the sphere moves to
+    it.
 
     **Raises:** `ValueError` unless the radius is positive and finite.
     """
@@ -100,11 +101,11 @@ class ConstrainedPoses(PoseSpace):
     The pose satisfies the constraints for any parameters (8,):
 
     - Three parameters move the direction from the origin, as in `SpherePoses`.
-    - One parameter moves the distance, and two move the image of the origin. The map s / sqrt(1 + s^2) of any number s
-      into (-1, 1) keeps them in their ranges.
-    - Two parameters are added to (1, 0), and the sum is normalised. It is the cosine and sine of a roll angle.
+    - One parameter moves the distance, and two move the image of the origin. The map s / sqrt(1 + s^2) from all numbers
+      s into (-1, 1) keeps both in their ranges.
+    - Two parameters are added to (1, 0), and the sum is normalised. The result is the cosine and sine of a roll angle.
 
-    A start that violates the constraints is first moved just inside the constraints.
+    A start that violates the constraints is first moved to just inside them.
 
     **Raises:** `ValueError` unless 0 < nearest < farthest and 0 < off_axis < pi / 2.
     """
@@ -153,7 +154,7 @@ class ConstrainedPoses(PoseSpace):
         return Pose(_product(_product(rotation, rotation_between(target, to_origin)), roll_matrix), position)
 
     def check_camera(self, camera: Camera) -> None:
-        """Raise `ValueError` if the origin can leave the image: an edge is nearer than `off_axis` to the axis."""
+        """Raise `ValueError` if the image is so narrow that the origin could leave it."""
         left, top, right, bottom = camera.edges
         half = math.atan(min(-left, -top, right, bottom))
         require(
@@ -173,7 +174,7 @@ def _sphere_poses(count: int, radius: float, key: PRNGKeyArray | None) -> Pose:
 
 
 def _directions(start: Pose, parameters: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-    """Return the unit vectors from the origin to the camera, before and after the move by the parameters."""
+    """Return the unit vectors from the origin to the camera, before and after the parameters move it."""
     old_direction = normalise(start.position, jnp.asarray([0.0, 0.0, 1.0], start.position.dtype))
     return old_direction, normalise(old_direction + parameters, old_direction)
 

@@ -19,7 +19,7 @@ from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning import GridSurface, Obstacles, barrier_of
 
 ApplyCost: TypeAlias = Callable[[Float[Array, "*samples poses"], Observations, Pose], Float[Array, "*samples poses"]]
-"""Function of values, observations and poses that returns the values after the cost of moving from the last view."""
+"""Function of values, observations and poses that includes the cost of the move from the last view in the values."""
 
 
 class Problem(eqx.Module):
@@ -27,8 +27,8 @@ class Problem(eqx.Module):
 
     - `inputs`: the observations and, if the search uses samples, the posterior and its samples.
     - `camera`: the camera whose scans are simulated.
-    - `cost`: function that changes the values of poses by the cost of moving there; None to ignore the cost.
-    - `pending`: poses of earlier proposals without a view; None if there are none.
+    - `cost`: function that changes the values of poses by the cost of moving to them; None to ignore the cost.
+    - `pending`: proposed poses without an image; None if there are none.
     - `context`: context of the acquisition, computed once from the inputs by `prepared`.
     """
 
@@ -45,7 +45,7 @@ class Problem(eqx.Module):
         return self.inputs.observations
 
     def prepared(self) -> "Problem":
-        """Return a copy with the acquisition's context, which scores need; None without samples."""
+        """Return a copy with the acquisition's context, which `scores` needs. It is None without samples."""
         context = None if self.inputs.surfaces is None else context_of(self.acquisition, self.inputs)
         return dataclasses.replace(self, context=context)
 
@@ -60,21 +60,21 @@ class Problem(eqx.Module):
     def scores(
         self, poses: Pose, samples: slice | Int[Array, " rows"] = slice(None)
     ) -> Float[Array, "*scores samples poses"]:
-        """Return the score of each sample and pose after the cost. An `AcquisitionList` adds a leading axis."""
+        """Return the score of each sample and pose, with the cost. An `AcquisitionList` adds a leading axis."""
         surfaces = jax.tree.map(lambda leaf: leaf[samples], self.surfaces)
         barrier = barrier_of(self.obstacles, self.camera, poses)
         values = self.acquisition.sample_scores(self.context, surfaces, self.camera, poses, barrier)
         return self.apply_cost(jnp.moveaxis(values, (0, 1), (-2, -1)), poses)
 
     def apply_cost(self, values: Float[Array, "*samples poses"], poses: Pose) -> Float[Array, "*samples poses"]:
-        """Return values after the cost of moving from the last view to each pose, if there is a cost."""
+        """Include the cost of the move from the last view to each pose in the values, if there is a cost."""
         return values if self.cost is None else self.cost(values, self.observations, poses)
 
     def value_at_visited(self) -> Float[Array, ""]:
         """Return the mean value that the acquisition expects at the visited poses, without the cost of moves.
 
         If a second view from the same pose gains nothing, this value is an error, which may be as large at other poses.
-        Return zero for one view, whose value is not an error: it counts surface that was seen only at a steep angle.
+        It is zero for one view, whose value is not an error but counts surface seen only at a steep angle.
         """
         visited_poses = self.observations.poses
         without_cost = dataclasses.replace(self, cost=None)
@@ -108,7 +108,7 @@ class Problem(eqx.Module):
         return is_excluded | (self.violation(poses) > 0)
 
     def violation(self, poses: Pose) -> Float[Array, " poses"]:
-        """Return the length by which each pose is too close to an obstacle or to D, see `Obstacles.violation`."""
+        """Return the length by which each pose is too close to obstacles or the cloud, see `Obstacles`."""
         if self.obstacles is None:
             return jnp.zeros(poses.position.shape[:-1], poses.position.dtype)
         return self.obstacles.violation(poses, self.observations.cloud)

@@ -32,8 +32,8 @@ class Proposal(eqx.Module):
     - `trajectories`: trajectories of a gradient search from the best candidates; None for other searches.
     - `standard_errors`: standard errors of `values`. Each value is a mean over the posterior samples on which the
       candidate was scored. None for a search without scores.
-    - `difference_errors`: standard errors of the differences between the values and the best value, which are smaller,
-      because the samples are the same. None for a search that does not score all candidates on all samples.
+    - `difference_errors`: standard errors of the differences between the values and the best value. They are smaller
+      than `standard_errors`, because the samples are shared. None if not all candidates are scored on all samples.
     - `standard_error`: standard error of `value`. NaN for one sample; None for a search without scores.
     - `value_at_visited`: see `Problem.value_at_visited`. None unless the distance from earlier cameras decides ties.
     """

@@ -23,7 +23,7 @@ def check_traceable(
     differentiate it (because it calls code outside JAX).
     """
     if acquisition.needs_posterior or acquisition.needs_hypotheses:
-        # There are no posterior and no hypotheses yet to test this acquisition with.
+        # This acquisition needs a posterior or hypotheses, which do not exist yet.
         return
 
     def cloud(rows: int) -> PointCloud:
@@ -46,5 +46,5 @@ def check_traceable(
     except ValueError as error:
         raise InputError(
             f"{type(acquisition).__name__} cannot be differentiated, so no gradient search can use it ({error}). "
-            "Use DiscreteSearch, which asks for values only"
+            "Use DiscreteSearch, which needs only values"
         ) from error
