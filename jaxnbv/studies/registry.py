@@ -1,7 +1,7 @@
 """Registry of the studies of `jaxnbv study`.
 
 Any installed package can register a study as an entry point of the group `jaxnbv.studies`. The entry point names an
-`Entry` in a module that does not import JAX, which would slow down the command's help.
+`Entry`. Its module should not import JAX, because this would slow down the command's help.
 """
 
 import functools

@@ -69,9 +69,7 @@ class PyramidStudy(ClassificationStudy):
 class TruckStudy(ClassificationStudy):
     """Measures how many views a method needs to tell the class of a truck's cargo.
 
-    The first view is random.
-
-    - `trucks`: mesh files of trucks, which carry the objects of `meshes`.
+    The first view is random. If there are `meshes`, they are the cargo, and `trucks` are mesh files of the trucks.
     """
 
     title: ClassVar[str] = "The class of a truck's cargo"

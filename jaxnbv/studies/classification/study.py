@@ -186,7 +186,7 @@ class ClassificationStudy(Study):
 
     @classmethod
     def group(cls, record: Record) -> str:
-        """Return the name of the scene's group: whether the first view shows the cue; "" without a cue."""
+        """Return the name of the scene's group, by whether the first view shows the cue; "" without a cue."""
         if not cls.cue:
             return ""
         # All methods share the first view.

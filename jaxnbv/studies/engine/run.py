@@ -26,8 +26,7 @@ def run_scene(
 ) -> Record:
     """Run all methods on one scene and return the record, from which tables and figures are made.
 
-    All methods share the first view, which `Study.first_view` chooses, and the sensor noise and the prior samples at
-    each view.
+    All methods share the first view (see `Study.first_view`), and the sensor noise and prior samples at each view.
 
     - `methods`: names of the study's methods to run; default: `Study.methods`.
     - `own`: the user's methods by name. Each is a function that makes the planner for a scene.

@@ -1,4 +1,4 @@
-"""The demonstration object, a mug on a saucer. Parts of its surface are visible from only a few directions."""
+"""The demonstration object, a mug on a saucer. Parts of its surface show from few directions only."""
 
 import math
 
