@@ -138,7 +138,7 @@ def _resting(vertices: Float[np.ndarray, "v 3"], random: np.random.Generator) ->
 
 
 def _obstacles(half: Float[np.ndarray, "3"], has_box: bool, random: np.random.Generator) -> Obstacles:
-    """Return a table below a part of these half sizes and, if `has_box`, a box that hides half of one side."""
+    """Return a table below a part of these half sizes and, if `has_box`, a box that hides half a side."""
     table = HalfSpace(np.array([0.0, -half[1], 0.0]), np.array([0.0, 1.0, 0.0]))
     if not has_box:
         return Obstacles((table,))
