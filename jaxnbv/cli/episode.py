@@ -51,8 +51,6 @@ _DEFAULT_RULES = [
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeOptions:
-    """Options of a command that simulates an episode."""
-
     task: TaskOption
     views: Annotated[int, task_option(metavar="N", help="Number of views, including the first.")] = 5
     until: Annotated[

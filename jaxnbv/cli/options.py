@@ -32,9 +32,7 @@ def help_sentence(choices: Iterable[tuple[str, str]]) -> str:
 def one_of(choices: Mapping[str, str], metavar: str, about: str = "") -> dict[str, Any]:
     """Return arguments for `typer.Option`, so that the option accepts only the names in `choices`.
 
-    The error for any other name suggests a similar one.
-
-    - `choices`: meanings for the help, keyed by name.
+    - `choices`: meanings for the help, keyed by name. The error for an unknown name suggests a similar one.
     - `about`: sentence that precedes the meanings in the help.
     """
 

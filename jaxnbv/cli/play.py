@@ -45,7 +45,6 @@ from jaxnbv.viz.task import rival_text
 class Sizes(NamedTuple):
     """Sizes of a planner. A size of None is replaced by that of the task.
 
-    - `samples`, `candidates`: number of posterior samples, and number of candidate poses.
     - `capacity`: number of points to keep in the cloud.
     - `rays`: number of rays along each side of an image.
     """

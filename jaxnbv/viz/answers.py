@@ -1,7 +1,7 @@
 """Words and charts for the answers of tasks. The tasks themselves return only numbers.
 
-An answer is what is known after a view, such as class probabilities. `words_of` dispatches on the type of an answer. An
-answer of your own type is shown by its names and values, unless you register words for it:
+An answer contains what is known after a view, such as class probabilities. `words_of` dispatches on its type. Answers
+of your own type are shown by their names and values, unless you register words for the type:
 
     @words_of.register
     def _(answer: MyAnswer) -> Words: ...
@@ -27,12 +27,12 @@ from jaxnbv.utility import Answer, Quantity
 
 # An answer is reliable if it changed by less than this fraction since the previous view.
 _MAX_CHANGE = 0.05
-# Numbers of classes and of kinds of known shapes that a text names.
+# Largest numbers of classes, and of kinds of known shapes, that a text names.
 _NUM_CLASSES_NAMED, _NUM_KINDS_NAMED = 3, 4
-# Number of parts in a chart.
+# Largest number of parts in a chart.
 _MAX_PARTS = 6
 
-# Function that returns whether a stop rule held after a view, given the index of the view from 0.
+# Function of a stop rule and the index of a view (from 0). It returns whether the rule held after the view.
 Holds: TypeAlias = Callable[[Sure, int], bool]
 
 
@@ -40,7 +40,7 @@ class Chart(NamedTuple):
     """Data of a line chart: named numbers with a value after each view.
 
     - `label`: label of the vertical axis, with the unit.
-    - `true`: values of the numbers if all of the surface had been seen.
+    - `true`: the values if all of the surface had been seen. None if they are unknown.
     - `marks_true_name`: whether `true` is 1 for the true name and 0 for all others.
     - `goal`: a value that the numbers should reach.
     """
@@ -54,7 +54,7 @@ class Chart(NamedTuple):
 
 
 class Words:
-    """Texts and charts about an answer. Subclasses are for particular types of answers."""
+    """Texts and charts about an answer. There are subclasses for particular types of answers."""
 
     def __init__(self, answer: Answer):
         self.answer = answer
@@ -66,7 +66,7 @@ class Words:
 
     @property
     def question(self) -> str:
-        """The question of the task, as text for the head of the report."""
+        """The question of the task, for the head of the report."""
         return f"{capital(' and '.join(self.answer.names[index] for index in self.shown))}?"
 
     def value(self, answer: Answer, index: int) -> str:
@@ -89,21 +89,21 @@ class Words:
 
     @property
     def settled_means(self) -> str:
-        """Text that says when `settled` counts an answer as reliable."""
+        """The condition under which `settled` counts an answer as reliable, as text."""
         return f"within {100 * _MAX_CHANGE:.0f} % of the view before"
 
     def settled(self, answers: Sequence[Answer], holds: Holds) -> list[bool]:
         """Return, for each view, whether the answer after it is reliable.
 
         - `answers`: the answers after all views so far; the last one is `self.answer`.
-        - `holds`: function that returns whether a stop rule holds after the view with an index.
+        - `holds`: see `Holds`.
         """
         return [False, *(np.allclose(now.values, was.values, rtol=_MAX_CHANGE) for was, now in pairwise(answers))]
 
     def charts(self, answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...]:
         """Return charts of the answers over the views. The last of `answers` is `self.answer`.
 
-        - `truth`: the answer if all of the surface had been seen.
+        - `truth`: the answer if all of the surface had been seen. None if it is unknown.
         """
         names = self.answer.names
         return (Chart(", ".join(names), names, _rows(answers), None if truth is None else truth.values),)
@@ -139,7 +139,7 @@ class _ClassWords(Words):
         return name if p == 1.0 else f"{name}, probability {p:.2f}"
 
     def settled(self, answers: Sequence[Answer], holds: Holds) -> list[bool]:
-        """Return whether `Sure` held after each view, unless it held for a different class after the previous view."""
+        """Return, for each view, whether `Sure` holds and did not hold for a different class one view earlier."""
         is_sure = [holds(self.rule, index) for index in range(len(answers))]
         best = [int(np.argmax(answer.values)) for answer in answers]
         is_contradicted = [False, *(was and a != b for was, (a, b) in zip(is_sure, pairwise(best), strict=False))]
@@ -160,7 +160,7 @@ class _IdentityWords(_ClassWords):
         return super().settled(answers, lambda _, index: bool(answers[index].values.max() >= self.min_probability))
 
     def charts(self, answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...]:
-        """Return a chart of at most six parts: those whose probability was highest after any of the views."""
+        """Return a chart of the at most six parts that had the highest probabilities after any of the views."""
         values = _rows(answers)
         rows = np.sort(np.argsort(-values.max(axis=0), kind="stable")[:_MAX_PARTS])
         names = tuple(self.answer.names[index] for index in rows)
@@ -252,7 +252,7 @@ class _CoverageWords(Words):
 
 
 def label_of(quantity: Quantity, frame: Frame = Frame()) -> str:  # noqa: B008
-    """Return a quantity's name and its unit in world units, such as "expected new area (m²)"."""
+    """Return a quantity's name and unit, with lengths in world units, such as "expected new area (m²)"."""
     unit = quantity.unit_in(frame)
     return f"{quantity.name} ({unit})" if unit else quantity.name
 
@@ -269,7 +269,7 @@ def point_text(point: Float[np.ndarray, "3"], frame: Frame = Frame()) -> str:  #
 
 
 def length_text(length: float, frame: Frame) -> str:
-    """Return a length in world units as text, rounded to a hundredth of a scene unit or finer."""
+    """Return a length in world units as text, with decimals down to a hundredth of a scene unit or finer."""
     return f"{length:.{max(0, 2 + math.ceil(math.log10(frame.scale)))}f}".replace("-", "−")
 
 
@@ -279,7 +279,7 @@ def capital(text: str) -> str:
 
 
 def number_text(value: float) -> str:
-    """Return a number as text: three significant digits, or no decimals from 1,000 to 10 million."""
+    """Return a number as text with three significant digits. From 1,000 to 10 million it has no decimals."""
     text = f"{value:,.0f}" if 999.5 <= abs(value) < 1e7 else f"{value:.3g}"
     return text.replace("-", "−")
 

@@ -14,7 +14,7 @@ from jaxnbv.viz.choice import descending_values
 from jaxnbv.viz.data import ReportData
 from jaxnbv.viz.style import GREY, INK, LINE, NEW, SERIES
 
-# Maximum number of lines, of letters in a name, and of views for which a chart prints the values.
+# Largest numbers of lines, of letters in a name, and of views for which a chart prints the values.
 _MAX_LINES, _MAX_LETTERS, _MAX_VIEWS = 6, 22, 10
 # Lines that differ by less than this fraction of the range of values look like one line.
 _MIN_DIFFERENCE = 0.02
@@ -24,7 +24,7 @@ _LEGEND: dict[str, Any] = {"loc": "outside lower center", "frameon": False, "fon
 
 
 def visible_lines(chart: Chart) -> dict[int, int]:
-    """Return the indices of the lines to draw, each with how many nearly coinciding lines it hides.
+    """Return the indices of the lines to draw, each with the number of nearly equal lines that it hides.
 
     At most six lines are drawn: those whose largest value, or true value, is highest.
     """
@@ -35,7 +35,7 @@ def visible_lines(chart: Chart) -> dict[int, int]:
     for index in np.argsort(-largest, kind="stable").tolist():
         distances = {other: np.abs(chart.values[:, other] - chart.values[:, index]).max() for other in num_hidden}
         coinciding = (other for other, distance in distances.items() if distance < tolerance)
-        # The line of the true name hides no other line. Lines that each have a true value are never hidden.
+        # The line of the true name hides no other line. If every line has a true value of its own, none is hidden.
         front = next(coinciding, None) if chart.true is None or chart.marks_true_name else None
         if front is not None and not (chart.marks_true_name and chart.true is not None and chart.true[front] > 0):
             num_hidden[front] += 1
@@ -47,7 +47,7 @@ def visible_lines(chart: Chart) -> dict[int, int]:
 def draw_chart(axes: Axes, chart: Chart, rival: Chart | None = None, rival_name: str = "") -> list[Line2D]:
     """Draw the numbers and their true values as lines over the views, and return the entries of a legend.
 
-    - `rival`: chart of a different search. One of its lines is drawn: that of the true name, or the only one.
+    - `rival`: chart of a different search. Only its line for the true name is drawn, or its only line.
     """
     views, is_one = np.arange(1, len(chart.values) + 1), len(chart.names) == 1
     true_index = None if chart.true is None or not chart.marks_true_name else int(np.argmax(chart.true))
@@ -89,7 +89,7 @@ def set_view_axis(axes: Axes, count: int) -> None:
 
 
 def draw_values(axes: Axes, data: ReportData) -> list[Line2D]:
-    """Draw each chosen view's value, its standard error and the candidates' median. Return legend entries."""
+    """Draw each chosen view's value and standard error, and the candidates' median. Return legend entries."""
     for view, view_data in enumerate(data.views, start=1):
         if view_data.proposal is None:
             axes.annotate("given", (view, 0), (0, 4), textcoords="offset points", ha="center", color=GREY, fontsize=8)
@@ -134,7 +134,7 @@ def _labelled_figure(
     figure = Figure(figsize=size, layout="constrained")
     handles = draw_chart(figure.subplots(), chart, rival, "" if data.task.rival is None else data.task.rival.name)
     if handles:
-        # An inch holds twelve letters. A mark with its gap is six letters wide.
+        # An inch holds twelve letters. A legend entry's mark and gap are six letters wide.
         longest = max(len(str(handle.get_label())) for handle in handles) + 6
         columns = max(1, min(len(handles), int(12 * size[0]) // longest))
         figure.legend(handles=handles, ncols=columns, columnspacing=1.2, **_LEGEND)

@@ -21,12 +21,12 @@ from jaxnbv.viz.style import GREY, INK, LINE, NEW, VALUE
 
 # The map is coloured between candidates if there are at least this many.
 _MIN_CANDIDATES = 12
-# Letters in a line of the caption.
+# Largest number of letters in a line of the caption.
 _MAX_LETTERS = 56
 
 
 def open_values(proposal: Proposal) -> Float[np.ndarray, " c"]:
-    """Return the values of a proposal's candidates, NaN for candidates that were excluded as visited."""
+    """Return the values of a proposal's candidates, NaN for those that were excluded."""
     values = np.asarray(proposal.values, dtype=np.float64)
     return np.where(np.isfinite(values), values, np.nan)
 
@@ -38,7 +38,7 @@ def descending_values(proposal: Proposal) -> Float[np.ndarray, " o"]:
 
 
 def colour_range(values: Float[np.ndarray, "*n"]) -> tuple[float, float]:
-    """Return the smallest and the largest value that is not NaN, or a wider range if the two are equal."""
+    """Return the smallest and the largest value, ignoring NaN, or a wider range if the two are equal."""
     numbers = values[~np.isnan(values)]
     if not numbers.size:
         return 0.0, 1.0
@@ -62,7 +62,7 @@ def marks(*proposals: Proposal) -> list[str]:
 def draw_choice(figure: Figure, proposal: Proposal | None, quantity: Quantity, frame: Frame) -> None:
     """Draw a map of the candidates, and below it the candidates by value over a colour bar.
 
-    The values are in units of `frame`. Without a proposal (for a given view), only the grid of the map is drawn.
+    The values are in the world units of `frame`. For a view without a proposal, the map is empty.
     """
     colours = draw_acquisition(figure.add_axes((0.06, 0.4, 0.88, 0.58)), proposal, quantity)
     if proposal is None or colours is None:
@@ -97,8 +97,8 @@ def draw_acquisition(
 ) -> ScalarMappable | None:
     """Draw the candidates' values as a map of the sphere, and return the colours for a colour bar.
 
-    Without a proposal, for a view that was given and not chosen, the map is empty and the result is None. If there are
-    many candidates, the map is also coloured between them, except for random values.
+    If the view was given and has no proposal, the map is empty and the result is None. With at least twelve
+    candidates, the map is also coloured between them, unless `quantity.smooth` is False.
 
     - `weight`: factor for the sizes of lines, marks and letters.
     """
@@ -139,7 +139,7 @@ def directions_of(poses: Pose) -> Float[np.ndarray, "*n 3"]:
 
 
 def _draw_ascents(globe: Any, ascents: Float[np.ndarray, "starts steps 3"], weight: float) -> None:
-    """Draw a line from a ring (start) to a dot (end)."""
+    """Draw each ascent, given as unit vectors, as a line from a ring (start) to a dot (end)."""
     for directions in ascents:
         line = sphere.path(directions).T
         globe.plot(*line, color="white", lw=2.2 * weight, zorder=6)

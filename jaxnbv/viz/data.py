@@ -34,11 +34,10 @@ class ViewData(eqx.Module):
     """One view, ready to be drawn.
 
     - `view`: the view, with the values of its proposal in world units.
-    - `before`, `new`: points of the cloud before the view, and points that the view added, in scene coordinates.
-    - `surface`: see `shown_surface`, but with the deviation in world units. `has_shape`: whether it is a known shape.
+    - `before`, `new`: points of the cloud before the view, and points of the view's scan, in scene coordinates.
+    - `surface`: see `shown_surface`; but its deviation is in world units. `has_shape`: whether it is a known shape.
     - `coverage`: amount of surface seen after the view.
-    - `sentences`: see `sentences_about`.
-    - `imagined`, `image`: see `render_imagined` and `view_image`.
+    - `sentences`, `imagined`, `image`: see `sentences_about`, `render_imagined` and `view_image`.
     """
 
     view: View
@@ -67,7 +66,7 @@ class ViewData(eqx.Module):
 
 
 class ReportData(eqx.Module):
-    """Data of a report."""
+    """Everything that the pictures of an episode show."""
 
     episode: Episode
     views: tuple[ViewData, ...]
@@ -116,7 +115,7 @@ def report_data(
 
     - `truth`, `rival`: see `write_report`.
     - `imagine`: whether to show the surfaces that the steps imagined, and surface that no view could measure.
-    - `sketches`: sketches made while the episode ran. Steps without a sketch are computed again.
+    - `sketches`: sketches made while the episode ran. Missing sketches are made here.
     """
     planner, frame = episode.planner, episode.frame
     true_surface = None if episode.scene is None else true_mesh(episode.scene)
@@ -133,7 +132,7 @@ def report_data(
         for view in episode.views
     ]
     sketch = Sketch(None, None)
-    # Only for such an acquisition can one view gain what its value promises.
+    # The gain of a single view is comparable with its expected value only if `gains_once` holds.
     gains = episode.actual_scores(all_observations) if planner.acquisition.gains_once else itertools.repeat(None)
     for index, (next_sketch, gain) in enumerate(zip(next_sketches, gains, strict=False)):
         view, gain = views[index], None if gain is None else float(frame.length_to_world(gain, power))

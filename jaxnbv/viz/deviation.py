@@ -1,4 +1,4 @@
-"""Inspection: distances of a scanned surface from its CAD model, the worst places, and the unscanned surface."""
+"""Inspection: distances of a scan from its CAD model, the worst places, and the surface that was not scanned."""
 
 import dataclasses
 import warnings
@@ -23,19 +23,19 @@ from jaxnbv.scanning.mesh_files import read_nodes
 from jaxnbv.scanning.sdf.sampled import checked_triangles
 from jaxnbv.surfaces.rigid import orient_outward, register_scan
 
-# Points sampled from a scanned mesh, least number of points of a cloud, points of the CAD at which coverage is tested.
+# Number of points sampled from a scanned mesh, least number of points of a cloud, and number of tested CAD points.
 _POINTS, _MIN_POINTS, _SAMPLES = 50_000, 10, 20_000
 # A scan that is this many times larger or smaller than the CAD must be in different units.
 _LARGE_RATIO, _SMALL_RATIO = 8.0, 50.0
-# Fractions of the CAD's diameter: least distance of worst places, largest distance of a point that covers the CAD, and
-# median distance of a poor fit.
+# Fractions of the CAD's diameter: least distance between two worst places, largest deviation of a point that covers the
+# CAD, and median distance above which the fit is poor.
 _MIN_DISTANCE, _MAX_DISTANCE, _POOR_MEDIAN = 0.05, 0.05, 0.02
 # Number of nearest points over which a median smooths the deviation.
 _NEIGHBOURS = 9
-# A place on the CAD is covered by this many points within a radius (relative to the distance between a point and its
-# fourth neighbour). The cosine of the angle between the normals must exceed the last value.
+# A place on the CAD is covered if at least this many points lie within a radius, given relative to the distance between
+# a point and its fourth neighbour. The cosine between the normals of place and point must exceed the last value.
 _MIN_COVERING, _RADIUS, _MIN_COSINE = 3, 1.5, 0.3
-# Numbered places are this many times worse than the median. End of the colours if nothing deviates.
+# Numbered places have at least this many times the median deviation. End of the colours if nothing deviates.
 _MIN_OUTLIER_RATIO, _MIN_LIMIT = 4.0, 1e-9
 
 _Mesh: TypeAlias = trimesh.Trimesh | trimesh.Scene | str | Path
@@ -63,7 +63,7 @@ class Deviation(eqx.Module):
     - `nearest_points`, `normals`: for each point, the nearest point of the CAD and its outward normal.
     - `cad`: the CAD at this pose.
     - `area`, `missing_area`: areas of the CAD that the scan covers and does not cover.
-    - `imagined`: fraction of the scanned mesh that no view measured. This part is left out.
+    - `imagined`: fraction of the scanned mesh's area that no view measured. This area is not compared.
     - `radius`: a place on the CAD is covered if at least three of the four nearest rows of `nearest_points` are within
       this distance and on the same side of the wall, as their normals show.
     """
@@ -128,8 +128,9 @@ class Deviation(eqx.Module):
     def values_at(self, places: Float[np.ndarray, "m 3"], normals: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, " m"]:
         """Return the signed distances of the scan from the CAD at places on the CAD, NaN where not covered.
 
-        - `places`, `normals`: points of `cad` and the outward normals there. A scan of one side of a wall does not
-          cover the other side.
+        A scan of one side of a wall does not cover the other side.
+
+        - `places`, `normals`: points of `cad` and the outward normals there.
         """
         rows = np.flatnonzero(np.abs(self.distances) < _MAX_DISTANCE * _diameter(self.cad.vertices))
         if len(rows) == 0:
@@ -153,8 +154,8 @@ class Deviation(eqx.Module):
     ) -> Any:
         """Draw the CAD from two sides, coloured by the deviation, and return the matplotlib `Figure`.
 
-        The CAD is grey where it was not scanned. Numbers mark the worst place, and other places with at least four
-        times the median deviation.
+        The CAD is grey where it was not scanned. Numbers mark the worst place, and the next places whose deviation is
+        at least four times the median.
 
         - `unit`: name of the unit of the colours.
         - `scale`: factor from the scan's unit to `unit`: 1000 for millimetres if the scan is in metres.
@@ -192,16 +193,15 @@ def deviation(
 ) -> Deviation:
     """Compare a scanned surface, or a part of it, with a CAD model in the same units.
 
-    Iterative closest points align the CAD with the scan. A symmetric CAD has several equally good poses. Distances are
-    to the nearest surface, so a dent deeper than half of a wall is measured from the wall's other side.
+    The CAD is aligned with the scan by iterative closest points. For a symmetric CAD several poses are equally good.
+    Distances are to the nearest surface, so a dent deeper than half of a wall is measured from the wall's other side.
 
     - `mesh`: the scan: a mesh whose faces are wound outward, the file of such a mesh, or a cloud with outward normals.
-      If a mesh says which faces were measured, as `surface_mesh` and the PLY files of `save_mesh` do, only these are
-      compared.
+      In meshes of `surface_mesh` and PLY files of `save_mesh`, only the faces marked as measured are compared.
     - `cad`: the CAD model, which need not be closed. The outside of a sheet is where the normals of its faces point.
     - `pose`: pose of the CAD (from its coordinates to the scan's) at which the alignment starts, such as
       `session.object_pose.matrix`. By default all rotations are tried.
-    - `register`: False to leave the CAD at `pose`, or at the identity without one.
+    - `register`: False to leave the CAD at `pose`, by default the identity.
 
     A `UserWarning` says if no pose fits well, or if other poses fit nearly as well.
 
@@ -245,7 +245,7 @@ def deviation(
 
 
 def _mesh_of(source: _Mesh | TriangleMesh) -> trimesh.Trimesh:
-    """Convert a mesh to trimesh in its own units, with its face attribute `measured` if it has one."""
+    """Convert a mesh to trimesh in its own units, and keep its face attribute `measured` if it has one."""
     if isinstance(source, TriangleMesh):
         return trimesh.Trimesh(source.frame.to_world(source.vertices), source.faces, process=False)
     parts = [part for _, part in read_nodes(source)]
@@ -266,7 +266,7 @@ def _mesh_of(source: _Mesh | TriangleMesh) -> trimesh.Trimesh:
 
 
 def _points_of(scan: _Mesh | PointCloud) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], float]:
-    """Return measured points of a scan, their normals, and the fraction of its area that was imagined."""
+    """Return measured points of a scan, their normals, and the fraction of the scan's area that was imagined."""
     if isinstance(scan, PointCloud):
         check_single(scan)
         points, normals = (rows.astype(np.float64) for rows in scan.to_numpy())

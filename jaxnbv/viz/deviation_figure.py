@@ -24,11 +24,11 @@ from jaxnbv.viz.style import INK
 _COLOURS, _BLANK = mpl.colormaps["RdBu_r"], "#76808f"
 # Pixels along each side of a picture. Width and height of the figure in inches.
 _SIZE, _WIDTH, _HEIGHT = 640, 7.2, 3.7
-# Number of viewing directions to choose from, and their largest height. Number of points on the CAD whose visibility
-# decides, and distance from the surface at which their rays to the viewer start.
+# Number of viewing directions to choose from, and largest height of these unit vectors. Number of points on the CAD
+# whose visibility decides, and distance from the surface at which their rays to the viewer start.
 _NUM_EYES, _MAX_HEIGHT, _NUM_SAMPLES, _CLEARANCE = 120, 0.7, 400, 0.02
-# Weight of the visibility of a numbered place (a fully scanned surface has weight 1 in all), and of a point that was
-# not scanned relative to a scanned point.
+# Weight of a numbered place's visibility, where a fully scanned surface has weight 1 in total. Weight of a point that
+# was not scanned, relative to a scanned point.
 _PLACE_WEIGHT, _UNSCANNED_WEIGHT = 1.0, 1.0 / 3.0
 
 # Function that returns the deviations at places on the CAD, given the places and their normals. NaN if not scanned.
@@ -78,7 +78,7 @@ def deviation_figure(
 def _two_eyes(
     scene: TriangleMesh, values_at: Values, positions: Float[np.ndarray, "k 3"], outward: Float[np.ndarray, "k 3"]
 ) -> Float[np.ndarray, "2 3"]:
-    """Return two viewing directions that together show most of the scan and of the places (scene coordinates)."""
+    """Return two viewing directions that show most of the scan and of the places to number (scene coordinates)."""
     mesh = scene.to_trimesh()
     samples, rows = trimesh.sample.sample_surface(mesh, _NUM_SAMPLES, seed=0)
     normals = mesh.face_normals[rows]

@@ -38,7 +38,7 @@ def scanned_cloud(episode: Episode) -> PointCloud:
 
 @checked
 def surface_mesh(episode: Episode, imagined: bool = True) -> trimesh.Trimesh:
-    """Return the surface after the last view in world units: the posterior mean's, or the likeliest part.
+    """Return the surface after the last view (world units): the posterior mean's, or the likeliest part.
 
     - `imagined`: whether to keep surface that no view measured.
 
@@ -68,7 +68,7 @@ def surface_mesh(episode: Episode, imagined: bool = True) -> trimesh.Trimesh:
 class Region(NamedTuple):
     """A connected part of the surface that no view measured, in world units.
 
-    - `center`, `normal`: mean position, and mean outward normal: look at the region from this side.
+    - `center`, `normal`: mean position and mean outward normal. To see the region, look against `normal`.
     - `area`, `radius`: area, and largest distance of a triangle of the region from `center`.
     """
 
@@ -82,7 +82,7 @@ class Region(NamedTuple):
 def missing_regions(episode: Episode, smallest: float = 0.0) -> list[Region]:
     """Return the connected parts of the expected surface that no view measured, the largest first.
 
-    Surface near an obstacle, such as the table under the object, cannot be measured, and does not count as missing.
+    Surface near an obstacle, such as the table under the object, cannot be measured and does not count as missing.
 
     - `smallest`: area that a region must exceed, in squared world units.
 
@@ -111,7 +111,9 @@ def _region(mesh: trimesh.Trimesh, faces: Int[np.ndarray, " f"]) -> Region:
 
 @checked
 def save_cloud(episode: Episode, path: str | Path) -> Path:
-    """Write `scanned_cloud` to a PLY (with normals), OBJ, GLB or XYZ file, as the suffix of `path` says.
+    """Write `scanned_cloud` to a PLY, OBJ, GLB or XYZ file, according to the suffix of `path`.
+
+    Only a PLY file holds the normals.
 
     **Raises:** `ValueError` for an episode without views, for a different suffix, or if the file cannot be written.
     """
@@ -126,7 +128,7 @@ def save_mesh(episode: Episode, path: str | Path, imagined: bool = True) -> Path
 
     Only a PLY file holds the deviation of each vertex, and whether each face was measured.
 
-    **Raises:** `ValueError` as `surface_mesh`, for a different suffix, or if the file cannot be written.
+    **Raises:** `ValueError` if `surface_mesh` does, for a different suffix, or if the file cannot be written.
     """
     kind = _kind(path, _MESH_FORMATS)
     return _write(path, surface_mesh(episode, imagined).export(file_type=kind))

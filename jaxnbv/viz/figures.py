@@ -30,7 +30,7 @@ STYLE: dict[Any, Any] = {
     "figure.facecolor": "white",
 }
 _ROW_HEIGHT, _LINE_HEIGHT = 5.0, 0.26
-# Pixels of a view's still, which is drawn three inches wide.
+# Pixels along each side of a view's picture, which is drawn three inches wide.
 _STILL_SIZE = 320
 
 

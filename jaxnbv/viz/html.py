@@ -8,7 +8,7 @@ import jinja2
 
 
 def render(template: Path, **values: Any) -> str:
-    """Return the HTML text that a Jinja template file makes of these values."""
+    """Return the text of a Jinja template file, filled with these values."""
     settings: dict[str, Any] = {"autoescape": True, "trim_blocks": True, "lstrip_blocks": True}
     environment = jinja2.Environment(undefined=jinja2.StrictUndefined, **settings)
     environment.filters["base64"] = lambda content: base64.b64encode(content).decode()

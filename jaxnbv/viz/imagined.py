@@ -1,4 +1,4 @@
-"""Pictures of a step's imagined surfaces, as the chosen camera would see them."""
+"""Pictures of the surfaces that a step imagined, as the chosen camera would see them."""
 
 import math
 from typing import NamedTuple, TypeAlias
@@ -30,7 +30,7 @@ NUM_SHOWN = 4
 _PIXELS = 96
 # Colours of surface seen before, and of other imagined surface. The latter is light, so that its shape shows.
 _SEEN_COLOUR, _UNSEEN_COLOUR = "#c3c9d2", "#5b8fc7"
-# A point counts as seen before if it is nearer to the cloud than this (scene units) or this many spacings of the cloud.
+# A point counts as seen before if its distance to the cloud is below this (scene units) or this many point spacings.
 _MAX_DISTANCE, _MAX_SPACINGS = 0.05, 3.0
 
 
@@ -43,9 +43,9 @@ class ShadedImage(eqx.Module):
 
 
 class Imagined(eqx.Module):
-    """Imagined surfaces of a step before its view.
+    """Pictures of the surfaces that a step imagined, before its view was taken.
 
-    - `samples`, `names`: pictures from the chosen pose of some sampled surfaces or of the likeliest parts.
+    - `samples`, `names`: some sampled surfaces or the likeliest parts, seen from the chosen pose.
     - `kinds`: kinds of known shapes with their probabilities. Empty without known shapes.
     """
 
@@ -67,7 +67,7 @@ def render_imagined(episode: Episode, index: int, inputs: StepInputs) -> Imagine
         return None
     camera, cloud = _fine_camera(planner.camera), inputs.observations.cloud.to_numpy()[0]
     barrier, samples = barrier_of(planner.obstacles, camera, view.pose), list[ShadedImage]()
-    # Scan triangles: other scans must be compiled, which takes too long for a picture of this size.
+    # Scan triangles. Scans of other surfaces must be compiled, which takes too long for a picture of this size.
     if isinstance(parts, PartHypotheses):
         likely = placed_parts(parts, NUM_SHOWN)
         names, kinds = [part.name for part in likely], parts.names()
@@ -102,7 +102,7 @@ def sampled_surfaces(
 
 
 def view_image(view: View, cloud: Float[np.ndarray, "n 3"]) -> ShadedImage | None:
-    """Return the picture of a view's scan, see `shaded_image`; None if the scan is not an image."""
+    """Return the picture of a view's scan; None if the scan is not an image. `cloud`: points seen before."""
     is_image = view.scan.capacity == view.camera.num_rays
     return shaded_image(view.scan, view.camera, view.pose, cloud) if is_image else None
 
@@ -120,7 +120,7 @@ def shaded_image(view_scan: PointCloud, camera: Camera, pose: Pose, cloud: Float
 
 
 def lamp(pose: Pose) -> Float[np.ndarray, "3"]:
-    """Return the unit vector toward a picture's lamp, which is beside the camera."""
+    """Return the unit vector toward the lamp of a picture from this pose. The lamp is beside the camera."""
     right, down, forward = np.asarray(pose.rotation, np.float64).T
     return unit(-forward - 0.5 * right - 0.7 * down)
 
@@ -131,7 +131,7 @@ def _fine_camera(camera: Camera) -> Camera:
 
 
 def colour_image(image: ShadedImage, new_colour: str = BEFORE, is_plain: bool = False) -> UInt8[np.ndarray, "h w 3"]:
-    """Colour a surface grey where seen before (if `is_plain` everywhere), else `new_colour`, on white."""
+    """Colour a surface grey where seen before (everywhere if `is_plain`), else in `new_colour`."""
     tints = np.array([mpl.colors.to_rgb(colour) for colour in (new_colour, _SEEN_COLOUR)])
     colours = tints[(image.is_seen | is_plain).astype(int)] * (0.25 + 0.75 * image.brightness[..., None])
     return np.round(255.0 * np.where(image.mask[..., None], colours, 1.0)).astype(np.uint8)
@@ -145,7 +145,7 @@ class Tile(NamedTuple):
 
 
 def image_tiles(imagined: Imagined, view_image: ShadedImage | None) -> list[Tile]:
-    """Return pictures of the imagined surfaces from the chosen pose, and of what the view then saw."""
+    """Return coloured pictures of the imagined surfaces, and of what the view then saw."""
     pairs = zip(imagined.names, imagined.samples, strict=True)
     tiles = [Tile(name, colour_image(sample, _UNSEEN_COLOUR)) for name, sample in pairs]
     return tiles if view_image is None else [*tiles, Tile("then seen", colour_image(view_image, NEW))]

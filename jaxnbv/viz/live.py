@@ -1,4 +1,4 @@
-"""A live view in the browser, by viser: scanned points, imagined surfaces, and the next view."""
+"""A live view in the browser, made with viser: scanned points, imagined surfaces, and the next view."""
 
 import dataclasses
 import html
@@ -51,7 +51,7 @@ _PANEL_STYLE = (
 class LiveView:
     """A web page that shows an episode or a session.
 
-    It shows points, cameras, candidates coloured by value, and the next view with its expected depth, in scene
+    The page shows points, cameras, candidates coloured by value, and the next view with its expected depth, in scene
     coordinates. The surface is the likeliest known shape, or else the posterior mean coloured by its uncertainty.
     Imagined surfaces can be switched on in the scene tree. A slider goes back to earlier views. `stop` stops the server
     at `address`.
@@ -72,7 +72,7 @@ class LiveView:
         self._image: Any = None
         self._slider: Any = None
         self._handles: list[Any] = []
-        # A reader may move the slider while the next view is drawn.
+        # The user may move the slider while the next view is drawn.
         self._drawing = threading.RLock()
 
     @property
@@ -158,7 +158,7 @@ def _surfaces(
 
     With known parts, the imagined surfaces are the likeliest parts.
 
-    - `answer`: probabilities of classes, which decide which known shape is shown; see `likeliest_shape`.
+    - `answer`: see `likeliest_shape`.
     """
     if isinstance(observations.hypotheses, PartHypotheses):
         parts = placed_parts(observations.hypotheses, NUM_SHOWN)
@@ -174,7 +174,7 @@ def _surfaces(
 def _live_text(
     episode: Episode, answer: Answer | None, kinds: list[tuple[str, float]], proposal: Proposal | None
 ) -> str:
-    """Return the answer, the next view (in world units) and the amount seen, as Markdown.
+    """Return Markdown with the answer, the next view (in world units) and the amount of surface seen.
 
     Without an answer, the text also names the kinds of known shapes.
     """

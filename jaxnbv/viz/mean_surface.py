@@ -1,4 +1,4 @@
-"""Computes the surface of a posterior's mean as triangles, with a standard deviation at each vertex."""
+"""Computes the surface of a posterior's mean: triangles with a standard deviation at each vertex."""
 
 import dataclasses
 
@@ -22,9 +22,9 @@ from jaxnbv.scanning.mesh import level_triangles
 _DEVIATION_ANCHORS = 256
 _SLOPE_ANCHORS = 1024
 _SLOPE_STEP = 0.005
-# Deviation as a fraction of the distance to the nearest point. On a cow after one to five views, between 0.1 and 0.4
-# from the points, the error of the surface is 0.2 to 0.3 of this distance (root mean square), which is two to three of
-# the posterior's standard deviations. Measured from the truth to the surface, which may lack a part, it is 0.4 to 0.7.
+# Deviation as a fraction of the distance to the nearest point. On a cow after one to five views, at distances of
+# 0.1 to 0.4 scene units, the surface's root mean square error is 0.2 to 0.3 of the distance, two to three of the
+# posterior's standard deviations. Measured from the truth to the surface, which may lack a part, it is 0.4 to 0.7.
 _DEVIATION_PER_DISTANCE = 0.25
 # A piece of the surface is kept if a point of the cloud is nearer than this, in scene units.
 _MAX_DISTANCE = 0.1
@@ -49,7 +49,7 @@ class MeanSurface(eqx.Module):
         return trimesh.Trimesh(self.vertices, self.faces, process=False)
 
     def part(self, is_kept: Bool[np.ndarray, " v"]) -> "MeanSurface | None":
-        """Return the part with these vertices, which are those of whole pieces; None for a part without faces."""
+        """Return the part with the vertices `is_kept`, which must form whole pieces. None if it has no faces."""
         faces = self.faces[is_kept[self.faces[:, 0]]]
         if len(faces) == 0:
             return None
@@ -72,7 +72,7 @@ def mean_surface(sampler: SurfaceSampler, inputs: StepInputs) -> MeanSurface | N
     if triangles is None:
         return None
     vertices, faces, normals = triangles
-    # Normals are features too, so that the two sides of a thin sheet are far apart.
+    # Add normals to the positions, so that the two sides of a thin sheet are far apart.
     features = np.concatenate([vertices, 0.1 * normals], axis=1)
     anchors = _farthest_rows(features, _SLOPE_ANCHORS)
     deviation_rows = anchors[:_DEVIATION_ANCHORS]
@@ -121,7 +121,7 @@ def padded(rows: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "m d"]:
 
 
 def _farthest_rows(features: Float[np.ndarray, "n d"], count: int) -> Int[np.ndarray, " count"]:
-    """Return indices of rows far from each other, in order of choice. If there are too few, the first is repeated."""
+    """Return indices of rows far from each other, in order of choice. The first is repeated if there are too few."""
     rows = jnp.asarray(padded(features.astype(np.float32)))
     return np.asarray(farthest_point_indices(rows, jnp.arange(len(rows)) < len(features), count))
 

@@ -1,4 +1,4 @@
-"""Shows objects in notebooks: pictures of clouds, posteriors, proposals and episodes, and captions."""
+"""Shows clouds, posteriors, proposals, episodes and other objects in notebooks, as pictures with captions."""
 
 import base64
 import builtins
@@ -40,7 +40,7 @@ from jaxnbv.viz.style import BEFORE, VALUE
 _INCHES, _LARGE, _MAX_LETTERS, _DPI = 2.4, 4.8, 62, 110
 # Viewpoint for clouds whose normals point in all directions.
 _DEFAULT_EYE = np.array([0.8, 0.9, 2.2])
-# Half the side of the slice of a posterior, in scene units, and its pixels along a side.
+# Half the side of a posterior's slice, in scene units, and number of pixels along each side.
 _HALF_SIDE, _PIXELS = 1.5, 48
 
 
@@ -84,7 +84,7 @@ def html_of(value: Any) -> str:
 
 @functools.singledispatch
 def drawing_of(value: Any) -> Drawing:
-    """Return the drawing of an object, according to its type."""
+    """Return the drawing of an object, which depends on its type."""
     return Drawing(None, repr(value))
 
 
@@ -105,7 +105,7 @@ def _(cloud: PointCloud) -> Drawing:
 
 
 def _draw_shaded(points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], axes: Axes) -> None:
-    """Draw a cloud (in any unit) from the mean direction of its normals, bright where it faces the viewer."""
+    """Draw a cloud in any unit, seen from the mean direction of its normals, bright where it faces the viewer."""
     eye = normals.mean(axis=0)
     eye = eye if np.linalg.norm(eye) > 0.2 else _DEFAULT_EYE
     rotation = np.asarray(look_at(eye).rotation)

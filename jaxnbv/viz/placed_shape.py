@@ -32,24 +32,24 @@ _Values: TypeAlias = Float[np.ndarray, "_ _ _"]
 # Nodes along each axis of the grids for the surface of a shape, for its disputed space, and for the distances to the
 # hypotheses. Half extent of the grids relative to the half extent of the shapes.
 _NODES, _FINE_NODES, _COARSE_NODES, _MARGIN = 128, 96, 48, 1.05
-# No shape is drawn if the probability of "none of these" is higher. Few objects fit an example of a bank exactly.
+# No shape is drawn if the probability of "none of these" exceeds this. Few objects fit a shape of a bank exactly.
 _MAX_NONE_PROBABILITY = 0.9
-# Number of hypotheses to compare, and the least fraction of their probability that makes space disputed.
+# Largest number of hypotheses to compare. Space is disputed if this fraction of their probability fills it.
 _MAX_HYPOTHESES, _MIN_DISPUTED = 12, 0.1
-# Distance between two registrations that still agree, and softness of a surface's step, in scene units.
+# Surfaces of two hypotheses agree within twice this distance. Softness of a surface's step. Both in scene units.
 _TOLERANCE, _SOFTNESS = 0.05, 0.012
 # Pieces of disputed space smaller than this fraction of the shape's area are left out.
 _MIN_PIECE = 0.01
 # Surface this near to a scanned point counts as measured, and beyond twice this distance as imagined, in scene units.
 _MEASURED_DISTANCE = 0.06
-# Weight of normals in that distance: it separates the two sides of a sheet.
+# Weight of normals in that distance, which separates the two sides of a sheet.
 _NORMAL_WEIGHT = 0.1
 
 
 class PlacedShape(MeanSurface):
     """A known shape at its registered placement, in scene coordinates. Its deviation is zero.
 
-    - `name`, `probability`: those of the part, or of the kind of shape.
+    - `name`, `probability`: of the part, or of the kind of shape.
     - `measured`: 1 where points were scanned, 0 where the shape is imagined.
     - `agreed`: 1 where most hypotheses have the same surface, 0 where few do.
     - `disputed_space`: surface of the space that other hypotheses fill.
@@ -65,12 +65,11 @@ class PlacedShape(MeanSurface):
 
     @property
     def caption(self) -> str:
-        """Name and probability as text."""
         return f"{self.name}  {100 * self.probability:.0f} %"
 
 
 def _select(tree: T, rows: int | list[int]) -> T:
-    """Return rows of all leaves. Indexing JAX's arrays would compile a program for each shape of a leaf."""
+    """Return rows of all leaves. JAX's own indexing would compile a program for each shape of a leaf."""
     return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[rows]), tree)
 
 
@@ -87,7 +86,7 @@ def placed_parts(hypotheses: PartHypotheses, count: int) -> list[PlacedShape]:
 def likeliest_part(hypotheses: PartHypotheses, cloud: PointCloud | None = None) -> PlacedShape | None:
     """Return the likeliest part at its placement; None if "none of these" is more likely.
 
-    Without a cloud of scanned points, it counts as measured and agreed everywhere, and has no `disputed_space`.
+    Without a cloud of scanned points, the part counts as measured and agreed everywhere.
     """
     if next(iter(hypotheses.names())) == NONE:
         return None
@@ -111,8 +110,8 @@ def likeliest_shape(
     """Return the likeliest shape of the likeliest kind; None if "none of these" is nearly certain.
 
     - `hypotheses`, `weights`: the registered shapes and their weights. The last weight is that of "none of these".
-    - `answer`: probabilities of classes. If each kind is one of the classes, the weights of the kinds are multiplied by
-      them and normalised, so that a picture does not contradict the answer beside it.
+    - `answer`: probabilities of classes. If every kind is one of the classes, its weight is multiplied by the class's
+      probability and normalised, so that a picture does not contradict the answer beside it.
     """
     weights = np.asarray(weights, np.float64)
     if weights[-1] > _MAX_NONE_PROBABILITY:
@@ -156,10 +155,10 @@ def _place_shape(bank: ShapeBank, hypotheses: Hypotheses, row: int, probability:
 def _with_hypotheses(
     shape: PlacedShape, bank: ShapeBank, hypotheses: Hypotheses, weights: Float[np.ndarray, " h"], cloud: PointCloud
 ) -> PlacedShape:
-    """Set `measured`, `agreed` and `disputed_space` of a shape, the first of `hypotheses` with these weights."""
+    """Return a copy of `shape`, the first of `hypotheses`, with `measured`, `agreed` and `disputed_space`."""
     half_extent = min(_MARGIN * float(_extent(bank, hypotheses)) + _TOLERANCE, np.pi)
     grid, coarse = Grid(_FINE_NODES, half_extent), Grid(_COARSE_NODES, half_extent)
-    # Compute distances on a coarse grid: they are smooth, and each hypothesis costs as much as the whole shape.
+    # A coarse grid suffices because distances are smooth. A fine one would take long for many hypotheses.
     others = np.array(_distances(bank, hypotheses, jnp.asarray(coarse.axis, jnp.float32)))
     occupancy, own_distances = np.zeros((_FINE_NODES,) * 3, others.dtype), _resample(others[0], coarse, grid)
     grid_points, agreed = (shape.vertices + half_extent).T / coarse.spacing, np.zeros(len(shape.vertices))

@@ -25,9 +25,9 @@ from jaxnbv.viz.sphere import unit
 from jaxnbv.viz.style import DEVIATION, DISPUTED, LINE, NEW, draw_border, shape_colours
 
 _DISTANCE = 11.0
-_DEPTH_TOLERANCE = 0.04  # Noise and the mean's own error must not hide a point behind the surface that it lies on.
+_DEPTH_TOLERANCE = 0.04  # Noise, or an error of the mean, must not hide a point behind the surface that it lies on.
 _HIDDEN_OPACITY = 0.18
-# Width of the region for the mean depth (fraction of the picture), largest darkening, and depth at which it is reached.
+# Hollows: width of the filter for the mean depth (fraction of the picture), largest darkening, and depth that gets it.
 _OCCLUSION_WIDTH, _MAX_DARKENING, _FULL_DEPTH = 0.05, 0.4, 0.25
 _INSET_SIZE = 0.24
 # Opacity of the space that other hypotheses fill.
@@ -113,7 +113,7 @@ class Still:
         under, front = np.zeros((len(mask), 4)), np.zeros((len(mask), 4))
         deep, near = np.full(len(mask), np.inf), np.full(len(mask), np.inf)
         under[mask], deep[mask], near[is_disputed] = colours, depth, disputed_depth
-        # Brightness of its own shading, relative to a lit face.
+        # Shade the disputed space: `over` is its brightness in the colour of a lit face.
         disputed, lit = (np.array(mpl.colors.to_rgb(colour)) for colour in (DISPUTED, LINE))
         front[is_disputed, :3] = disputed * (over[:, :3] / lit)
         front[is_disputed, 3] = _DISPUTED_OPACITY
@@ -172,7 +172,7 @@ def _occlusion(mask: Bool[np.ndarray, "h w"], depth: Float[np.ndarray, " hits"])
 
 
 def draw_truth(axes: Axes, data: ReportData) -> bool:
-    """Draw the true surface from the viewpoint of the other pictures. Returns False if it is not known."""
+    """Draw the true surface from the viewpoint of the other pictures. Return False if it is unknown."""
     mesh = data.true_surface
     if mesh is None:
         return False
@@ -187,7 +187,7 @@ def draw_truth(axes: Axes, data: ReportData) -> bool:
 
 
 def render_view(data: ReportData, index: int, size: int | None = None) -> Still:
-    """Return a picture of the surface after view `index` (from 0), by default of the size for a report."""
+    """Return a picture of the surface after view `index` (from 0). The default size is that for a report."""
     viewpoint, norm = data.viewpoint, LogNorm(*data.deviations)
     return Still(viewpoint.eye, data.views[index].surface, size or _STILL_SIZE, viewpoint.extent, norm)
 
@@ -195,11 +195,11 @@ def render_view(data: ReportData, index: int, size: int | None = None) -> Still:
 def draw_scene(
     axes: Axes, data: ReportData, index: int, still: Still, weight: float = 1.0, inset: bool = True, aspect: float = 1.0
 ) -> None:
-    """Draw surface, points and cameras after view `index` (from 0) into empty axes. Names the part.
+    """Draw surface, points and cameras after view `index` (from 0), and a part's name, into empty axes.
 
     - `still`: see `render_view`.
     - `weight`: factor for the sizes of lines, dots and letters.
-    - `inset`: whether the emptiest corner shows what the last view saw.
+    - `inset`: whether to show the image of view `index` in the emptiest corner.
     - `aspect`: width divided by height.
     """
     view, viewpoint = data.views[index], data.viewpoint
@@ -236,7 +236,7 @@ def _free_corner(axes: Axes, content: list[Float[np.ndarray, "_ 2"]]) -> tuple[i
 
 
 def _content_pixels(data: ReportData, still: Still) -> list[Float[np.ndarray, "_ 2"]]:
-    """Return the pixels of the content of all views, so that their pictures can be cropped alike."""
+    """Return the pixels of the content of all views, so that all pictures can be cropped in the same way."""
     surfaces = [view.surface.vertices for view in data.views if view.surface is not None]
     content = [still.project(rows)[0] for rows in (*surfaces, *(view.new for view in data.views)) if len(rows)]
     for view in data.views:
@@ -273,8 +273,8 @@ def draw_items(
 def _draw_segments(
     axes: Axes, still: Still, ends: Float[np.ndarray, "n 2 3"], colour: str, width: float
 ) -> Float[np.ndarray, "m 2"]:
-    """Draw segments (scene coordinates), faint behind the surface. Return pixels along the segments."""
-    # Divide each segment into short ones, so that a part of it can be hidden.
+    """Draw segments (scene coordinates), faint where the surface hides them. Return pixels along the segments."""
+    # Divide each segment into short ones, because the surface may hide a part of it.
     steps = np.linspace(0.0, 1.0, 25)[:, None, None]
     fine = ends[:, 0] + steps * (ends[:, 1] - ends[:, 0])
     pixels, in_front = still.project(fine.reshape(-1, 3))
@@ -287,7 +287,7 @@ def _draw_segments(
 
 
 def crop(axes: Axes, still: Still, content: list[Float[np.ndarray, "_ 2"]], aspect: float = 1.0) -> None:
-    """Crop the picture to the region of these pixels, with a width of `aspect` times the height."""
+    """Crop the picture to the region of these pixels. The width is `aspect` times the height."""
     pixels = np.concatenate(content)
     (left, top), (right, bottom) = pixels.min(axis=0), pixels.max(axis=0)
     half = 0.53 * max((right - left) / aspect, bottom - top) + 0.03 * still.size

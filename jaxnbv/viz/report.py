@@ -59,7 +59,7 @@ def write_report(
       scene if possible. Without truth the chart shows the area that the scans have seen.
     - `title`: name of the object.
     - `rival`: an episode of a different search from the same first view, for comparison.
-    - `sketches`: sketches of the episode's steps. Missing ones are made again.
+    - `sketches`: sketches of the episode's steps. Missing sketches are made here.
     - `question`: the question in words, such as "What does the truck carry?"; by default that of the task.
 
     **Raises:** `ValueError` if the folder cannot be written, or another process writes in it.
@@ -115,7 +115,7 @@ def _matrix(data: ReportData, index: int) -> str:
 
 
 def _world_of(episode: Episode) -> tuple[Frame, str]:
-    """Return frame and unit of poses that a reader copies: those of the object's file, or else of the episode."""
+    """Return frame and unit for the poses in the report: those of the object's file, or else of the episode."""
     if episode.scene is not None and (world_frame := episode.scene.world_frame) is not None:
         return world_frame, "the units of the object's file"
     return episode.frame, episode.frame.unit

@@ -1,4 +1,4 @@
-"""Contents of the scene after a view, for still pictures, 3-D figures and the live view."""
+"""Points and cameras to draw after a view, for still pictures, 3-D figures and the live view."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -23,7 +23,7 @@ class Points(NamedTuple):
 
 
 class Cameras(NamedTuple):
-    """Cameras of one colour, drawn as fields of view up to a depth, with numbers that start at `first`."""
+    """Cameras of one colour, drawn as fields of view up to `depth` and numbered from `first`."""
 
     name: str
     poses: Sequence[Pose]
@@ -41,7 +41,7 @@ def scene_items(
     camera: Camera,
     depth: float = FRUSTUM_DEPTH,
 ) -> tuple[Points | Cameras, ...]:
-    """Return what to draw: points before the last view, points that it added, and the cameras."""
+    """Return what to draw: points before the last view, points of this view, and the cameras."""
     return (
         Points("points before", before, BEFORE, 0.7),
         Points("new points", new, NEW, 1.1),

@@ -19,11 +19,11 @@ def needs_no_posterior(sampler: SurfaceSampler) -> bool:
 def shown_surface(sampler: SurfaceSampler, inputs: StepInputs, answer: Answer | None = None) -> MeanSurface | None:
     """Return the likeliest known shape at its placement, or else the posterior mean's surface near points.
 
-    Return None if there is no such surface. The mean over several known shapes is the shape of none of them, so if the
-    object fits no known shape, the mean is that of the model without the bank.
+    Return None if there is no such surface. If the object fits no known shape, the mean is that of the model without
+    the bank, because a mean over several known shapes looks like none of them.
 
     - `inputs`: inputs of a step, with a posterior unless `needs_no_posterior`.
-    - `answer`: the acquisition's answer, whose classes may also be the kinds of the known shapes.
+    - `answer`: the acquisition's answer, see `likeliest_shape`.
     """
     observations, posterior, model = inputs.observations, inputs.posterior, sampler.model
     if isinstance(observations.hypotheses, PartHypotheses):
@@ -42,7 +42,7 @@ def shown_surface(sampler: SurfaceSampler, inputs: StepInputs, answer: Answer | 
 
 
 def _within_volume(sampler: SurfaceSampler, observations: Observations) -> Observations:
-    """Return the observations for conditioning the model, with only the empty nodes inside the volume."""
+    """Return the observations for conditioning the model. Empty nodes outside the carving volume are left out."""
     observations = sampler.adapt(observations)
     if sampler.carving is None or observations.empty_nodes is None:
         return observations

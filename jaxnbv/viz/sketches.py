@@ -1,4 +1,4 @@
-"""Sketches are the costly parts of an episode's pictures, made while the step's samples are in memory."""
+"""Sketches: the costly parts of an episode's pictures, made while a step's samples are in memory."""
 
 import dataclasses
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -19,7 +19,7 @@ class Sketch(NamedTuple):
     """Costly parts of the pictures of one step, before its view is taken.
 
     - `surface`, `unmeasured`: see the functions `shown_surface` and `unmeasured`.
-    - `imagined`: see `render_imagined`; None also if the step's view was not taken.
+    - `imagined`: see `render_imagined`. None also for a step whose view was not taken.
     """
 
     surface: MeanSurface | None
@@ -31,7 +31,7 @@ class Sketches:
     """Sketches of a running episode. Pass `add` to `simulate(each=...)`, and the object to `write_report`.
 
     - `episode`: the episode without views.
-    - `held`: sketches keyed by the index of the view, from 0. The first view and views read from a file have none.
+    - `held`: sketches keyed by the index of the view, from 0. The first view and views from a file have no sketch.
     """
 
     def __init__(self, episode: Episode):
@@ -69,7 +69,7 @@ def sketches_of(
         inputs, is_imagined = StepInputs(observations), imagine and index < len(episode.views)
         if not planner.acquisition.needs_hypotheses and (is_imagined or not needs_no_posterior(sampler)):
             posterior, surfaces = sampler.posterior(observations), None
-            # The step's own key gives the samples that it imagined. Moments without closed form need samples.
+            # The step's own key gives the samples that it imagined. A posterior without closed forms needs samples too.
             if is_imagined or not posterior.has_closed_forms:
                 sample_key, *_ = view_keys(episode.key, index)
                 surfaces = sampler.sample(observations, sample_key, posterior)

@@ -1,4 +1,4 @@
-"""3-D figures of the scene for the report, which a reader can turn. They are made with plotly."""
+"""3-D figures of the scene for the report, made with plotly. A reader can turn them."""
 
 from typing import Any
 
@@ -12,9 +12,9 @@ from jaxnbv.viz.placed_shape import PlacedShape
 from jaxnbv.viz.scene import Cameras, Points, frustum, scene_items
 from jaxnbv.viz.style import DEVIATION, DISPUTED, IMAGINED, INK, OPEN, PART, colour_scale
 
-# Largest numbers of points and vertices of all views together, for a small page, and least vertices of one view.
+# For a small page: largest numbers of points and of vertices in all views together. Least number of vertices in a view.
 _MAX_POINTS, _MAX_VERTICES, _MIN_VERTICES = 18_000, 24_000, 1500
-# Coordinates are rounded to this, in scene units: a power of two, whose multiples pack well.
+# Coordinates are rounded to multiples of this, in scene units. Multiples of a power of two compress well.
 _ROUNDING = 1 / 256
 _GLASS = {"color": DISPUTED, "opacity": 0.25}
 _LIGHT = {"ambient": 0.72, "diffuse": 0.45, "specular": 0.04, "roughness": 0.9}
@@ -90,7 +90,7 @@ def _mesh(surface: MeanSurface, limit: int, grades: Float[np.ndarray, "2"]) -> d
     - `grades`: decimal logarithms of the deviations at the ends of the colours.
     """
     if isinstance(surface, PlacedShape):
-        # Open, imagined, scanned.
+        # Disputed, imagined and scanned surface.
         scale = [[0.0, OPEN], [0.5, IMAGINED], [1.0, PART]]
         grade = np.maximum(surface.measured, 0.5 * surface.agreed)
         style = _legend_entry("likeliest shape") | {"cmin": 0.0, "cmax": 1.0, "colorscale": scale}
@@ -104,7 +104,7 @@ def _mesh(surface: MeanSurface, limit: int, grades: Float[np.ndarray, "2"]) -> d
 def _triangles(
     surface: MeanSurface, limit: int, style: dict[str, Any], grade: Float[np.ndarray, " v"] | None = None
 ) -> dict[str, Any]:
-    """Return a plotly trace of a surface, coarsened to at most `limit` vertices, in colours of `grade`."""
+    """Return a plotly trace of a surface, coarsened to at most `limit` vertices and coloured by `grade`."""
     new_index, faces = clustered(surface.vertices, surface.faces, limit)
     count = np.bincount(new_index)
     vertices = np.stack([np.bincount(new_index, column) / count for column in surface.vertices.T], axis=1)
@@ -125,7 +125,7 @@ def clustered(
 ) -> tuple[Int[np.ndarray, " v"], Int[np.ndarray, "g 3"]]:
     """Merge vertices in the same cell of a lattice, so that at most `limit` remain.
 
-    Returns the new index of each vertex, and the faces (Rossignac and Borrel 1993).
+    Return the new index of each vertex, and the faces. The method is that of Rossignac and Borrel (1993).
     """
     new_index = np.arange(len(vertices))
     cell = 0.01

@@ -1,4 +1,4 @@
-"""Maps of the sphere in longitude and latitude (radians). The scene's +z is at the centre, y is up."""
+"""Maps of the sphere in longitude and latitude (radians). The scene's +z axis is at the centre, +y at the top."""
 
 from itertools import pairwise
 
@@ -44,7 +44,7 @@ def smooth_map(
 
 
 def path(directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 2"]:
-    """Return a line on the map that joins directions by great circles. NaN rows cut it at the map's rim."""
+    """Return a line on the map that joins directions by great circles. NaN rows split it at the map's rim."""
     steps = np.linspace(0.0, 1.0, 20)[:, None]
     fine = on_map(unit(np.concatenate([a + steps * (b - a) for a, b in pairwise(directions)])))
     leaps = np.flatnonzero(np.abs(np.diff(fine[:, 0])) > np.pi) + 1

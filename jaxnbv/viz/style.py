@@ -1,4 +1,4 @@
-"""Colours and ranges that the page and the figures share; all can be told apart by colour-blind readers."""
+"""Colours and ranges that the report and the figures share. Colour-blind readers can tell the colours apart."""
 
 from pathlib import Path
 
@@ -13,25 +13,25 @@ from jaxnbv.storage.files import write_whole
 
 INK, GREY, LINE = "#1f2733", "#7a8494", "#d9dee6"
 BEFORE, NEW = "#26344d", "#d55e00"
-# Colours of a known shape: scanned, imagined, different in other hypotheses. Colour of the space that those fill.
+# Colours of a known shape: scanned, imagined, different in other hypotheses. Colour of space that only these fill.
 PART, IMAGINED, OPEN, DISPUTED = "#6cc5a6", "#d7efe6", "#d5d0ec", "#8c7fc0"
-# Colours of several lines in one chart (Okabe and Ito). NEW is not among them, because it marks the true one.
+# Colours of several lines in one chart (Okabe and Ito). NEW is not among them, because it marks the true line.
 SERIES = ["#0072b2", "#56b4e9", "#009e73", "#e69f00", "#cc79a7", "#7a8494", "#26344d", "#b8b04a"]
-# Pale where the surface is known, dark where it is not: the scanned points stand out on what is known.
+# Pale where the surface is known, so that the scanned points stand out there. Dark where it is uncertain.
 DEVIATION = LinearSegmentedColormap.from_list("deviation", mpl.colormaps["YlGnBu"](np.linspace(0.04, 0.92, 256)))
 # Values of candidates. The hue differs from that of deviations, and from the marks on the map.
 VALUE = LinearSegmentedColormap.from_list("value", mpl.colormaps["BuPu"](np.linspace(0.03, 0.95, 256)))
 
 
 def shape_colours(measured: Float[np.ndarray, " n"], agreed: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
-    """Mix the colours of a known shape, see `PlacedShape`."""
+    """Return the colours (RGB) of a known shape, given `measured` and `agreed` of `PlacedShape`."""
     scanned, imagined, disputed = (np.array(mpl.colors.to_rgb(colour)) for colour in (PART, IMAGINED, OPEN))
     measured, agreed = measured[:, None], agreed[:, None]
     return measured * scanned + (1.0 - measured) * (agreed * imagined + (1.0 - agreed) * disputed)
 
 
 def colour_scale(colours: Colormap) -> list[list]:
-    """Convert a colour map to plotly's format, a list of pairs: position from 0 to 1, and colour."""
+    """Convert a colour map to plotly's format, a list of pairs of position (from 0 to 1) and colour."""
     return [[t, mpl.colors.to_hex(colours(t))] for t in np.linspace(0.0, 1.0, 32).tolist()]
 
 

@@ -1,4 +1,4 @@
-"""Task section of an episode's report: question, answers by view, their reliability, and charts."""
+"""The task section of an episode's report: question, answers after each view, their reliability, and charts."""
 
 import itertools
 import re
@@ -71,12 +71,11 @@ def task_of(
     all_observations: Sequence[Observations] | None = None,
     true_surface: TriangleMesh | None = None,
 ) -> TaskReport:
-    """Return the task of an episode: that of the acquisition, or coverage for one without answers.
+    """Return the task of an episode: the acquisition's, or coverage if the acquisition has no answers.
 
     - `truth`: points of the true surface, in scene coordinates.
     - `rival`: an episode of a different search from the same first view.
-    - `all_observations`, `true_surface`: observations after each view and `true_mesh` of the scene, if they are already
-      computed.
+    - `all_observations`, `true_surface`: observations after each view, and `true_mesh` of the scene, if already known.
     """
     planner = episode.planner
     amounts, true_answer = coverage_answers(episode, truth, all_observations), None
@@ -119,9 +118,9 @@ def coverage_answers(
 ) -> list[CoverageAnswer]:
     """Return how much of the surface was seen after each view.
 
-    Given points of the true surface (`truth`), this is the percentage of them that was seen. Otherwise it is the sum of
-    the new areas that scans show, in squared world units. What is new is defined by `NewSurface`: the episode's
-    acquisition, if it is one, or else the default. Unlike there, area that was measured at a slant counts in full.
+    Given points of the true surface (`truth`), this is the percentage of these points that was seen. Otherwise it is
+    the total new area in the scans, in squared world units. The acquisition if it is a `NewSurface`, or else
+    `NewSurface()`, defines what is new. In a pixel's area, the cosine of incidence is at least 0.2, not 0.5 as there.
     """
     views, acquisition = episode.views, episode.planner.acquisition
     if truth is not None:
@@ -144,7 +143,7 @@ def _new_area(new_surface: NewSurface, before: Observations | None, view: Imagin
 
 
 def true_cloud(scene: Surface, count: int) -> PointCloud | None:
-    """Sample `count` points with normals, uniform by area, from a known surface; None if it has no mesh."""
+    """Sample `count` points with normals, uniformly by area, from a known surface. None if it has no mesh."""
     mesh = true_mesh(scene)
     if mesh is None:
         return None
@@ -156,7 +155,7 @@ def true_cloud(scene: Surface, count: int) -> PointCloud | None:
 def is_reliable_after(episode: Episode, answers: Sequence[Answer]) -> list[bool]:
     """Return, for each view, whether its answer is reliable.
 
-    Stop rules, which decide this for probabilities, get the random keys of the episode.
+    For class probabilities the stop rule `Sure` decides, with the random keys of the episode.
     """
 
     def holds(rule: Sure, index: int) -> bool:
@@ -167,12 +166,12 @@ def is_reliable_after(episode: Episode, answers: Sequence[Answer]) -> list[bool]
 
 
 def first_reliable(is_reliable: Sequence[bool]) -> int | None:
-    """Return the first view (from 1) from which on all answers are reliable; None if the last one is not."""
+    """Return the view (from 1) from which on all answers are reliable; None if the last answer is not."""
     return len(is_reliable) - int(np.argmin([*is_reliable[::-1], False]) - 1) if is_reliable[-1] else None
 
 
 def first_lost(is_reliable: Sequence[bool]) -> int | None:
-    """Return the first view (from 1) with a reliable answer if reliability is lost later; else None."""
+    """Return the first view (from 1) with a reliable answer if a later one is not reliable; else None."""
     index = int(np.argmax(is_reliable))
     return index + 1 if is_reliable[index] and not all(is_reliable[index:]) else None
 
@@ -183,7 +182,7 @@ def search_name(episode: Episode) -> str:
 
 
 def rival_text(rival: Episode, episode: Episode) -> str:
-    """Return a sentence about a different search: number of views, whether it was done, and answer."""
+    """Return a sentence about a different search: number of views, whether a stop rule held, and answer."""
     name, count = search_name(rival).capitalize(), len(rival.views)
     answers = _answers(episode, rival.views[-1:])
     views = f"{count} view{'s' * (count > 1)}"

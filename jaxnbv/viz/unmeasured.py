@@ -1,4 +1,4 @@
-"""Surface that views looked at but did not measure, because it is too dark or too shiny, or does not exist."""
+"""Surface that views looked at but did not measure, because it is too dark or shiny, or does not exist."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -15,12 +15,13 @@ from jaxnbv.scanning import Carving, TriangleMesh
 from jaxnbv.viz.answers import number_text, point_text
 from jaxnbv.viz.mean_surface import padded
 
-# Least number of views that looked at a patch (one may be chance), least fraction of the surface, most patches.
+# Least number of views that looked at a patch (one may fail by chance), least area as a fraction of the surface, and
+# largest number of patches.
 _MIN_LOOKS, _MIN_AREA, _MAX_PATCHES = 2, 0.005, 3
 
 
 class Patch(NamedTuple):
-    """A piece of unmeasured surface: area and middle in scene units, and number of views that faced it."""
+    """A patch of unmeasured surface: area, middle (scene units), and number of views that looked at it."""
 
     area: float
     middle: Float[np.ndarray, "3"]

@@ -1,4 +1,4 @@
-"""The viewpoint of all pictures of an episode, and the places at which its cameras are drawn."""
+"""The common viewpoint of an episode's pictures, and the places at which its cameras are drawn."""
 
 import equinox as eqx
 import numpy as np
@@ -10,12 +10,12 @@ from jaxnbv.planning.episode import Episode
 from jaxnbv.scanning.triangle_rays import first_faces
 from jaxnbv.viz.sphere import unit
 
-# Depth of drawn fields of view in radii of the object. Distance from the origin at which they end, in extents of the
-# object in this direction, and least value of this extent in radii.
+# Drawn fields of view: their depth, in radii of the object, and the distance of their ends from the origin, relative to
+# the object's extent in this direction. Least value of this extent, in radii.
 _FRUSTUM_DEPTH, _END_DISTANCE, _MIN_EXTENT = 0.2, 1.06, 0.35
 _RADIUS_PERCENTILE, _MAX_OUTLINE_POINTS = 99.0, 1000
 _NUM_DIRECTIONS, _MAX_HEIGHT = 80, 0.8
-# Number of points whose visibility is tested, and start of the test rays in front of them, in radii.
+# Number of points whose visibility is tested, and distance in front of them at which test rays start, in radii.
 _NUM_TESTED, _CLEARANCE = 300, 0.05
 # A camera nearer to the line of sight than this (cosine) would stand in front of the object.
 _MIN_COSINE = 0.9
@@ -40,7 +40,7 @@ class Viewpoint(eqx.Module):
         return 1.1 * (_END_DISTANCE * self.radius + self.depth)
 
     def drawn_pose(self, pose: Pose) -> Pose:
-        """Return the pose at which to draw a camera: moved toward the origin, until just outside the object."""
+        """Return the pose at which to draw a camera: moved toward the origin until just outside the object."""
         position = np.asarray(pose.position, np.float64)
         distance = max(float(np.linalg.norm(position)), 1e-9)
         extent = max(float((self.outline @ position).max()) / distance, _MIN_EXTENT * self.radius)
@@ -48,7 +48,7 @@ class Viewpoint(eqx.Module):
 
 
 def viewpoint_of(episode: Episode, surfaces: list[trimesh.Trimesh]) -> Viewpoint:
-    """Choose the viewpoint of an episode's pictures. `surfaces`: surfaces to show, in the order of views."""
+    """Choose the viewpoint of an episode's pictures. `surfaces`: those shown, in the order of views."""
     outlines = episode.cloud.to_numpy()[0], *(np.asarray(surface.vertices) for surface in surfaces)
     samples = [np.asarray(rows, np.float64)[:: max(1, len(rows) // _MAX_OUTLINE_POINTS)] for rows in outlines]
     distances = [np.linalg.norm(rows, axis=1) for rows in samples]
@@ -66,7 +66,7 @@ def viewpoint_of(episode: Episode, surfaces: list[trimesh.Trimesh]) -> Viewpoint
 def _visible_fraction(
     episode: Episode, surface: trimesh.Trimesh | None, eyes: Float[np.ndarray, "e 3"], clearance: float
 ) -> Float[np.ndarray, " e"]:
-    """Return the fraction of the chosen views' points that face each of `eyes` and are not hidden by the surface.
+    """Return the fraction of the chosen views' points that face each of `eyes` and that the surface does not hide.
 
     - `clearance`: distance in front of a point at which the ray to the viewer starts.
     """

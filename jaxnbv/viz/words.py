@@ -21,11 +21,11 @@ def sentences_about(
     frame: Frame,
     gain: float | None = None,
 ) -> dict[str, str]:
-    """Return sentences about the last view, by heading: pose, expected value, other candidates, result.
+    """Return sentences about the last view by heading: pose, expected value, other candidates, result.
 
     - `views`: all views up to this one, with the values of their proposals in world units.
     - `amounts`: how much was seen after each view.
-    - `gain`: true gain of the last view, to compare with its expected value, in world units.
+    - `gain`: actual gain of the last view in world units, to compare with its expected value.
     """
     *earlier, view = views
     points, amount = int(view.scan.count), amounts[-1].amount
@@ -37,7 +37,7 @@ def sentences_about(
     nearest = np.degrees(np.arccos(np.clip((earlier_directions @ direction).max(), -1.0, 1.0)))
     added = f"It added {points:,} points ({int(view.cloud.count):,} are kept)" if points else "It saw nothing"
     if gain is not None:
-        added += f", and {value_text(quantity, gain, frame)} of what it promised"
+        added += f", and its actual value was {value_text(quantity, gain, frame)}"
     before = amounts[-2].amount
     change = f"stayed at {amount}" if before == amount else f"went from {before} to {amount}"
     return {
@@ -48,7 +48,7 @@ def sentences_about(
 
 
 def _reason(quantity: Quantity, proposal: Proposal, frame: Frame) -> dict[str, str]:
-    """Return sentences, by heading, about the value of a view and the values of the other candidates."""
+    """Return sentences, keyed by heading, about the value of a view and the values of the other candidates."""
     value, others, num_tied = float(proposal.value), descending_values(proposal).tolist(), proposal.num_tied
     if not quantity.smooth:
         return {"Why this view": f"It was drawn at random from {len(others)} open candidates."}
