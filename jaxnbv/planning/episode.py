@@ -34,7 +34,6 @@ class Episode(eqx.Module):
     """The views that a planner chose for a scene, in scene coordinates, and everything they depend on.
 
     - `scene`, `noise`: true surface and sensor noise; None if a real sensor took the views.
-    - `first`: pose of the first view.
     - `stop_reason`: the stop rule's reason to end the episode; None if no rule ended it.
     - `frame`: frame of the user's world, in which the episode is shown and its cloud is saved.
     """
@@ -89,8 +88,8 @@ class Episode(eqx.Module):
     def load(cls, path: str | Path, planner: Planner | None = None, scene: Surface | None = None) -> "Episode":
         """Load a saved episode, or the views that `simulate` has stored so far.
 
-        - `planner`, `scene`: planner and scene, if the stored ones hold a function or network that cannot be restored.
-          They must have the same descriptions as the stored ones.
+        - `planner`, `scene`: planner and scene to use if the stored ones hold a function or network that cannot be
+          restored. The descriptions must be the same.
 
         **Raises:** `ValueError` if the folder holds no episode or no view, or if its planner or scene cannot be
         restored.

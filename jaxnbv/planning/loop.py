@@ -34,7 +34,7 @@ from jaxnbv.tasks.identification import identity_answer
 from jaxnbv.utility import Answer
 
 Sensor: TypeAlias = Callable[[Pose, PRNGKeyArray], PointCloud]
-"""Function that returns the scan from a pose. The key decides simulated noise; a real sensor ignores it."""
+"""Function that returns the scan from a pose. The key determines simulated noise."""
 
 STAGES = ("sampling surfaces", "searching", "scanning")
 
@@ -42,7 +42,6 @@ STAGES = ("sampling surfaces", "searching", "scanning")
 class View(eqx.Module):
     """One view of an episode, in scene coordinates.
 
-    - `pose`: pose of the sensor.
     - `scan`: the scan, with noise and one row for each pixel.
     - `cloud`: the cloud D after this view.
     - `proposal`: None if the view was not proposed, such as the first view.
@@ -208,7 +207,6 @@ class Loop:
     ) -> Iterator[Step]:
         """Take views until the stop rule holds or `max_views` is reached, and yield the step of each view.
 
-        - `first`: pose of the first view.
         - `stored_views`: stored views of the episode, in order. They are added first, without the sensor.
 
         **Raises:** `ValueError` whenever `take` raises it, for example when every candidate has been visited.

@@ -1,4 +1,4 @@
-"""Stop rules about the segmented parts of an object, and about which known part it is and where."""
+"""Stop rules about an object's segmented parts, and about which known part the object is and where."""
 
 import equinox as eqx
 

@@ -299,10 +299,7 @@ def _propose(search: Search, problem: Problem, key: PRNGKeyArray) -> Proposal:
 
 
 def _checked_proposal(planner: Planner, problem: Problem, proposal: Proposal) -> Proposal:
-    """Return the proposal.
-
-    **Raises:** `ValueError` that names the cause if the value is not finite, or if every candidate has been visited.
-    """
+    """Return the proposal, or raise `ValueError` that names the cause if its value is not finite."""
     if is_traced(proposal):
         return proposal
     value, search = float(proposal.value), planner.search

@@ -51,10 +51,10 @@ def table_under(cloud: PointCloud, box: Box) -> Obstacles | None:
     - It is level to within 30 degrees, so it is not a wall.
     - At the middle of the box it is below the top, and at most a quarter of the box's longest side below the bottom.
     - At most 2 % of the points in the box are below the plane, so it is not the top of an object.
-    - Of the points in, under, above and close beside the box, at least as many are on the plane as below it. So it is
+    - At least as many of the points in, under, above and close beside the box are on the plane as below it, so it is
       not the edge of something in the air.
 
-    - `cloud`, `box`: the cloud of the whole image, and a box around the object, in scene coordinates (y is up).
+    The cloud of the whole image and the box around the object are in scene coordinates, with y up.
     """
     low, high = box.low, box.high
     side, middle = float((high - low).max()), 0.5 * (low + high)

@@ -50,7 +50,7 @@ class UncertaintyView(Baseline):
 
 
 def uncertain_length(problem: Problem, poses: Pose) -> Float[Array, " poses"]:
-    """Return the length along which the hit of each pose's principal ray is uncertain, in scene units.
+    """Return, for each pose, the length of its principal ray on which the hit is uncertain (scene units).
 
     The transmittance T(t) is the fraction of sampled surfaces that the ray has not entered before distance t. It is
     evaluated every half cell within the samples' grid. The length is from the first t with T(t) < 1 to the last t with

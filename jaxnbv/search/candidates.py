@@ -36,7 +36,7 @@ class Candidates(eqx.Module):
         return self
 
     def where(self, allowed: Callable[[Pose], Bool[AnyArray, ""] | bool]) -> "GivenPoses":
-        """Return the candidates for which a function of one pose is True, such as a robot's reach.
+        """Return the candidates that `allowed`, a function of one pose, accepts, such as a robot's reach.
 
         **Raises:** `ValueError` if no candidate is allowed, or if the function does not return a single bool.
         """

@@ -71,7 +71,8 @@ class FreePoses(PoseSpace):
     """6-DOF poses with any position and rotation.
 
     Six parameters are added to the first two columns of the start's rotation (Zhou et al. 2019), and three parameters
-    to its position. The camera may turn away from the object, or move into it. Candidates lie on a sphere of `radius`.
+    to its position. The camera may turn away from the object or enter it. Candidates lie on a sphere of `radius` (scene
+    units).
 
     **Raises:** `ValueError` unless the radius is positive and finite.
     """

@@ -67,7 +67,7 @@ class Problem(eqx.Module):
         return self.apply_cost(jnp.moveaxis(values, (0, 1), (-2, -1)), poses)
 
     def apply_cost(self, values: Float[Array, "*samples poses"], poses: Pose) -> Float[Array, "*samples poses"]:
-        """Include the cost of the move from the last view to each pose in the values, if there is a cost."""
+        """Return values that include the cost of the move from the last view to each pose, if there is one."""
         return values if self.cost is None else self.cost(values, self.observations, poses)
 
     def value_at_visited(self) -> Float[Array, ""]:

@@ -75,7 +75,7 @@ class Proposal(eqx.Module):
 
         Excluded candidates are left out. The batch is shorter than `count` if there are not enough candidates.
 
-        - `min_angle`: least angle in degrees, at the origin, between a candidate and all better ones.
+        - `min_angle`: smallest angle in degrees, at the origin, between two candidates of the batch.
 
         **Raises:** `ValueError` for a count below 1, or an angle outside [0, 180].
         """
