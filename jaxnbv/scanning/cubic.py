@@ -1,7 +1,7 @@
 """The cubic polynomial of a cell's trilinear function along a ray, and the first root of this cubic.
 
-A batch of n vectors is a list of three components (n,). In their coordinates the cell is [0, 1]^3. A batch of n cubics
-is a list of four coefficients (n,), constant first.
+A batch of n vectors is a list of three components (n,), in coordinates in which the cell is [0, 1]^3. A batch of n
+cubics is a list of four coefficients (n,), constant first.
 """
 
 import jax
@@ -56,9 +56,9 @@ def first_root(c: list) -> Float[Array, " n"]:
     """Return the first root in [0, 1] of each cubic, which must have one.
 
     The root is 0 for a cubic that is not positive at 0. Newton's method finds the root in the interval of
-    `first_bracket`. A step that leaves the interval by more than the rounding error is replaced by bisection. This
-    tolerance is needed because compiled code may compute the same value twice with different rounding, and then the
-    interval may end just beside the root.
+    `first_bracket`. A step that leaves the interval by more than the rounding error is replaced by bisection. Smaller
+    excesses are allowed because compiled code may compute the same value twice with different rounding, so that the
+    interval ends just beside the root.
     """
     high, _ = first_bracket(c)
     drop = c[0] - _polynomial(c, high)

@@ -29,7 +29,7 @@ _MAX_STRAY_FRACTION = 0.01
 class Carving(eqx.Module):
     """Removal of sampled surface in space that was seen to be empty, and outside the object's volume.
 
-    - `volume`: the region that can hold the object, see `jaxnbv.geometry.volume`; by default that of `Frame.fit`.
+    - `volume`: the region that can hold the object, see `jaxnbv.geometry.volume`. The default is the default `Box`.
     - `margin_voxels`: the margin, in spacings of the grid. A node is seen empty if every ray that passes the node
       within the margin, and every neighbour of such a ray in the image, stayed empty to at least the margin beyond the
       node. A node counts as outside if it lies more than two margins outside the volume.
@@ -90,8 +90,8 @@ class Carving(eqx.Module):
     def with_room(self, box: Box, grid: Grid, frame: Frame) -> Box:
         """Return a box (world) with all faces but the lower one moved outward by two margins / sqrt(3).
 
-        Its corners are at most two margins from the given box, so points in it still count as inside the volume. A scan
-        cropped to it shows that the surface goes on where the given box cuts it.
+        The new corners are at most two margins from `box`, so points in the result still count as inside the volume. A
+        scan that is cropped to the result shows that the surface continues where `box` cuts it.
         """
         return frame.to_world(frame.to_scene(box).widened(self._beyond_volume(grid) / math.sqrt(3.0)))
 
@@ -170,7 +170,7 @@ def _is_crossed(
         is_inside = (pixel >= 0.5) & (pixel <= jnp.array([[camera.width - 0.5], [camera.height - 0.5]]))
         column, row = jnp.floor(pixel).astype(jnp.int32)
         # The image of the ball of radius `margin` about the node lies within this radius, in pixels. The factor
-        # 1 + a^2 + b^2 bounds its stretch off the axis. One pixel is added to include the rays on both sides.
+        # 1 + a^2 + b^2 bounds how far it is stretched off the axis. One more pixel includes the rays on both sides.
         radius = max(camera.focal_lengths) * margin / (safe_depth - margin) * (1.0 + a**2 + b**2) + 1.0
         radius = jnp.ceil(radius)
         level = jnp.floor(jnp.log2(radius)).astype(jnp.int32)
@@ -190,7 +190,7 @@ def _is_crossed(
 
 
 def _least_within(image: Float[Array, "h w"], pixels: int) -> Float[Array, "h w"]:
-    """Return the minimum of nine pixels about each pixel, a 3 x 3 pattern with a spacing of `pixels`."""
+    """Return, for each pixel, the minimum over a 3 x 3 pattern around it with a spacing of `pixels`."""
     for axis in (0, 1):
         pad = [(0, 0), (0, 0)]
         pad[axis] = (pixels, pixels)

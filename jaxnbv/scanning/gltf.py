@@ -15,7 +15,7 @@ from trimesh.resolvers import Resolver
 
 from jaxnbv.checks import require
 
-# Divisor of normalised integers, by the component type of their accessor.
+# Divisor of normalised integers, keyed by the component type of their accessor.
 _DIVISORS = {5120: 127.0, 5121: 255.0, 5122: 32767.0, 5123: 65535.0}
 # Modes of glTF primitives: modes that trimesh reads, modes with triangles (lists and strips), and the mode of fans.
 _READABLE, _TRIANGLES, _FANS = (0, 1, 4, 5), (4, 5), 6
@@ -26,7 +26,7 @@ _REMEDY = "export the file again without these, for example from Blender"
 
 
 def read_gltf(content: bytes, kind: str, resolver: Resolver) -> trimesh.Scene:
-    """Read the scene in the bytes of a "gltf" or "glb" file, which may refer to files of the `resolver`.
+    """Read the scene of a "gltf" or "glb" file. `resolver` opens the other files that it refers to.
 
     **Raises:** `ValueError` if the file has features that trimesh does not read, or if the counts or bounds of the
     meshes differ from those in the file's header.

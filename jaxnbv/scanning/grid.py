@@ -1,4 +1,4 @@
-"""`GridSurface`, the level set of a function on a regular grid. Posterior samples are traced in this form."""
+"""`GridSurface`, the level set of a function on a regular grid, such as a posterior sample."""
 
 import dataclasses
 import warnings
@@ -48,8 +48,8 @@ class Grid(eqx.Module):
     def cell_of(self, points: Float[Array, "*n 3"]) -> Int[Array, "*n 3"]:
         """Return the index of the cell that holds each point (scene coordinates).
 
-        Along each axis, cell i lies between the nodes i and i + 1, for i from 0 to `resolution - 2`. For a point
-        outside the grid, at least one index is above that. None is negative, since JAX would count it from the end.
+        Along each axis, cell i lies between the nodes i and i + 1, for i from 0 to `resolution - 2`. A point outside
+        the grid has at least one larger index. No index is negative, because JAX would count it from the end.
         """
         cell = jnp.floor((points + self.half_extent) / self.spacing).astype(jnp.int32)
         return jnp.where(cell < 0, self.resolution, cell)
@@ -80,8 +80,7 @@ class GridSurface(Surface):
 
     - `values`: values of a function f at the nodes, minus the level of f on the surface; positive outside the solid.
     - `distance`: `tracing.free_distance` of the values.
-    - `is_void`: whether a ray misses if its first zero is in a cell, since a sensor cannot see the surface there. None
-      if there are no such cells.
+    - `is_void`: whether each cell counts as free of surface. A ray whose first zero is in such a cell misses.
     """
 
     in_jit: ClassVar[bool] = True
@@ -162,7 +161,7 @@ def scan_samples(
 def samples_at_once(camera: Camera, poses: Pose) -> int:
     """Return the number of sampled surfaces to scan together from a batch of poses.
 
-    On a CPU this is one, so that the scans of a sample stay in the cache. On a GPU it gives up to eight million rays.
+    It is one on a CPU, so that the scans of a sample stay in the cache. On a GPU it gives up to eight million rays.
     """
     return 1 if on_cpu() else max(1, 2**23 // (poses.position.shape[0] * camera.num_rays))
 
@@ -170,7 +169,7 @@ def samples_at_once(camera: Camera, poses: Pose) -> int:
 @jax.debug_nans(False)
 @program
 def mean_depth(scans: PointCloud, pose: Pose) -> Float[Array, " rays"]:
-    """Return each ray's mean depth over the samples (leading axis) that it hits; NaN if it misses most."""
+    """Return each ray's mean depth in the samples (leading axis) that it hits; NaN if it misses over half."""
     depth = jnp.einsum("snd,d->sn", scans.points - pose.position, pose.forward, precision="highest")
     count = jnp.sum(scans.mask, axis=0)
     mean = jnp.sum(jnp.where(scans.mask, depth, 0.0), axis=0) / jnp.maximum(count, 1)

@@ -1,7 +1,7 @@
 """The surface that earlier views have measured, and how far each view saw.
 
-The observed cloud is thinned, so surface between its points may have been measured too. This module stores the hits of
-all rays instead. If a view should have seen a sampled surface but did not measure it, later views will not measure it
+The observed cloud is thinned, so surface between its points may have been measured too. This module instead uses the
+hits of all rays. If a view should have seen a sampled surface but did not measure it, later views will not measure it
 either: the surface does not exist, or it is too dark or too shiny for the sensor.
 """
 
@@ -38,8 +38,8 @@ class Looks(eqx.Module):
     """The measured surface and the lines of sight of all views. Immutable, with fixed shapes.
 
     - `distance`: distance from each node to the nearest measured surface, in scene units, at most `reach`.
-    - `sight`: distance from each view's position to what it saw along each ray of `camera`, in scene units; infinite if
-      the ray met nothing, and zero for a ray outside the image of the view.
+    - `sight`: distance that each view measured along each ray of `camera`, in scene units; infinite if it measured
+      none, and zero for a ray outside the image of the view.
     - `camera`: a copy of the sensor's camera with only every k-th row and column, to limit the number of rays.
     """
 
@@ -64,7 +64,7 @@ class Looks(eqx.Module):
     def with_points(self, cloud: PointCloud, radii: Float[Array, " n"] | float = 0.0) -> "Looks":
         """Return a copy with the points of a cloud added to the measured surface.
 
-        - `radii`: radius of the surface that was measured around each point, in scene units, at most a spacing.
+        - `radii`: radius of the surface that was measured around each point, in scene units, up to the grid's spacing.
         """
         radii = jnp.minimum(radii, self.grid.spacing)
         position = (cloud.points + self.grid.half_extent) / self.grid.spacing
@@ -92,7 +92,7 @@ class Looks(eqx.Module):
         """Return a copy with one more view.
 
         - `index`: index of the view, from 0.
-        - `barrier`: distance along each ray of the camera to the first obstacle, behind which the view saw nothing.
+        - `barrier`: distance along each ray of `camera` to the first obstacle. The view saw nothing behind it.
         """
         # The radius is half the diagonal of a pixel on the surface, so that surface between the rays of a coarse image
         # counts as measured.
@@ -122,9 +122,9 @@ class Looks(eqx.Module):
     def unmeasured_cells(self, surface: Surface, index: Int[Array, ""] | int, pose: Pose) -> Int[Array, "rays 3"]:
         """Return, for each ray of a view, the cell of its hit on a surface if the hit is unmeasured.
 
-        A hit is unmeasured if the view should have measured it, but no measured surface lies within a spacing of the
-        grid. The view should have measured a hit if the surface faces the camera there and the view saw as far as the
-        hit, or if the view's ray passed the hit and went on to something deeper. Others get an index beyond the grid.
+        A hit is unmeasured if the view should have measured it, but no measured surface is within one grid spacing. The
+        view should have measured a hit if the surface faces the camera there and the view saw as far as the hit, or if
+        the view's ray passed the hit and went on to something deeper. All other rays get an index beyond the grid.
 
         - `index`, `pose`: index of the view, from 0, and its pose.
         """

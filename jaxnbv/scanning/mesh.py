@@ -1,4 +1,4 @@
-"""`TriangleMesh`: meshes of any quality, including triangle soups and open sheets, traced by host code."""
+"""`TriangleMesh`: meshes of any quality, such as triangle soups and open sheets, traced by host code."""
 
 import dataclasses
 import warnings
@@ -24,7 +24,7 @@ from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.scanning.sdf.sampled import checked_triangles, is_inside
 from jaxnbv.scanning.triangle_rays import FirstFaces, first_faces
 
-# A connected component of a mesh that is supported by fewer points may come from stray points alone.
+# A connected component of a mesh with fewer points nearby may come from stray points alone.
 _MIN_POINTS = 4
 
 
@@ -32,7 +32,7 @@ _MIN_POINTS = 4
 class _Tree:
     """Cache of the ray tracer for the triangles of the last call.
 
-    All instances are equal, as this is a static field and the content follows from the triangles. A copy is empty.
+    All instances compare equal, because the cache is a static field and follows from the triangles. A copy is empty.
     """
 
     _cache = None
@@ -101,7 +101,7 @@ class TriangleMesh(Surface):
         return cls(frame.to_scene(vertices[rows]), faces.reshape(-1, 3), frame)
 
     def trace(self, origins: Float[AnyArray, "rays 3"], directions: Float[AnyArray, "rays 3"]) -> Hits:
-        """Return the first hits of the rays (see `Surface.trace`), which lie in the triangles' planes.
+        """Return the first hits of the rays, see `Surface.trace`. A hit lies in the plane of its triangle.
 
         **Raises:** `ValueError` under `jit`, `vmap` or `grad`.
         """
@@ -166,7 +166,7 @@ def level_triangles(
 ) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"], Float[np.ndarray, "v 3"]] | None:
     """Return vertices, faces and unit vertex normals of the zero set of `values`; None for an empty set.
 
-    They come from marching cubes, in scene coordinates, and faces and normals point outward.
+    Marching cubes computes them in scene coordinates. Faces and normals point outward.
 
     - `values`: one value per node of the grid, positive outside the solid.
     """
@@ -186,8 +186,8 @@ def supported_pieces(
 ) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "k 3"], int]:
     """Return the connected components of a mesh that have at least four points nearby.
 
-    A point belongs to the component of its nearest vertex, if that vertex is within `max_distance`. If no component has
-    four points, those with the most points are kept. Also returns the number of dropped components.
+    A point belongs to the component of its nearest vertex, if this vertex is within `max_distance`. If no component has
+    four points, the components with the most points are returned. The third result is the number of other components.
     """
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
     graph = coo_array((np.ones(len(edges), bool), edges.T), (len(vertices), len(vertices)))

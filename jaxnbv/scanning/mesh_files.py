@@ -118,7 +118,7 @@ def _read_file(path: Path) -> list[tuple[str, trimesh.Trimesh]]:
         return _read(path)
     except InputError as error:
         raise InputError(f"cannot read {path}: it {error}") from error
-    except Exception as error:  # Each of trimesh's readers fails in its own way.
+    except Exception as error:  # Each of trimesh's readers raises errors of its own types.
         formats = ", ".join(sorted(trimesh.available_formats()))
         raise InputError(
             f"cannot read {path} as a mesh ({type(error).__name__}: {error}): it is damaged, or none of {formats}, "
@@ -138,7 +138,7 @@ def _read(path: Path) -> list[tuple[str, trimesh.Trimesh]]:
 
 
 def _named_meshes(geometry: trimesh.Geometry) -> list[tuple[str, trimesh.Trimesh]]:
-    """Return the node's name (or an index) and the mesh in scene coordinates of each mesh of a scene."""
+    """Return the name of each mesh's node (or an index), and the mesh in the scene's coordinates."""
     parts = geometry.dump() if isinstance(geometry, trimesh.Scene) else [geometry]
     meshes = [part for part in parts if isinstance(part, trimesh.Trimesh)]
     return [(str(mesh.metadata.get("node", index)), mesh) for index, mesh in enumerate(meshes)]

@@ -89,7 +89,7 @@ def read_off(content: bytes) -> Triangles:
 
 
 def triangles_of(polygons: Sequence[Sequence[int]] | Sequence[np.ndarray] | np.ndarray) -> Int[np.ndarray, "f 3"]:
-    """Cut polygons into fans of triangles about their first corners; none for fewer than three corners."""
+    """Cut each polygon into a fan of triangles about its first corner. Two corners or fewer give none."""
     if isinstance(polygons, np.ndarray):
         groups = [polygons]
     else:

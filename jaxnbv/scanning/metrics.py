@@ -1,4 +1,4 @@
-"""Comparison of views or of a reconstruction with the true surface: coverage, Chamfer and Hausdorff distance."""
+"""Comparison of views and reconstructions with the true surface, by coverage and surface distances."""
 
 import math
 from collections.abc import Iterable
@@ -19,7 +19,7 @@ from jaxnbv.scanning.sphere_tracing import SDFSurface
 
 # Number of points that the paper's authors sample on each of two surfaces to compare them.
 SURFACE_POINTS = 20_000
-# Least cosine of incidence. A smaller one counts as this value.
+# A ray whose cosine of incidence is below this value counts as grazing.
 GRAZING = 0.2
 
 
@@ -30,8 +30,8 @@ def coverage(views: Iterable[Any], truth: Float[AnyArray, "n 3"], size: float = 
     a closed cavity, counts as not covered. A view from either side covers both sides of a sheet thinner than `size`.
 
     - `views`: the views of an episode, or other objects with the attributes `scan`, `camera` and `pose`.
-    - `truth`: points on the true surface, in scene coordinates.
-    - `size`: largest distance along the ray between a covered point and its pixel's hit (scene units), above the noise.
+    - `truth`: points on the true surface, in scene coordinates. `size` is in the same units.
+    - `size`: largest distance along the ray between a covered point and its pixel's hit. Give more than the noise.
 
     **Raises:** `ValueError` if `truth` is empty or not finite, `size` <= 0, or a scan does not have one row per ray.
     """
@@ -50,8 +50,8 @@ def is_shown(
 ) -> Bool[np.ndarray, " n"]:
     """Return, for each point of the true surface, whether a scan shows the point.
 
-    The point and the hit of its pixel must be at the same distance from the camera, up to `size` plus the change of
-    distance within half a pixel on the plane of the hit.
+    The point and the hit of its pixel must have the same distance from the camera, up to `size` plus the change of
+    distance across half a pixel on the plane that touches the surface at the hit.
 
     **Raises:** `ValueError` if the scan does not have one row per ray of the camera.
     """
@@ -83,7 +83,7 @@ def truth_points(scene: Surface, key: PRNGKeyArray, count: int = SURFACE_POINTS)
 
 
 def true_mesh(scene: Surface) -> TriangleMesh | None:
-    """Return a `TriangleMesh` unchanged, an `SDFSurface` as a mesh (on the default grid), or else None."""
+    """Return a `TriangleMesh` as it is, and an `SDFSurface` meshed on the default grid; None for others."""
     if isinstance(scene, SDFSurface):
         return mesh_from_sdf(scene.sdf, Grid())
     return scene if isinstance(scene, TriangleMesh) else None
@@ -105,7 +105,7 @@ class SurfaceDistance(NamedTuple):
 
     @property
     def chamfer(self) -> float:
-        """Chamfer distance: accuracy + completeness. The paper's values have the magnitude of this sum."""
+        """Chamfer distance: accuracy + completeness. By their size, the paper's values are this sum too."""
         return self.accuracy + self.completeness
 
 

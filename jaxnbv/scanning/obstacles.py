@@ -75,7 +75,7 @@ class Obstacles(eqx.Module):
         return _distance(self.solids, x)
 
     def barrier(self, camera: Camera, poses: Pose) -> Float[Array, "*batch rays"] | None:
-        """Return the distance (scene units) along each ray to the first obstacle or clutter; else infinity.
+        """Return each ray's distance (scene units) to the first obstacle or clutter; infinite if it hits none.
 
         Returns None if there are neither obstacles nor clutter.
         """
@@ -89,7 +89,7 @@ class Obstacles(eqx.Module):
 
     @program
     def remove_points(self, scan: PointCloud) -> PointCloud:
-        """Remove the points of solids from a scan. In a sensor's image, their rays then count as missed."""
+        """Remove the points of solids from a scan. If it is a sensor's image, their rays count as missed."""
         is_obstacle = scan.mask & (self.distance(scan.points) < self.margin)
         missed = None if scan.missed is None else scan.missed | is_obstacle
         return dataclasses.replace(scan.only(~is_obstacle), missed=missed)

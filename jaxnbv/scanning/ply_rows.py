@@ -92,7 +92,7 @@ def _element(
 
 
 def _row(body: bytes, start: int, properties: list[_Property], message: str) -> tuple[list[np.ndarray], int]:
-    """Return the values of a row that begins at a byte, and the row's end, or raise with the message."""
+    """Return the row at byte `start` and the byte where it ends, or raise with `message` if `body` ends."""
     row: list[np.ndarray] = []
     for _, kind, length in properties:
         parts = [(kind, 1)] if length is None else [(length, 1), (kind, -1)]

@@ -103,7 +103,7 @@ class SensorNoise(eqx.Module):
     ) -> PointCloud:
         """Return the cloud with noise on its filled rows. `camera` is ignored.
 
-        With the camera's `pose`, `sight` becomes the distance from the pose to the noisy points instead of the hits.
+        If `pose`, the camera's pose, is given, `sight` becomes the distance from the camera to the noisy points.
         """
         point_key, normal_key = jax.random.split(key)
         points = cloud.points + self.points * jax.random.normal(point_key, cloud.points.shape, cloud.points.dtype)
@@ -195,7 +195,7 @@ Noise: TypeAlias = SensorNoise | DepthNoise
 
 
 def distance_problem(pose: Pose) -> str | None:
-    """Return a message if a concrete pose, or a batch, is so far away that its unit must be wrong."""
+    """Return a message if a pose, or one of a batch, is too far away for its unit to be right; else None."""
     distance = float(np.linalg.norm(np.asarray(pose.position), axis=-1).max(initial=0.0))
     if distance <= _MAX_CAMERA_DISTANCE:
         return None
@@ -217,7 +217,7 @@ def scan(
 
     - `barrier`: distance along each ray to the first obstacle. A ray that reaches it before the surface is missed.
 
-    Runs under `jit` if `surface.in_jit`. Warns of an empty scan from so far away that the pose's unit must be wrong.
+    Runs under `jit` if `surface.in_jit`. Warns if nothing is seen from so far away that the pose's unit must be wrong.
     """
     origins, directions = camera.rays(pose)
     hits = surface.trace(origins.reshape(-1, 3), directions.reshape(-1, 3))
@@ -263,7 +263,7 @@ def implicit_depth(
 ) -> Float[Array, " n"]:
     """Return `depth` unchanged, but with derivatives (of any order) from the implicit function theorem.
 
-    A ray meets the surface at a depth t where a function f is zero. f and t depend on parameters theta of the ray and
+    A ray meets the surface at the depth t where a function f is zero. f and t depend on parameters theta of the ray and
     of the surface: f(theta, t(theta)) = 0. So dt = -(df/dtheta dtheta) / (df/dt).
 
     - `field_along_ray`: a module that returns f at a given depth along each ray. Its arrays are the parameters theta.
@@ -288,8 +288,8 @@ def _implicit_depth_jvp(primals, tangents):
 def pixel_area(scan: PointCloud, camera: Camera, pose: Pose, least_cosine: float) -> Float[Array, " rays"]:
     """Return the surface area that each pixel shows, in squared scene units; zero without a point.
 
-    The area is r^2 omega / cos = z^3 / (r fx fy cos), with focal lengths fx and fy, depth z, distance r, the pixel's
-    solid angle omega and the cosine of incidence cos.
+    The area is r^2 omega / cos = z^3 / (r fx fy cos), with the pixel's distance r, depth z and solid angle omega, the
+    focal lengths fx and fy in pixels, and the cosine of incidence cos.
 
     - `least_cosine`: a smaller cosine of incidence is replaced by this value.
     """

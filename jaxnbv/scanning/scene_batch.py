@@ -21,7 +21,7 @@ def scene_batch(scenes: Any, count: int) -> Surface:
 
     - `scenes`: a list of scenes, or one scene whose arrays already have this leading axis.
 
-    **Raises:** `ValueError` for a scene that JAX cannot trace, another number of scenes, or different structures.
+    **Raises:** `ValueError` for a scene that JAX cannot trace, not `count` scenes, or scenes of different structures.
     """
     if not isinstance(scenes, Sequence):
         batch = _traceable(scenes, "the scene")

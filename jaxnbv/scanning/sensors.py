@@ -1,4 +1,4 @@
-"""The authors' usual camera and camera distance, and the distance from which an image shows a whole object."""
+"""The authors' usual camera and its distance, and a distance at which an image shows a whole object."""
 
 import math
 from typing import NamedTuple

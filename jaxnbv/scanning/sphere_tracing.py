@@ -13,10 +13,10 @@ from jaxnbv.programs import program
 from jaxnbv.scanning.scanner import Hits, Surface, implicit_depth
 from jaxnbv.scanning.sdf import SignedDistance
 
-# Far above the rounding of float32 distances in the scene (4e-7) and far below the size of relevant detail.
+# This is far above the rounding of float32 distances in the scene (4e-7) and far below the size of relevant detail.
 _SHORTEST_STRIDE = 1e-3
 _MAX_STRIDES = 512
-# Nearly all rays finish within a few strides. Once at most this fraction is left, it continues in a smaller batch.
+# Nearly all rays finish within a few strides. Once at most this fraction is left, the rest continue in a smaller batch.
 _MAX_UNFINISHED = 1 / 8
 _NUM_CHORDS = 2
 # Slopes are evaluated this far before a hit along the ray, in units of the machine epsilon. The length is 1e-5 scene
@@ -101,7 +101,7 @@ class _DistanceAlongRay(eqx.Module):
 def _first_root(
     sdf: SignedDistance, origins: Float[Array, "n 3"], directions: Float[Array, "n 3"], radius: float
 ) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
-    """Return the depth of each ray's first crossing in a ball of this radius, and whether there is one."""
+    """Return the depth at which each ray first crosses the boundary within a ball, and whether it does."""
     middle = -jnp.sum(origins * directions, axis=-1)
     squared = middle**2 - jnp.sum(origins**2, axis=-1) + radius**2
     half_chord = jnp.sqrt(jnp.maximum(squared, 0.0))
@@ -128,7 +128,7 @@ class _March(eqx.Module):
 
     - `start_sign`: sign of the signed distance at the start of each ray.
     - `max_depth`: depth at which the ray leaves the ball in which surfaces are searched.
-    - `depth`, `value`: current depth, and the signed distance there. `previous_...`: those one stride earlier.
+    - `depth`, `value`: current depth, and the signed distance there. `previous_...`: the same, one stride earlier.
     - `is_unfinished`: whether the ray has neither crossed the boundary nor left the ball.
     """
 
@@ -144,7 +144,7 @@ class _March(eqx.Module):
 
 
 def _advance(sdf: SignedDistance, march: _March, count, max_unfinished: int):
-    """Advance the rays until at most `max_unfinished` are left or `count` has grown to `_MAX_STRIDES`."""
+    """Advance the rays until at most `max_unfinished` are left or the stride `count` is `_MAX_STRIDES`."""
     distance = _DistanceAlongRay(sdf, march.origins, march.directions)
 
     def body(carry):

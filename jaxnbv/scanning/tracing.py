@@ -36,8 +36,8 @@ class March(NamedTuple):
 
     - `entry`: point at which each ray enters the grid's box.
     - `t`: the ray's current position.
-    - `t_end`: t at which the ray leaves the box or, once it has reached a cell with a zero, this cell. So if t < t_end
-      after the march, there is a zero between t and t_end.
+    - `t_end`: t at which the ray leaves the box. Once the ray has reached a cell with a zero, it is the t at which the
+      ray leaves this cell. So if t < t_end after the march, there is a zero between t and t_end.
     - `sign`: sign of f at the start; zero until it has been computed.
     - `is_unfinished`: whether the ray has neither reached the cell of its first zero nor left the box.
     """
@@ -161,8 +161,8 @@ def _traced_zero_batched(size: int, batched, field: GridField, u: list[Array], d
 def smooth_gradient(field: GridField, x: Triple) -> Triple:
     """Return a continuous gradient of f, in change per cell, at points x within the grid.
 
-    It is interpolated linearly from central differences at the nodes (one-sided on the border). The gradient of the
-    trilinear interpolant itself would jump between cells.
+    It is interpolated linearly from central differences at the nodes, or from one-sided differences on the border. The
+    gradient of the trilinear interpolant itself would jump between cells.
     """
     last = field.resolution - 1
     cell = [jnp.clip(jnp.floor(jax.lax.stop_gradient(p)).astype(jnp.int32), 0, last - 1) for p in x]
@@ -186,7 +186,7 @@ def smooth_gradient(field: GridField, x: Triple) -> Triple:
 
 
 def enter(u: Triple, du: Triple, field: GridField) -> tuple[March, Float[Array, " n"]]:
-    """Return a march from where the rays u + t du enter the grid's box (its t is 0), and their t there."""
+    """Return a march that starts at t = 0 where the rays u + s du enter the grid's box, and this s."""
     # The box is smaller than the grid by a sliver, so that no position lies outside the grid after it is rounded and
     # moved forward.
     low, high = 2 * field.offset, field.resolution - 1 - 2 * field.offset
@@ -240,7 +240,7 @@ def _stride(rays: March, field: GridField) -> March:
 
 
 def _search_cell(rays: March, field: GridField) -> March:
-    """Stop each ray whose cell holds its first zero. Others leave their cell if it has a change of sign."""
+    """Stop each ray whose cell holds its first zero. Other rays leave a cell that has a change of sign."""
     local, cell = cell_at(rays, field)
     distance = _take(field.cell_distance, _flat(cell, field.resolution - 1))
     has_sign_change = rays.is_unfinished & (distance * rays.sign <= 0)
@@ -260,7 +260,7 @@ def _search_cell(rays: March, field: GridField) -> March:
 
 
 def cell_at(rays: March, field: GridField) -> tuple[Triple, list[Int[Array, " n"]]]:
-    """Return each ray's position, in [0, 1], within its cell or the one that it enters, and this cell."""
+    """Return each ray's position within its cell, in [0, 1]^3, and the cell; on a border, the cell ahead."""
     position = [x + rays.t * d for x, d in zip(rays.entry, rays.direction, strict=True)]
     cell = [
         jnp.floor(x + jnp.where(d > 0, field.offset, -field.offset)).astype(jnp.int32)
@@ -270,7 +270,7 @@ def cell_at(rays: March, field: GridField) -> tuple[Triple, list[Int[Array, " n"
 
 
 def _t_leave(rays: March, cell: list[Int[Array, " n"]], cells) -> Float[Array, " n"]:
-    """Return the t at which each ray leaves the cube of cells that are within `cells` cells of its own."""
+    """Return the t at which each ray leaves the cube of all cells within `cells` cells of its own cell."""
     sides = [c + jnp.where(d > 0, cells + 1, -cells) for c, d in zip(cell, rays.direction, strict=True)]
     ends = [(side - x) / d for side, x, d in zip(sides, rays.entry, rays.direction, strict=True)]
     return functools.reduce(jnp.minimum, ends)

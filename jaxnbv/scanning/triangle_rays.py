@@ -1,4 +1,4 @@
-"""Host code that finds the first triangle on each ray by Embree, or by libigl on platforms without an Embree wheel."""
+"""Host code that finds the first triangle on each ray, by Embree or, where it has no wheel, by libigl."""
 
 import importlib
 import weakref

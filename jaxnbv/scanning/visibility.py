@@ -79,7 +79,7 @@ def is_visible(
 
     A camera sees a point if the point lies in its image and range, is not at a grazing angle, and nothing hides it.
 
-    - `tolerance`: the surface hides a point if it is hit more than this length before the point, in scene units.
+    - `tolerance`: the surface hides a point if a ray hits it more than this length (scene units) before the point.
     - `barrier`: distance along each ray of the camera to an obstacle, see `Obstacles.barrier`.
     """
 

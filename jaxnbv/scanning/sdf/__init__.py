@@ -1,4 +1,4 @@
-"""Solids defined by signed distance functions, and set operations on solids (constructive solid geometry)."""
+"""Solids defined by signed distance functions, and set operations on them."""
 
 from jaxnbv.scanning.sdf.base import Difference as Difference
 from jaxnbv.scanning.sdf.base import Intersection as Intersection

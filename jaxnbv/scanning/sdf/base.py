@@ -1,9 +1,9 @@
 """The base class of solids, rigid motions, scaling, and set operations (constructive solid geometry).
 
 A solid is defined by a signed distance function, which is negative inside. All functions here have slopes of at most
-one, so their magnitude never exceeds the distance to the surface, and a ray may advance by it (Hart 1996). A class is
-*exact* if the magnitude equals this distance, and a *lower bound* if it may be smaller, provided that the solids that
-it combines are exact. Parameters are arrays, so `jax.vmap` can build a batch of solids that one compiled program scans.
+one, so their magnitude never exceeds the distance to the surface, and a ray may advance by it (Hart 1996). Each class
+says whether its magnitude equals this distance (*exact*) or is a *lower bound* on it, provided that the solids that it
+combines are exact. Parameters are arrays, so `jax.vmap` can build a batch of solids that one compiled program scans.
 """
 
 import functools
@@ -21,7 +21,7 @@ from jaxnbv.checks import AnyArray, InputError, as_floats, check_type, is_traced
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.rotations import rotation_about, safe_norm
 
-# Fields of these types also accept numbers and lists, which their converter makes arrays. mypy does not know this.
+# Fields of these types also accept numbers and lists, which a converter turns into arrays. mypy does not know this.
 if TYPE_CHECKING:
     Scalar: TypeAlias = Any
     Vector: TypeAlias = Any
@@ -65,8 +65,8 @@ def greatest(a, b):
 def least_of_last(values):
     """Return the minimum along the last axis. Its derivative is that of the first least entry.
 
-    The derivative of `jnp.min` would compare the values with their minimum, which can differ in the last bit if both
-    are compiled separately. The derivative is then 0 / 0.
+    The derivative of `jnp.min` compares the values with their minimum. If both are compiled separately, they can differ
+    in the last bit, and the derivative is then 0 / 0.
     """
     return jnp.min(values, axis=-1)
 
@@ -79,7 +79,7 @@ def _least_of_last_jvp(values, tangents):
 
 
 def corner_distance(*q):
-    """Return the signed distance to the solid where the distances q to orthogonal planes are negative."""
+    """Return the signed distance to the solid behind orthogonal planes, from the distances q to each."""
     outside = safe_norm(*(greatest(c, 0.0) for c in q))
     return outside + least(functools.reduce(greatest, q), 0.0)
 
@@ -146,7 +146,7 @@ class SignedDistance(eqx.Module):
         shapes = axis.shape, angle.shape
         require(shapes == ((3,), ()), f"axis and angle have shapes {shapes[0]} and {shapes[1]}: give (3,) and ()")
         if not is_traced(axis):
-            # JAX's float type flushes numbers below its least normal number to zero, so the limit is this number.
+            # JAX flushes numbers below the least normal number of its float type to zero.
             longer = bool(np.sum(np.square(np.asarray(axis))) >= jnp.finfo(axis.dtype).tiny)
             require(longer, f"the axis of rotation is {axis}: give a direction that is not zero")
         return Rotated(self, rotation_about(axis, angle))
@@ -234,7 +234,7 @@ class Rotated(SignedDistance):
         Pose(self.rotation, np.zeros(3))
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
-        # R^T x as a sum, which XLA fuses with other operations; a matrix product would not fuse.
+        # This is R^T x. XLA fuses the sum with other operations, but would not fuse a matrix product.
         a, b, c = (x[..., i, None] * self.rotation[i] for i in range(3))
         return self.solid(a + b + c)
 

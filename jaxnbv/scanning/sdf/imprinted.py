@@ -58,7 +58,7 @@ class ImprintedPyramid(SignedDistance):
 
 
 def pattern_distance(pattern: Int[Array, ""], x: Float[Array, "*n"], y: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Return the signed distance, a lower bound, from points (x, y) to a pattern in the unit circle.
+    """Return a lower bound on the signed distance from points (x, y) to a pattern in the unit circle.
 
     - `pattern`: index in `PATTERNS`. All patterns are evaluated, so that scenes of all classes share one program.
     """

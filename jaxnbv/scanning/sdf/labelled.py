@@ -1,4 +1,4 @@
-"""Unions of labelled primitives. All unions have the same type, so that one compiled program scans any of them."""
+"""Unions of labelled primitives, all of one type, so that one compiled program scans any of them."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -19,9 +19,9 @@ class LabelledSolid(SignedDistance):
 
         d(u) = |max(q, 0)| + min(max(q1, q2, q3), 0) - t,    q = |u| - (h - t).
 
-    A solid of revolution uses the two-dimensional form of d at the point (r - radius - slant * u2, u2), where r is the
-    distance from the axis u2. The result is divided by (|slant| + sqrt(slant^2 + 4)) / 2, the largest singular value of
-    this shear.
+    A solid of revolution about the axis u2 uses the two-dimensional form of d at the point (r - radius - slant * u2,
+    u2), where r is the distance from the axis. The result is divided by (|slant| + sqrt(slant^2 + 4)) / 2, the largest
+    singular value of the shear by `slant`.
 
     - `labels`, `revolved`: label of each primitive (-1 for an unused slot), and whether it is a solid of revolution.
     - `centre`, `rotation`, `half_size`, `rounding`: the quantities of the formula, in scene units. For a solid of
@@ -44,7 +44,7 @@ class LabelledSolid(SignedDistance):
     def distances(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n primitives"]:
         """Return the signed distance from the points x to each primitive; infinite for unused slots."""
         a, b, c = (x[..., i, None] - self.centre[:, i] for i in range(3))
-        # R^T x as sums, which XLA fuses with other operations; a matrix product would not fuse.
+        # This is R^T x. XLA fuses the sums with other operations, but would not fuse a matrix product.
         u, v, w = (
             a * self.rotation[:, 0, i] + b * self.rotation[:, 1, i] + c * self.rotation[:, 2, i] for i in range(3)
         )

@@ -97,7 +97,7 @@ def _signed_distance(
 def is_inside(
     points: Float[np.ndarray, "n 3"], vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Bool[np.ndarray, " n"]:
-    """Return whether triangles enclose each point, even if wound inside out. Open sheets enclose nothing."""
+    """Return whether triangles, in any winding, enclose each point. Open sheets enclose nothing."""
     return np.abs(winding_number(points, vertices, faces)) > 0.5
 
 

@@ -70,7 +70,7 @@ class Cone(SignedDistance):
     half_height: Scalar = nonnegative()
 
     def __call__(self, x: Float[AnyArray, "*n 3"]) -> Float[Array, "*n"]:
-        # The profile in the half plane (r, y): two caps, and a slanted edge from the bottom corner to the top corner.
+        # The profile in the half plane (r, y) has two caps, and a slanted edge from the bottom to the top corner.
         x, y, z = split(x)
         r = safe_norm(x, z)
         widening, rise = self.top_radius - self.bottom_radius, 2.0 * self.half_height
@@ -87,7 +87,7 @@ class Cone(SignedDistance):
 
 
 class Torus(SignedDistance):
-    """The torus about the y axis: a tube of `minor_radius` about a circle of `major_radius`. It is exact."""
+    """A tube of `minor_radius` about a circle of `major_radius` around the y axis. The distance is exact."""
 
     major_radius: Scalar = nonnegative()
     minor_radius: Scalar = nonnegative()
