@@ -40,8 +40,7 @@ def _limit(depth: Any) -> Any:
 class Camera(eqx.Module):
     """A pinhole depth camera. The centres of pixels are at 0.5, 1.5, ... from the image's top left corner.
 
-    - `fov`: 2 atan(height / (2 fy)) for a vertical focal length of fy pixels, in radians within (0, pi). This is the
-      vertical field of view if the principal point is the image's centre.
+    - `fov`: vertical field of view 2 atan(height / (2 fy)), in radians within (0, pi), for a focal length of fy pixels.
     - `height`, `width`: number of rows and columns of pixels. One ray goes through the centre of each pixel.
     - `aspect`: horizontal focal length divided by vertical focal length, both in pixels; 1 for square pixels.
     - `center`: the principal point, as fractions of the width and the height.
@@ -49,8 +48,7 @@ class Camera(eqx.Module):
       units. `nearest=0` and `farthest=None` mean no limit. A hit nearer than `nearest` is invalid. A ray without a hit
       up to `farthest` counts as a miss: the space along it is empty up to `farthest`.
     - `max_incidence`: largest angle between a ray and the normal of a measured hit, in radians within (0, pi/2].
-    - `distortion`: OpenCV's coefficients, see `from_intrinsics`. The rays do not use them, because
-      `PointCloud.from_depth` removes the distortion of an image.
+    - `distortion`: coefficients, see `from_intrinsics`. Rays ignore them. `PointCloud.from_depth` undoes distortion.
 
     The defaults are the paper's: 30 degrees, 50 x 50 pixels, no limits.
 
@@ -104,8 +102,7 @@ class Camera(eqx.Module):
         point may lie outside the image, since the image may be a window of a larger image. Warns if the matrix is
         probably for another image size than `height` x `width`.
 
-        - `nearest`, `farthest`, `max_incidence`: see `Camera`.
-        - `distortion`: OpenCV's coefficients k1, k2, p1, p2[, k3[, k4, k5, k6]].
+        - `distortion`: OpenCV's coefficients k1, k2, p1, p2[, k3[, k4, k5, k6]]. For the other arguments, see `Camera`.
 
         **Raises:** `ValueError` for a matrix of another form (for example with skew), a matrix that is certainly for
         another image size, a wrong number of coefficients, or coefficients that map two points to the same pixel.
@@ -192,7 +189,7 @@ class Camera(eqx.Module):
         return jnp.asarray(directions, dtype=jnp.result_type(float))
 
     def to_pixels(self, plane_points: _Points) -> _Points:
-        """Convert points (x, y) of the plane z = 1 to pixels (column, row), the first centred at (0.5, 0.5)."""
+        """Convert points (x, y) of the plane z = 1 to (column, row). The first pixel's centre is (0.5, 0.5)."""
         (fx, fy), (cx, cy) = self.focal_lengths, self.center
         scale, offset = np.array([[fx, fy], [cx * self.width, cy * self.height]], plane_points.dtype)
         return plane_points * scale + offset

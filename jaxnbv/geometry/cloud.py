@@ -74,11 +74,9 @@ class PointCloud(eqx.Module):
         normals: Float[AnyArray, "n 3"] | list,
         capacity: int | None = None,
     ) -> "PointCloud":
-        """Build a cloud from points and outward normals, padded to `capacity` rows.
+        """Build a cloud from points and outward normals, padded to `capacity` rows (by default, not padded).
 
         Normals are scaled to unit length, with a `UserWarning` if the length of one changes by more than 1 %.
-
-        - `capacity`: number of rows, by default the number of points.
 
         **Raises:** `ValueError` for shapes other than (n, 3), no points, an entry that is not finite, a normal of
         length zero, or more points than the capacity.

@@ -89,7 +89,6 @@ def _points_and_normals(
     """Return the cloud's rows, and a lower bound on the depth around each pixel (-inf if it has no depth).
 
     - `rounding`: standard deviation of the rounding of depths.
-    - `block_side`: see `fit_planes`.
     """
     rows, strided_camera = slice(stride // 2, None, stride), camera.strided(stride)
     samples = _strided_samples(depth, jnp.isfinite(depth) & (depth > 0), stride, block_side)[0]

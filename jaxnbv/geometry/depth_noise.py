@@ -27,8 +27,8 @@ def depth_noise(
     """Return the standard deviation of each pixel's noise and rounding, in units of the depth.
 
     The noise is estimated from the median magnitude of third differences of depth along rows and columns, which are
-    mostly noise on a smooth surface. The differences are taken from near the pixel at a similar depth. If there are
-    fewer than 16, they are taken from the whole image at a similar depth or, if there are still fewer, at any depth. If
+    mostly noise on a smooth surface. The median is over differences near the pixel at a similar depth. If there are
+    fewer than 16, it is over the whole image at a similar depth or, if there are still fewer than 16, at any depth. If
     between half and three quarters of the differences are zero, the depths are rounded to steps, and the median is over
     the other differences. The result is at least `min_noise`.
     """

@@ -49,10 +49,7 @@ def undistort_points(
 def pixels_of(
     plane_points: Float[AnyArray, "*n 2"], matrix: Float[AnyArray, "3 3"], coefficients: tuple[float, ...]
 ) -> tuple[Float[AnyArray, "*n"], Float[AnyArray, "*n"]]:
-    """Return the column and row at which a lens shows each point of the plane Z = 1.
-
-    - `matrix`: intrinsic matrix in pixels.
-    """
+    """Return the column and row at which a lens shows points of the plane Z = 1, by intrinsic `matrix`."""
     x, y = distort_points(plane_points[..., 0], plane_points[..., 1], coefficients)
     return x * matrix[0, 0] + matrix[0, 2], y * matrix[1, 1] + matrix[1, 2]
 
@@ -90,8 +87,7 @@ def undistort_image(
     Each new depth is interpolated linearly in 1 / depth between the four nearest pixels of the distorted image. If they
     are not on one surface, the new depth is that of the nearest. It is 0 outside the distorted image.
 
-    - `depth`: the distorted image, in which valid depths are positive and finite.
-    - `missed`: whether each ray of the distorted image met nothing.
+    - `depth`, `missed`: depths of the distorted image, positive and finite if valid, and whether its rays met nothing.
     - `plane_points`: positions of the new image's pixels in the plane Z = 1.
     - `matrix`: intrinsic matrix of both images.
     """

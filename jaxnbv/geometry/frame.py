@@ -60,9 +60,7 @@ class Frame(eqx.Module):
     @classmethod
     @checked
     def fit(cls, points: Float[AnyArray, "n 3"], longest_side: float = 2.5, up: str = "y") -> "Frame":
-        """Return the frame that centres the bounding box of points (world) and scales its longest side.
-
-        - `longest_side`: length of this side in the scene, in scene units.
+        """Return the frame that centres the bounding box of world points and scales it to `longest_side`.
 
         **Raises:** `ValueError` if there are no points, if all points coincide, or if a point is not finite.
         """

@@ -1,7 +1,4 @@
-"""Sampling of depth images with gaps between valid pixels, such as those of a lidar.
-
-An image that was aligned to a camera with more pixels has gaps too.
-"""
+"""Sampling of depth images with gaps between valid pixels: of a lidar, or aligned to a finer camera."""
 
 import jax.numpy as jnp
 import numpy as np

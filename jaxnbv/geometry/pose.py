@@ -62,8 +62,7 @@ class Pose(eqx.Module):
         - `convention`: "opencv" for cameras that look along +z with y down, or "opengl" (also used by Blender and NeRF)
           for cameras that look along -z with y up.
 
-        **Raises:** `ValueError` for an unknown convention, a last row other than (0, 0, 0, 1), or a pose that `Pose`
-        refuses.
+        **Raises:** `ValueError` for an unknown convention, a last row other than (0, 0, 0, 1), or an invalid pose.
         """
         axes = _axes(convention)
         matrices = as_floats(matrix, "the matrix of a pose")

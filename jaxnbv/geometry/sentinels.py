@@ -20,7 +20,6 @@ def sentinel_pixels(image: Real[np.ndarray, "h w"], max_depth: float) -> Bool[np
     far more pixels than any similar value. A value that all measured pixels have is not a sentinel, because the image
     may show a wall.
 
-    - `image`: depths in any units.
     - `max_depth`: the largest relevant depth, in the image's units. If it is infinite (unknown), a sentinel of the
       second kind must be more than twice any other value.
     """

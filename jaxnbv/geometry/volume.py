@@ -76,7 +76,7 @@ class Box(eqx.Module):
 
     @classmethod
     def cube(cls, side: float) -> "Box":
-        """Return the cube with sides of this length about the origin."""
+        """Return the cube that is centred at the origin and has sides of length `side`."""
         return cls((-0.5 * side,) * 3, (0.5 * side,) * 3)
 
     @takes_native
@@ -112,7 +112,7 @@ def ray_interval(
 def boundary_points(volume: Volume, count: int, level: float = 0.0) -> Float[Array, "count 3"]:
     """Return points where `count` evenly spread rays from the origin cross the boundary of a volume.
 
-    Bisection between the origin and a sphere beyond the scene finds one crossing on each ray, which may have several.
+    Bisection between the origin and a sphere beyond the scene finds one crossing per ray, even if there are more.
 
     - `level`: value of the volume's function at the returned points, in scene units; positive for points outside.
     """
