@@ -20,7 +20,7 @@ _load_name, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         problem = f"module {__name__!r} has no attribute {name!r}."
-        # With `obj=None`, Python does not append a suggestion of its own.
+        # `obj=None` stops Python from appending a suggestion of its own.
         raise AttributeError(f"{problem}{suggestion(name, __all__)}", name=name, obj=None)
     with explained_imports():
         return _load_name(name)

@@ -87,7 +87,7 @@ class Acquisition(eqx.Module):
         )
 
     def inputs(self, step: StepInputs) -> StepInputs:
-        """Return only the inputs that `context` reads. Steps whose inputs have equal shapes share one compilation."""
+        """Return only the inputs that `context` reads. Steps with inputs of equal shapes share a compilation."""
         if self.cloud_only:
             return inputs_of(step.observations.cloud)
         return StepInputs(step.observations, step.posterior if self.needs_posterior else None)
@@ -247,7 +247,7 @@ def inputs_of(observations: StepInputs | Observations | PointCloud) -> StepInput
 def context_of(acquisition: Acquisition, observations: StepInputs | Observations | PointCloud) -> Any:
     """Compute the acquisition's context for these observations, as a compiled program.
 
-    **Raises:** `ValueError` if JAX cannot trace a user's function, or if the acquisition lacks a posterior.
+    **Raises:** `ValueError` if JAX cannot trace a user's function, or if a posterior is needed but missing.
     """
     inputs = _inputs(acquisition, observations)
     with functions_of_users():
@@ -290,8 +290,8 @@ def expected_value(
     - `surfaces`: the samples along a leading axis.
     - `barrier`: distance along each ray to an obstacle, see `scan`.
 
-    **Raises:** `ValueError` if JAX cannot trace a user's function, if the acquisition lacks a posterior, or if
-    `Acquisition.check` raises it, which is called only if nothing is traced.
+    **Raises:** `ValueError` if JAX cannot trace a user's function, if a posterior is needed but missing, or if
+    `Acquisition.check` raises it. The check runs only if nothing is traced.
     """
     inputs = _inputs(acquisition, observations)
     # `check` needs concrete results. Under jit, results (and this zero) are traced even if all inputs are concrete.

@@ -70,7 +70,7 @@ def require(condition: bool | np.bool_, message: str) -> None:
 
 
 def is_traced(*trees) -> bool:
-    """Return whether any leaf of the trees is a tracer, which stands for a value inside a JAX transformation."""
+    """Return whether any leaf of the trees is a tracer, JAX's stand-in for a value under `jit` or `grad`."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
 
 
@@ -88,7 +88,7 @@ def check_fields(module: Any) -> None:
 def own_settings() -> Iterator[None]:
     """Context manager or decorator: allow rank promotion, type promotion and transfers in JAX.
 
-    A user who forbids these in `jax.config` means the user's own code. `jax_debug_nans` is not changed.
+    A user's strict settings in `jax.config` are meant for the user's own code. `jax_debug_nans` is not changed.
     """
     with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"), jax.transfer_guard("allow"):
         yield
@@ -166,7 +166,7 @@ def on_host(tree: Any) -> Any:
 
 
 def native(value: Any) -> Any:
-    """Convert a NumPy array to native byte order and at most double precision; return other values unchanged.
+    """Convert a NumPy array to native byte order and at most double precision; return others unchanged.
 
     JAX's `jit` reads an array of non-native byte order without swapping the bytes.
     """

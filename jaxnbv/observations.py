@@ -60,7 +60,7 @@ class Observations(eqx.Module):
         obstacle_nodes: Bool[Array, "g g g"] | None = None,
         camera: Camera = Camera(),
     ) -> "Observations":
-        """Return observations of a cloud, with room for `max_views` views. They have no view and no empty node yet.
+        """Return observations of a cloud, with no view yet but room for `max_views`, and with no empty node.
 
         - `camera`: the camera for whose rays `looks` stores lengths.
         """
@@ -99,7 +99,7 @@ class Observations(eqx.Module):
         - `carving`: the margin around rays within which nodes count as empty; None leaves `empty_nodes` unchanged.
         - `obstacles`: solids that may hide the object. A ray shows nothing behind them.
         """
-        # The program does not get the cloud, because it would be compiled again for each capacity of the cloud.
+        # The cloud is not an argument, because the program would be compiled again for each capacity of the cloud.
         fields = self.poses, self.looks, self.empty_nodes
         poses, looks, empty = _with_view(*fields, pose, scan, camera, carving, obstacles)
         return dataclasses.replace(self, poses=poses, looks=looks, empty_nodes=empty)

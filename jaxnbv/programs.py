@@ -110,7 +110,7 @@ class _Program:
         return self._compile(entry, static, tree, leaves)
 
     def _compile(self, entry: Path, static: Any, tree: Any, leaves: list) -> _Executable:
-        """Trace the function. Then load its program, if lowered code like this is stored, or else compile it.
+        """Trace the function, then load its program if this lowered code is already stored, or else compile it.
 
         - `entry`: path of the file for these arguments. It stores the name of the program's file.
         """
@@ -223,7 +223,7 @@ def _pickle(x: Any) -> bytes:
     """Pickle an object so that equal objects give equal bytes. **Raises:** `_ForeignCodeError`."""
     file = io.BytesIO()
     pickler = _Pickler(file)
-    # Turn off the memo. With it, two equal objects give other bytes than the same object twice.
+    # Turn off the memo. With it, two equal objects would give other bytes than the same object twice.
     pickler.fast = True
     try:
         pickler.dump(x)
@@ -233,10 +233,7 @@ def _pickle(x: Any) -> bytes:
 
 
 def _without_names(code: str) -> str:
-    """Replace the names of functions in lowered code by numbers, in order of appearance.
-
-    The names depend on what the process lowered before.
-    """
+    """Replace functions' names in lowered code by numbers. The names depend on what was lowered before."""
     numbers: dict[str, int] = {}
 
     def number(match: re.Match[str]) -> str:

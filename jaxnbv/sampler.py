@@ -214,7 +214,7 @@ class SurfaceSampler(eqx.Module):
     def carve(
         self, observations: Observations | PointCloud, values: Float[Array, "*s g g g"]
     ) -> Float[Array, "*s g g g"]:
-        """Make values positive where the object cannot be: at empty nodes, outside the volume and in obstacles.
+        """Make values positive where the object cannot be: empty nodes, obstacles, and outside the volume.
 
         - `values`: f minus its level at the grid's nodes.
 

@@ -95,7 +95,7 @@ class Utility(eqx.Module):
         return None
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> Answer | None:
-        """Return the correct answer for the true surface `scene`; None if `answer(cloud)` is the correct answer.
+        """Return the correct answer for the true surface `scene`; None if `answer(cloud)` is correct.
 
         - `cloud`: points on the whole surface.
         """

@@ -1,7 +1,7 @@
 """Files of networks: published PointNet++ checkpoints, and the files of jaxnbv's own networks.
 
-The file of an own network holds the network's arrays, keyed by attribute path, such as `pattern.pair.weight`. The
-metadata of the file hold the network's class and the arguments of its constructor.
+`save_checkpoint` stores a network's arrays, keyed by attribute path, such as `pattern.pair.weight`. The metadata of the
+file hold the network's class and the arguments of its constructor.
 """
 
 import functools

@@ -60,9 +60,7 @@ class CloudSegmenter(Segmenter):
     - `network`: called as `network(points, normals, category, mask)`. It returns log-probabilities of the fifty parts
       of ShapeNet-part.
     - `category`: name of the object's category, or its index in `CATEGORIES`.
-    - `num_points`: number of points that the network gets, selected by farthest point sampling. A smaller cloud is
-      padded with rows whose mask is False.
-    - `scale`: network units per scene unit.
+    - `num_points`, `scale`: see `CloudClassifier`.
 
     **Raises:** `ValueError` for an unknown category, if `num_points` or `scale` is not positive, or if the network
     classifies whole clouds.
@@ -110,10 +108,7 @@ class CloudSegmenter(Segmenter):
         return self._probabilities(farthest_point_subsample(cloud, self.num_points))
 
     def predict(self, cloud: PointCloud) -> tuple[PointCloud, Int[Array, " num_points"]]:
-        """Return the points that the network gets, in scene coordinates, and the most probable part of each.
-
-        The part is -1 in rows whose mask is False.
-        """
+        """Return the points that the network gets and the most probable part of each (-1 in masked rows)."""
         inputs = farthest_point_subsample(cloud, self.num_points)
         labels = jnp.argmax(self._probabilities(inputs), axis=-1).astype(jnp.int32)
         return inputs, jnp.where(inputs.mask, labels, -1)

@@ -72,7 +72,6 @@ class SetAbstraction(eqx.Module):
 
     - `branches`, `radii`: perceptrons, and radii of their balls in units of the points.
     - `members`: number of points in a group, for each radius.
-    - `centers`: number of centres.
     """
 
     branches: tuple[PooledMLP, ...]
@@ -177,7 +176,7 @@ def _bit_count(words):
 def interpolate(
     points: Float[Array, "n 3"], coarse: Float[Array, "m 3"], features: Float[Array, "m f"]
 ) -> Float[Array, "n f"]:
-    """Interpolate features at each point from the three nearest coarse points, or from all if there are fewer.
+    """Interpolate features at each point from its three nearest coarse points, or all if there are fewer.
 
     Weights are inverse squared distances. The result is differentiable in all arguments. The derivative ignores that
     the nearest points may change.

@@ -24,7 +24,7 @@ import numpy as np
 from jaxnbv.checks import InputError, require
 from jaxnbv.networks.pickle_bounds import skip_pickle
 
-# Values are names of types instead of types, because a pickle could modify a type, but cannot modify a string.
+# Values are names of types, because a pickle could modify a type, but cannot modify a string.
 _TYPES = {
     "DoubleStorage": "float64",
     "FloatStorage": "float32",

@@ -39,7 +39,7 @@ _ASK_UNIT = (
 
 
 class _StoredRecording(NamedTuple):
-    """Image files of a recording, camera-to-world matrices, and intrinsics and length unit if they are stored."""
+    """Image files of a recording, camera-to-world matrices, and intrinsics and length unit if stored."""
 
     files: list[Path]
     matrices: Float[np.ndarray, "n 4 4"]

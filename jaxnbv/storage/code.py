@@ -76,10 +76,7 @@ class _Plain:
 
 
 def is_plain(obj: Any) -> bool:
-    """Return whether the whole state of an object is in its `__dict__`.
-
-    The state of other objects is also in slots or in memory of a C library.
-    """
+    """Return whether the whole state of an object is in its `__dict__`, not in slots or a C library."""
     kind = type(obj)
     has_slots = any(isinstance(member, MemberDescriptorType) for base in kind.__mro__ for member in vars(base).values())
     is_python_class = bool(kind.__flags__ & _HEAP_TYPE) and kind.__basicsize__ == _Plain.__basicsize__

@@ -45,7 +45,7 @@ def versions() -> dict[str, Any]:
 
 
 def differences(stored: Any, current: Any, name: str = "") -> list[str]:
-    """Return one text for each entry that differs between two descriptions. It begins with the entry's path."""
+    """Return a text for each entry that differs between two descriptions. It begins with the entry's path."""
     if isinstance(stored, dict) and isinstance(current, dict):
         keys = list(dict.fromkeys([*stored, *current]))
         nested = (differences(stored.get(key), current.get(key), f"{name}.{key}".lstrip(".")) for key in keys)

@@ -48,8 +48,6 @@ _MODULES = {
 class RunFolder(ResultFolder):
     """The folder of an episode or a session: a record of the configuration, and numbered files of arrays.
 
-    Each file has a checksum, which is checked when the file is read.
-
     - `kind`: "episode" or "session".
     - `config`: parts of the configuration, keyed by name. The record has their descriptions, see `describe`.
 
@@ -108,7 +106,7 @@ class RunFolder(ResultFolder):
     def read(self, name: str, index: int) -> dict[str, Any]:
         """Read the parts in a file, keyed by name. Parts that were None are absent.
 
-        **Raises:** `ValueError` if the file is damaged, or if the index stored in it differs from `index`.
+        **Raises:** `ValueError` if the file is damaged, or if the checksum or index stored in it is wrong.
         """
 
         def check(arrays: dict[str, np.ndarray]) -> None:

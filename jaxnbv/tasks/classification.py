@@ -90,8 +90,7 @@ def cross_entropy(
 class ClassAcquisition(Acquisition):
     """Base class of acquisitions that compare a classifier's results before and after a simulated scan.
 
-    - `classifier`: a `Classifier`, or a function from a cloud to log-probabilities.
-    - `num_points`: number of points to which D is thinned by farthest point sampling, once for each proposal.
+    - `classifier`, `num_points`: see `CrossEntropy`.
     """
 
     cloud_only: ClassVar[bool] = True
@@ -111,7 +110,7 @@ class ClassAcquisition(Acquisition):
         """Return the value of a scan in nats, from the log-probabilities before and after the scan is added."""
 
     def score(self, context: Context, view: ImaginedView) -> Float[Array, "*values"]:
-        """Return the result of `compare` for the cloud without and with the scan. It is zero for an empty scan."""
+        """Return the result of `compare` for the cloud without and with the scan, or zero for an empty scan."""
         cloud, log_p = context
         return zero_if_empty(view.scan, self.compare(log_p, self._log_p(concatenate(cloud, view.scan))))
 

@@ -100,7 +100,7 @@ class Temperature(NamedTuple):
     reached: Bool[np.ndarray, " n"]
 
     def coldest(self, reached_only: bool) -> int | None:
-        """Return the first index of the coldest of all points or only `reached` points; None if there are none."""
+        """Return the index of the coldest point, or of the coldest `reached` point; None without a point."""
         candidates = np.flatnonzero(self.reached) if reached_only else np.arange(len(self.values))
         return int(candidates[np.argmin(self.values[candidates])]) if len(candidates) else None
 

@@ -1,4 +1,4 @@
-"""Heat diffusion: where is a body coldest that is heated near one point?"""
+"""Heat diffusion: which point of a body is coldest if the body is heated in one place?"""
 
 import math
 import multiprocessing

@@ -172,7 +172,7 @@ def _information(images: _Image, context: ImaginedParts, camera: Camera) -> Floa
 
 
 def _misfits(image: _Image, others: _Image, tau: Float[Array, ""]) -> Float[Array, "h rays"]:
-    """Return, for each ray, the misfit between the image of one hypothesis and the images of all hypotheses.
+    """Return each ray's misfit between the image of one hypothesis and the images of all hypotheses.
 
     The misfit grows with the distance between the two surfaces along the ray. It is at most `MAX_MISFIT`, and equal to
     it if the ray hits only one of the surfaces.
