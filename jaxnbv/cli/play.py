@@ -43,7 +43,7 @@ from jaxnbv.viz.task import rival_text
 
 
 class Sizes(NamedTuple):
-    """Sizes of a planner. A size of None is replaced by that of the task.
+    """Sizes of a planner. The task decides a size that is None.
 
     - `capacity`: number of points to keep in the cloud.
     - `rays`: number of rays along each side of an image.
@@ -63,7 +63,7 @@ _MAX_RIVAL_VIEWS = 10
 
 
 def stop_rule_of(texts: Sequence[str]) -> StopRule | None:
-    """Return a rule that holds once any rule such as "sure=0.95" holds. None for no rules or "never".
+    """Return a rule that holds once any of `texts`, such as "sure=0.95", holds. None for "never".
 
     **Raises:** `ValueError` if a name is unknown, or if a value is not a number or out of range.
     """
@@ -81,7 +81,7 @@ def stop_rule_of(texts: Sequence[str]) -> StopRule | None:
 
 
 def search_of(name: str, radius: float, count: int) -> Search:
-    """Make the search with this name, one of `SEARCHES`, over `count` candidates at distance `radius`."""
+    """Make the search `name` of `SEARCHES`, over `count` candidates at distance `radius` from the origin."""
     candidates = SphereCandidates(count, radius)
     if name == "tie-break":
         return TieBreakSearch(candidates, second=Coverage())

@@ -86,7 +86,7 @@ def run_study(name: str, options: StudyOptions, **settings: Any) -> None:
 
 
 def _executor(options: StudyOptions) -> AbstractContextManager[Executor | None]:
-    """Return a context manager of the executor that runs the scenes, or of None to run them in this process."""
+    """Return a context manager that gives the executor for the scenes, or None to run them in this process."""
     require(
         options.cluster is None or options.workers == 1,
         f"--workers {options.workers} and --cluster {options.cluster} exclude each other: leave one out",

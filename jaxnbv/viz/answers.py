@@ -160,7 +160,7 @@ class _IdentityWords(_ClassWords):
         return super().settled(answers, lambda _, index: bool(answers[index].values.max() >= self.min_probability))
 
     def charts(self, answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...]:
-        """Return a chart of the at most six parts that had the highest probabilities after any of the views."""
+        """Return a chart of at most six parts, which had the highest probabilities after any of the views."""
         values = _rows(answers)
         rows = np.sort(np.argsort(-values.max(axis=0), kind="stable")[:_MAX_PARTS])
         names = tuple(self.answer.names[index] for index in rows)

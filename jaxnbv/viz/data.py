@@ -35,7 +35,7 @@ class ViewData(eqx.Module):
 
     - `view`: the view, with the values of its proposal in world units.
     - `before`, `new`: points of the cloud before the view, and points of the view's scan, in scene coordinates.
-    - `surface`: see `shown_surface`; but its deviation is in world units. `has_shape`: whether it is a known shape.
+    - `surface`: see `shown_surface`, but its deviation is in world units. `has_shape`: whether it is a known shape.
     - `coverage`: amount of surface seen after the view.
     - `sentences`, `imagined`, `image`: see `sentences_about`, `render_imagined` and `view_image`.
     """

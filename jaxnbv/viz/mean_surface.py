@@ -103,7 +103,7 @@ def near_points(surface: MeanSurface | None, cloud: PointCloud) -> MeanSurface |
     """Return the connected pieces of a surface that are near points of the cloud; None if there are none.
 
     The deviation becomes sqrt(sd^2 + (r / 4)^2), where sd is the surface's deviation and r the distance to the nearest
-    point of the cloud, because sd is too small where no ray has hit.
+    point of the cloud. Without the second term, it would be too small where no ray has hit.
     """
     if surface is None:
         return None

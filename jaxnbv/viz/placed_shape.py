@@ -86,7 +86,7 @@ def placed_parts(hypotheses: PartHypotheses, count: int) -> list[PlacedShape]:
 def likeliest_part(hypotheses: PartHypotheses, cloud: PointCloud | None = None) -> PlacedShape | None:
     """Return the likeliest part at its placement; None if "none of these" is more likely.
 
-    Without a cloud of scanned points, the part counts as measured and agreed everywhere.
+    Without a cloud of scanned points, its `measured` and `agreed` are 1 everywhere.
     """
     if next(iter(hypotheses.names())) == NONE:
         return None
@@ -221,7 +221,7 @@ def _measured_weight(surface: MeanSurface, cloud: PointCloud) -> Float[np.ndarra
 
 
 def _pieces(values: Float[np.ndarray, "g g g"], grid: Grid, min_area: float) -> MeanSurface | None:
-    """Return the pieces of the zero set of grid values with at least this area; None if there are none."""
+    """Return the surface where grid values are zero, without pieces smaller than `min_area`; None if empty."""
     triangles = level_triangles(values, grid)
     if triangles is None:
         return None

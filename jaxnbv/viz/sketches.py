@@ -30,7 +30,7 @@ class Sketch(NamedTuple):
 class Sketches:
     """Sketches of a running episode. Pass `add` to `simulate(each=...)`, and the object to `write_report`.
 
-    - `episode`: the episode without views.
+    - `episode`: the episode so far, at first without views.
     - `held`: sketches keyed by the index of the view, from 0. The first view and views from a file have no sketch.
     """
 

@@ -120,7 +120,7 @@ def coverage_answers(
 
     Given points of the true surface (`truth`), this is the percentage of these points that was seen. Otherwise it is
     the total new area in the scans, in squared world units. The acquisition if it is a `NewSurface`, or else
-    `NewSurface()`, defines what is new. In a pixel's area, the cosine of incidence is at least 0.2, not 0.5 as there.
+    `NewSurface()`, defines what is new, but the cosine in a pixel's area is clipped to at least 0.2 instead of 0.5.
     """
     views, acquisition = episode.views, episode.planner.acquisition
     if truth is not None:

@@ -33,7 +33,7 @@ class ClassTask(Task):
     def demo(cls, scene: int, seed: int) -> Subject:
         """Return a truck whose cargo is the question, and a first view from above that hides the cargo.
 
-        The grid of the imagined surfaces is that of the classifier's training.
+        Surfaces are imagined on the same grid as in the classifier's training.
         """
         import jax
         import numpy as np
