@@ -61,7 +61,7 @@ on_grid_of_torus = _on_torus(lambda axis: axis.ndim == 1, "the nodes along one a
 
 
 def sampling_method(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Decorator: check the random key and the number of samples. **Raises:** `ValueError` for others."""
+    """Decorator: check the random key and number of samples. **Raises:** `ValueError` if one is wrong."""
 
     @functools.wraps(method)
     def call(self: Any, key: PRNGKeyArray, num_samples: int) -> Any:
@@ -83,14 +83,11 @@ class Fields(eqx.Module):
 
     @on_torus
     def gradient(self, x: Float[AnyArray, "n 3"]) -> Float[Array, "s n 3"]:
-        """Return the gradients of all samples at the points x (scene coordinates).
-
-        The default differentiates the values in forward mode.
-        """
+        """Return the gradients of all samples at the points x (scene coordinates)."""
         x = jnp.asarray(x)
 
         def derivative(direction):
-            # The value at a point depends on this point alone, so one sweep differentiates at all points.
+            # The value at a point depends on this point alone. So one `jvp` gives a derivative at all points.
             return jax.jvp(self, (x,), (jnp.broadcast_to(direction, x.shape),))[1]
 
         return jnp.moveaxis(jax.vmap(derivative)(jnp.eye(3, dtype=x.dtype)), 0, -1)
@@ -105,7 +102,7 @@ class SurfacePosterior(eqx.Module):
     """The posterior p(f | D). The surface is where f equals `level`, and f is greater outside.
 
     A subclass defines `level` and `sample`, and overrides `mean`, `variance` and `probability_inside` if it has closed
-    forms. By default they are estimated from 64 samples, drawn with a fixed key and evaluated at all points.
+    forms. By default, these three are estimated from 64 samples, which are drawn with a fixed key.
     """
 
     level: eqx.AbstractVar[Float[Array, ""]]
@@ -120,11 +117,11 @@ class SurfacePosterior(eqx.Module):
         return type(self).mean is not SurfacePosterior.mean
 
     def kinds(self) -> dict[str, float]:
-        """Return the probability of each kind of known shape ("chair"), most likely first; {} without any."""
+        """Return the probability of each kind of known shape ("chair"), most likely first. Empty by default."""
         return {}
 
     def names_of_samples(self, key: PRNGKeyArray, num_samples: int) -> list[str]:
-        """Return the known shape's name, or "", of each sample that `sample` draws with this key."""
+        """Return, for each sample that `sample` draws with this key, the name of its known shape or ""."""
         return [""] * num_samples
 
     def mean(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
@@ -158,19 +155,19 @@ class SurfaceModel(eqx.Module):
     def condition(self, observations: Observations | PointCloud) -> SurfacePosterior:
         """Return the posterior p(f | observations).
 
-        All models use the filled rows of the cloud, some also the space that was seen to be empty. Implementations
-        convert a `PointCloud` with `as_observations`.
+        All models use the filled rows of the cloud. Some models also use the space that was seen to be empty.
+        Implementations convert a `PointCloud` with `as_observations`.
         """
 
     def add_state(self, observations: Observations) -> Observations:
-        """Return the observations with the state that the model carries from view to view (by default none).
+        """Return the observations with the state that the model carries from view to view, by default none.
 
         The loop calls this method after each view.
         """
         return observations
 
     def in_scene(self, frame: Frame) -> "SurfaceModel":
-        """Return a copy with the sizes of known parts, if any, converted from a frame's world to scene units."""
+        """Return a copy in which sizes of known parts, if any, are converted from world to scene units."""
         return self
 
     @property
@@ -179,5 +176,5 @@ class SurfaceModel(eqx.Module):
         return False
 
     def check(self, cloud: PointCloud) -> None:
-        """Warn if a cloud, whose values must not be traced, does not suit the model."""
+        """Warn if a cloud does not suit the model. Do not call this under `jit`, because it reads values."""
         return

@@ -4,13 +4,13 @@
     cov(f(x), v_d(y))   = sum_n s(n) n_d / |n|^2 sin(n.(x - y))
     cov(f(x), f(y))     = sum_n s(n) / |n|^2 cos(n.(x - y)),   n != 0
 
-The sums are over integer frequency vectors n with components from -L to L, and d is a component of v. The spectrum s(n)
-is a product over the axes. The prior may be a sum of such spectra, one for each lengthscale. Each covariance is then a
-sum over these spectra.
+The sums are over integer frequency vectors n with components from -L to L, and v_d is component d of v. The spectrum
+s(n) is a product over the axes, s1(n_1) s1(n_2) s1(n_3). A prior with several lengthscales has one spectrum for each,
+and its covariances are sums over the spectra.
 
-For one spectrum, the first covariance is a product over the axes. The other two are short sums of such products, since
-1 / r = int exp(-r e^u) e^u du with r = |n|^2 is nearly a short sum of exponentials of r (Beylkin and Monzon 2010). This
-avoids an array over the (2 L + 1)^3 frequencies.
+For one spectrum, the first covariance is a product over the axes. The other two are nearly short sums of such products,
+because 1 / r = int exp(-r e^u) e^u du, with r = |n|^2, is nearly a short sum of exponentials of r (Beylkin and Monzon
+2010). So no array over the (2 L + 1)^3 frequencies is needed.
 """
 
 import functools
@@ -35,8 +35,8 @@ def circle_spectrum(nu: float, lengthscale: Scalar, variance: Scalar, truncation
     s1(n) = variance w(n) / sum_{m in Z} w(m),   w(n) = (2 nu / ell^2 + 4 pi^2 n^2)^-(nu + 1/2)
 
     The function sum_{n in Z} s1(n) cos(n t) is the Matern kernel on the circle, with value `variance` at t = 0
-    (Borovitskiy et al. 2020). The sum over m has a closed form and includes all integers. Truncation therefore removes
-    the variance of frequencies above L from the kernel, and does not move it to lower frequencies.
+    (Borovitskiy et al. 2020). The sum over m includes all integers, and has a closed form. So truncation removes the
+    variance of frequencies above L from the kernel, and does not move it to lower frequencies.
 
     - `nu`: smoothness, one of 1/2, 3/2, 5/2.
     - `lengthscale`: ell, in units of the circumference.
@@ -64,7 +64,7 @@ def _lattice_sum(nu: float, a: Float[Array, ""]) -> Float[Array, ""]:
 
 
 def normal_covariance(x: Float[Array, "n 3"], y: Float[Array, "m 3"], spectrum: Spectra) -> Float[Array, "n m"]:
-    """Return the prior covariance of each component of the normal field. The components are independent."""
+    """Return the prior cov(v_d(x), v_d(y)), the same for each of the independent components d of v."""
     return _sum_scales(lambda single: _normal_covariance(x, y, single), spectrum)
 
 
@@ -107,7 +107,7 @@ def function_variance(spectrum: Spectra) -> Float[Array, ""]:
 
 
 def mode_variance(spectrum: Spectra) -> Float[Array, "a a a"]:
-    """Return prior variances of the trigonometric coefficients of each component of the normal field."""
+    """Return the prior variance of each trigonometric coefficient of a component of the normal field."""
 
     def of_one(spectrum):
         variance = basis_variance(spectrum)
@@ -136,9 +136,9 @@ def _sine_sum(x: Float[Array, " n"], y: Float[Array, " m"], spectrum: Spectrum) 
 
 
 def _inverse_square_sum(products, spectrum: Spectrum):
-    """Return the sum that `products` computes over frequency vectors n, but with term n divided by |n|^2.
+    """Return the sum over frequency vectors n that `products` computes, with each term divided by |n|^2.
 
-    - `products`: maps a spectrum s1 to the undivided sum. Its term n is proportional to s1(n_1) s1(n_2) s1(n_3).
+    - `products`: maps s1 to the undivided sum, whose term n is proportional to s1(n_1) s1(n_2) s1(n_3), or 0 if n = 0.
     """
     frequency = jnp.arange(spectrum.shape[0], dtype=spectrum.dtype)
 
@@ -153,11 +153,11 @@ def _inverse_square_sum(products, spectrum: Spectrum):
 
 
 def _inverse_quadrature(spectrum: Spectrum) -> tuple[np.ndarray, np.ndarray]:
-    """Return rates t_q and weights w_q with 1 / r = sum_q w_q exp(-t_q r) for 1 <= r <= 3 L^2.
+    """Return rates t_q and weights w_q for which sum_q w_q exp(-t_q r) is nearly 1 / r if 1 <= r <= 3 L^2.
 
-    Here L is the largest frequency of the spectrum. The rates are spaced as in the trapezoidal rule. The weights are a
-    least-squares fit, which needs fewer rates at both ends than the rule. The relative error is at most 100 times the
-    precision of the spectrum's dtype.
+    Here L is the largest frequency of the spectrum. The logarithms of the rates are evenly spaced, as in the
+    trapezoidal rule. The weights are fitted by least squares, because the weights of the trapezoidal rule would need
+    more rates at both ends. The relative error is at most 100 times the precision of the spectrum's dtype.
     """
     tolerance = 10 * float(jnp.finfo(spectrum.dtype).eps)
     largest = 3.0 * (spectrum.shape[0] - 1) ** 2
@@ -165,6 +165,6 @@ def _inverse_quadrature(spectrum: Spectrum) -> tuple[np.ndarray, np.ndarray]:
     count = math.ceil((high - low) * math.log(10.0 / tolerance) / math.pi**2) + 1
     rate = np.exp(np.linspace(low, high, count))
     r = largest ** (0.5 + 0.5 * np.cos(np.linspace(0.0, math.pi, 8 * count)))
-    # `np.linalg.lstsq` drops small singular values, and would lose half of float64's digits.
+    # `np.linalg.lstsq` would drop small singular values, and so lose half of the digits of float64.
     q, upper = np.linalg.qr(r[:, None] * np.exp(-np.outer(r, rate)))
     return rate, np.linalg.solve(upper, q.sum(axis=0))

@@ -11,15 +11,15 @@ Rows = Float[Array, "n *columns"]
 class CholeskyFactor(eqx.Module):
     """The Cholesky factor of a covariance A: the lower triangular C with A = C C^T.
 
-    - `upper`: C^T. C^T in row-major order is C in column-major order, which LAPACK requires. A row-major C would have
-      to be transposed first, which takes ten times as long as a solve.
+    - `upper`: C^T. LAPACK requires C in column-major order, which is C^T in row-major order. A row-major C would have
+      to be transposed before each solve, which takes ten times as long as the solve.
     """
 
     upper: Float[Array, "n n"]
 
     @classmethod
     def of(cls, matrix: Float[Array, "n n"]) -> "CholeskyFactor":
-        """Factorise A, of which one triangle is read. The factor is not finite unless A is positive definite."""
+        """Factorise A, reading its upper triangle. The factor is not finite unless A is positive definite."""
         return cls(jnp.linalg.cholesky(matrix.T, symmetrize_input=False).T)
 
     def leading(self, size: int) -> "CholeskyFactor":

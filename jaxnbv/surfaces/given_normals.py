@@ -5,7 +5,7 @@
     sample   Poisson(v + k(., X) A^-1 (n - v(X) - eps)), v and eps from the prior
 
 X are the points of D, n their normals, v the normal field with prior covariance k, and eps the noise of the normals.
-`jaxnbv.surfaces.spsr` defines the prior.
+`jaxnbv.surfaces.spsr` defines the prior and Poisson.
 """
 
 from typing import NamedTuple
@@ -38,8 +38,8 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
     - `level`: mean of E f(x_j) over the points x_j of D.
     - `mean_coefficients`: coefficients of E f, see `surfaces/trigonometric.py`.
     - `weights`: A^-1 n, where n are the observed normals and A is their covariance.
-    - `solver`: applies A^-1, and has the cloud, spectrum and noise that define A. For more than 16,384 points it uses
-      conjugate gradients, and `covariance` and `log_marginal_likelihood` are not available.
+    - `solver`: applies A^-1, and has the cloud, spectrum and noise that define A. For a capacity above 16,384 points it
+      uses conjugate gradients, and then `covariance` and `log_marginal_likelihood` raise `ValueError`.
     """
 
     level: Float[Array, ""]
@@ -72,7 +72,7 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
     @on_torus
     @program
     def covariance(self, x: Float[AnyArray, "n 3"], y: Float[AnyArray, "m 3"]) -> Float[Array, "n m"]:
-        """Return Cov(f(x), f(y)) between points in scene coordinates, computed in one batch."""
+        """Return Cov(f(x), f(y)) between points in scene coordinates. All points are processed at once."""
         x, y = (jnp.asarray(points, dtype=self.weights.dtype) for points in (x, y))
         explained = jnp.einsum("djn,djm->nm", *map(self.solver.whitened_cross, (x, y)), precision="highest")
         return function_covariance(x, y, self.spectrum) - explained
@@ -84,7 +84,7 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
         return -0.5 * (fit + 3.0 * self.solver.factor.log_determinant + 3.0 * count * jnp.log(2.0 * jnp.pi))
 
     def data_points(self) -> DataPoints:
-        """Return the cloud's points, where both gradients and values of mean functions are needed."""
+        """Return the cloud's points twice. Mean functions need gradients and values at all of them."""
         points = fill_rows(self.cloud.points, self.cloud.mask)
         return DataPoints(points, points)
 
@@ -123,13 +123,13 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
         return jnp.where(self.cloud.mask[:, None], self.cloud.normals - means.gradients - draws.noisy_normals, 0.0)
 
     def whitened_residual(self, draws: NormalDraws, means: MeansAtData) -> Float[Array, "s n 3"]:
-        """Return C^-1 times the normals minus the means' gradients and the draws, with A = C C^T."""
+        """Return C^-1 (n - grad m(X) - v(X) - eps) for each sample, where A = C C^T."""
         return self.solver.whiten(self._residual(draws, means))
 
     def update_draws(
         self, coefficients: Float[Array, "s 3 a a a"], residual: Float[Array, "s n 3"]
     ) -> Float[Array, "s a a a"]:
-        """Return the coefficients of Poisson(v + k(., X) C^-T z), given those of v, and the residual z."""
+        """Return the coefficients of Poisson(v + k(., X) C^-T z) for normal fields v and whitened residuals z."""
         return self._reconstruct_samples(coefficients, self.solver.unwhiten(residual))
 
     def _reconstruct_samples(
@@ -147,7 +147,7 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
 @program
 def condition_on_normals(cloud: PointCloud, spectrum: Spectra, noise: Scalar) -> GeometricSPSRPosterior:
     """Return the posterior p(f | D), with a solver that suits the cloud's capacity."""
-    # Unfilled rows may hold NaN, and become zero so that NaN does not spread through products.
+    # Unfilled rows may hold NaN. Set them to zero, because NaN would spread through products.
     points, normals = (jnp.where(cloud.mask[:, None], rows, 0.0) for rows in (cloud.points, cloud.normals))
     cloud = PointCloud(points, normals, cloud.mask)
     solver = solver_of(cloud, spectrum, noise)
@@ -168,7 +168,7 @@ def reconstruct(
 def mean_at_data(
     transform: NonuniformTransform, coefficients: Float[Array, "a a a"], cloud: PointCloud
 ) -> Float[Array, ""]:
-    """Average the function with these coefficients over a cloud, which has the points of the transform."""
+    """Return a function's mean over the points of a cloud, which must be the points of the transform."""
     values = transform.evaluate(coefficients[None])[:, 0]
     return jnp.sum(jnp.where(cloud.mask, values, 0.0)) / jnp.sum(cloud.mask)
 

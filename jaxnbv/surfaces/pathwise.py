@@ -1,15 +1,15 @@
 """Gaussian posteriors over band-limited functions: closed forms, and samples by pathwise conditioning.
 
 A sample is a draw of the prior plus a correction at the data (Matheron's rule; Wilson et al. 2020). The data are
-normals n_j at points x_j and values z_k of f at points y_k. Samples can have mean functions m_1, ..., m_S in place of
-zero. The prior is then f_s = m_s + g, with g of mean zero:
+normals n_j at points x_j and values z_k of f at points y_k. The prior mean may be zero, or a function m_s for each
+sample s = 1, ..., S. Then f_s = m_s + g, with g of prior mean zero:
 
     data     g is conditioned on n_j - grad m_s(x_j) and z_k - m_s(y_k), in place of n_j and z_k
-    scale    the draws of the prior and of the noise are multiplied by the noise scale rho_s. The posterior mean stays
-             the same, and the posterior covariance is multiplied by rho_s^2
+    scale    the draws of g and of the noise are multiplied by the noise scale rho_s. This keeps the posterior mean,
+             and multiplies the posterior covariance by rho_s^2
     sample   f_s = m_s + g_s, where g_s is a sample of g
 
-The covariances do not depend on m_s. So all mean functions share one factorisation, and each adds a right-hand side.
+The covariances do not depend on m_s. So all samples share one factorisation, and each m_s adds one right-hand side.
 """
 
 from abc import abstractmethod
@@ -36,10 +36,10 @@ class MeansAtData(NamedTuple):
 
 
 class DataPoints(NamedTuple):
-    """The data points where `sample_about` evaluates the mean functions of the samples.
+    """The points at which `sample_about` evaluates mean functions.
 
-    - `gradient_points`: points of the observed normals, from which gradients are subtracted.
-    - `value_points`: points where values are used, for observed values of f or for the level.
+    - `gradient_points`: where it needs gradients, the points of the observed normals.
+    - `value_points`: where it needs values, for the observed values of f or for the level.
     """
 
     gradient_points: Float[Array, "n 3"]
@@ -110,11 +110,11 @@ class TrigonometricPosterior(SurfacePosterior):
 
         g_s is a sample of the posterior given the observed normals minus grad m_s, and the observed values minus m_s.
         If all mean functions are zero, the result equals that of `sample` with this key. The surface of a sample is
-        where its returned field equals `posterior.level`.
+        where its field equals `level`.
 
         - `means`: the mean functions m_s, which must be differentiable once.
-        - `noise_scale`: factor on the standard deviation of the samples about the posterior mean, a single number or
-          one for each mean function. With 0, each sample is the posterior mean about m_s.
+        - `noise_scale`: factor on the deviation of samples from the posterior mean, one number or one for each mean
+          function. With 0, each sample is the posterior mean for its m_s.
 
         **Raises:** `ValueError` for means that are not `Fields`, a noise scale that is negative or not finite, a number
         of noise scales that differs from the number of mean functions, or means that are not finite at the data.
@@ -148,11 +148,11 @@ class TrigonometricPosterior(SurfacePosterior):
 
     @abstractmethod
     def data_points(self) -> DataPoints:
-        """Return the data points where `sample_about` needs gradients and values of mean functions."""
+        """Return the points at which `sample_about` needs gradients and values of mean functions."""
 
     @abstractmethod
     def level_shift(self, means: MeansAtData) -> Float[Array, " s"]:
-        """Return, for each mean function, the level of samples about it minus the level about zero."""
+        """Return, for each mean function, the level of samples about it minus `level`."""
 
     @abstractmethod
     def prior_draws(self, key: PRNGKeyArray, num_samples: int) -> Any:
@@ -162,7 +162,7 @@ class TrigonometricPosterior(SurfacePosterior):
     def condition_draws(self, draws: Any, means: MeansAtData) -> Float[Array, "s a a a"]:
         """Condition the draws on the data minus the means, and return the coefficients of the samples.
 
-        They are jointly linear in the draws, the data and the means, and do not include the means themselves.
+        The coefficients are those of g_s, without m_s. They are jointly linear in the draws, the data and the means.
         """
 
 
@@ -177,7 +177,7 @@ def fill_rows(points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Float[Arr
     """Return the points with the first filled row copied into all unfilled rows.
 
     Unfilled rows hold the origin, where a mean function may have no gradient. Derivatives would then not be finite,
-    although the rows are masked.
+    although these rows are masked.
     """
     return jnp.where(mask[:, None], points, points[jnp.argmax(mask)])
 

@@ -1,10 +1,10 @@
-"""Stochastic Poisson surface reconstruction from normals and values, screened and enveloped.
+"""Stochastic Poisson surface reconstruction from normals and from observed values of f.
 
 This is a second step of Bayes' rule after `GeometricSPSR`, whose posterior given the normals has mean m and
 covariance k:
 
     level    c ~ N(0, tau^2), broad and independent of f;   g = f - c, and the surface is where g = 0
-    data     g(y_j) = h value_j + e_j,   e_j ~ N(0, h^2 noise_j^2),   j = 1, ..., M
+    data     h value_j = g(y_j) + e_j,   e_j ~ N(0, h^2 noise_j^2),   j = 1, ..., M
     factor   S = k(Y, Y) + tau^2 11^T + Sigma,   k(Y, Y) = K_ff - sum_d K_fd A^-1 K_df
     mean     E g(x) = m(x) + (k(x, Y) + tau^2 1^T) w,   w = S^-1 (h value - m(Y))
     sample   f a sample given the normals, c and e from the prior;   w = S^-1 (h value - f(Y) + c - e)
@@ -13,9 +13,9 @@ Here h is half the rise of E f across the scanned surface (see `ScreenedSPSR.off
 vector of ones, and Sigma is the covariance of e. K_ff is the prior covariance of f(Y), K_df the covariance of component
 d of the normals with f(Y), and A the covariance of the normals.
 
-The values change f by k(., Y) w. This is the sum of two changes: u_d = -A^-1 K_df w is added to the weights of the
-normals, and s(n) / |n|^2 sum_j w_j e^{-i n.y_j} to the coefficients of f. The level c changes by -tau^2 1^T w. The
-three components of the normal field still share A.
+The values change f by k(., Y) w, which is the sum of two changes. The weights of the normals change by
+u_d = -A^-1 K_df w, and the coefficients of f change by s(n) / |n|^2 sum_j w_j e^{-i n.y_j}. The level c changes by
+-tau^2 1^T w. The three components of the normal field still share A.
 """
 
 import math
@@ -49,14 +49,14 @@ class ScreenedSPSR(SurfaceModel):
 
     The defaults were the best over validation objects in `benchmarks/imagination.py`.
 
-    - `base`: the prior, and the noise of the normals. The default has a short lengthscale for detail, and a long one
-      for the overall shape, which lets values affect f far from their points.
+    - `base`: the prior, and the noise of the normals. The default has a short lengthscale for detail, and a long
+      lengthscale for the overall shape, so that values affect f far from their points.
     - `values`: sources of values, see `jaxnbv.surfaces.values`.
     - `level_deviation`: prior standard deviation of the level, which is broad compared with the values of f.
     - `offset`: distance from the surface, in scene units, at which the unit h of values is measured. The rise at a
-      point x_j is the value outside minus the value inside, E f(x_j + offset n_j) - E f(x_j - offset n_j), given the
-      normals alone. h is half the median rise. On a thin sheet the two sides cancel and the rise is near zero, so h is
-      at least half the prior standard deviation of f.
+      point x_j is E f(x_j + offset n_j) - E f(x_j - offset n_j), outside minus inside, given the normals alone. h is
+      half the median rise. On a thin sheet the two sides cancel and the rise is near zero, so h is at least half the
+      prior standard deviation of f.
 
     N normals and M values take 3 N^2 M + M^3 operations in addition to the cost of `base`.
 
@@ -112,7 +112,7 @@ class ScreenedSPSR(SurfaceModel):
 def _condition(
     model: ScreenedSPSR, base: GeometricSPSRPosterior, observations: Observations
 ) -> "ScreenedSPSRPosterior":
-    # `base.cloud` has zeros in unfilled rows, where the cloud may hold NaN.
+    # Use `base.cloud`, which has zeros in unfilled rows, where `observations.cloud` may hold NaN.
     observations = eqx.tree_at(lambda e: e.cloud, observations, base.cloud)
     spectrum, rows = model.base.spectrum, concatenate_rows(model.values, observations)
     value_unit = _value_unit(base, model.offset)
@@ -121,10 +121,10 @@ def _condition(
     level_variance = model.level_deviation**2
     covariance = function_covariance(rows.points, rows.points, spectrum) - explained + level_variance
     covariances = jnp.where(rows.mask[:, None] & rows.mask, covariance, 0.0)
-    # An unfilled row is a row of the identity, and its weight is zero.
+    # An unfilled row becomes a row of the identity, and its weight becomes zero.
     factor = CholeskyFactor.of(covariances + jnp.diag(jnp.where(rows.mask, (value_unit * rows.noise) ** 2, 1.0)))
 
-    # The posterior given the normals alone. The weights of the values and the mean are replaced below.
+    # Start with the posterior given the normals alone. Its weights and mean are replaced at the end.
     level, zeros = jnp.zeros_like(base.level), jnp.zeros_like(rows.values)
     posterior = ScreenedSPSRPosterior(
         level, base.mean_coefficients, model, base, rows, value_unit, whitened_cross, factor, zeros
@@ -148,7 +148,7 @@ def _value_unit(base: GeometricSPSRPosterior, offset: float) -> Float[Array, ""]
 
 
 class ScreenedDraws(NamedTuple):
-    """Prior draws of the normal field and its noise, the level c, and the noise e of the observed values."""
+    """Draws from the prior: normal field and its noise, level c, and noise e of the observed values."""
 
     normals: NormalDraws
     level: Float[Array, " s"]
@@ -187,7 +187,7 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
         prior = function_variance(spectrum) + self.model.level_deviation**2
 
         def at_point(point):
-            # `normals`: whitened covariances of g with the normals. `values`: with the values, given the normals.
+            # Whitened covariances of g with the normals, and with the observed values given the normals.
             normals = self.base.solver.whitened_cross(point[None])
             cross = function_covariance(self.rows.points, point[None], spectrum) + self.model.level_deviation**2
             cross = cross - jnp.einsum("dnm,dnx->mx", self.whitened_cross, normals, precision="highest")
@@ -219,14 +219,14 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
         coefficients, level, noise = draws.normals.coefficients, draws.level, draws.noise
         transform = NonuniformTransform(self.rows.points, self.model.base.truncation)
         row_values = shared_map(_evaluate, coefficients, transform)
-        # Condition f at the values' points Y on the normals. Their residual r adds k(Y, X) A^-1 r, computed whitened.
+        # Condition f(Y) on the normals. Their residual r adds K_fd A^-1 r, which is a product of two whitened arrays.
         update = jnp.einsum("dnm,snd->sm", self.whitened_cross, residual, precision="highest")
         row_values = row_values + update + means.values
         weights = jax.vmap(self.solve)(self.value_unit * self.rows.values - row_values + level[:, None] - noise)
         return self._update_draws(coefficients, residual, -level, weights)
 
     def solve(self, residual: Float[Array, " m"]) -> Float[Array, " m"]:
-        """Return the weights S^-1 r of a residual r whose covariance is S, with zeros in unfilled rows."""
+        """Return S^-1 r for a residual r of the observed values, with zeros in unfilled rows."""
         return self.factor.solve(jnp.where(self.rows.mask, residual, 0.0))
 
     def _update_draws(
@@ -238,7 +238,7 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
     ) -> Float[Array, "s a a a"]:
         """Return the coefficients of g for each sample.
 
-        - `coefficients`, `constant`: coefficients of the drawn normal field, and the drawn level, negated.
+        - `coefficients`, `constant`: coefficients of the drawn normal field, and minus the drawn level.
         - `residual`, `weights`: whitened residual of the normals, and the weights w of the values.
         """
         remainder = residual - jnp.einsum("dnm,sm->snd", self.whitened_cross, weights, precision="highest")

@@ -2,7 +2,7 @@
 
     DenseSolver               factorises A = C C^T once; the factor also gives covariances and likelihoods
     ConjugateGradientSolver   never forms A: A = Phi S Phi^T + noise^2 I, with Phi the basis at the data and S the
-                              variances of the modes, so a product is a transform to coefficients and back
+                              variances of the modes, so A times a vector is a transform to coefficients and back
 
 X are the points of a cloud, and k is the prior covariance of the normal field. If rows of a cloud are unfilled, the
 corresponding rows of A are rows of the identity, which change neither solves nor determinants.
@@ -37,9 +37,9 @@ class Solver(eqx.Module):
     """A solver for the covariance A of the normals of a cloud.
 
     - `cloud`: D, with zeros in unfilled rows.
-    - `noise`: standard deviation of the normals' components.
+    - `noise`: standard deviation of the noise of each component of the normals.
 
-    `whiten`, `unwhiten` and `whitened_cross` need the factor. They raise `ValueError` if A is not factorised.
+    `whiten`, `unwhiten` and `whitened_cross` raise `ValueError` if A is not factorised.
     """
 
     cloud: eqx.AbstractVar[PointCloud]
@@ -60,11 +60,11 @@ class Solver(eqx.Module):
         """Return how much the data reduce Var f(x), at points in scene coordinates."""
 
     def whiten(self, matrices: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
-        """Apply C^-1 to columns that are zero in unfilled rows, with C the Cholesky factor of A."""
+        """Apply C^-1 to columns that are zero in unfilled rows, where C is the Cholesky factor of A."""
         return _apply_to_leading_rows(CholeskyFactor.whiten, self.factor, self.cloud, matrices)
 
     def unwhiten(self, matrices: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
-        """Apply C^-T to columns that are zero in unfilled rows, with C the Cholesky factor of A."""
+        """Apply C^-T to columns that are zero in unfilled rows, where C is the Cholesky factor of A."""
         return _apply_to_leading_rows(CholeskyFactor.unwhiten, self.factor, self.cloud, matrices)
 
     def whitened_cross(self, x: Float[Array, "n 3"]) -> Float[Array, "3 capacity n"]:
@@ -121,7 +121,7 @@ class DenseSolver(Solver):
 
 
 class ConjugateGradientSolver(Solver):
-    """A solver by conjugate gradients, for A that is too large to factorise. See `Solver`.
+    """A solver by conjugate gradients, for an A that is too large to factorise. See `Solver`.
 
     A solve takes about 200 products with A for 50,000 points and a truncation of 50. In float32 the error of the result
     is at most 1e-4 of the largest value. The result is NaN if the solve did not converge.
@@ -174,15 +174,15 @@ def solver_of(cloud: PointCloud, spectrum: Spectra, noise: Scalar) -> Solver:
 
 
 def points_per_batch(count: int, capacity: int) -> int:
-    """Return how many of `count` points to whiten together, so that memory stays bounded."""
+    """Return how many of `count` points to process together, so that memory stays bounded."""
     return max(1, min(count, _CHUNK_VALUES // capacity))
 
 
 def _call_on_leading_rows(cloud: PointCloud, compute: Callable[[int], Float[Array, "*of"]]) -> Float[Array, "*of"]:
     """Call `compute(size)` with a `size` for which the first `size` rows of the cloud hold all its points.
 
-    The size is the smallest of a few fixed ones, so the time depends on the number of filled rows. A small cloud always
-    uses its capacity as the size, because each size is compiled separately.
+    The size is one of a few fixed sizes, the smallest that fits, so the time depends on the number of filled rows. A
+    small cloud uses its whole capacity, because each size is compiled separately.
     """
     capacity = cloud.capacity
     if capacity <= _SMALL_CAPACITY:
@@ -200,7 +200,7 @@ def _apply_to_leading_rows(
     cloud: PointCloud,
     matrices: Float[Array, "s n k"],
 ) -> Float[Array, "s n k"]:
-    """Apply a function of a factor and columns to the columns of matrices that are zero in unfilled rows."""
+    """Apply `function(factor, columns)` to the columns of matrices that are zero in unfilled rows."""
 
     def apply(size: int):
         columns = functools.partial(function, factor.leading(size))
@@ -214,6 +214,6 @@ def _pad_rows(matrices: Float[Array, "s size k"], cloud: PointCloud) -> Float[Ar
 
 
 def _apply_to_columns(function: Callable[[Array], Array], matrices: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
-    """Apply a function of a matrix's columns to the columns of all matrices, in a single call."""
+    """Call a function once, on the columns of all matrices together, and return the results as matrices."""
     columns = jnp.moveaxis(matrices, 0, 1)
     return jnp.moveaxis(function(columns.reshape(len(columns), -1)).reshape(columns.shape), 1, 0)

@@ -7,9 +7,9 @@
     data     n_j = v(x_j) + eps_j,   eps_j ~ N(0, noise^2 I),   A = k(X, X) + noise^2 I
     sample   v_post = v + k(., X) A^-1 (n - v(X) - eps), v and eps from the prior;   f = Poisson(v_post)
 
-Here m is an integer frequency vector, s1 the Matern spectrum on the circle, L the truncation, X are the observed
-points and n their normals. A sample's prior part, residual at the data and update come from the same draw (Matheron's
-rule; Wilson et al. 2020), so samples have exactly the posterior's distribution.
+Here m is an integer frequency vector, s1 the Matern spectrum on the circle, and L the truncation. X are the observed
+points, and n are their normals. All terms of a sample use the same draws of v and eps (Matheron's rule; Wilson et al.
+2020), so samples have exactly the posterior's distribution.
 """
 
 import functools
@@ -49,8 +49,8 @@ def _to_float(value) -> Float[Array, "*scales"]:
 class GeometricSPSR(SurfaceModel):
     """Matern prior on the normal field v over the torus, with f as its Poisson reconstruction.
 
-    - `lengthscale`: ell, in units of the circumference 2 pi: 0.005 is 0.031 in scene units. Several lengthscales make a
-      sum of independent priors: short ones for detail, and long ones for the overall shape.
+    - `lengthscale`: ell, in units of the circumference 2 pi: 0.005 is 0.031 in scene units. With several lengthscales,
+      the prior is a sum of independent priors: short ones for detail, and long ones for the overall shape.
     - `variance`: variance per axis, one for each lengthscale. Without truncation, Var v_d = variance^3 for each d.
     - `noise`: standard deviation of each component of the observed normals.
     - `nu`: smoothness, 1/2, 3/2 or 5/2.
@@ -111,7 +111,7 @@ class GeometricSPSR(SurfaceModel):
     def check(self, cloud: PointCloud) -> None:
         """Warn if the median distance between neighbouring points exceeds 2.5 times the longest lengthscale.
 
-        Then the standard deviation of f minus its level at the data is 0.9 times that of the prior or more.
+        At the data, the standard deviation of f minus its level is then at least 0.9 times that of the prior.
         """
         points, _ = cloud.to_numpy()
         if len(points) < 2 or is_traced(self):
@@ -129,8 +129,8 @@ class GeometricSPSR(SurfaceModel):
     def condition(self, observations: Observations | PointCloud) -> GeometricSPSRPosterior:
         """Return the posterior p(f | D), given only the cloud of the observations.
 
-        The cost is one Cholesky factorisation of a matrix with one row per row of the cloud. Above a capacity of 16,384
-        the cost is a few hundred transforms per solve.
+        The cost is one Cholesky factorisation of a matrix with a row for each row of the cloud. Above a capacity of
+        16,384 points, the cost is a few hundred transforms per solve.
 
         **Raises:** `ValueError` if the cloud is empty, has entries that are not finite, a normal longer than 10 or
         points outside [-pi/2, pi/2]^3 (scene coordinates), or if the covariance of the normals is singular in the

@@ -2,8 +2,8 @@
 
 The basis on the circle is phi_a(x) = cos(a x) for a = 0, ..., L and phi_a(x) = sin(-a x) for a = -L, ..., -1, where L
 is the truncation, the largest frequency. The products phi_a(x1) phi_b(x2) phi_c(x3) span the same space as the paper's
-exponentials, with the same number of real coefficients. In this basis evaluation is a chain of real matrix products,
-and the derivative of a function with coefficients C_a has the coefficients a C_{-a}.
+exponentials, with the same number of real coefficients. In this basis, evaluation is a chain of real matrix products,
+and differentiation along an axis maps the coefficients C_a, with index a on that axis, to a * C_{-a}.
 
 All products request full float32 precision, because some GPUs use a lower precision by default.
 """
@@ -114,10 +114,10 @@ class TrigonometricFields(Fields):
 class NonuniformTransform(eqx.Module):
     """Fast transforms between coefficients up to frequency L and values at given points of the scene.
 
-    `evaluate` interpolates values on a tensor grid that covers the scene, twice as fine as the highest frequency needs,
-    with a Kaiser-Bessel window. The effect of the window on each frequency is divided out beforehand (Dutt and Rokhlin
-    1993; Barnett, Magland and af Klinteberg 2019 on windows). The error is close to rounding error, about 1e-6 in
-    float32 and 1e-12 in float64. `adjoint` is the transpose of `evaluate`.
+    `evaluate` computes values on a tensor grid that covers the scene, twice as fine as frequency L needs, and
+    interpolates them with a Kaiser-Bessel window. Beforehand it divides the coefficients by the effect of the window on
+    each frequency (Dutt and Rokhlin 1993; Barnett, Magland and af Klinteberg 2019 on windows). The error is close to
+    rounding error, about 1e-6 in float32 and 1e-12 in float64. `adjoint` is the transpose of `evaluate`.
 
     - `start`: first node of each point's window, per axis.
     - `weights`: the window's values at its nodes, per axis.
@@ -138,7 +138,7 @@ class NonuniformTransform(eqx.Module):
         radicand = jnp.maximum(1.0 - (2.0 * offset / window) ** 2, jnp.finfo(points.dtype).eps ** 2)
         self.start = (first + window // 2).astype(jnp.int32)
         weights = jnp.i0(beta * jnp.sqrt(radicand)) / float(i0(beta))
-        # JAX clamps a slice that starts outside its array, and would use the wrong nodes. Such points give NaN instead.
+        # JAX clamps a slice that starts outside its array. That would use the wrong nodes, so these points give NaN.
         is_in_grid = (self.start >= 0) & (self.start <= 2 * truncation + 1)
         self.weights = jnp.where(is_in_grid[..., None], weights, jnp.nan)
         self.truncation = truncation
@@ -149,7 +149,7 @@ class NonuniformTransform(eqx.Module):
         return self._interpolate(jnp.moveaxis(values, 0, -1))
 
     def adjoint(self, values: Float[Array, "n k"]) -> Float[Array, "k a a a"]:
-        """Apply `evaluate` transposed: sum over points j of values_j phi_a(x_j1) phi_b(x_j2) phi_c(x_j3)."""
+        """Apply the transpose of `evaluate`: sum_j values_j phi_a(x_j1) phi_b(x_j2) phi_c(x_j3)."""
         basis = self._node_basis(values.dtype)
         node_values = self._spread(values, basis.shape[0])
         return evaluate_on_grid(jnp.moveaxis(node_values, -1, 0), basis.T)
@@ -164,7 +164,7 @@ class NonuniformTransform(eqx.Module):
         return jax.lax.map(lambda point: at_point(*point), (self.start, self.weights), batch_size=128)
 
     def _spread(self, values: Float[Array, "n k"], nodes: int) -> Float[Array, "nodes nodes nodes k"]:
-        """Spread values at the points over the nodes of the grid: apply the transpose of `_interpolate`."""
+        """Spread values at the points to the nodes of the grid: apply the transpose of `_interpolate`."""
         grid = jnp.zeros((nodes, nodes, nodes, values.shape[1]), values.dtype)
         if not on_cpu():
             return jax.linear_transpose(self._interpolate, grid)(values)[0]

@@ -1,4 +1,4 @@
-"""Observed values of f relative to its level, beside the normals, which observe the gradient of f.
+"""Sources of observed values of f relative to its level, in addition to the observed normals.
 
 Values are in units of h, because the scale of f depends on the prior. h is half the rise of E f across the scanned
 surface, given the normals alone (see `ScreenedSPSR.offset`).
@@ -77,22 +77,22 @@ class ValueSource(eqx.Module):
     def rows(self, observations: Observations) -> ValueRows:
         """Return the observed values that this source adds.
 
-        The method is called under `jit`, so the number of rows may depend only on the capacity of the cloud. A filled
-        row outside [-pi/2, pi/2]^3 makes `condition` of the model raise an error, or under `jit` makes the posterior
-        NaN.
+        The method is called under `jit`, so the number of rows may depend only on the capacity of the cloud. Filled
+        rows must lie in [-pi/2, pi/2]^3. Otherwise `condition` of the model raises `ValueError`, or under `jit` the
+        posterior is NaN.
         """
 
 
 class OutsideBoundary(ValueSource):
     """Positive values of f minus its level on the boundary of the volume that holds the object.
 
-    The boundary is thus observed to be outside: the "envelope" of Poisson reconstruction (Kazhdan et al. 2020).
+    They tell the model that the boundary is outside the object, like the "envelope" of Kazhdan et al. (2020).
 
     - `volume`: see `jaxnbv.geometry.volume`; by default the box to which scenes are scaled.
     - `num_points`: number of points, spread evenly as seen from the origin.
     - `value`, `noise`: observed value and its standard deviation, in units of h, see `ScreenedSPSR.offset`.
-    - `margin`: distance by which the points lie outside the boundary, in scene units. Points are clipped to the scene.
-      If the volume cuts the object, give a positive distance. Otherwise sampled objects would close at the cut.
+    - `margin`: distance from the boundary to the points, outward, in scene units. Points are clipped to the scene. Give
+      a positive distance if the volume cuts the object. Otherwise sampled objects would close at the cut.
 
     **Raises:** `ValueError` for a count below one, noise that is not positive, a negative margin, or a boundary that
     leaves the scene, [-pi/2, pi/2]^3, or does not enclose the origin.
@@ -130,7 +130,7 @@ class OutsideBoundary(ValueSource):
 
     def rows(self, observations: Observations) -> ValueRows:
         points = boundary_points(self.volume, self.num_points, self.margin).astype(observations.cloud.points.dtype)
-        # Clip to the border of the scene, because points may lie beyond it by `margin` or by rounding in this dtype.
+        # The margin, or rounding in this dtype, may put points beyond the scene.
         points = jnp.clip(points, -HALF_WIDTH, HALF_WIDTH)
         return _rows(points, self.value, self.noise, jnp.ones(self.num_points, bool))
 
@@ -194,7 +194,7 @@ def concatenate_rows(sources: tuple[ValueSource, ...], observations: Observation
     for source, part in zip(sources, parts, strict=True):
         check_type(part, ValueRows, f"the result of {type(source).__name__}.rows")
     rows = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
-    # Unfilled rows may hold NaN, and become zero so that NaN does not spread through products.
+    # Unfilled rows may hold NaN. Set them to zero, because NaN would spread through products.
     points = jnp.where(rows.mask[:, None], rows.points, 0.0)
     values, noise = (jnp.where(rows.mask, leaf, 0.0) for leaf in (rows.values, rows.noise))
     return ValueRows(points, values, noise, rows.mask)
