@@ -1,16 +1,15 @@
-"""A mixture prior over a bank of known shapes, registered to the scan, plus a Gaussian process.
+"""A mixture prior: a known shape of a bank plus a Gaussian process, or none of the shapes.
 
-    prior      f = m_k(T^-1 x) + g,   k ~ pi over shapes 1..K and 0 for none of these,   T the placement of the shape,
-               g a Gaussian process, the residual
-    mean       m_k = h tanh(d_k / h), d_k the signed distance of shape k
-    weights    w_i proportional to exp(-beta E_i) for fit i = (k, T),   w_0 to exp(-beta E_0) for none of these
-    sample     fits by systematic resampling of w; then f about the mean m_k(T^-1 x), or for i = 0 a sample of the
-               model without known shapes
+    prior      f = m_i + g for fit i, with g a Gaussian process, the residual;   for i = 0, f from `model_of_none`
+    mean       m_i = h tanh(d_i / h), with d_i the signed distance of the placed shape
+    weights    w_i proportional to exp(-beta E_i)
+    sample     i by systematic resampling of w, then f from its posterior given i
 
-A fit, or hypothesis, is a shape with a placement. One shape may have several fits, and w is over the distinct ones
-(`Hypotheses.is_distinct`). h is half the rise of f across the surface, the unit of values in `ScreenedSPSR`. E_i is the
-misfit of fit i to the scan (`surfaces/registration.py`), E_0 is `misfit_of_none`. The factor beta keeps several shapes
-possible. A likelihood that treats thousands of normals as independent would always select one shape.
+Fit i (also called a hypothesis) is a shape of the bank with a placement, and i = 0 is "none of these". A shape may have
+several fits, but only distinct fits (`Hypotheses.is_distinct`) have a weight. h is half the rise of f across the
+surface, the unit of values in `ScreenedSPSR`. E_i is the misfit of fit i to the scan (`surfaces/registration.py`), and
+E_0 is `misfit_of_none`. beta is small enough to keep several shapes possible. A likelihood that treats thousands of
+normals as independent would always select one shape. Weights of parts at true size are in `surfaces/part_evidence.py`.
 """
 
 import dataclasses
@@ -48,18 +47,18 @@ def short_ranged(longest_side: float = 2.5, truncation: int = 32) -> ScreenedSPS
     """
     scale = longest_side / 2.5
     # Long lengthscales, or values at points off the surface, would change the shape far from the scan. `noise` covers
-    # errors of the shape's normals: near an edge of a slightly misplaced shape, they are the normals of the wrong face.
-    # `level_deviation` is small because the shape's own surface has level zero. The noise of `OnSurface` is the error
-    # of the placement.
+    # errors of the shape's normals: near an edge, a slightly misplaced shape has the normals of the wrong face.
+    # `level_deviation` is small, because the shape's surface has level zero. The noise of `OnSurface` covers errors of
+    # the placement.
     base = GeometricSPSR(0.01 * scale, truncation=min(round(32 / scale), truncation), noise=0.2)
     return ScreenedSPSR(base, (OnSurface(noise=0.3),), level_deviation=0.02, offset=0.1 * scale)
 
 
 class KnownShapes(SurfaceModel):
-    """A mixture prior of known shapes, registered to the scan, and a model for "none of these".
+    """A mixture prior of known shapes, which are registered to the scan, and a model for "none of these".
 
-    - `residual`: the model of the difference between object and shape. Its short lengthscale limits it to the
-      neighbourhood of the scan.
+    - `residual`: the model of the difference between object and shape. Its lengthscale is short, so a scanned point
+      changes the shape only nearby.
     - `poses`: the possible placements of shapes in the scene.
     - `box`: a tight box around the object.
     - `model_of_none`: the model for an object that is none of the shapes. With an empty bank this is the whole model.
@@ -110,7 +109,7 @@ class KnownShapes(SurfaceModel):
         )
 
     def fit(self, observations: Observations) -> tuple[Hypotheses, Float[Array, " h_and_none"]]:
-        """Return the registered shapes, and their weights, followed by that of "none of these"."""
+        """Return the shapes registered to the scan, and their weights. The last weight is of "none of these"."""
         fits = register(self.bank, Prior(self.poses, self.box), FitTargets.of(observations), self.num_starts)
         return fits, _weights(fits, self.inverse_temperature, self.misfit_of_none)
 
@@ -119,7 +118,7 @@ class KnownShapes(SurfaceModel):
 
         The shapes are registered to the cloud and to the space that was seen to be empty.
 
-        **Raises:** `ValueError` whenever the `condition` of `residual` or of `model_of_none` raises it.
+        **Raises:** `ValueError` if the `condition` of `residual` or of `model_of_none` raises it.
         """
         observations = as_observations(observations)
         of_none = self.model_of_none.condition(observations)
@@ -155,8 +154,9 @@ class KnownShapesPosterior(SurfacePosterior):
     """The posterior p(f | D) under `KnownShapes`.
 
     - `level`: zero.
-    - `fits`, `weights`: the registered shapes; and their weights, followed by the weight of "none of these".
-    - `residual`: posterior of the difference between object and shape, which draws samples about the shapes.
+    - `fits`: the shapes registered to the scan.
+    - `weights`: probability of each fit, followed by the probability of "none of these".
+    - `residual`: posterior of the difference between object and shape.
     - `of_none`: posterior of f if the object is none of the shapes.
     """
 
@@ -233,7 +233,7 @@ def _draw_indices(posterior: KnownShapesPosterior, key: PRNGKeyArray, num_sample
     """Draw the index of each sample's hypothesis. The last index is "none of these"."""
     shape_key, order_key = jax.random.split(jax.random.split(key, 3)[0])
     index = systematic_resampling(shape_key, posterior.weights, num_samples)
-    # The indices are sorted. Shuffle them to make the first few samples as representative as all.
+    # The indices are sorted. Shuffle them, because the first few samples should vary as much as all.
     return jax.random.permutation(order_key, index)
 
 
@@ -246,7 +246,7 @@ def kind_of(name: str) -> str:
 def systematic_resampling(
     key: PRNGKeyArray, weights: Float[Array, " n"], num_samples: int
 ) -> Int[Array, " num_samples"]:
-    """Draw each index in proportion to its weight, within one of the expected count (Kitagawa 1996)."""
+    """Draw indices by weight. The count of each is within one of its expected value (Kitagawa 1996)."""
     positions = (jnp.arange(num_samples) + jax.random.uniform(key)) / num_samples
     total = jnp.cumsum(weights)
     return jnp.clip(jnp.searchsorted(total / total[-1], positions, side="right"), 0, len(weights) - 1)
@@ -257,7 +257,7 @@ class PlacedShapes(Fields):
 
     They are bounded by h, and at the surface their gradient equals that of d.
 
-    - `solids`, `placements`: both along a leading axis.
+    - `solids`, `placements`: one for each sample, along a leading axis.
     - `bound`: h, in scene units.
     """
 
@@ -276,7 +276,7 @@ class PlacedShapes(Fields):
 class MixtureFields(Fields):
     """A batch of samples in which each sample comes from one of two batches of the same size.
 
-    - `level`: the level of `of_none`, which is subtracted from its values.
+    - `level`: the level of `of_none`. It is subtracted from the values of `of_none`.
     - `is_none`: for each sample, whether it comes from `of_none`.
     """
 

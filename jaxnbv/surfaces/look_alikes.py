@@ -1,4 +1,4 @@
-"""Detection of parts of a bank that no scan can distinguish: they have the same surface and size."""
+"""Detection of parts of a bank that no scan can distinguish, because their shape and size are equal."""
 
 import itertools
 import warnings
@@ -15,7 +15,7 @@ from jaxnbv.surfaces.mesh_shapes import MeshShape
 _NUM_PROBES, _MAX_DISTANCE = 8192, 3.0
 # Number of pairs that a warning names.
 _NUM_NAMED = 5
-# The rotations of a cube onto itself are tested, because files often store equal parts along different axes.
+# Parts are compared in all rotations of a cube onto itself, because files may store equal parts along different axes.
 _ROTATIONS = Rotation.create_group("O").as_matrix()
 
 
@@ -41,7 +41,7 @@ def warn_of_look_alikes(
 
 
 class _Grid:
-    """Signed distances of a shape, interpolated on a grid with NumPy, and half the shape's side lengths."""
+    """Signed distances of a shape, interpolated linearly from its grid, and half the shape's side lengths."""
 
     def __init__(self, shape: MeshShape):
         solid = shape.solid
@@ -56,8 +56,8 @@ class _Grid:
 def _difference(one: _Grid, other: _Grid, ratio: float) -> float:
     """Return the largest difference of signed distances to two centred shapes, near the surface of `one`.
 
-    The shape `other` is scaled by `ratio` and rotated by right angles to make this difference smallest. The result is
-    infinite if the side lengths differ in every rotation.
+    The shape `other` is scaled by `ratio`, and rotated by the right angles for which the difference is smallest. The
+    result is infinite if the side lengths differ in every rotation.
     """
     smallest, points = np.inf, None
     for rotation in _ROTATIONS:

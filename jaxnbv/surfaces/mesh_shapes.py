@@ -30,7 +30,7 @@ _T = TypeVar("_T")
 
 
 def as_tuple(values: Sequence[_T], name: str) -> tuple[_T, ...]:
-    """Return a tuple. **Raises:** `ValueError` if the values, called `name`, are not iterable."""
+    """Return the values, called `name` in errors, as a tuple. **Raises:** `ValueError` if not iterable."""
     try:
         return tuple(values)
     except TypeError as error:
@@ -40,7 +40,7 @@ def as_tuple(values: Sequence[_T], name: str) -> tuple[_T, ...]:
 def mesh_paths(meshes: str | Path | Sequence[str | Path | trimesh.Trimesh]) -> list[Path | trimesh.Trimesh]:
     """Return the listed files and meshes, or all mesh files in a folder and its subfolders.
 
-    A file counts as a mesh file if its extension belongs to a format that trimesh reads.
+    A mesh file has the extension of a format that trimesh reads.
 
     **Raises:** `ValueError` for a folder that does not exist or contains no mesh, or for an empty list.
     """
@@ -73,9 +73,9 @@ class MeshShape(NamedTuple):
 def shapes_of_meshes(
     paths: Sequence[Path | trimesh.Trimesh], resolution: int, sheet: float, num_extremes: int, up: str, progress: bool
 ) -> tuple[list[MeshShape], list[int]]:
-    """Return the shapes of all usable meshes, and their indices. Warn of each unusable mesh.
+    """Return the shapes of all usable meshes, and the indices of these meshes. Warn of each unusable mesh.
 
-    See `ShapeBank.from_meshes` for the settings.
+    See `ShapeBank.from_meshes` for the arguments.
 
     **Raises:** `ValueError` if no mesh can be used.
     """
@@ -130,7 +130,7 @@ def _sample(mesh: TriangleMesh, resolution: int, sheet: float, num_extremes: int
 
 
 def _read(file: Path) -> dict[str, np.ndarray] | None:
-    """Read cached arrays; None if the file is missing or damaged."""
+    """Return the cached arrays, or None if the file is missing or damaged."""
     try:
         with np.load(file) as archive:
             return {name: archive[name] for name in _ARRAYS}

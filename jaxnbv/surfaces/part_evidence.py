@@ -1,22 +1,23 @@
-"""Evidence of the rays of all views for placed parts, and the weights that follow from this evidence.
+"""Misfits of placed parts to the rays of all views, and the weights that follow from these misfits.
 
 A ray passes through empty space and meets the object at x. It tests a placed part with signed distance d in two ways:
 x should lie on the part's surface, and the ray should not pass through the part before x. The misfit is
 
     L = sum over rays of  l(d(x)) + l(min over the ray of min(d, 0)),   l(r) = log(1 + r^2 / 2 tau^2)
 
-A ray that did not meet the object has only the second term. Each term is clipped at C = l(4 tau), which limits the
-effect of outliers. tau is twice the noise of the measured ray lengths, but at least 0.03 scene units, the accuracy of a
-part's surface on its grid. The noise is estimated from third differences of the lengths between pixels. A sensor may
+A ray that did not meet the object has only the second term. Each term is clipped at l(4 tau), which limits the effect
+of outliers. tau is twice the noise of the measured ray lengths, but at least 0.03 scene units, the accuracy of a part's
+surface on its grid. The noise is estimated from third differences of the lengths at neighbouring pixels. A sensor may
 miss a surface. So a ray without a return counts only if it passes through the part in space that was seen to be empty.
-Misfits are summed over rays, so the weights become more decisive with more views. Rays that meet the object less than
-0.12 apart have dependent errors, so each counts as less than one ray. A hypothesis h (a placed part) has the weight
+Misfits are summed over rays, so the weights become more decisive with more views. If rays meet the object less than
+0.12 scene units apart, their errors are dependent, and each counts as less than one ray. The weights are
 
-    w_h proportional to exp(-L_h),   w_0 (none of these) to exp(-L_0),   L_0 = sum over rays of e_0 + o
+    w_h proportional to exp(-L_h) for each hypothesis h, a placed part
+    w_0 proportional to exp(-L_0) for none of these,   L_0 = sum over rays that met the object of  e_0 + o
 
-The sum for L_0 is over the rays that met the object. e_0 is a constant. o is the amount by which l(d(x)) exceeds e_0
-for the hypothesis that explains x best. So o covers points that belong to a different object, which no hypothesis
-explains. The sum of o is limited, on the assumption that at most a fifth of the points belong to a different object.
+Here e_0 is a constant. o is the amount by which l(d(x)) exceeds e_0 for the hypothesis that explains x best. So o
+covers points of a different object, which no hypothesis explains. At most a fifth of the points are assumed to belong
+to a different object, which limits the sum of o.
 """
 
 import math
@@ -46,7 +47,7 @@ _NOISE_PER_QUARTILE = 1.0 / 0.31864
 _MIN_STRIDE, _NUM_STRIDES = 0.04, 40
 # Largest number of rays used from all views together.
 _MAX_RAYS = 4096
-# Rays closer together than this on the object have dependent errors; scene units.
+# Rays that meet the object less than this far apart, in scene units, have dependent errors.
 _CORRELATION_LENGTH = 0.12
 # e_0, the misfit of "none of these" per ray. The mean misfit per ray is up to 0.15 for the correct part, and in most
 # cases at least 0.3 for the best part if the object is none of the parts.
@@ -58,7 +59,8 @@ _MAX_STRAY = 0.2
 class Rays(NamedTuple):
     """Rays of the views so far, in random order.
 
-    - `sight`: length of each ray in scene units; infinite without a return, zero for padding.
+    - `sight`: length of each ray in scene units. It is infinite without a return, and zero for padding.
+    - `is_object`: whether the ray met the object.
     - `weight`: number of independent rays that the ray counts as. It is lower if rays are closer together than
       `_CORRELATION_LENGTH`, and higher if the ray also represents rays that were left out.
     - `empty_nodes`: mask of the nodes of `grid` that were seen to be empty.
@@ -77,7 +79,7 @@ class Rays(NamedTuple):
     @classmethod
     @program
     def of(cls, observations: Observations, box: Box) -> "Rays | None":
-        """Return those rays of all views that enter a box; None if the observations do not store rays."""
+        """Return the rays of all views that enter a box, or None if the observations do not store rays."""
         looks, poses = observations.looks, observations.poses
         if looks is None or observations.empty_nodes is None:
             return None
@@ -98,7 +100,7 @@ class Rays(NamedTuple):
             indices.append(order.at[rows].get(mode="fill", fill_value=count))
             factor = jnp.maximum(2.0 * jnp.sum(kind) / _MAX_RAYS, 1.0)
             weights.append(jnp.broadcast_to(factor * jnp.minimum(ray_weight(distance, looks.camera), 1.0), rows.shape))
-        # Rays that met the object alternate with the other rays, so that the first few rays contain both kinds.
+        # Rays that met the object alternate with other rays, so that the first few rays contain both kinds.
         index, weight = (jnp.stack(parts, axis=1).reshape(-1) for parts in (indices, weights))
         row = jnp.minimum(index, count - 1)
         return cls(
@@ -125,9 +127,9 @@ class Rays(NamedTuple):
 def _estimate_noise(
     sight: Float[Array, "views rays"], is_object: Bool[Array, " all_rays"], camera: Camera
 ) -> Float[Array, ""]:
-    """Return the standard deviation of the noise in the ray lengths on the object; zero without data.
+    """Return the standard deviation of the noise in the ray lengths on the object, or zero without data.
 
-    It is computed from third differences along rows and columns of an image, which would be near zero without noise on
+    It is computed from third differences along rows and columns of an image. Without noise, these would be near zero on
     a surface of low curvature.
     """
     images = jnp.where(is_object, sight.reshape(-1), jnp.nan).reshape(-1, camera.height, camera.width)
@@ -160,7 +162,7 @@ def evidence(bank: ShapeBank, hypotheses: Hypotheses, rays: Rays) -> tuple[Float
 
 
 def ray_weight(distance: Float[Array, ""], camera: Camera) -> Float[Array, ""]:
-    """Return the number of independent rays that a camera's ray counts as, at this distance of the object.
+    """Return how many independent rays one ray of a camera stands for, at this distance of the object.
 
     It is the ray's area on the object divided by the area within which rays have dependent errors.
     """
@@ -178,7 +180,7 @@ def _deepest_penetration(
 ) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
     """Return the smallest signed distance to a solid along each ray, and whether it is evidence.
 
-    The distance is zero if the ray misses the solid. It is evidence if the ray has a return, or if the position of the
+    The distance is zero if the ray misses the solid. It is evidence if the ray has a return, or if the point with the
     smallest distance was seen to be empty.
     """
 

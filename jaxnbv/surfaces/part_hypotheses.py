@@ -1,4 +1,4 @@
-"""Weighted hypotheses about the part and its placement, carried from view to view."""
+"""Weighted hypotheses about which known part the object is, and where, carried from view to view."""
 
 import equinox as eqx
 import jax
@@ -20,7 +20,7 @@ from jaxnbv.surfaces.shape_bank import ShapeBank
 NONE = "none of these"
 # Number of placements tried for each part.
 _NUM_STARTS = 1024
-# For a cloud alone, which has no rays: number of rays that its points count as, and the misfit of "none of these".
+# For a cloud without rays: the number of rays that its points count as, and the misfit of "none of these".
 _NUM_RAYS, _NONE_MISFIT = 0.3 * NUM_POINTS, 0.6
 
 
@@ -28,10 +28,10 @@ class PartHypotheses(eqx.Module):
     """Parts of a bank, each with a placement, the most likely first.
 
     - `bank`: the parts at true size, in scene units.
-    - `placed`: part and placement of each hypothesis. Of several placements of a part with equal surfaces, only one has
-      a weight above zero.
+    - `placed`: part and placement of each hypothesis. If several placements give a part the same surface, only one of
+      them has a weight above zero.
     - `weights`: probability of each hypothesis, followed by the probability of "none of these".
-    - `tau`: scale of the distances of measured points from the surface, in scene units, see `part_evidence`.
+    - `tau`: scale of the distances from measured points to the surface, in scene units, see `part_evidence`.
     """
 
     bank: ShapeBank
@@ -62,7 +62,7 @@ class PartHypotheses(eqx.Module):
 
     @property
     def most_likely(self) -> tuple[int, Placement]:
-        """The most likely part, as an index in the bank, and its most likely placement."""
+        """The index of the most likely part in the bank, and the most likely placement of this part."""
         shapes, weights = np.asarray(self.placed.shape), np.asarray(self.weights)[:-1]
         part = int(np.argmax(np.bincount(shapes, weights, len(self.bank))))
         row = int(np.argmax(np.where(shapes == part, weights, -1.0)))
@@ -85,8 +85,7 @@ def identify(
     """Return the weighted hypotheses given the observations.
 
     - `bank`: the parts at true size, in scene units.
-    - `poses`, `box`: the possible placements of the parts, and a box around the object.
-    - `previous`: the hypotheses after the previous view, which are kept while they fit; None for the first view.
+    - `previous`: the hypotheses after the previous view, or None at the first view. They are kept while they fit.
     """
     targets = FitTargets.of(observations)
     starts = placeholder_hypotheses(targets.points.dtype) if previous is None else previous.placed

@@ -22,8 +22,8 @@ _ANGLE_STEP = np.radians(5.0)
 # Prior standard deviations of a rotation (radians) and a shift (scene units). They matter in directions that the points
 # do not constrain.
 _ROTATION_DEVIATION, _SHIFT_DEVIATION = np.pi / np.sqrt(3.0), 1.0
-# Smallest error of the points in scene units, which is the accuracy of a part's surface on its grid; and the standard
-# deviation of a normal distribution divided by the median of its absolute value.
+# Smallest error of the points in scene units, the accuracy of a part's surface on its grid. Standard deviation of a
+# normal distribution divided by the median of its absolute value.
 _MIN_ERROR, _ERROR_PER_MEDIAN = 0.005, 1.4826
 
 
@@ -31,8 +31,8 @@ class ObjectPose(eqx.Module):
     """World pose of a part.
 
     - `matrix`: rigid motion from the coordinates of the part's mesh, in world units, to the world.
-    - `covariance`: joint covariance of the rotation (rotation vector about the part's centre, radians, world axes) and
-      of the centre's position (world units), given that the object is this part. It includes the errors of the points.
+    - `covariance`: joint covariance of the rotation vector about the part's centre (radians, world axes) and of the
+      centre's position (world units), if the object is this part. It comes from the errors of the points.
     - `alternatives`: all equivalent matrices of a symmetric part, starting with `matrix`. A part that is round about an
       axis has 72 alternatives, five degrees apart, or 144 if its two ends are equal.
     """
@@ -61,8 +61,8 @@ def object_pose(hypotheses: PartHypotheses, observations: Observations, frame: F
 def surface_error(hypotheses: PartHypotheses, observations: Observations) -> float:
     """Return the expected distance of the most likely part's surface from the true one, in scene units.
 
-    It is a root mean square over points of the part's surface. It has two parts: the uncertainty of the pose due to
-    errors of the scanned points, and the distances to the surfaces of all hypotheses, weighted by their probabilities.
+    It is a root mean square over points of the part's surface. The mean square is the sum of two: the variance due to
+    errors of the scanned points, and the squared distance to the surface of each hypothesis, weighted by probability.
     """
     part, placement = hypotheses.most_likely
     shape = hypotheses.bank.shape(jnp.asarray(part))
@@ -71,7 +71,7 @@ def surface_error(hypotheses: PartHypotheses, observations: Observations) -> flo
     surface = jnp.asarray(points.T, jnp.float32)
     distances = np.asarray(distances_to(hypotheses, surface), np.float64)
     _, gradient = values_and_gradients(lambda x: placement.distance(shape.solid, x), surface)
-    # Only motion along the normal counts, since motion along the surface leaves the surface in place.
+    # Only motion along the normal counts. Motion along the surface leaves the surface in place.
     normals = np.asarray(gradient, np.float64)
     rows = np.concatenate([np.cross(normals, points.T - np.asarray(placement.shift)), -normals], axis=1)
     pose_variance = float(np.mean(np.einsum("ni,ij,nj->n", rows, covariance, rows)))
@@ -89,8 +89,8 @@ def distances_to(hypotheses: PartHypotheses, points: Float[Array, "p 3"]) -> Flo
 def symmetries(shape: Shape) -> Float[np.ndarray, "n 3 3"]:
     """Return the rotations about a shape's centre that leave the shape unchanged, the identity first.
 
-    Rotations by multiples of five degrees about each axis are tested, and the rotations of a cube onto itself. The
-    result contains all products of a symmetry about an axis and a symmetry among the rotations of the cube.
+    Two sets of rotations are tested: multiples of five degrees about each axis, and the rotations of a cube onto
+    itself. The result contains the products of a symmetry from the first set and a symmetry from the second.
     """
     vectors = [angle * axis for axis in np.eye(3) for angle in np.arange(0.0, 2.0 * np.pi, _ANGLE_STEP)]
     about_axes, of_cube = Rotation.from_rotvec(vectors).as_matrix(), Rotation.create_group("O").as_matrix()
@@ -100,7 +100,7 @@ def symmetries(shape: Shape) -> Float[np.ndarray, "n 3 3"]:
     change = _max_change(shape, jnp.asarray(rotations, shape.extremes.dtype), jnp.asarray(probes, shape.extremes.dtype))
     is_symmetry = np.asarray(change) < TOLERANCE
     axial, cubic = about_axes[is_symmetry[: len(about_axes)]], of_cube[is_symmetry[len(about_axes) :]]
-    # A product of two symmetries is a symmetry too.
+    # Products need no test, because a product of two symmetries is a symmetry.
     products = np.concatenate([np.eye(3)[None], np.einsum("aij,bjk->abik", axial, cubic).reshape(-1, 3, 3)])
     _, rows = np.unique(np.round(products, 6).reshape(-1, 9) + 0.0, axis=0, return_index=True)
     return products[np.sort(rows)]

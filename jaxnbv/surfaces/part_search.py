@@ -1,10 +1,10 @@
 """Search for parts of known size, and their placements, that fit the scan.
 
-Each part is tried in the same number of placements, and its best few are refined by Gauss-Newton steps on the misfit E
+Each part is tried in the same number of placements, and the best few are refined by Gauss-Newton steps on the misfit E
 of `registration`. The best distinct results of each part are refined again on more points, together with the hypotheses
-of the previous view. Finally all parts are tried in each of the best placements so far, since the right placement of a
-part may have been found only for a similar part. Results are kept for every part, so no part is lost because a similar
-part fits better. The time grows linearly with the number of parts.
+of the previous view. Then all parts are tried in each of the best placements so far, because the right placement of a
+part may have been found only for a similar part. Until the final selection, every part keeps results of its own, so
+similar parts that fit better do not displace it. The time grows linearly with the number of parts.
 """
 
 import dataclasses
@@ -36,22 +36,22 @@ from jaxnbv.surfaces.shape_bank import ShapeBank
 NUM_HYPOTHESES = 32
 # Number of positions tried for each rotation.
 _NUM_POSITIONS = 4
-# Starts per part, points and steps, for the first and for the second refinement; number of placements tried with all
-# parts; steps of the last refinement.
+# Starts per part, points and steps of the first and the second refinement. Number of placements that are tried with all
+# parts. Steps of the last refinement.
 _COARSE, _FINE, _NUM_SHARED, _LAST = (10, 48, 5), (4, 128, 10), 16, 3
 # Before the last stage, placements with nearly equal rotations count as equal if their shifts differ by less than this,
 # in scene units.
 _MAX_SHIFT = 0.15
-# How far a part may extend beyond the box, and the difference of surfaces below which placements of a part count as
-# equal, in scene units.
+# How far a part may extend beyond the box, and the difference of signed distances below which placements of a part
+# count as equal. Both are in scene units.
 _MARGIN, TOLERANCE = 0.2, 0.03
 _NUM_PROBES, _NUM_RAYS = 4096, 1024
 
 
 def placeholder_hypotheses(dtype: Any) -> Hypotheses:
-    """Return placeholders for the hypotheses of the view before the first, with infinite misfit.
+    """Return hypotheses of infinite misfit to use as the previous hypotheses at the first view.
 
-    Each is the first part at the identity placement. As an extra start of the search, it does no harm.
+    Each is the first part at the identity placement, which does no harm as an extra start of the search.
     """
     identity = Placement(jnp.eye(3, dtype=dtype), jnp.zeros(3, dtype), jnp.ones(3, dtype))
     one = Hypotheses(jnp.zeros((), int), identity, jnp.asarray(jnp.inf, dtype), jnp.asarray(False))
@@ -124,12 +124,12 @@ def _starts(bank: ShapeBank, prior: Prior, targets: FitTargets, num_starts: int)
 
     At the first position of a rotation, the side of the shape's bounding box that faces the sensor touches the scan,
     and the box is centred on the scan in the two directions across the line of sight. The other positions are spread
-    over all those at which the box contains the scan, if it is large enough.
+    over all positions at which the box, if large enough, contains the scan.
     """
     dtype = targets.points.dtype
     rotations = jnp.asarray(prior.poses.rotations_of(len(bank), max(1, num_starts // _NUM_POSITIONS)), dtype)
     count = rotations.shape[1]
-    # A low-discrepancy sequence (Roberts 2018), after the first position.
+    # The positions after the first follow a low-discrepancy sequence (Roberts 2018).
     increments = np.array([0.8191725134, 0.6710436067, 0.5497004779])
     sequence = (0.5 + np.arange(1, count * (_NUM_POSITIONS - 1) + 1)[:, None] * increments) % 1.0
     first = np.tile([[[0.5, 0.5, 1.0]]], (1, count, 1))
@@ -160,7 +160,7 @@ def _starts(bank: ShapeBank, prior: Prior, targets: FitTargets, num_starts: int)
 def _axes_of_sight(targets: FitTargets) -> Float[Array, "3 3"]:
     """Return unit vectors as rows: two across the line of sight, and one toward the sensor.
 
-    The direction toward the sensor is estimated by the mean normal of the scan.
+    The direction toward the sensor is taken to be that of the scan's mean normal.
     """
     mean = jnp.sum(jnp.where(targets.mask[:, None], targets.normals, 0.0), axis=0)
     length = jnp.linalg.norm(mean)
@@ -173,7 +173,7 @@ def _axes_of_sight(targets: FitTargets) -> Float[Array, "3 3"]:
 def _mark_repeats(bank: ShapeBank, box: Box, hypotheses: Hypotheses) -> Hypotheses:
     """Mark each hypothesis that has the same surface as an earlier one of the same part.
 
-    It gets `is_distinct` False and an infinite misfit. The hypotheses must be sorted, best first.
+    A marked hypothesis has `is_distinct` False and infinite misfit. The hypotheses must be sorted, best first.
     """
     dtype = hypotheses.misfit.dtype
     low, high = jnp.asarray(box.low, dtype) - _MARGIN, jnp.asarray(box.high, dtype) + _MARGIN

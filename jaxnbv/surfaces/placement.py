@@ -32,7 +32,7 @@ class Placement(eqx.Module):
 
     @property
     def factor(self) -> Float[Array, "*batch"]:
-        """Factor on a shape's distances: the geometric mean of `scale`, exact if its entries are equal."""
+        """Factor on a shape's distances: the geometric mean of `scale`. It is exact if all scales are equal."""
         return jnp.exp(jnp.mean(jnp.log(self.scale), axis=-1))
 
     def to_shape(self, x: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
@@ -49,7 +49,7 @@ class Placement(eqx.Module):
     def moved(self, step: Float[Array, "9"]) -> "Placement":
         """Return a copy that is rotated about the origin of the shape, shifted and scaled.
 
-        - `step`: rotation vector, shift, and logarithms of the scale factors.
+        - `step`: rotation vector (radians, scene axes), shift (scene units), and logarithms of factors on `scale`.
         """
         return Placement(
             jnp.matmul(rotation_from_vector(step[:3]), self.rotation, precision="highest"),
@@ -82,16 +82,16 @@ class ShapePoses(eqx.Module):
 
     @abstractmethod
     def rotation_axes(self) -> Float[np.ndarray, "3 k"]:
-        """Return the axes about which a placement can rotate, as columns."""
+        """Return unit vectors, as columns, of the axes about which a placement can rotate."""
 
     @property
     def rigid_basis(self) -> Float[np.ndarray, "9 k"]:
-        """`step_basis` for a fixed scale."""
+        """`step_basis` without changes of scale."""
         return scipy.linalg.block_diag(self.rotation_axes(), np.eye(3), np.zeros((3, 0)))
 
     @property
     def step_basis(self) -> Float[np.ndarray, "9 k"]:
-        """Basis, as columns, of the steps of `Placement.moved` by which a placement may change."""
+        """Basis, as columns, of the possible steps of `Placement.moved`."""
         smallest, largest = self.scale
         scales = np.zeros((3, 0)) if smallest == largest else np.eye(3) if self.by_axis else np.full((3, 1), 3**-0.5)
         return scipy.linalg.block_diag(self.rotation_axes(), np.eye(3), scales)
@@ -137,7 +137,7 @@ class Upright(ShapePoses):
         require(0 < self.within <= math.pi, f"turns are searched within {self.within} rad; give an angle in (0, pi]")
 
     def rotations(self, count: int) -> Float[np.ndarray, "m 3 3"]:
-        """Return at most `count` rotations by evenly spaced angles that are at least two degrees apart."""
+        """Return at most `count` rotations, at evenly spaced angles that are at least two degrees apart."""
         count = max(1, min(count, round(self.within / math.radians(1.0))))
         angles = self.within * ((2.0 * np.arange(count) + 1.0) / count - 1.0)
         return Rotation.from_rotvec(angles[:, None] * self._unit).as_matrix()

@@ -5,11 +5,11 @@ A shape with signed distance d and placement T has the misfit
     E = mean_j [ log(1 + d(x_j)^2 / 2 tau^2) + (1 - n_j . grad d(x_j)) / 2 ]
         + 2 mean_i log(1 + min(d(z_i) + margin, 0)^2 / tau^2) + prior(T)
 
-for scanned points x_j with normals n_j, and points z_i that were seen to be empty. A point z_i counts if it lies deeper
-inside the shape than the margin, 0.05. Without the points z_i, shapes would shrink onto the visible patch. The prior on
-shift and scale is weak. All shapes are tried in many rotations. The hypotheses of smallest E are refined by
-Gauss-Newton steps (iteratively reweighted least squares, with weights from the logarithms in E), while tau, the scale
-of the distances, falls from 0.12 to 0.03.
+for scanned points x_j with normals n_j, and points z_i that were seen to be empty. A point z_i counts if it is deeper
+inside the shape than the margin of 0.05 scene units. Without the points z_i, shapes would shrink onto the visible
+patch. prior(T) is a weak prior on shift and scale. All shapes are tried in many rotations. The hypotheses of smallest E
+are refined by Gauss-Newton steps (iteratively reweighted least squares, with weights from the logarithms in E). During
+these steps tau, the scale of the distances, falls from 0.12 to 0.03 scene units.
 """
 
 import dataclasses
@@ -46,7 +46,7 @@ _MAX_STEP = 0.3
 class FitTargets(NamedTuple):
     """Data to which shapes are fitted: points with normals, and empty points, in scene coordinates.
 
-    The first rows cover the region of all rows, more sparsely. `mask` and `is_empty` are False for padding.
+    The first rows alone cover the same region as all rows, more sparsely. `mask` and `is_empty` are False for padding.
     """
 
     points: Float[Array, "n 3"]
@@ -57,7 +57,7 @@ class FitTargets(NamedTuple):
 
     @classmethod
     def of(cls, observations: Observations) -> "FitTargets":
-        """Choose points of the cloud (farthest point sampling), and random nodes where the object cannot be."""
+        """Choose points of the cloud by farthest point sampling, and random nodes where no object can be."""
         cloud = farthest_point_subsample(observations.cloud, NUM_POINTS)
         empty, is_empty = _choose_empty_points(observations)
         return cls(cloud.points, cloud.normals, cloud.mask, empty.astype(cloud.points.dtype), is_empty)
@@ -82,7 +82,7 @@ def _choose_empty_points(observations: Observations) -> tuple[Float[Array, "m 3"
 def _first_empty_nodes(
     empty_nodes: Bool[Array, "g g g"], order: Int[Array, " nodes"]
 ) -> tuple[Int[Array, "m 3"], Bool[Array, " m"]]:
-    """Return the grid indices of the first empty nodes in this order, and a mask of the filled rows."""
+    """Return the grid indices of the first 512 empty nodes in this order, and a mask of the filled rows."""
     is_empty = empty_nodes.reshape(-1)[order]
     row = jnp.where(is_empty, jnp.cumsum(is_empty) - 1, _NUM_EMPTY)
     indices = jnp.zeros(_NUM_EMPTY, jnp.int32).at[row].set(order, mode="drop")
@@ -93,9 +93,9 @@ class Hypotheses(eqx.Module):
     """Explanations of a scan: shapes of a bank, each with a placement.
 
     - `shape`: index of each shape in the bank.
-    - `misfit`: E (see `surfaces/registration.py`), or for parts with rays L (see `surfaces/part_evidence.py`).
-    - `is_distinct`: False for a hypothesis that nearly repeats a better one of the same shape. For `register`, the
-      rotations of the two differ by less than 15 degrees. For `search_parts`, the two have the same surface.
+    - `misfit`: E (see `surfaces/registration.py`), or L for parts with rays (see `surfaces/part_evidence.py`).
+    - `is_distinct`: False if a better hypothesis has the same shape and nearly the same placement. In `register` this
+      means rotations less than 15 degrees apart. In `search_parts` it means equal surfaces.
     """
 
     shape: Int[Array, "*h"]
@@ -113,7 +113,7 @@ class Prior(NamedTuple):
     """Prior over placements.
 
     - `box`: a box that the object approximately fills.
-    - `is_true_size`: whether shapes have their true size, so that they keep their scale and need not fill the box.
+    - `is_true_size`: whether shapes are at true size. Then they keep their scale and need not fill the box.
     """
 
     poses: ShapePoses
@@ -134,9 +134,9 @@ class Prior(NamedTuple):
         return Placement(rotation, 0.5 * (box_low + box_high) - 0.5 * scale * (low + high), jnp.broadcast_to(scale, 3))
 
     def deviation(self, shape: Shape, placement: Placement) -> Float[Array, "9"]:
-        """Return how far a placement deviates in shift and size from `fill_box` with the same rotation.
+        """Return the shift and scaling from `fill_box`, with the same rotation, to a placement.
 
-        The result is a step of `Placement.moved`, whose rotation is zero. It is all zero for shapes at true size.
+        The result is a step of `Placement.moved` without rotation. For shapes at true size it is zero.
         """
         if self.is_true_size:
             return jnp.zeros(9, placement.shift.dtype)
@@ -160,8 +160,8 @@ _PRECISION = _PRIOR_WEIGHT * np.array([0.0] * 3 + [_SHIFT_DEVIATION**-2] * 3 + [
 def register(bank: ShapeBank, prior: Prior, targets: FitTargets, num_starts: int) -> Hypotheses:
     """Return the shapes and placements that fit the scan best, best first.
 
-    All shapes are tried in many rotations (`num_starts`, all shapes together), and the best hypotheses are refined.
-    Then all shapes are tried in the placements of a few of these, and the best of all are refined again.
+    Each shape is tried in many rotations (`num_starts` for all shapes together), and the best hypotheses are refined.
+    Then each shape is tried in the placements of a few refined hypotheses, and the best results are refined again.
     """
     coarse_targets, fine_targets = targets.first(_COARSE[1]), targets.first(_FINE[1])
     starts = _rotated_starts(bank, prior, coarse_targets, num_starts)
@@ -177,7 +177,7 @@ def _rotated_starts(bank: ShapeBank, prior: Prior, targets: FitTargets, num_star
     """Compute the misfit of each shape in several rotations, scaled to fill the box."""
     all_rotations = jnp.asarray(prior.poses.rotations(num_starts), targets.points.dtype)
     count = max(1, min(len(all_rotations), num_starts // len(bank)))
-    # Each shape gets evenly spaced rotations with its own offset. Together the shapes cover the rotations without gaps.
+    # Each shape gets evenly spaced rotations with its own offset, so that together the shapes try all rotations.
     offsets = np.random.default_rng(0).permutation(len(bank)) / len(bank)
     positions = (np.arange(count) + offsets[:, None]) * len(all_rotations) / count
 
@@ -189,9 +189,9 @@ def _rotated_starts(bank: ShapeBank, prior: Prior, targets: FitTargets, num_star
 
 
 def _swap_shapes(bank: ShapeBank, prior: Prior, hypotheses: Hypotheses, targets: FitTargets) -> Hypotheses:
-    """Compute the misfit of each shape in the placements of some good hypotheses with distinct rotations.
+    """Compute the misfit of each shape in the placements of the best hypotheses with distinct rotations.
 
-    Each shape takes the rotation of the hypothesis, and its shift and scale relative to the box-filling placement.
+    A shape takes the rotation of a hypothesis, and its shift and scale relative to `Prior.fill_box`.
     """
     hypotheses = hypotheses.best(len(hypotheses.misfit))
     is_distinct = _find_distinct(jnp.zeros_like(hypotheses.shape), hypotheses.placement.rotation)
@@ -224,14 +224,14 @@ def join(*parts: Hypotheses, axis: int = 0) -> Hypotheses:
 
 
 def flatten(rows_of_shapes: Any) -> Any:
-    """Merge the first two axes, of shapes and of rows of each shape, of all arrays in a tree."""
+    """Merge the first two axes (shapes, and rows of a shape) of each array in a tree."""
     return jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), rows_of_shapes)
 
 
 def refine(bank: ShapeBank, prior: Prior, starts: Hypotheses, targets: FitTargets, num_steps: int) -> Hypotheses:
     """Refine each start by Gauss-Newton steps on the misfit E, while tau falls.
 
-    Return for each start the iterate whose E at the last tau is smallest.
+    For each start, the result is the iterate whose E at the last tau is smallest.
     """
     taus = jnp.append(jnp.geomspace(_FIRST_TAU, _LAST_TAU, num_steps), _LAST_TAU)
     basis = jnp.asarray(prior.step_basis, targets.points.dtype)
@@ -243,7 +243,7 @@ def refine(bank: ShapeBank, prior: Prior, starts: Hypotheses, targets: FitTarget
             current, best, smallest = state
             step, misfit = _newton_step(shape, prior, current, targets, tau, basis)
             best = jax.tree.map(lambda a, b: jnp.where(misfit < smallest, a, b), current, best)
-            # E is computed before each step. So the placement after the last step is never evaluated, and is dropped.
+            # E is computed before each step, so the placement after the last step has no E and is dropped.
             return (prior.clip_scale(shape, current.moved(step)), best, jnp.minimum(misfit, smallest)), None
 
         state = start.placement, start.placement, jnp.asarray(jnp.inf, targets.points.dtype)
@@ -324,7 +324,7 @@ def _newton_step(
         ]
     )
 
-    # On flat parts of the surface, the gradient rotates with the shape: d(grad d) = omega x grad d.
+    # On flat parts of the surface, a small rotation omega of the shape changes the gradient by omega x gradient.
     length = jnp.maximum(jnp.linalg.norm(gradient[:count], axis=1, keepdims=True), 1e-6)
     unit = gradient[:count] / length
     normal_rows = jnp.cross(jnp.eye(3, dtype=unit.dtype), unit[:, None])
@@ -348,7 +348,7 @@ def _newton_step(
 
 
 def _find_distinct(shape: Int[Array, " h"], rotation: Float[Array, "h 3 3"]) -> Bool[Array, " h"]:
-    """Return a mask of the hypotheses more than 15 degrees from all better ones of the same shape.
+    """Return a mask that keeps a hypothesis unless a better kept one of its shape is within 15 degrees.
 
     The hypotheses must be sorted, best first.
     """
@@ -362,7 +362,7 @@ def similar_rotations(rotation: Float[Array, "h 3 3"]) -> Bool[Array, "h h"]:
 
 
 def keep_first(is_same: Bool[Array, "h h"]) -> Bool[Array, " h"]:
-    """Return the mask of rows to keep: those that equal no earlier row that is kept."""
+    """Return a mask that keeps a row unless it is the same as an earlier kept row."""
     order = jnp.arange(is_same.shape[0])
 
     def keep(is_first, index):

@@ -12,7 +12,7 @@ from jaxnbv.checks import AnyArray, require
 from jaxnbv.surfaces.placement import ShapePoses
 from jaxnbv.surfaces.shape_bank import ShapeBank
 
-# Largest number of stable poses per part, and the angle (radians) between upward directions below which two poses count
+# Largest number of stable poses per part. Poses whose upward directions differ by less than this angle (radians) count
 # as equal.
 _MAX_POSES, _MIN_ANGLE = 8, np.radians(10.0)
 _NODES = 32
@@ -23,7 +23,7 @@ _UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 class Resting(ShapePoses):
     """Placements of parts that rest on a table: a stable pose, rotated by any angle about the vertical y.
 
-    A search starts from these. Refined hypotheses may tilt.
+    Searches start from such placements, but refinement may tilt parts.
 
     - `stable`: (k, p, 3, 3) rotations of each part of a bank to its stable poses, the most likely pose first.
     """

@@ -1,4 +1,4 @@
-"""Registration of a partial scan with a mesh of the same size: iterative closest points, many starts.
+"""Registration of a partial scan to a mesh of its size: iterative closest points from many starts.
 
 A motion x -> R x + t maps the points p and normals n of the scan to the mesh. Let c be the point of the mesh nearest to
 R p + t, and m the normal at c. A Gauss-Newton step reduces
@@ -23,13 +23,14 @@ from jaxnbv.errors import optional
 from jaxnbv.scanning.sdf.sampled import winding_number
 from jaxnbv.surfaces.placement import FreeRotation
 
-# Number of initial rotations, of initial shifts per rotation, and of points sampled on the mesh, which replace the mesh
-# in the first two stages.
+# Number of initial rotations, of initial shifts per rotation, and of points sampled on the mesh. The sampled points
+# replace the mesh in the first two stages.
 _NUM_ROTATIONS, _NUM_SHIFTS, _NUM_SAMPLES = 400, 3, 4000
-# Number of scan points in each stage; scales s of the steps in the first three stages; number of motions kept after the
-# first and the second stage, and number of steps in the last stage.
+# Number of scan points in each stage.
 _FIRST, _SECOND, _THIRD, _LAST = 64, 400, 1000, 20_000
+# Scales s of the steps in the first three stages.
 _SCALES = np.geomspace(0.1, 0.03, 8), np.geomspace(0.05, 0.01, 12), np.geomspace(0.02, 0.003, 12)
+# Number of motions that the first and the second stage pass on, and number of steps in the last stage.
 _BEST_FIRST, _BEST_SECOND, _NUM_LAST_STEPS = 40, 6, 12
 # Default scale s as a multiple of the median distance, smallest scale, damping relative to the trace of the normal
 # equations, and largest step.
@@ -37,7 +38,7 @@ _SCALE_PER_MEDIAN, _MIN_SCALE, _DAMPING, _MAX_STEP = 2.0, 1e-9, 1e-5, 0.5
 # Motions that differ by less than this angle (stored as its cosine) and this shift count as equal.
 _MIN_COSINE, _MAX_SHIFT = np.cos(np.radians(10.0)), 0.05
 # Number of rotations tried about the axis that the scan constrains least. An almost round part has many local optima
-# there.
+# in rotation about its axis.
 _SWEEP = 72
 # A motion is a rival of the best motion if its fit is at least this fraction of the best fit, and if the two motions
 # place the mesh at least this mean distance apart.
@@ -52,8 +53,8 @@ class Registration(NamedTuple):
 
     - `matrix`: the motion from the scan to the mesh.
     - `median_distance`: median distance of the scan's points from the mesh, after this motion.
-    - `ambiguity`: the largest distance, a mean over the mesh, between the mesh placed by `matrix` and by a motion that
-      fits nearly as well. It is 0 if no such motion is clearly different.
+    - `ambiguity`: mean distance between the mesh placed by `matrix` and the mesh placed by the most different motion
+      that fits nearly as well. It is 0 if no such motion is clearly different.
     """
 
     matrix: Float[np.ndarray, "4 4"]
@@ -124,7 +125,7 @@ class _Stage(NamedTuple):
         return motions
 
     def best(self, motions: _Motions, scale: float, count: int) -> _Motions:
-        """Return the `count` motions with the best fits that do not nearly equal a better motion."""
+        """Return the `count` motions with the best fits, skipping any that nearly equals a better motion."""
         rows: list[int] = []
         for row in np.argsort(-self.equations(motions, scale).fit(scale), kind="stable").tolist():
             cosine = 0.5 * (np.einsum("kij,ij->k", motions.rotations[rows], motions.rotations[row]) - 1.0)
@@ -136,7 +137,7 @@ class _Stage(NamedTuple):
         return motions.take(rows)
 
     def rotate_about_weakest_axis(self, motion: _Motions) -> _Motions:
-        """Return copies of a motion, followed by turns about the screw axis that the scan constrains least."""
+        """Return copies of a motion, each followed by a turn about the least constrained screw axis."""
         weakest = np.linalg.eigh(self.equations(motion).matrix[0])[1][:, 0]
         twist = np.zeros((4, 4))
         twist[:3, :3], twist[:3, 3] = np.cross(np.eye(3), weakest[:3]), weakest[3:]
@@ -241,7 +242,7 @@ def _initial_motions(
 ) -> _Motions:
     """Return the initial motions: rotations, each with a few shifts that put the scan in the mesh's box.
 
-    The first shift centres the scan, and moves it along its mean normal to the front of the mesh. Others are random.
+    The first shift centres the scan, and moves it along its mean normal to the mesh's front. Other shifts are random.
     """
     rotations = FreeRotation().rotations(_NUM_ROTATIONS)
     rotated = np.einsum("nj,sij->sni", points[:_THIRD], rotations)
@@ -261,7 +262,7 @@ def _initial_motions(
 def _mesh_distance(first: _Motions, second: _Motions, samples: Float[np.ndarray, "m 3"], nearest: Nearest) -> float:
     """Return the mean distance of the mesh placed by `second` from the mesh placed by `first`.
 
-    The inverses of the motions place the mesh, of which `samples` are points, at the scan.
+    A motion's inverse places the mesh at the scan. `samples` are points of the mesh.
     """
     moved = (samples - second.shifts[0]) @ second.rotations[0] @ first.rotations[0].T + first.shifts[0]
     return float(np.mean(np.linalg.norm(moved - nearest(moved)[0], axis=1)))

@@ -29,7 +29,7 @@ _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 class Shape(NamedTuple):
     """One shape of a bank, or several along a leading axis.
 
-    - `extremes`: points on the surface. For every direction, one of them is nearly the farthest point of the shape.
+    - `extremes`: points on the surface. In every direction, one of these is nearly the farthest point of the shape.
     """
 
     solid: SignedDistance
@@ -40,7 +40,7 @@ class ShapeBank(eqx.Module):
     """Known shapes, each centred in its own frame. Shapes of the same kind are oriented alike.
 
     - `solids`: all shapes as one batch, whose arrays have a leading axis of shapes; None for an empty bank.
-    - `codes`: the names in UTF-8, as an array so that compiled programs do not depend on the names.
+    - `codes`: the names in UTF-8. They are an array, so that compiled programs do not depend on the names.
     - `from_mesh`: (k, 4, 4) similarity transforms from the coordinates of each mesh to the coordinates of its shape;
       None if the shapes do not come from meshes.
     - `is_true_size`: whether the shapes are as large as the real objects, so that placements do not scale them.
@@ -68,9 +68,7 @@ class ShapeBank(eqx.Module):
     def of(
         cls, solids: Sequence[SignedDistance], names: Sequence[str] | None = None, is_true_size: bool = False
     ) -> "ShapeBank":
-        """Make a bank of solids of one type.
-
-        The signed distances are evaluated exactly, without a grid.
+        """Make a bank of solids of one type, whose signed distances are evaluated exactly, without a grid.
 
         - `names`: by default the indices.
         - `is_true_size`: whether the solids are as large as the real objects, see `from_meshes`.
@@ -115,10 +113,10 @@ class ShapeBank(eqx.Module):
         - `resolution`: nodes along the longest side.
         - `sheet`: thickness given to faces that have the outside on both sides, in units in which the mesh's longest
           side is 2.5.
-        - `names`: by default the name of each file, the path within the folder, or the index of a `trimesh` mesh.
-        - `scale`: the length of the meshes' unit in world units, for parts at true size. Give a number, or for a world
-          in metres one of "m", "cm", "mm", "in" and "ft". Use None for examples of categories, whose size does not
-          matter. Their longest side becomes 2.5.
+        - `names`: by default each file's path within the folder, a listed file's name, or a `trimesh` mesh's index.
+        - `scale`: the length of the meshes' unit in world units, for parts at true size. Give a number, or one of "m",
+          "cm", "mm", "in" and "ft" if the world is in metres. Use None for examples of categories, whose size does not
+          matter. Their longest side then becomes 2.5.
         - `up`: the upward axis of the meshes, see `Frame`.
 
         A `UserWarning` names each unusable mesh, which is left out, and each pair of parts at true size that are equal.
@@ -148,7 +146,7 @@ class ShapeBank(eqx.Module):
         return dataclasses.replace(bank, is_true_size=True)._resize(sizes)
 
     def in_scene(self, frame: Frame) -> "ShapeBank":
-        """Return a copy with true sizes, if any, converted from a frame's world units to scene units."""
+        """Return a copy with true sizes, if the bank has them, in scene units instead of world units."""
         return self._resize(jnp.full(len(self), frame.scale)) if self.is_true_size else self
 
     def _resize(self, factors: Float[Array, " k"]) -> "ShapeBank":
@@ -235,7 +233,7 @@ def _extremes(solids: SignedDistance) -> Float[Array, "k p 3"]:
             return points - (distance / jnp.where(square > 0, square, 1.0))[:, None] * gradient, None
 
         points = jax.lax.scan(stride, start, length=_NUM_STRIDES)[0]
-        # If a solid gives only a bound of the distance, points may not reach the surface. One that did replaces them.
+        # If a solid gives only a bound of the distance, points may miss the surface. A point that hit it replaces them.
         is_on_surface = jnp.abs(solid(points)) < _MAX_DISTANCE
         return jnp.where(is_on_surface[:, None], points, points[jnp.argmax(is_on_surface)])
 
@@ -245,7 +243,7 @@ def _extremes(solids: SignedDistance) -> Float[Array, "k p 3"]:
 def values_and_gradients(
     function: Callable[[Float[Array, "n 3"]], Float[Array, " n"]], points: Float[Array, "n 3"]
 ) -> tuple[Float[Array, " n"], Float[Array, "n 3"]]:
-    """Return the values and gradients at points of a function whose value at a point depends on it alone."""
+    """Return a function's values and gradients at points. A value must depend on its own point alone."""
     values, derivative = jax.linearize(function, points)
     columns = [derivative(jnp.broadcast_to(direction, points.shape)) for direction in jnp.eye(3, dtype=points.dtype)]
     return values, jnp.stack(columns, axis=-1)

@@ -14,14 +14,14 @@ from jaxnbv.scanning.sdf import UNUSED, ImprintedPyramid, LabelledSolid, Sampled
 from jaxnbv.surfaces.placement import FreeRotation, ShapePoses, Upright
 from jaxnbv.surfaces.shape_bank import ShapeBank, encode_names
 
-# Unit of the stored distances of a mesh, which are clipped to 127 units.
+# Unit of a mesh's stored distances, in the shape's frame. They are clipped to 127 units.
 QUANTUM = 0.008
 # Upright, with a separate scale for each axis.
 _FURNITURE = Upright(by_axis=True)
 
 
 class ShippedBank(NamedTuple):
-    """A solid with the PyTree structure of a bank's solids, and the possible placements of these."""
+    """Description of a shipped bank: `form()` returns a solid with the PyTree structure of its solids."""
 
     form: Callable[[], SignedDistance]
     poses: ShapePoses
