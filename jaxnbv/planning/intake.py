@@ -72,7 +72,7 @@ class Intake:
             cloud = only_where(cloud, image.mask, self.camera, self.stride)
         if image.robot is not None or image.mask is not None:
             shows_any = index > 0 or bool(cloud.mask.any())
-            require(shows_any, "the first image shows nothing of the box inside the mask, or all points are ignored")
+            require(shows_any, "the first image shows nothing of the box at the pixels of the mask, or all is ignored")
         obstacles, scan = loop.planner.obstacles, self.frame.to_scene(cloud)
         loop.add(self.frame.to_scene(pose), scan if obstacles is None else obstacles.remove_points(scan), on_accept)
         if self.clutter is not None and obstacles is not None:

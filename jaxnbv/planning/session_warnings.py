@@ -14,7 +14,7 @@ from jaxnbv.scanning import Obstacles
 
 # Smallest fraction of points beyond a face of the box that leads to a warning. Fewer points may be stray.
 _MIN_FRACTION = 0.01
-# `stacklevel` for the user's call of a session's method. For `add` it is one more, because a wrapper checks arguments.
+# `stacklevel` that points at the user's call: one more for `add`, whose arguments a wrapper checks.
 _CALLER, _CALLER_OF_ADD = 3, 4
 
 
