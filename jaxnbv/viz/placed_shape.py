@@ -65,6 +65,7 @@ class PlacedShape(MeanSurface):
 
     @property
     def caption(self) -> str:
+        """Name and probability in percent, as text."""
         return f"{self.name}  {100 * self.probability:.0f} %"
 
 
