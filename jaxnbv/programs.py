@@ -176,8 +176,11 @@ def _is_plain_context() -> bool:
 
 
 def _settings() -> tuple:
-    """Return JAX's settings, including those of context managers, but without those of JAX's cache."""
-    names = [name for name in jax.config.values if "cache" not in name]
+    """Return JAX's settings, including those of context managers, but without those that change no program.
+
+    `own_settings` allows all transfers, so a program may run with and without a transfer guard.
+    """
+    names = [name for name in jax.config.values if "cache" not in name and "transfer_guard" not in name]
     return tuple([str(getattr(jax.config, name, jax.config.values[name])) for name in names])
 
 

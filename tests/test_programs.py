@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from jaxnbv import programs
+from jaxnbv.checks import own_settings
 from jaxnbv.compiled import PROGRAMS
 from jaxnbv.programs import program
 from jaxnbv.scanning import sdf
@@ -134,6 +135,15 @@ def test_settings_are_part_of_a_program(folder):
         assert stored(jnp.ones(2)).dtype == jnp.float64
     with jax.debug_nans(True), pytest.raises(FloatingPointError):
         counted(jnp.log)[0](-jnp.ones(2))
+
+
+def test_transfer_guards_are_no_part_of_a_program(folder):
+    """The same program runs within `own_settings`, which allows transfers, and outside it."""
+    stored, calls = counted(lambda x: 2.0 * x)
+    stored(jnp.ones(2))
+    with own_settings():
+        stored(jnp.ones(2))
+    assert len(calls) == 1
 
 
 def test_code_of_others_is_not_kept(folder):
