@@ -25,6 +25,7 @@ from jaxnbv.geometry.cloud import farthest_point_subsample
 from jaxnbv.geometry.volume import Box
 from jaxnbv.observations import Observations
 from jaxnbv.programs import program
+from jaxnbv.surfaces.factor import CholeskyFactor
 from jaxnbv.surfaces.placement import Placement, ShapePoses
 from jaxnbv.surfaces.shape_bank import Shape, ShapeBank, values_and_gradients
 
@@ -341,7 +342,7 @@ def _newton_step(
     vector = vector + jnp.matmul(basis.T, precision * deviation, precision="highest")
 
     matrix = matrix + _DAMPING * jnp.trace(matrix) * jnp.eye(len(matrix), dtype=matrix.dtype)
-    step = jnp.matmul(basis, jnp.linalg.solve(matrix, -vector), precision="highest")
+    step = jnp.matmul(basis, CholeskyFactor.of(matrix).solve(-vector), precision="highest")
     agreement = jnp.sum(targets.normals * gradient[:count], axis=1)
     misfit = _sum_terms(distance[:count], agreement, distance[count:], deviation, targets, _LAST_TAU)
     return step * jnp.minimum(1.0, _MAX_STEP / jnp.maximum(jnp.max(jnp.abs(step)), 1e-9)), misfit
