@@ -13,7 +13,8 @@ from jaxnbv.networks.categories import CATEGORIES
 from jaxnbv.scanning import TriangleMesh, load_mesh
 
 _T = TypeVar("_T")
-# Patterns of the mesh files in the folder of a class, and the up axis in these files. {name} is the name of the folder.
+# For each layout of a class's folder, in the order in which the layouts are tried: pattern of the mesh files, and their up
+# axis. {name} stands for the name of the folder.
 _LAYOUTS = {
     "test/{name}_[0-9]*.off": "z",  # ModelNet
     "*/Scan/Scan.obj": "y",  # OmniObject3D
@@ -27,7 +28,7 @@ _SYNSETS = {category.name: category.synset for category in CATEGORIES}
 
 
 class MeshFile(NamedTuple):
-    """A mesh file, with the class index (`label`), name and upward axis (see `Frame`) of its object."""
+    """A mesh file of one object: its class index (`label`), name, path, and upward axis `up` (see `Frame`)."""
 
     label: int
     name: str
@@ -50,13 +51,13 @@ def interleave(groups: Iterable[Sequence[_T]]) -> list[_T]:
 
 @checked
 def class_meshes(folder: str | Path, classes: Sequence[str]) -> tuple[MeshFile, ...]:
-    """List the mesh files of some classes in the layout `folder/class/.../name`.
+    """List the mesh files in a folder that has one subfolder for each class, named after the class.
 
     The list has the first object of each class, then the second of each, and so on. Labels are indices in `classes`.
-    Classes without a folder are skipped, and so are folders that match none of `classes`. The name of a folder may have
-    underscores instead of spaces. The files in a class's folder show which layout it has: ModelNet, OmniObject3D,
-    ShapeNet, or any other. ShapeNet's folders have numbers as names, but `classes` may have the names instead. If a
-    class has a folder `test`, only the meshes in this folder are listed.
+    Classes without a subfolder are skipped, and so are subfolders that match none of `classes`. The name of a subfolder
+    may have underscores instead of spaces. ShapeNet names its subfolders by number, but `classes` may hold the names of
+    the categories. The layout within a subfolder is recognised: ModelNet, OmniObject3D, ShapeNet, or any other. If a
+    class has a folder `test`, only the meshes in it are listed.
 
     **Raises:** `ValueError` if there is no such folder, if no class has a folder, if the folder of a class has no mesh,
     or if `classes` is not a list of names.
@@ -95,7 +96,7 @@ def _class_files(folder: Path, label: int) -> list[MeshFile]:
         matches = sorted(folder.glob(pattern.format(name=folder.name)))
         files = [file for file in matches if file.suffix[1:].lower() in formats and file.is_file()]
         if files:
-            # If each object has its own folder, the folder has the name of the object.
+            # If each object has its own folder, the object is named after the folder, otherwise after the file.
             names = [file.relative_to(folder).parts[0] if pattern.startswith("*/") else file.stem for file in files]
             return [MeshFile(label, name, str(file), up) for name, file in zip(names, files, strict=True)]
     raise InputError(f"the folder {folder} holds no mesh: its files must end in {', '.join(sorted(formats))}")

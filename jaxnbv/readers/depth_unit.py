@@ -1,4 +1,4 @@
-"""Finds the unit of recorded depth images: the common unit with which overlapping frames agree."""
+"""Finds the unit of recorded depth images, by comparing overlapping frames for each of the usual units."""
 
 import math
 from collections.abc import Callable
@@ -8,14 +8,14 @@ from jaxtyping import Float, UInt16
 
 from jaxnbv.geometry.camera import Camera
 
-# Common units of depth images, each as the number of units per metre. 1 is for images in the unit of the world.
+# Usual units of depth images, each as the number of units per metre. 1 is for images in the unit of the world.
 _UNITS_PER_METRE = (1000.0, 5000.0, 10000.0, 4000.0, 6553.5, 1.0)
 
-# Number of pairs of frames, cosine of the largest angle between the viewing directions of a pair, number of pixels that
-# are used of the first frame, and relative difference up to which depths count as equal.
+# Number of pairs of frames, cosine of the largest angle between the viewing directions of a pair, number of pixels of
+# the first frame to use, and relative difference up to which depths count as equal.
 _NUM_PAIRS, _MIN_COSINE, _NUM_PIXELS, _TOLERANCE = 12, math.cos(math.radians(45.0)), 2000, 0.02
-# Least fraction of the points that agree with the best unit, and least ratio of their number to the number of points
-# that agree with the second-best unit.
+# The best unit is returned only if more than this fraction of the points agree, and more than this many times as many
+# as with the second-best unit.
 _MIN_FRACTION, _MIN_RATIO = 0.03, 2.0
 
 
@@ -24,10 +24,11 @@ def depth_unit(
 ) -> float | None:
     """Return the length of the images' unit in world units, or None if the frames do not determine it.
 
-    For each common unit, the points of a frame are projected into the most distant frame with a similar viewing
-    direction. With the right unit, the depths of the projected points agree with the second image.
+    For each usual unit, the points of a frame are projected into the most distant frame that looks in a similar
+    direction. If the unit is right, the depths of the projected points equal the depths that the second frame measured.
+    This is repeated for up to 12 frames, and the unit for which most points agree is chosen.
 
-    - `image`: returns the depth image of a frame, 0 where nothing was measured.
+    - `image`: function from the index of a frame to its depth image, which is 0 where nothing was measured.
     - `matrices`: poses of the frames, camera to world, OpenCV's axes.
     """
     scales = 1.0 / np.array(_UNITS_PER_METRE)

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from jaxnbv.checks import AnyArray, InputError, as_numbers, require, short_text
 from jaxnbv.readers.text_files import read_rows, read_table, read_text
 
-# The order matters: intrinsics of a depth camera are preferred to intrinsics of a colour camera.
+# Patterns of the files, first choice first: intrinsics of a depth camera are preferred to those of a colour camera.
 _FILES = ("*depth*intrinsic*", "*intrinsic*depth*", "*camera*intrinsic*", "*intrinsic*", "calibration.txt", "info.txt")
 _BUNDLE_FUSION = "m_calibrationDepthIntrinsic"
 
@@ -17,7 +17,7 @@ _BUNDLE_FUSION = "m_calibrationDepthIntrinsic"
 def intrinsic_matrix(values: Float[AnyArray, "..."] | list | tuple, name: str) -> Float[np.ndarray, "3 3"]:
     """Return the 3 x 3 matrix of intrinsics in pixels, given a 3 x 3 or 4 x 4 matrix, or fx, fy, cx, cy.
 
-    **Raises:** `ValueError` if `values` have none of these shapes.
+    **Raises:** `ValueError` if `values` have none of these shapes. The message calls them `name`.
     """
     array = np.squeeze(as_numbers(values, name, np.float64))
     if array.shape == (4,):
@@ -28,11 +28,11 @@ def intrinsic_matrix(values: Float[AnyArray, "..."] | list | tuple, name: str) -
 
 
 def stored_intrinsics(folder: Path) -> Float[np.ndarray, "3 3"] | None:
-    """Read the 3 x 3 matrix from a file of intrinsics (.txt or .json) in a folder or its parent.
+    """Read the 3 x 3 matrix of intrinsics from a .txt or .json file in a folder or its parent.
 
-    Returns None if there is no such file. A file in the folder is preferred to a file in its parent. A text file holds
-    a 3 x 3 or 4 x 4 matrix, or fx, fy, cx, cy, or is BundleFusion's `info.txt`. A JSON file has Open3D's format, or
-    holds fx, fy, cx, cy with these keys, or only the matrix.
+    Returns None if there is no such file. A file in the folder is preferred to a file in the parent. A text file holds
+    a 3 x 3 or 4 x 4 matrix, or fx, fy, cx, cy, or is BundleFusion's `info.txt`. A JSON file has Open3D's format, or the
+    keys fx, fy, cx and cy, or holds only the matrix.
 
     **Raises:** `ValueError` if the file has none of these formats.
     """

@@ -10,13 +10,15 @@ from scipy.sparse.csgraph import connected_components
 
 from jaxnbv.geometry.camera import Camera
 
-# Numbers of frames to compare, of frames that must show the mount, and of blocks along an image's longer side.
+# Images are compared in square blocks of pixels.
+# Number of frames to compare, smallest number of them that must measure a depth, and blocks along the longer side.
 _NUM_FRAMES, _MIN_FRAMES, _NUM_BLOCKS = 16, 4, 80
-# Relative differences up to which depths count as equal: of a block in all frames, and of a point in two frames.
+# Relative differences up to which depths count as equal: for a block in all frames, and for a point in two frames.
 _BLOCK_TOLERANCE, _POINT_TOLERANCE = 0.02, 0.05
 # Neighbouring blocks belong to the same component if their depths differ by at most this factor.
 _MAX_DEPTH_RATIO = 1.1
-# For a component of the mount, more than this many frames see through its place for each frame that sees surface there.
+# A component is part of the mount if frames see through its place more than this many times as often as they see a
+# surface there.
 _MIN_DEEPER_RATIO = 4
 
 
@@ -26,11 +28,12 @@ def own_parts(
     camera: Camera,
     scale: float,
 ) -> Float[np.ndarray, "h w"]:
-    """Return, for each pixel, the depth up to which it shows the camera's mount; zero where it does not.
+    """Return for each pixel the largest depth that counts as the camera's mount; zero where there is no mount.
 
-    Depths are in units of the images. Most frames show the mount at the same pixels and at the same depth. It moves
-    with the camera: where it was during one frame, frames from other poses see something deeper. A vase in the middle
-    of an orbit also has nearly equal depths in all frames, but all frames see the vase at the same place in the world.
+    Depths are in units of the images. A mount has the same depth at the same pixels in most frames, and moves with the
+    camera. So where the mount was in the world during one frame, frames from other poses see something deeper. A vase
+    in the middle of an orbit also has nearly the same depth in all frames, but every frame sees the vase at the same
+    place in the world.
 
     - `image`, `matrices`: as in `depth_unit`.
     - `scale`: length of a unit of the images in world units.
@@ -55,7 +58,7 @@ def own_parts(
 
 
 def _block_minima(image: UInt16[np.ndarray, "h w"], side: int) -> Float[np.ndarray, "k l"]:
-    """Return the least depth in each block of `side` x `side` pixels; zero if nothing was measured."""
+    """Return the least depth in each block of `side` x `side` pixels; zero in blocks without a measurement."""
     image = np.pad(image, [(0, -size % side) for size in image.shape]).astype(float)
     blocks = np.where(image > 0, image, np.inf).reshape(image.shape[0] // side, side, image.shape[1] // side, side)
     least = blocks.min(axis=(1, 3))
@@ -69,10 +72,12 @@ def _is_mount(
     camera: Camera,
     side: int,
 ) -> Bool[np.ndarray, "k l"]:
-    """Return a mask of the connected components of `candidate_depth` that other frames see through.
+    """Return a mask of the blocks that show the mount.
+
+    These are the connected components of `candidate_depth` whose place in the world other frames see through.
 
     - `candidate_depth`: depth of each block that has the same depth in most frames, in world units; zero elsewhere.
-    - `depths`: depths of the blocks in each frame, in world units.
+    - `depths`: least depth of each block in each frame, in world units; zero where nothing was measured.
     - `side`: length of a block's side in pixels.
     """
     row, column = np.nonzero(candidate_depth)
@@ -83,7 +88,8 @@ def _is_mount(
     block_depths = candidate_depth[row, column]
     points = block_depths[:, None] * rays
     num_deeper, num_equal = np.zeros(count), np.zeros(count)
-    # Use bounds of the depths around a block, because its surface may be slanted and the point anywhere in the block.
+    # Compare a point with the least and greatest depth of its block and the neighbours, because the surface may be
+    # slanted and the point may lie anywhere in the block.
     window = (1, 3, 3)
     least = minimum_filter(np.where(depths > 0, depths, np.inf), window)
     greatest = maximum_filter(depths, window)
@@ -108,7 +114,10 @@ def _is_mount(
 
 
 def _components(candidate_depth: Float[np.ndarray, "k l"]) -> tuple[Int[np.ndarray, " blocks"], int]:
-    """Return the component of each block with positive depth (neighbours at about equal depths), and their number."""
+    """Return the index of the component of each block with positive depth, and the number of components.
+
+    Neighbouring blocks at about the same depth belong to the same component.
+    """
     padded = np.pad(candidate_depth, 1)
     number = np.zeros(padded.shape, int)
     number[padded > 0] = np.arange(np.count_nonzero(candidate_depth))

@@ -39,7 +39,7 @@ _ASK_UNIT = (
 
 
 class _StoredRecording(NamedTuple):
-    """Image files of a recording, camera-to-world matrices, and intrinsics and length unit if stored."""
+    """Depth image files of a recording, their camera-to-world matrices, and, if stored, intrinsics and unit."""
 
     files: list[Path]
     matrices: Float[np.ndarray, "n 4 4"]
@@ -64,13 +64,13 @@ class RecordedFrames:
       file of 3DMatch, ScanNet, ETH3D, BundleFusion or Open3D. The formats 7-Scenes and TUM RGB-D do not store
       intrinsics.
     - `depth_scale`: length of the images' unit in the unit of the poses, for example 1/5000. By default it is read from
-      `frames.json`, or chosen from the common units (1/1000, 1/5000, 1/10000, ...) so that frames that show the same
-      surface agree.
+      `frames.json`, or is the usual unit (1/1000, 1/5000, 1/10000, ...) for which frames that show the same surface
+      agree.
 
     `camera` is the sensor, and `matrices` (n, 4, 4) are its poses in world units, with OpenCV's axes. To add frame i to
     a session, call `session.add(frames.depth(i), frames.matrices[i], frames.depth_scale)`. Frames without a valid pose
-    (not finite, zeros, or no rotation) are left out with a `UserWarning`, and so are pixels that show the camera's own
-    mount, such as a gripper.
+    (not finite, zeros, or no rotation) are left out with a `UserWarning`. Pixels that show the camera's own mount, such
+    as a gripper, are set to 0 with a `UserWarning`.
 
     **Raises:** `ValueError` if the folder has none of these formats, or is incomplete or damaged, if there are no
     intrinsics, if the frames do not determine the unit, or if most poses are invalid.
@@ -121,7 +121,9 @@ class RecordedFrames:
         return len(self.files)
 
     def depth(self, index: int) -> UInt16[np.ndarray, "height width"]:
-        """Return a depth image in units of `depth_scale`, 0 where nothing but the camera's mount was measured.
+        """Return the depth image of a frame in units of `depth_scale`.
+
+        It is 0 where nothing was measured, and where it shows the camera's mount.
 
         **Raises:** `ValueError` for an index out of range, or an image that cannot be read or is not a depth image.
         """
@@ -143,7 +145,7 @@ class RecordedFrames:
         return parts
 
     def _stored(self, index: int) -> UInt16[np.ndarray, "height width"]:
-        """Read the depth image of a frame, including the mount, 0 where nothing was measured."""
+        """Read the depth image of a frame, with the mount. It is 0 where nothing was measured."""
         require(0 <= index < len(self), f"there is no frame {index}: {self.folder} has {len(self)}, counted from 0")
         file = self.files[index]
         try:
@@ -216,7 +218,7 @@ def _rotation_to_z_up(up: tuple[float, float, float]) -> Float[np.ndarray, "4 4"
     direction = as_numbers(up, "up", np.float64)
     length = float(np.linalg.norm(direction)) if direction.shape == (3,) else 0.0
     require(0 < length < math.inf, f"up is {short_text(up)}; give a direction, such as (0, -1, 0)")
-    # If `up` is nearly parallel to x, map the y axis into this plane instead.
+    # If `up` is nearly parallel to x, map the y axis into the plane y = 0 instead.
     second_axis = np.eye(3)[int(abs(direction[0]) > 0.9 * length)]
     rotation, _ = Rotation.align_vectors(np.eye(3)[[2, 0]], [direction / length, second_axis], weights=[np.inf, 1.0])
     matrix = np.eye(4)

@@ -58,7 +58,7 @@ def is_installed(module: str | None) -> bool:
         return True
     try:
         spec = importlib.util.find_spec(package)
-    # Raised for modules without a file, such as __main__.
+    # `find_spec` raises these errors for modules without a file, such as __main__.
     except (ValueError, ImportError):
         return False
     locations = [] if spec is None else [spec.origin, *(spec.submodule_search_locations or ())]
@@ -93,11 +93,12 @@ def closure(function: FunctionType) -> dict[str, Any]:
 
 
 def globals_read(code: CodeType, names: dict[str, Any], path: str) -> Iterator[tuple[str, Any]]:
-    """Yield the names and values of the global variables that code reads.
+    """Yield the name and value of each global variable that code reads.
 
-    If the code reads an attribute of a user's module, yields this attribute instead of the module.
+    If the code reads an attribute of a user's module, as in `module.attribute`, yields this attribute instead of the
+    module.
 
-    - `names`: values of the global variables, keyed by name.
+    - `names`: all global variables, as values keyed by name.
     - `path`: see `describe`.
 
     **Raises:** `ValueError` if the code imports a user's module.
@@ -135,7 +136,7 @@ def is_user_defined(name: str, member: Any) -> bool:
 
 
 def source_of(function: FunctionType, path: str) -> str:
-    """Return the source of a function as text, for a lambda only its body.
+    """Return the source code of a function, or the body of a lambda, as text.
 
     - `path`: see `describe`.
 

@@ -29,7 +29,7 @@ from jaxnbv.storage.code import (
 )
 
 _MAX_LISTED = 16
-# Classes of objects that wrap functions, some with custom derivatives for JAX.
+# Names of the classes whose objects wrap functions, and the attributes in which the objects hold the functions.
 _WRAPPERS = {"PjitFunction", "custom_jvp", "custom_vjp", "_JitWrapper", "BoundMethod", "_lru_cache_wrapper"} | {
     kind.__name__ for kind in (functools.cached_property, classmethod, property, staticmethod)
 }
@@ -48,8 +48,8 @@ def describe(obj: Any, arrays: dict[str, np.ndarray] | None = None, path: str = 
     - `arrays`: a dictionary to fill with the contents of the large arrays, keyed by hash.
     - `path`: path of `obj` in a larger configuration, such as "planner.search", for error messages.
 
-    **Raises:** `ValueError` for an object whose state cannot be described, or a function whose source cannot be read,
-    unless it has a `version`. The error names its path.
+    **Raises:** `ValueError` for an object without a `version` whose state cannot be described, and for a function
+    without a `version` whose source cannot be read. The message contains the path of the object or function.
     """
     return _Describer({} if arrays is None else arrays).describe(obj, path)
 
@@ -65,7 +65,10 @@ def fields_of(kind: type) -> Sequence[str]:
 
 
 class _Describer:
-    """State of one call of `describe`. If an object contains itself, a reference stands for the inner one."""
+    """State of one call of `describe`.
+
+    A reference describes an object inside itself, and a function or class that has been described before.
+    """
 
     def __init__(self, arrays: dict[str, np.ndarray]):
         self.arrays = arrays
@@ -94,8 +97,8 @@ class _Describer:
         try:
             return self._describe_object(obj, kind, path)
         finally:
-            # Only functions and classes are described once per call and then by reference. Other equal objects have
-            # equal descriptions, whether or not they are the same object.
+            # Only functions and classes are described once and then by reference. Other objects are described anew, so
+            # that the description does not depend on whether two equal objects are the same object.
             if not isinstance(obj, FunctionType | type):
                 del self.visited[id(obj)]
 
@@ -106,7 +109,7 @@ class _Describer:
         if is_record(kind) and not is_wrapper:
             code = {} if is_installed(kind.__module__) else {"class": self.describe(kind, f"{path}.class")}
             values = {name: getattr(obj, name) for name in fields_of(kind)}
-            # The version is described instead of fields that are functions.
+            # If there is a version, leave out fields that are functions, because the version stands for them.
             state = {name: value for name, value in values.items() if not (has_version and callable(value))}
             return {"type": name_of(kind), **code, **self._describe_values(state, path)}
         if has_version:
@@ -180,7 +183,10 @@ class _Describer:
         return source | self._without_arrays(parts, path)
 
     def _without_arrays(self, parts: dict[str, Any], path: str) -> dict[str, Any]:
-        """Describe the parts of a function or class, without storing arrays. `rebuild` finds it by its name."""
+        """Describe the parts of a function or class, without storing arrays.
+
+        `rebuild` does not need the arrays, because it looks up the function or class by its name.
+        """
         arrays, self.arrays = self.arrays, {}
         try:
             return self._describe_values(parts, path)

@@ -90,11 +90,11 @@ class RunFolder(ResultFolder):
         return self.path / f"{name}_{index:02d}.npz"
 
     def write(self, name: str, index: int, **parts: Any) -> None:
-        """Write a file, completely or not at all. The first call also writes the record of the folder.
+        """Write the file with this name and index, as `write_arrays` does. The first call also writes the record.
 
         - `parts`: Equinox modules, arrays or None, keyed by name.
 
-        **Raises:** `ValueError` whenever `write_whole` raises it.
+        **Raises:** `ValueError` whenever `write_arrays` raises it.
         """
         self.bind()
         name_of = functools.partial(jax.tree_util.keystr, simple=True, separator=".")
@@ -104,9 +104,9 @@ class RunFolder(ResultFolder):
         write_arrays(self.file(name, index), contents)
 
     def read(self, name: str, index: int) -> dict[str, Any]:
-        """Read the parts in a file, keyed by name. Parts that were None are absent.
+        """Read the parts in the file with this name and index, keyed by part. Parts that were None are absent.
 
-        **Raises:** `ValueError` if the file is damaged, or if the checksum or index stored in it is wrong.
+        **Raises:** `ValueError` if the file is missing or damaged, or if its stored checksum or index is wrong.
         """
 
         def check(arrays: dict[str, np.ndarray]) -> None:
@@ -141,7 +141,7 @@ def _checksum(arrays: dict[str, np.ndarray]) -> str:
 
 
 def _parts(arrays: dict[str, Any]) -> dict[str, Any]:
-    """Return the modules and arrays of a file, keyed by name, from arrays with keys such as "scan.points"."""
+    """Join arrays with keys such as "scan.points" and "scan.normals" to modules, here "scan"; keyed by name."""
     parts: dict[str, Any] = {}
     for name, array in arrays.items():
         part, _, rest = name.partition(".")
