@@ -1,4 +1,4 @@
-"""Networks on clouds: PointNet++, small invariant classifiers, a small segmenter, and checkpoint files."""
+"""Networks on clouds: PointNet++, small invariant classifiers, a small segmenter, and checkpoints."""
 
 from jaxnbv.networks.categories import CATEGORIES as CATEGORIES
 from jaxnbv.networks.categories import Category as Category

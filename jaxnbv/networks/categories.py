@@ -12,7 +12,11 @@ from jaxnbv.checks import require
 
 
 class Category(NamedTuple):
-    """A category: name, folder in the data set, names of the parts, and label of the first part."""
+    """A category of objects, and its parts.
+
+    - `synset`: name of the category's folder in the data set.
+    - `first_label`: label of the first part. The labels of a category's parts are consecutive.
+    """
 
     name: str
     synset: str
@@ -47,7 +51,7 @@ NUM_PARTS = 50
 
 
 def category_index(name: str) -> int:
-    """Return the index of a category in `CATEGORIES` and in the networks' one-hot input, given its name.
+    """Return the index in `CATEGORIES` of the category with this name. Networks use the same index.
 
     **Raises:** `ValueError` for an unknown name.
     """
@@ -57,5 +61,5 @@ def category_index(name: str) -> int:
 
 
 def part_mask() -> Bool[np.ndarray, "categories parts"]:
-    """Return a mask that says which of the fifty parts belong to each of the sixteen categories."""
+    """Return a mask that is True where the part (axis 1) belongs to the category (axis 0)."""
     return np.array([[label in category.labels for label in range(NUM_PARTS)] for category in CATEGORIES])

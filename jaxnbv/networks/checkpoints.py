@@ -1,4 +1,4 @@
-"""Files of networks: published PointNet++ checkpoints, and the files of jaxnbv's own networks.
+"""Loads and saves networks: published PointNet++ checkpoints, and files of jaxnbv's own networks.
 
 `save_checkpoint` stores a network's arrays, keyed by attribute path, such as `pattern.pair.weight`. The metadata of the
 file hold the network's class and the arguments of its constructor.
@@ -35,10 +35,11 @@ def load_checkpoint(path: str | Path) -> Network:
     """Load the network in a PyTorch (.pth, .pt) or .safetensors file.
 
     The network is a classifier or a part segmenter: PointNet++ as published, or a network that `save_checkpoint` wrote.
-    No code in the file is run, and PyTorch is not needed. Wrap the network in `CloudClassifier` or `CloudSegmenter`.
+    No code in the file is run, and PyTorch is not needed. To apply the network to a `PointCloud`, wrap it in
+    `CloudClassifier` or `CloudSegmenter`.
 
-    **Raises:** `ValueError` if the file has a different suffix, is missing or damaged, or if its tensors fit none of
-    these networks.
+    **Raises:** `ValueError` if the file has a different suffix, is missing or damaged, or if its tensors do not fit any
+    of these networks.
     """
     tensors, metadata = _read(path)
     try:
@@ -51,9 +52,9 @@ def load_checkpoint(path: str | Path) -> Network:
 
 @checked
 def save_checkpoint(network: OwnNetwork, path: str | Path) -> None:
-    """Write a network of jaxnbv as a safetensors file.
+    """Write an `InvariantClassifier` or a `CompactPartSegmenter` to a safetensors file.
 
-    **Raises:** `ValueError` if the network is not one of jaxnbv's own, or if the file cannot be written.
+    **Raises:** `ValueError` if the network has another type, or if the file cannot be written.
     """
     settings = network.settings if isinstance(network, InvariantClassifier) else {}
     metadata = {"network": json.dumps({"kind": type(network).__name__, **settings})}
@@ -62,7 +63,7 @@ def save_checkpoint(network: OwnNetwork, path: str | Path) -> None:
 
 
 def _read(path: str | Path) -> tuple[_Tensors, Mapping[str, str]]:
-    """Read the tensors of a file, keyed by name, and its metadata."""
+    """Return the tensors in a file, keyed by name, and the file's metadata."""
     suffix = Path(path).suffix
     require(
         suffix in (".pth", ".pt", ".safetensors"),
@@ -79,7 +80,7 @@ def _read(path: str | Path) -> tuple[_Tensors, Mapping[str, str]]:
 
 
 def _blank_network(text: str) -> Any:
-    """Make a network of jaxnbv with shapes in place of arrays, from the text in a file's metadata."""
+    """Make the network that the text in a file's metadata describes, with shapes in place of arrays."""
     try:
         arguments = json.loads(text)
         kind = _KINDS[arguments.pop("kind")]
@@ -90,7 +91,7 @@ def _blank_network(text: str) -> Any:
 
 
 def _fill(blank: Any, arrays: _Tensors) -> Any:
-    """Return a copy of the network `blank` with arrays in place of its shapes."""
+    """Return a copy of the network `blank` in which arrays, keyed by attribute path, replace the shapes."""
     expected = {name: leaf.shape for name, leaf in _named_leaves(blank)}
     leaves: dict[str, np.ndarray] = {}
     for name in sorted(expected.keys() | arrays.keys()):

@@ -23,7 +23,7 @@ class CloudClassifier(Classifier):
     - `num_points`: number of points that the network gets, selected by farthest point sampling. A smaller cloud is
       padded with rows whose mask is False.
     - `scale`: network units per scene unit.
-    - `classes`: names of the classes, by default `network.classes` if there are any.
+    - `classes`: names of the classes, by default `network.classes` if the network has this attribute.
 
     **Raises:** `ValueError` if `num_points` or `scale` is not positive, or if the network segments parts.
     """
@@ -53,7 +53,7 @@ class CloudClassifier(Classifier):
 
 
 class CloudSegmenter(Segmenter):
-    """A segmenter made from a network. It maps a `PointCloud` to the part probabilities of each point.
+    """A segmenter made from a network. It maps a `PointCloud` to part probabilities at some of its points.
 
     Category and scale are arrays, so objects of different category or scale use the same compiled program.
 
@@ -101,14 +101,15 @@ class CloudSegmenter(Segmenter):
         return dict(zip(category.labels, category.parts, strict=True))
 
     def __call__(self, cloud: PointCloud) -> Float[Array, "num_points parts"]:
-        """Compute the part probabilities at the points that the network gets, see `num_points`.
+        """Return the probability of each part (axis 1) at each point that the network gets (axis 0).
 
-        They are zero for parts of other categories and in rows whose mask is False. In other rows they sum to one.
+        Parts of other categories have probability zero. If the cloud has fewer than `num_points` points, the last rows
+        are zero. Each other row sums to one.
         """
         return self._probabilities(farthest_point_subsample(cloud, self.num_points))
 
     def predict(self, cloud: PointCloud) -> tuple[PointCloud, Int[Array, " num_points"]]:
-        """Return the points that the network gets and the most probable part of each (-1 in masked rows)."""
+        """Return the points that the network gets, and the most probable part of each (-1 in unfilled rows)."""
         inputs = farthest_point_subsample(cloud, self.num_points)
         labels = jnp.argmax(self._probabilities(inputs), axis=-1).astype(jnp.int32)
         return inputs, jnp.where(inputs.mask, labels, -1)

@@ -52,9 +52,11 @@ class PairLevel(eqx.Module):
         neighbourhood: tuple[Float[Array, "n 3"], Float[Array, "n 3"], Float[Array, "n inputs"] | None],
         mask: Bool[Array, " n"],
     ) -> Float[Array, "m outputs"]:
-        """Compute the features of each centre, given by position and normal.
+        """Return the features of each centre.
 
-        - `neighbourhood`: points, normals and features of all rows. Rows whose `mask` is False are ignored.
+        - `centers`: positions and normals of the centres.
+        - `neighbourhood`: positions, normals and features of the points from which neighbours are taken. Points whose
+          `mask` is False are ignored.
         """
         points, normals, features = neighbourhood
         index = ball_query(centers[0], points, mask, self.radius, self.neighbours)
@@ -78,8 +80,8 @@ class Focus(eqx.Module):
 
     For example, the cargo is the cue for the class of a truck. The network is invariant under rotations and
     translations, and has about 12,000 parameters. It computes features of each point's neighbourhood, groups them
-    around farthest point samples, and interpolates the features of the groups back to the points. A perceptron then
-    takes both kinds of features.
+    around farthest point samples, and interpolates the features of the groups back to the points. A perceptron maps
+    both kinds of features of a point to the log-odds that the point is part of the cue.
     """
 
     edge: PairLevel
@@ -95,7 +97,10 @@ class Focus(eqx.Module):
     def __call__(
         self, points: Float[Array, "n 3"], normals: Float[Array, "n 3"], mask: Bool[Array, " n"]
     ) -> Float[Array, " n"]:
-        """Compute the log-odds that each point is part of the cue. Ignore rows whose mask is False."""
+        """Return the log-odds that each point is part of the cue.
+
+        Rows whose mask is False do not affect the other rows, and their own values have no meaning.
+        """
         edges = self.edge((points, normals), (points, normals, None), mask)
         order = farthest_point_indices(points, mask, self.around.groups)
         around = self.around((points[order], normals[order]), (points, normals, edges), mask)
@@ -108,8 +113,8 @@ class Focus(eqx.Module):
     ) -> tuple[Float[Array, "few 3"], Float[Array, "few 3"], Bool[Array, " few"]]:
         """Select the first 320 points that are part of the cue with a probability above 0.5.
 
-        Returns the points, their normals and their mask. If `points` are in farthest point order, the selected points
-        are farthest point samples of the cue.
+        Returns points, normals, and a mask that is False for the remaining rows if fewer points are selected. If
+        `points` are in farthest point order, the selected points are spread over the cue.
         """
         is_on_cue = mask & (self(points, normals, mask) > 0.0)
         index = jnp.argsort(~is_on_cue, stable=True)[:_NUM_SELECTED]
@@ -181,7 +186,7 @@ class InvariantClassifier(eqx.Module):
     def __call__(
         self, points: Float[Array, "n 3"], normals: Float[Array, "n 3"], mask: Bool[Array, " n"] | None = None
     ) -> Float[Array, " classes"]:
-        """Compute class log-probabilities. Normals have unit length. Rows whose mask is False are ignored."""
+        """Return class log-probabilities. Normals must have unit length. Rows with a False mask are ignored."""
         mask = jnp.ones(len(points), bool) if mask is None else mask
         if self.focus is not None:
             points, normals, mask = self.focus.select(points, normals, mask)

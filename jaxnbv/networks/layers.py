@@ -53,12 +53,12 @@ class PooledMLP(eqx.Module):
     layers: tuple[Linear, ...]
 
     def lift(self, points: Float[Array, "n 3"], features: Float[Array, "n inputs"] | None) -> Float[Array, "n outputs"]:
-        """Apply the first layer, without its bias, once to each point, for all groups that contain the point."""
+        """Apply the first layer without its bias to each point. The result serves all groups of the point."""
         inputs = points if features is None else jnp.concatenate([points, features], axis=-1)
         return product(inputs, self.layers[0].weight)
 
     def pool(self, lifted: Float[Array, "*groups members inputs"]) -> Float[Array, "*groups outputs"]:
-        """Apply the rest to the results of `lift`: first bias and rectifier, the other layers, the maximum."""
+        """Return the features of each group, from the results of `lift` for the members of the group."""
         hidden = jax.nn.relu(lifted + self.layers[0].bias)
         for layer in self.layers[1:-1]:
             hidden = jax.nn.relu(layer(hidden))
@@ -72,6 +72,7 @@ class SetAbstraction(eqx.Module):
 
     - `branches`, `radii`: perceptrons, and radii of their balls in units of the points.
     - `members`: number of points in a group, for each radius.
+    - `centers`: number of centres, around each of which the points within each radius form a group.
     """
 
     branches: tuple[PooledMLP, ...]
@@ -82,7 +83,10 @@ class SetAbstraction(eqx.Module):
     def __call__(
         self, points: Float[Array, "n 3"], features: Float[Array, "n inputs"] | None, mask: Bool[Array, " n"]
     ) -> tuple[Float[Array, "centers 3"], Float[Array, "centers outputs"]]:
-        """Return the centres and their features. Centres repeat if there are fewer points than centres."""
+        """Return the centres and their features. Rows whose mask is False are ignored.
+
+        If there are fewer points than centres, the first centre is repeated.
+        """
         centers = points[farthest_point_indices(points, mask, self.centers)]
         outputs = []
         for branch, radius, members in zip(self.branches, self.radii, self.members, strict=True):
@@ -109,7 +113,7 @@ class FeaturePropagation(eqx.Module):
         own: Float[Array, "n inputs"],
         features: Float[Array, "m f"],
     ) -> Float[Array, "n outputs"]:
-        """Compute new features of the points from their `own` and from the `features` of the coarse points."""
+        """Return new features of the points, from their `own` features and the `features` of coarse points."""
         first = self.layers[0]
         # Interpolation is linear, so compute the first product at the coarse points, which are fewer.
         lifted = interpolate(points, coarse, product(features, first.weight[own.shape[1] :]))
@@ -127,11 +131,10 @@ def ball_query(
     radius: float | Float[Array, ""],
     count: int,
 ) -> Int[Array, "m count"]:
-    """Return the indices of the first `count` rows within `radius` of each centre.
+    """Return, for each centre, the indices of the first `count` rows of `points` within `radius`.
 
     Rows whose mask is False are ignored. A point at exactly `radius` is in the ball. If a ball has fewer points, its
-    first index is repeated. If it has no point, all its indices are the first row whose mask is True. `points[index]`
-    is differentiable.
+    first index is repeated. If it has no point, all its indices are the first row whose mask is True.
 
     **Raises:** `ValueError` if `count` < 1.
     """
@@ -146,9 +149,9 @@ def ball_query(
 def _positions_of_true(flags: Bool[Array, "m n"], count: int) -> Int[Array, "m count"]:
     """Return the columns of the first `count` true entries of each row.
 
-    If a row has fewer true entries, the remaining columns are at least n. Each row is packed into words of 32 bits. Bit
+    If a row has fewer true entries, the remaining results are at least n. Each row is packed into words of 32 bits. Bit
     counts give the word that holds the k-th true entry, and five bisections of this word give the bit. This takes one
-    pass over the flags, but sorting the columns would take many.
+    pass over the flags, but sorting would take many.
     """
     flags = jnp.pad(flags, ((0, 0), (0, -flags.shape[1] % _WORD_BITS))).reshape(len(flags), -1, _WORD_BITS)
     bit = jnp.left_shift(jnp.uint32(1), jnp.arange(_WORD_BITS, dtype=jnp.uint32))
@@ -176,7 +179,7 @@ def _bit_count(words):
 def interpolate(
     points: Float[Array, "n 3"], coarse: Float[Array, "m 3"], features: Float[Array, "m f"]
 ) -> Float[Array, "n f"]:
-    """Interpolate features at each point from its three nearest coarse points, or all if there are fewer.
+    """Interpolate features at each point from its three nearest coarse points (all if fewer than three).
 
     Weights are inverse squared distances. The result is differentiable in all arguments. The derivative ignores that
     the nearest points may change.
@@ -189,8 +192,9 @@ def interpolate(
 
 
 def _nearest(points: Float[Array, "n 3"], coarse: Float[Array, "m 3"]) -> tuple[Int[Array, "n 3"], Bool[Array, "n 3"]]:
-    """Return the rows of the three nearest coarse points of each point, and whether there is such a row.
+    """Return the rows of the three coarse points nearest to each point, and a mask.
 
+    If there are fewer than three coarse points, the mask is False for the missing ones.
     On a CPU this loop over the coarse points is two to three times as fast as `jax.lax.top_k`.
     """
     points, coarse = jax.lax.stop_gradient((points, coarse))

@@ -35,7 +35,7 @@ PARTS_SCALES = SINGLE_SCALE, (Level(512, (0.1, 0.2, 0.4), (32, 64, 128)), Level(
 def _fill_masked(
     points: Float[Array, "n 3"], normals: Float[Array, "n 3"], mask: Bool[Array, " n"] | None
 ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Bool[Array, " n"]]:
-    """Return points and normals with zeros in rows whose mask is False, and the mask.
+    """Return points and normals with zeros in rows whose mask is False, and the mask (default: all True).
 
     **Raises:** `ValueError` if points and normals are not both (n, 3), or there are no rows.
     """
@@ -55,7 +55,7 @@ def _encode(
     features: Float[Array, "n inputs"] | None,
     mask: Bool[Array, " n"],
 ) -> tuple[list[Any], Float[Array, " outputs"]]:
-    """Return the centres and features of each level, and the features of the whole cloud."""
+    """Return a pair (centres, features) for each level, and the features of the whole cloud."""
     outputs = []
     for level in levels:
         points, features = level(points, features, mask)
@@ -107,10 +107,10 @@ class PointNet2Classifier(eqx.Module):
 class PointNet2PartSegmenter(eqx.Module):
     """Part segmenter of a cloud for an object of known category.
 
-    Set abstractions reduce the cloud to one vector, feature propagations carry it back to the points, and a perceptron
-    follows. The object must be centred and inside the unit sphere, as in training. The result is reverse-mode
-    differentiable in points and normals. The derivative ignores changes in the sampling, grouping and neighbours of
-    points.
+    Set abstractions reduce the cloud to one vector, feature propagations carry this vector back to the points, and a
+    perceptron follows. The object must be centred and inside the unit sphere, as in training. The result is
+    reverse-mode differentiable in points and normals. The derivative ignores changes in the sampling, grouping and
+    neighbours of points.
 
     - `whole`: the PointNet over the coordinates and features of the last level's centres.
     - `propagations`: the feature propagations, the coarsest level first.
@@ -170,7 +170,7 @@ class PointNet2PartSegmenter(eqx.Module):
 
 
 class CompactPartSegmenter(eqx.Module):
-    """Small part segmenter: two set abstractions, a PointNet over all centres, and three propagations.
+    """Small part segmenter: set abstractions, a PointNet over the last centres, and feature propagations.
 
     The segmenter has about 100,000 parameters. Absolute coordinates are features, so all objects must be upright and
     face the same direction as ShapeNet's objects. The result is reverse-mode differentiable in points and normals. The
@@ -219,6 +219,6 @@ class CompactPartSegmenter(eqx.Module):
 
 
 def _layers(keys: Any, *widths: int) -> tuple[Linear, ...]:
-    """Make layers of these widths with random initial weights, as in He et al. (2015)."""
+    """Make a layer between each two consecutive widths, with random weights as in He et al. (2015)."""
     normal = jax.nn.initializers.he_normal()
     return tuple(Linear(normal(next(keys), pair), jnp.zeros(pair[1])) for pair in itertools.pairwise(widths))

@@ -5,7 +5,7 @@
     sa3          mlp_convs.<layer>, mlp_bns.<layer>              all points
     fc1, bn1, fc2, bn2, fc3                                      the classifier's perceptron
     fp3, fp2, fp1    mlp_convs.<layer>, mlp_bns.<layer>          the part segmenter's feature propagations
-    conv1, bn1, conv2                                            its perceptron
+    conv1, bn1, conv2                                            the part segmenter's perceptron
 
 The shapes of the tensors give the numbers of channels, layers, classes and parts, and say whether normals are used. The
 radii are not stored, so they are those of the published networks with one or with several radii per level. Batch
@@ -29,9 +29,9 @@ _EPSILON = 1e-5
 
 
 def published_network(tensors: Tensors) -> PointNet2Classifier | PointNet2PartSegmenter:
-    """Make the network of these tensors: a part segmenter if there are propagations, else a classifier.
+    """Make the network with these tensors: a part segmenter if a name begins with fp, else a classifier.
 
-    **Raises:** `ValueError` if a tensor is missing, unexpected, of a wrong shape or not finite. The error names it.
+    **Raises:** `ValueError` that names the tensor, if it is missing, unexpected, of a wrong shape or not finite.
     """
     state = _State(tensors)
     segments = any(name.startswith("fp") for name in tensors)
@@ -69,10 +69,12 @@ def _part_segmenter(state: "_State") -> PointNet2PartSegmenter:
 def _encoder(
     state: "_State", scales: tuple[tuple[Level, ...], tuple[Level, ...]], kinds: dict[int, str]
 ) -> tuple[tuple[SetAbstraction, ...], PooledMLP, list[int]]:
-    """Return set abstractions, the PointNet over all points, and feature widths (points, then each level).
+    """Return the set abstractions, the PointNet over the last centres, and the numbers of features.
+
+    The first number of features is that of an input point, without coordinates. The others are those of each level.
 
     - `scales`: sizes of the levels for a network with one radius per level, and for a network with several.
-    - `kinds`: allowed numbers of inputs, and the meaning of each.
+    - `kinds`: allowed numbers of inputs of the first layer, each with its meaning.
     """
     is_multi_scale = "sa1.conv_blocks.0.0.weight" in state.tensors
     first = "sa1.conv_blocks.0.0.weight" if is_multi_scale else "sa1.mlp_convs.0.weight"
@@ -98,7 +100,7 @@ class _State:
     def take(self, name: str, *shape: int | None) -> np.ndarray:
         """Check the shape of a tensor, and return the tensor as float64.
 
-        - `shape`: required shape, where None is any length. The tensor may have further axes of length 1.
+        - `shape`: required shape, where None is any length. Further axes of length 1 are removed.
         """
         require(name in self.tensors, f"the tensor {name} is missing")
         actual = self.tensors[name].shape
@@ -111,9 +113,10 @@ class _State:
         return np.asarray(self.tensors[name], dtype=np.float64).reshape(actual[: len(shape)])
 
     def linear(self, name: str, inputs: int | None, norm: str | None = None, roll: bool = False) -> Linear:
-        """Make a layer and merge the batch normalisation `norm` that follows it into the layer.
+        """Make the layer `name`, and merge the batch normalisation `norm` that follows it, if any.
 
-        - `roll`: whether to move the coordinates from the last inputs to the first.
+        - `inputs`: required number of inputs; None for any number.
+        - `roll`: whether the file has the coordinates as the last three inputs. They become the first three.
         """
         weight = self.take(f"{name}.weight", None, inputs).T
         outputs = weight.shape[1]
@@ -132,7 +135,10 @@ class _State:
         return Linear(*map(jnp.asarray, arrays))
 
     def layers(self, name: str, inputs: int | None, roll: bool = False) -> tuple[Linear, ...]:
-        """Make the layers <name>.0, <name>.1, ..., each merged with its batch normalisation."""
+        """Make the layers <name>.0, <name>.1, ..., each merged with its batch normalisation.
+
+        `inputs` and `roll` are those of the first layer, see `linear`.
+        """
         norm = name.replace("mlp_convs", "mlp_bns").replace("conv_blocks", "bn_blocks")
         layers: list[Linear] = []
         while not layers or f"{name}.{len(layers)}.weight" in self.tensors:

@@ -133,7 +133,7 @@ def _read_stream(file: BufferedIOBase, size: int) -> Any:
 
 
 def _unpickle(file: BytesIO | mmap.mmap, size: int, load: _Load) -> Any:
-    """Load the object in the next pickle of a file."""
+    """Load the object in the next pickle of a file of `size` bytes, with storages from `load`."""
     start = file.tell()
     skip_pickle(file, size)
     end = file.tell()
@@ -142,7 +142,7 @@ def _unpickle(file: BytesIO | mmap.mmap, size: int, load: _Load) -> Any:
 
 
 class _TensorUnpickler(pickle.Unpickler):
-    """Unpickler that only creates tensors and dictionaries, and puts a `_Placeholder` for everything else."""
+    """Unpickler that only creates tensors and dictionaries. Everything else becomes a `_Placeholder`."""
 
     def __init__(self, file: BytesIO, load: _Load):
         super().__init__(file)
@@ -158,19 +158,22 @@ class _TensorUnpickler(pickle.Unpickler):
         return _FUNCTIONS.get((module, name), _Placeholder)
 
     def persistent_load(self, identifier: Any) -> np.ndarray:
-        """Return the storage of an identifier ('storage', type, key, device, count, and None in older files)."""
+        """Return the storage for an identifier: ('storage', type, key, device, count, None in older files)."""
         _, kind, key, _, count, *_ = identifier
         return self._storage(key, kind, count)
 
     def _dictionary(self, items: Any = ()) -> "_Dictionary":
-        """Return a dictionary of the items. All together may have at most as many items as the file has bytes."""
+        """Return a dictionary of the items.
+
+        All dictionaries of a pickle together may have at most as many items as the pickle has bytes.
+        """
         self._items -= len(items)
         require(self._items >= 0, "copies the same dictionary over and over: it is damaged")
         return _Dictionary(items)
 
 
 class _Dictionary(OrderedDict):
-    """A dictionary that ignores attributes, which a model's state dictionary may have besides tensors."""
+    """A dictionary that ignores the attributes that a pickled state dictionary may have beside its items."""
 
     def __setstate__(self, _: Any) -> None:
         pass
@@ -190,7 +193,10 @@ class _Placeholder:
 
 
 def _tensor(storage: np.ndarray, offset: int, shape: tuple[int, ...], strides: tuple[int, ...], *_: Any) -> np.ndarray:
-    """Return a tensor as a view of a storage. NumPy raises an error for a view beyond the storage's end."""
+    """Return a tensor as a view of a storage. `offset` and `strides` are in entries.
+
+    NumPy raises an error for a view beyond the storage's end.
+    """
     size = storage.itemsize
     tensor = np.ndarray(shape, storage.dtype, storage, offset * size, tuple(stride * size for stride in strides))
     require(tensor.size <= storage.size, f"stretches {storage.size} numbers to a tensor of shape {shape}: save a copy")
