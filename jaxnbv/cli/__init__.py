@@ -1,4 +1,4 @@
-"""The command line. Its commands are the entry points of the group `jaxnbv.commands`, typer functions or apps."""
+"""The command line. Its commands are the entry points `jaxnbv.commands`: functions or `typer.Typer` apps."""
 
 import sys
 from importlib.metadata import EntryPoint, entry_points
@@ -57,7 +57,7 @@ def _is_own(point: EntryPoint) -> bool:
 def _add_commands() -> None:
     """Add the commands of this package, then the commands of other packages.
 
-    If both have a command of the same name, that of the other package is skipped.
+    A command of another package is skipped if this package has a command of the same name.
     """
     named = {point.name: point for point in sorted(entry_points(group="jaxnbv.commands"), key=_is_own)}
     for point in sorted(named.values(), key=lambda point: (not _is_own(point), point.name)):

@@ -11,7 +11,10 @@ _NAME = "jaxnbv-background"
 
 
 def in_background(function: Callable[..., Any], *arguments: Any, **settings: Any) -> "Future[Any]":
-    """Start a call in a new thread and return its future. The arguments are freed when the call ends."""
+    """Call a function in a new thread, and return a future of the result.
+
+    The arguments are freed when the call ends.
+    """
     future: Future[Any] = Future()
 
     def call() -> None:
@@ -31,7 +34,7 @@ def is_working() -> bool:
 
 
 def end_process(code: int) -> NoReturn:
-    """End the process at once. A normal exit crashes if a thread still runs compiled code."""
+    """End the process at once with this exit code. A normal exit crashes if a thread still runs compiled code."""
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(code)

@@ -37,7 +37,7 @@ KnownOption = Annotated[
 
 
 def by_task(key: Callable[[type[Task]], T]) -> dict[T, str]:
-    """Return a dict from each value of `key` to the names of the tasks with this value, joined by "/"."""
+    """Group the tasks by `key(task)`. Return the names of each group, joined by "/", keyed by this value."""
     names: dict[T, list[str]] = {}
     for name, task in TASKS.items():
         names.setdefault(key(task), []).append(name)

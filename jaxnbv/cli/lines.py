@@ -12,7 +12,7 @@ from jaxnbv.viz.answers import label_of, number_text, words_of
 
 
 class ViewPrinter:
-    """Prints two lines about each view: position, points and why it was chosen, then the answer."""
+    """Prints each view: position, number of points and why it was chosen, then the task's answer."""
 
     def __init__(self, planner: Planner):
         self.planner, self.count = planner, 0
@@ -37,7 +37,7 @@ def _print(line: str) -> None:
 
 
 def _choice_text(planner: Planner, view: View) -> str:
-    """Return the reason for choosing a view as text: its value, and the rank of this value among the candidates."""
+    """Return as text why a view was chosen: its value, and its rank by value among the candidates."""
     if view.proposal is None:
         return "given"
     value, values = float(view.proposal.value), np.asarray(view.proposal.values, np.float64)

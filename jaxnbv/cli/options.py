@@ -1,4 +1,4 @@
-"""Declaration of commands: the fields of a dataclass are the arguments and options of its command."""
+"""Makes commands from dataclasses, whose fields are the arguments and options of the command."""
 
 import dataclasses
 import inspect
@@ -80,7 +80,7 @@ class Command(TyperCommand):
     """
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the words of a command and return those that remain, as click's method does."""
+        """Parse the words as click does, after repeating flags (see the class). Return the words left over."""
         repeated = {flag for one in self.params if str(one.metavar).endswith("...") for flag in one.opts}
         words: list[str] = []
         flag = None

@@ -39,7 +39,7 @@ _TASK_OPTIONS = {
     for name, hint in get_type_hints(task, include_extras=True).items()
     if name in {field.name for field in fields(task)}
 }
-"""Annotations of the options that not all tasks have, keyed by option."""
+"""Annotations of the options that belong to tasks, keyed by option. Each task has only some of them."""
 
 
 @command(RunOptions, _TASK_OPTIONS)
@@ -71,7 +71,10 @@ def run(options: RunOptions, **task_options: Any) -> None:
 
 
 def _task(name: str, settings: dict[str, Any]) -> Task:
-    """Make a task from its options, after checking that it has these options and needs no others."""
+    """Make a task from the options that the user gave.
+
+    **Raises:** `ValueError` for an option that the task does not have, or if an option that it requires is missing.
+    """
     declared = {field.name: field for field in fields(TASKS[name])}
     for option in settings.keys() - declared.keys():
         takers = ", ".join(other for other, task in TASKS.items() if option in {field.name for field in fields(task)})

@@ -97,7 +97,10 @@ def _executor(options: StudyOptions) -> AbstractContextManager[Executor | None]:
 
 
 def _sources(folders: Iterable[Path], parts: Iterable[str]) -> dict[str, list[Path]]:
-    """Return, for each part of the study, the folders from which to copy records."""
+    """Return, for each part of the study, the folders that hold its records.
+
+    - `folders`: output folders of the same study, given by `--join`.
+    """
     sources = {part: [folder / part for folder in folders if (folder / part / "study.json").exists()] for part in parts}
     for folder in folders:
         require(

@@ -16,7 +16,10 @@ _READABLE = str.maketrans(_LETTERS | {"±": "+-", "°": " deg", "…": "...", "�
 
 
 def _readable(error: UnicodeError) -> tuple[str, int]:
-    """Return a similar text (or else codes) for characters that an encoding lacks, and the position after them."""
+    """Return a replacement for characters that an encoding lacks, and the position after the characters.
+
+    The replacement is a similar text, such as "m2" for "m²", or else escape codes.
+    """
     assert isinstance(error, UnicodeEncodeError)
     text = error.object[error.start : error.end].translate(_READABLE)
     return text.encode("ascii", "backslashreplace").decode("ascii"), error.end
