@@ -41,13 +41,15 @@ class Acquisition(eqx.Module):
 
     A search maximises the mean score over the samples.
 
-    - `needs_posterior`: whether `context` reads the posterior. A planner then puts the posterior into the step inputs.
+    - `needs_posterior`: whether `context` reads the posterior. If not, `inputs` leaves it out.
     - `cloud_only`: whether `context` reads only the cloud D. A planner can then test the acquisition before any view.
-    - `measurable_only`: whether samples omit surface that an earlier view should have measured, but did not (`Looks`).
+    - `measurable_only`: whether a planner removes sampled surface that an earlier view should have measured, but did
+      not (see `Looks`).
     - `needs_hypotheses`: whether `context` reads the hypotheses of a model of known parts, and no posterior. The most
       likely part is then the only sample of the step.
-    - `gains_once`: whether a second view from the same pose gains nothing. Any value that is estimated at an earlier
-      pose is then an error. `DiscreteSearch` uses this error to decide which candidates are tied.
+    - `gains_once`: whether a second view from the same pose gains nothing. The true value at a visited pose is then
+      zero, so the estimated value there shows how large estimation errors are. `DiscreteSearch` treats candidates as
+      tied if their values differ by no more than such errors.
     """
 
     needs_posterior: ClassVar[bool] = False
@@ -74,11 +76,11 @@ class Acquisition(eqx.Module):
     ) -> Float[Array, "samples poses *scores"]:
         """Return the scores of imagined scans: one scan of each sampled surface from each pose.
 
-        An acquisition that is not a mean over samples may return a single row. The samples are divided among the
-        devices, or the poses if there are fewer samples than devices. Each device scans several samples together, from
-        all poses (see `samples_at_once`), and scores `batch_size` scans together.
+        An acquisition whose value is not a mean over samples, such as `Identify`, may return a single row. Devices
+        share the samples, or the poses if there are fewer samples than devices. Each device scans several samples
+        together from all poses (see `samples_at_once`), and scores `batch_size` scans together.
 
-        - `barrier`: distance along each ray to an obstacle, see `scan`.
+        - `barrier`: for each pose, the distance along each ray to the first obstacle, see `scan`.
         """
         samples_per_batch = min(samples_at_once(camera, poses), rows_per_device(surfaces.values.shape[0]))
         views = poses, barrier
@@ -87,7 +89,10 @@ class Acquisition(eqx.Module):
         )
 
     def inputs(self, step: StepInputs) -> StepInputs:
-        """Return only the inputs that `context` reads. Steps with inputs of equal shapes share a compilation."""
+        """Return only the inputs that `context` reads.
+
+        `context` is then not compiled again if another input changes its shape.
+        """
         if self.cloud_only:
             return inputs_of(step.observations.cloud)
         return StepInputs(step.observations, step.posterior if self.needs_posterior else None)
@@ -104,24 +109,27 @@ class Acquisition(eqx.Module):
         return Quantity(f"acquisition, {type(self).__name__}", "", meaning)
 
     def answer(self, cloud: PointCloud) -> Answer | None:
-        """Return the answer of a cloud to the acquisition's question, or None if there is no such answer."""
+        """Return the answer to the task's question given a cloud, for example the probability of each class.
+
+        The default is None: the task has no question that a cloud answers, as for `NewSurface`.
+        """
         return None
 
     def answer_values(self, cloud: PointCloud) -> Float[Array, " n"] | None:
-        """Return the values of `answer`; None if there is no answer, or if JAX operations cannot compute it."""
+        """Return `answer(cloud).values`, computed by JAX; None if there is no answer or JAX cannot compute it."""
         return None
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> Answer | None:
-        """Return the correct answer for the true surface `scene`, or None if it is not known.
+        """Return the correct answer for the true surface `scene`; None if it is unknown.
 
-        - `cloud`: points on the whole true surface, uniform by area.
+        - `cloud`: points on the whole true surface, uniform by area. By default `answer(cloud)` counts as correct.
         """
         return self.answer(cloud)
 
     def check(self, cloud: PointCloud) -> None:
         """Raise `ValueError` if a network or function of the acquisition returns an invalid result.
 
-        - `cloud`: the first cloud D, or the union of D and a scan whose score is not finite.
+        - `cloud`: the cloud D, or the union of D and a scan whose score is not finite.
         """
         return
 
@@ -168,19 +176,19 @@ class ExpectedUtilityImprovement(Acquisition):
         return self.utility.improvement
 
     def answer(self, cloud: PointCloud) -> Answer:
-        """Return the utility's own answer, or the utility of the cloud if there is no such answer."""
+        """Return `utility.answer(cloud)`, or the utility of the cloud as a single number if that is None."""
         answer = self.utility.answer(cloud)
         return Answer((self.utility.name,), np.array([float(context_of(self, cloud)[1])])) if answer is None else answer
 
     def answer_values(self, cloud: PointCloud) -> Float[Array, " n"] | None:
-        """Return the values of the utility's own answer, or the utility of the cloud, see `answer`."""
+        """Return `answer(cloud).values`, computed by JAX; None if JAX cannot compute the utility's own answer."""
         values = self.utility.answer_values(cloud)
         if values is None and type(self.utility).answer is Utility.answer:
             return jnp.atleast_1d(context_of(self, cloud)[1])
         return values
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> Answer:
-        """Return the utility's own true answer, or else the answer from points on the whole surface."""
+        """Return `utility.true_answer(scene, cloud)`, or `answer(cloud)` if that is None."""
         answer = self.utility.true_answer(scene, cloud)
         return self.answer(cloud) if answer is None else answer
 
@@ -193,7 +201,7 @@ class ExpectedUtilityImprovement(Acquisition):
 
 
 def as_acquisition(value: Any) -> Acquisition:
-    """Return an acquisition unchanged, or the expected improvement of a utility or function of a cloud.
+    """Return an acquisition unchanged; make `ExpectedUtilityImprovement` from a utility or function.
 
     **Raises:** `ValueError` for anything else.
     """
@@ -240,7 +248,7 @@ class AcquisitionList(Acquisition):
 
 
 def inputs_of(observations: StepInputs | Observations | PointCloud) -> StepInputs:
-    """Return step inputs unchanged, or make them from observations or a cloud, without a posterior."""
+    """Return step inputs unchanged; convert observations or a cloud to step inputs without a posterior."""
     return observations if isinstance(observations, StepInputs) else StepInputs(as_observations(observations))
 
 
@@ -288,10 +296,10 @@ def expected_value(
 
     - `observations`: the observations, or a cloud D. An acquisition that needs the posterior requires `StepInputs`.
     - `surfaces`: the samples along a leading axis.
-    - `barrier`: distance along each ray to an obstacle, see `scan`.
+    - `barrier`: for each pose, the distance along each ray to the first obstacle, see `scan`.
 
     **Raises:** `ValueError` if JAX cannot trace a user's function, if a posterior is needed but missing, or if
-    `Acquisition.check` raises it. The check runs only if nothing is traced.
+    `Acquisition.check` raises it. Under `jit`, `grad` or `vmap` this check is skipped.
     """
     inputs = _inputs(acquisition, observations)
     # `check` needs concrete results. Under jit, results (and this zero) are traced even if all inputs are concrete.
@@ -307,8 +315,8 @@ def scores(
 ) -> Float[Array, "poses *scores"]:
     """Return the scores of a batch of scans, one scan from each pose.
 
-    - `samples_per_batch`: number of samples for which this function runs at the same time. The number of poses whose
-      scans are scored together is `acquisition.batch_size` divided by this number.
+    - `samples_per_batch`: number of samples for which the caller runs this function at the same time. Each of these
+      runs scores `acquisition.batch_size // samples_per_batch` scans together.
     """
     return batched_map(
         lambda rows: acquisition.score(context, ImaginedView(rows[0], camera, rows[1])),
@@ -317,7 +325,7 @@ def scores(
     )
 
 
-# Poses, and for each pose the distance along each ray to an obstacle.
+# Poses, and for each pose the distance along each ray to the first obstacle.
 _Views: TypeAlias = tuple[Pose, Float[Array, "poses rays"] | None]
 
 

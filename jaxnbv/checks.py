@@ -47,7 +47,7 @@ _UNTRACEABLE: dict[type[Exception], tuple[str, str]] = {
         "write it with jnp.where, or jax.lax.cond",
     ),
 }
-# The largest 32-bit float. Larger numbers become infinite when they are converted.
+# The largest 32-bit float. Conversion to 32 bits makes larger numbers infinite.
 _MAX_FLOAT = float(np.finfo(np.float32).max)
 
 
@@ -140,9 +140,11 @@ def check_type(value: Any, hint: Any, name: str) -> None:
 
 
 def check_index(index: Any, batch: tuple[int, ...], name: str) -> None:
-    """Raise `ValueError` if the shape `batch` has no axes, or an integer index is outside its first axis.
+    """Raise `ValueError` if `index` is outside the first axis of a batch, or if the batch has no axis.
 
     JAX would clamp such an index. Only Python and NumPy integers are checked.
+
+    - `batch`: shape of the leading axes of the object called `name`.
     """
     if isinstance(index, int | np.integer):
         check_batch(batch, name)
@@ -161,12 +163,12 @@ def check_key(key: Any) -> None:
 
 
 def on_host(tree: Any) -> Any:
-    """Convert a tree's leaves to NumPy, so that operations compile nothing. Traced trees stay unchanged."""
+    """Convert a tree's leaves to NumPy, which compiles no operations; return a traced tree unchanged."""
     return tree if is_traced(tree) else jax.tree.map(np.asarray, tree)
 
 
 def native(value: Any) -> Any:
-    """Convert a NumPy array to native byte order and at most double precision; return others unchanged.
+    """Convert a NumPy array to native byte order and at most double precision; return other values as is.
 
     JAX's `jit` reads an array of non-native byte order without swapping the bytes.
     """
@@ -221,7 +223,7 @@ def as_numbers(value: Any, name: str, dtype: Any = float) -> np.ndarray:
 
 @contextmanager
 def functions_of_users() -> Iterator[None]:
-    """Context manager for calls of a user's function, which replaces JAX's tracing errors by explanations.
+    """Context manager: replace JAX's tracing errors in a user's function by explanations.
 
     **Raises:** `ValueError` for a function that calls NumPy, selects rows by a mask, or counts, indexes or branches in
     Python with a traced value.
@@ -241,11 +243,12 @@ def functions_of_users() -> Iterator[None]:
 
 
 def checked_result(value: Any, name: str, axes: int, requirement: str) -> Any:
-    """Check a value, called `name`, that a user's function returned, and return the value.
+    """Check the value that a user's function returned, and return the value.
 
-    - `requirement`: description of valid values for the error message.
+    - `name`, `requirement`: what the error message calls the value, and the message's description of valid values.
+    - `axes`: required number of axes. A plain number has zero axes.
 
-    **Raises:** `ValueError` unless it is an array of real numbers with this number of axes. A plain number has none.
+    **Raises:** `ValueError` unless the value is a real number or an array of real numbers, with `axes` axes.
     """
     dtype = getattr(value, "dtype", None)
     is_real = isinstance(value, numbers.Real) if dtype is None else any(jnp.issubdtype(dtype, kind) for kind in _REAL)
@@ -276,7 +279,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _classes(hint: Any) -> tuple[type, ...]:
-    """Return the classes in a type hint; none if it contains anything else."""
+    """Return the classes of a hint that is a class or a union of classes; an empty tuple for other hints."""
     kinds = get_args(hint) if isinstance(hint, types.UnionType) or get_origin(hint) is Union else (hint,)
     # Jaxtyping annotations are classes too, but do not count here, because shapes are checked elsewhere.
     is_plain = all(isinstance(kind, type) and not hasattr(kind, "dim_str") and kind is not object for kind in kinds)

@@ -17,7 +17,8 @@ from jaxnbv.geometry.pose_list import PoseList
 from jaxnbv.programs import program
 from jaxnbv.scanning import Carving, Grid, Looks, Obstacles, barrier_of
 
-# Number of nodes per axis from which a model chooses 100 to 200 empty points. The choice takes longer with more nodes.
+# Largest number of nodes per axis of the grid in `empty_points`. A model chooses 100 to 200 of the empty nodes, which
+# takes longer with more nodes.
 _MAX_POINTS_PER_AXIS = 20
 # After each scan, at most this number of points are checked for being stray. The time is proportional to this number
 # times the capacity of the cloud. Further points are checked after the next scan.
@@ -32,7 +33,7 @@ class EmptyPoints(NamedTuple):
 
 
 class Observations(eqx.Module):
-    """Everything observed so far, in scene coordinates. Array shapes are fixed, so nothing recompiles.
+    """Everything observed so far, in scene coordinates. More views do not change the arrays' shapes.
 
     - `cloud`: the thinned points of all scans, the paper's D.
     - `grid`: the grid of `looks`, `empty_nodes` and `obstacle_nodes`; None if there are none of these.
@@ -62,7 +63,7 @@ class Observations(eqx.Module):
     ) -> "Observations":
         """Return observations of a cloud, with no view yet but room for `max_views`, and with no empty node.
 
-        - `camera`: the camera for whose rays `looks` stores lengths.
+        - `camera`: the sensor's camera. `looks` stores how far each view measured along the rays of this camera.
         """
         empty = None if grid is None else jnp.zeros((grid.resolution,) * 3, bool)
         looks = None if grid is None else Looks.empty(grid, camera, max_views).with_points(cloud)
@@ -96,7 +97,7 @@ class Observations(eqx.Module):
     ) -> "Observations":
         """Return a copy with one more view: its pose, measured surface, and nodes that it showed to be empty.
 
-        - `carving`: the margin around rays within which nodes count as empty; None leaves `empty_nodes` unchanged.
+        - `carving`: decides which nodes the scan shows to be empty. None leaves `empty_nodes` unchanged.
         - `obstacles`: solids that may hide the object. A ray shows nothing behind them.
         """
         # The cloud is not an argument, because the program would be compiled again for each capacity of the cloud.
@@ -127,8 +128,8 @@ def _is_stray(cloud: PointCloud, empty: Bool[Array, "g g g"], grid: Grid) -> Boo
     """Return whether each point is stray: alone, and in a grid cell whose nodes were all seen to be empty.
 
     A point is alone if no other point is within twice the spacing, the median distance between neighbours. In a thinned
-    cloud, points on a connected surface are about one spacing apart. So a point on a thin part that a view missed is
-    not stray, and neither is a point of an image whose pose is slightly wrong.
+    cloud, points on a connected surface are about one spacing apart, so they are not alone. They are kept even if their
+    cell was wrongly seen to be empty, because a view missed a thin part or has a slightly wrong pose.
     """
     is_empty_cell = jax.lax.reduce_window(empty, True, jax.lax.bitwise_and, (2, 2, 2), (1, 1, 1), "VALID")
     cell = tuple(grid.cell_of(cloud.points).T)

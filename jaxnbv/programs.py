@@ -43,7 +43,7 @@ _compile_lock = threading.Lock()
 
 @dataclasses.dataclass(frozen=True)
 class _ArrayPlaceholder:
-    """Placeholder for an array in the result of a program: its index in the list of output arrays."""
+    """Placeholder for an array in a program's result. `index` is its place among the output arrays."""
 
     index: int
 
@@ -92,7 +92,7 @@ class _Program:
         """Load or compile the program; return None if the arguments contain code that is not permitted.
 
         - `static`: the arguments without their arrays.
-        - `tree`, `leaves`, `kinds`: structure of the tree of these arrays, the arrays, and their shapes and types.
+        - `tree`, `leaves`, `kinds`: structure of the tree of arrays, the arrays, and their shapes and types.
         """
         function = self._function.__module__, self._function.__qualname__
         try:
@@ -110,7 +110,7 @@ class _Program:
         return self._compile(entry, static, tree, leaves)
 
     def _compile(self, entry: Path, static: Any, tree: Any, leaves: list) -> _Executable:
-        """Trace the function, then load its program if this lowered code is already stored, or else compile it.
+        """Trace and lower the function. Load the program stored for the lowered code, or else compile it.
 
         - `entry`: path of the file for these arguments. It stores the name of the program's file.
         """
@@ -131,8 +131,8 @@ class _Program:
         # A program with a callback to Python cannot be stored, because it contains an address of this process.
         if "callback" in code:
             return _Executable(lowered.compile(), result)
-        # The same code may be stored for another entry, because the package was edited elsewhere since then, or because
-        # arguments differ only in names.
+        # The same code may be stored for another entry, because an unrelated part of the package was edited, or because
+        # the static arguments differ only in something that the code does not use, such as a name.
         name = hashlib.sha256(repr((_without_names(code), _settings(), _machine())).encode()).hexdigest()
         num_outputs = len(jax.tree.leaves(lowered.out_info))
         payload = _read(entry.parent / name)

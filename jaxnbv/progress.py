@@ -9,7 +9,7 @@ from tqdm import tqdm
 def progress_bar(
     items: Iterable[Any] | None = None, enabled: bool = True, leave: bool = False, **settings: Any
 ) -> "tqdm[Any]":
-    """Return tqdm's progress bar over `items`, which is shown on terminals only.
+    """Return tqdm's progress bar over `items`. It is shown only if `enabled`, and only on a terminal.
 
     - `leave`: whether the bar stays on the screen once it is full.
     - `settings`: further arguments of tqdm, such as `total`, the number of items.

@@ -51,7 +51,7 @@ MODELS = ("screened", "paper")
 
 
 class StepInputs(eqx.Module):
-    """The inputs of one step, the computation that chooses a view.
+    """The inputs of one step. A step is the computation that chooses the next view.
 
     - `posterior`: p(f | observations); None if nothing needs it.
     - `surfaces`: samples of the posterior along a leading axis; None if nothing needs them.
@@ -108,8 +108,8 @@ class SurfaceSampler(eqx.Module):
           "paper" is the published model with its published values. It uses normals only, without carving.
         - `longest_side`: longest side of the object's bounding box, in scene units.
         - `quick`: use fewer frequencies.
-        - `volume`: by default a cube about the origin whose sides are `longest_side`. A volume that you pass may cut
-          the object.
+        - `volume`: region that can hold the object, by default a cube about the origin with sides of `longest_side`. A
+          volume that you pass may cut the object.
         - `solid`: leave out `EmptySpace`, which assumes that unseen space next to empty space is probably empty too.
           This assumption is wrong for a body whose hidden side is as large as its visible side, such as the pyramid.
 
@@ -132,8 +132,8 @@ class SurfaceSampler(eqx.Module):
     def with_bank(self, bank: ShapeBank, poses: ShapePoses) -> "SurfaceSampler":
         """Return a copy whose prior is `KnownShapes`, with the current model for "none of these".
 
-        - `bank`, `poses`: the known shapes, and the placements that are possible. Shapes are registered within the
-          carving's volume, or within `Box()` if there is no carving.
+        - `bank`, `poses`: the known shapes, and their possible placements. Shapes are registered within the carving's
+          volume, or within `Box()` if there is no carving.
         """
         box = Box() if self.carving is None else bounding_box(self.carving.volume)
         longest_side = float(np.max(box.high - box.low))
@@ -151,7 +151,7 @@ class SurfaceSampler(eqx.Module):
 
     @own_settings()
     def within(self, volume: Box) -> "SurfaceSampler":
-        """Return a copy in which this box replaces every volume that is `Box()`. The box may cut the object."""
+        """Return a copy in which `volume` replaces every default `Box()`. The volume may cut the object."""
 
         def replace(leaf):
             if isinstance(leaf, OutsideBoundary):
@@ -214,9 +214,9 @@ class SurfaceSampler(eqx.Module):
     def carve(
         self, observations: Observations | PointCloud, values: Float[Array, "*s g g g"]
     ) -> Float[Array, "*s g g g"]:
-        """Make values positive where the object cannot be: empty nodes, obstacles, and outside the volume.
+        """Make values positive at nodes where no object can be: empty, in an obstacle, or outside the volume.
 
-        - `values`: f minus its level at the grid's nodes.
+        - `values`: f minus the level, at the grid's nodes.
 
         **Raises:** `ValueError` if the values or the observations have a different grid than the sampler.
         """
@@ -232,7 +232,7 @@ class SurfaceSampler(eqx.Module):
     def mean(
         self, observations: Observations | PointCloud, posterior: SurfacePosterior | None = None
     ) -> Float[Array, "g g g"]:
-        """Return E f minus the level at the grid's nodes, carved like the samples.
+        """Return the posterior mean of f minus the level, at the grid's nodes and carved like the samples.
 
         **Raises:** `ValueError` whenever `SurfaceSampler.posterior` raises it.
         """
@@ -281,9 +281,10 @@ class SurfaceSampler(eqx.Module):
         return TriangleMesh(vertices, faces, Frame())
 
     def adapt(self, observations: Observations | PointCloud) -> Observations:
-        """Return the observations as this sampler uses them: without carving, empty nodes are dropped.
+        """Return the observations as this sampler uses them.
 
-        A `PointCloud` becomes observations in which no node is empty.
+        A `PointCloud` becomes observations without views. Without carving, the empty nodes are dropped. If there are no
+        obstacles either, the grid and `looks` are dropped too.
 
         **Raises:** `ValueError` if the observations have a different grid than the sampler, or if they have no grid
         although samples are carved.

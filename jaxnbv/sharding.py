@@ -19,8 +19,9 @@ from jax.sharding import AxisType, PartitionSpec, get_abstract_mesh
 
 
 def shared_map(function: Callable[..., Any], rows: Any, *shared_args: Any, at_once: int = 1) -> Any:
-    """Map `function(row, *shared_args)` over the rows of a tree by `jax.lax.map`, divided among devices.
+    """Return `function(row, *shared_args)` for each row, stacked, with the rows divided among devices.
 
+    - `rows`: tree of arrays with the rows along the leading axis.
     - `at_once`: number of rows that a device computes together.
     """
 
@@ -31,7 +32,7 @@ def shared_map(function: Callable[..., Any], rows: Any, *shared_args: Any, at_on
 
 
 def batched_map(function: Callable[..., Any], rows: Any, at_once: int) -> Any:
-    """Map a function over batches of `at_once` rows by `jax.lax.map`."""
+    """Return `function(row)` for each row, stacked. `jax.lax.map` computes `at_once` rows together."""
     # `batch_size=1` gives the same result as None, but is 50 % slower.
     return jax.lax.map(function, rows, batch_size=at_once if at_once > 1 else None)
 

@@ -1,4 +1,4 @@
-"""Base classes of utilities and of a task's answers, and the names and units of maximised values."""
+"""Base classes of utilities and of a task's answers, and the name and unit of what a search maximises."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -18,7 +18,7 @@ _POWERS = {1: "", 2: "²", 3: "³"}
 
 
 class Quantity(eqx.Module):
-    """The name, unit and meaning of a maximised value, for tables and captions.
+    """Name, unit and meaning of the values that a search maximises, for tables and captions.
 
     - `name`, `unit`: in words. `unit` leaves out length, see `length_power`, and may be empty.
     - `meaning`: the rest of a caption that begins with "Value:".
@@ -87,11 +87,11 @@ class Utility(eqx.Module):
         return default_batch_size()
 
     def answer(self, cloud: PointCloud) -> Answer | None:
-        """Return the answer that a cloud gives to the task's question; None if its utility is the answer."""
+        """Return the answer to the task's question, given a cloud; None if the cloud's utility is the answer."""
         return None
 
     def answer_values(self, cloud: PointCloud) -> Float[Array, " n"] | None:
-        """Return the values of `answer`; None if there is no answer, or if JAX operations cannot compute it."""
+        """Return `answer(cloud).values`, computed by JAX; None if there is no answer or JAX cannot compute it."""
         return None
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> Answer | None:
