@@ -83,9 +83,10 @@ class KnownShapes(SurfaceModel):
 
     def __check_init__(self):
         check_fields(self)
-        require(self.num_starts >= 1, f"the number of starts is {self.num_starts}; it must be at least 1")
-        for name, value in (("inverse_temperature", self.inverse_temperature), ("noise scale", self.noise_scale)):
-            require(0 <= value < math.inf, f"the {name} is {value}; it must be finite and not negative")
+        require(self.num_starts >= 1, f"num_starts is {self.num_starts}; it must be at least 1")
+        for name in ("inverse_temperature", "noise_scale"):
+            value = getattr(self, name)
+            require(0 <= value < math.inf, f"{name} is {value}; it must be finite and not negative")
 
     def check(self, cloud: PointCloud) -> None:
         self.model_of_none.check(cloud)
@@ -127,12 +128,12 @@ class KnownShapes(SurfaceModel):
         if self.carries_hypotheses:
             is_added = observations.hypotheses is not None
             hypotheses = hypotheses_of(observations if is_added else self.add_state(observations))
-            fits, weights = hypotheses.placed, hypotheses.weights
+            fits, weights, misfit_of_none = hypotheses.placed, hypotheses.weights, hypotheses.misfit_of_none
         else:
             fits, weights = self.fit(observations)
-        return KnownShapesPosterior(
-            jnp.zeros_like(of_none.level), self, fits, weights, self.residual.condition(observations), of_none
-        )
+            misfit_of_none = jnp.asarray(self.misfit_of_none, fits.misfit.dtype)
+        residual, zero = self.residual.condition(observations), jnp.zeros_like(of_none.level)
+        return KnownShapesPosterior(zero, self, fits, weights, misfit_of_none, residual, of_none)
 
 
 @program
@@ -156,6 +157,7 @@ class KnownShapesPosterior(SurfacePosterior):
     - `level`: zero.
     - `fits`: the shapes registered to the scan.
     - `weights`: probability of each fit, followed by the probability of "none of these".
+    - `misfit_of_none`: misfit of "none of these".
     - `residual`: posterior of the difference between object and shape.
     - `of_none`: posterior of f if the object is none of the shapes.
     """
@@ -164,6 +166,7 @@ class KnownShapesPosterior(SurfacePosterior):
     model: KnownShapes
     fits: Hypotheses
     weights: Float[Array, " h_and_none"]
+    misfit_of_none: Float[Array, ""]
     residual: ScreenedSPSRPosterior
     of_none: SurfacePosterior
 
@@ -182,7 +185,7 @@ class KnownShapesPosterior(SurfacePosterior):
             )
             for row in np.flatnonzero(fits.is_distinct)
         ]
-        none = Hypothesis(NONE, float(weights[-1]), self.model.misfit_of_none, None)
+        none = Hypothesis(NONE, float(weights[-1]), float(self.misfit_of_none), None)
         return sorted([*hypotheses, none], key=lambda one: -one.weight)
 
     def kinds(self) -> dict[str, float]:
@@ -195,6 +198,18 @@ class KnownShapesPosterior(SurfacePosterior):
             kind = kind_of(one.name)
             weights[kind] = weights.get(kind, 0.0) + one.weight
         return dict(sorted(weights.items(), key=lambda item: -item[1]))
+
+    def given_likeliest(self) -> SurfacePosterior:
+        """Return the posterior given that the object is the likeliest shape of the likeliest kind.
+
+        It is `of_none` if the likeliest kind is "none of these".
+        """
+        kind, weights = next(iter(self.kinds())), np.asarray(self.weights)
+        if kind == NONE:
+            return self.of_none
+        is_of_kind = [kind_of(self.model.bank.names[index]) == kind for index in np.asarray(self.fits.shape)]
+        row = int(np.argmax(np.where(is_of_kind, weights[:-1], -1.0)))
+        return dataclasses.replace(self, weights=jnp.asarray(np.eye(len(weights), dtype=weights.dtype)[row]))
 
     def names_of_samples(self, key: PRNGKeyArray, num_samples: int) -> list[str]:
         """Return the name of the shape of each sample that `sample` draws with this key."""

@@ -15,6 +15,7 @@ from jaxnbv.planning.episode import Episode
 from jaxnbv.sampler import StepInputs, SurfaceSampler
 from jaxnbv.storage.files import write_bytes
 from jaxnbv.storage.run_folder import ply_of
+from jaxnbv.surfaces.known_shapes import KnownShapesPosterior
 from jaxnbv.surfaces.part_hypotheses import PartHypotheses
 from jaxnbv.viz.mean_surface import MeanSurface, mean_surface, near_points
 from jaxnbv.viz.placed_shape import likeliest_part
@@ -38,7 +39,10 @@ def scanned_cloud(episode: Episode) -> PointCloud:
 
 @checked
 def surface_mesh(episode: Episode, imagined: bool = True) -> trimesh.Trimesh:
-    """Return the surface after the last view (world units): the posterior mean's, or the likeliest part.
+    """Return the surface after the last view, in world units.
+
+    It is the surface of the posterior mean. With known shapes, it is the mean given that the likeliest shape is right,
+    and for parts at true size the likeliest part.
 
     - `imagined`: whether to keep surface that no view measured.
 
@@ -137,8 +141,11 @@ def save_mesh(episode: Episode, path: str | Path, imagined: bool = True) -> Path
 def _surface(sampler: SurfaceSampler, observations: Observations) -> MeanSurface | None:
     if isinstance(observations.hypotheses, PartHypotheses):
         return likeliest_part(observations.hypotheses)
-    inputs = StepInputs(observations, sampler.posterior(observations))
-    return near_points(mean_surface(sampler, inputs), observations.cloud)
+    posterior = sampler.posterior(observations)
+    if isinstance(posterior, KnownShapesPosterior):
+        # The mean over several shapes looks like none of them.
+        posterior = posterior.given_likeliest()
+    return near_points(mean_surface(sampler, StepInputs(observations, posterior)), observations.cloud)
 
 
 def _kind(path: str | Path, kinds: tuple[str, ...]) -> str:
