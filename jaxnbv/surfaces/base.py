@@ -20,7 +20,7 @@ from jaxnbv.observations import Observations
 from jaxnbv.programs import program
 
 HALF_WIDTH = 0.5 * math.pi
-"""Scattered points must lie in [-HALF_WIDTH, HALF_WIDTH]^3, the cube that the paper scales a scene into."""
+"""Half the side of the scene, which is the cube [-HALF_WIDTH, HALF_WIDTH]^3. Observed points must lie in it."""
 
 _NUM_SAMPLES = 64
 
@@ -30,7 +30,8 @@ def _on_torus(has_shape: Callable[[Any], bool], description: str) -> Callable[..
 
     Sampled functions have the period 2 pi, so points outside [-pi, pi]^3 would only repeat points inside.
 
-    - `has_shape`, `description`: whether an array has the right shape, and this shape in words for the error message.
+    - `has_shape`: function that says whether an array has the right shape.
+    - `description`: the right shape in words, for the error message.
     """
 
     def decorate(method: Callable[..., Any]) -> Callable[..., Any]:
@@ -117,11 +118,14 @@ class SurfacePosterior(eqx.Module):
         return type(self).mean is not SurfacePosterior.mean
 
     def kinds(self) -> dict[str, float]:
-        """Return the probability of each kind of known shape ("chair"), most likely first. Empty by default."""
+        """Return the probability of each kind of known shape, such as "chair", most likely first.
+
+        Empty by default.
+        """
         return {}
 
     def names_of_samples(self, key: PRNGKeyArray, num_samples: int) -> list[str]:
-        """Return, for each sample that `sample` draws with this key, the name of its known shape or ""."""
+        """Return, for each sample that `sample` draws with this key, the name of its known shape, or ""."""
         return [""] * num_samples
 
     def mean(self, x: Float[AnyArray, "n 3"]) -> Float[Array, " n"]:
@@ -160,9 +164,9 @@ class SurfaceModel(eqx.Module):
         """
 
     def add_state(self, observations: Observations) -> Observations:
-        """Return the observations with the state that the model carries from view to view, by default none.
+        """Return the observations, with the model's state for the next view added if it has any.
 
-        The loop calls this method after each view.
+        The loop calls this method after each view. By default there is no state.
         """
         return observations
 

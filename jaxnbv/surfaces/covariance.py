@@ -8,9 +8,9 @@ The sums are over integer frequency vectors n with components from -L to L, and 
 s(n) is a product over the axes, s1(n_1) s1(n_2) s1(n_3). A prior with several lengthscales has one spectrum for each,
 and its covariances are sums over the spectra.
 
-For one spectrum, the first covariance is a product over the axes. The other two are nearly short sums of such products,
-because 1 / r = int exp(-r e^u) e^u du, with r = |n|^2, is nearly a short sum of exponentials of r (Beylkin and Monzon
-2010). So no array over the (2 L + 1)^3 frequencies is needed.
+For one spectrum, the first covariance is a product over the axes. The other two are computed as short sums of such
+products, because 1 / r = int exp(-r e^u) e^u du, with r = |n|^2, is close to a short sum of exponentials of r (Beylkin
+and Monzon 2010). So no array over the (2 L + 1)^3 frequencies is needed.
 """
 
 import functools
@@ -138,7 +138,8 @@ def _sine_sum(x: Float[Array, " n"], y: Float[Array, " m"], spectrum: Spectrum) 
 def _inverse_square_sum(products, spectrum: Spectrum):
     """Return the sum over frequency vectors n that `products` computes, with each term divided by |n|^2.
 
-    - `products`: maps s1 to the undivided sum, whose term n is proportional to s1(n_1) s1(n_2) s1(n_3), or 0 if n = 0.
+    - `products`: returns the sum without the division, given s1(0), ..., s1(L). Its term for n must be proportional to
+      s1(n_1) s1(n_2) s1(n_3), and zero for n = 0.
     """
     frequency = jnp.arange(spectrum.shape[0], dtype=spectrum.dtype)
 
@@ -153,7 +154,7 @@ def _inverse_square_sum(products, spectrum: Spectrum):
 
 
 def _inverse_quadrature(spectrum: Spectrum) -> tuple[np.ndarray, np.ndarray]:
-    """Return rates t_q and weights w_q for which sum_q w_q exp(-t_q r) is nearly 1 / r if 1 <= r <= 3 L^2.
+    """Return rates t_q and weights w_q with sum_q w_q exp(-t_q r) close to 1 / r for 1 <= r <= 3 L^2.
 
     Here L is the largest frequency of the spectrum. The logarithms of the rates are evenly spaced, as in the
     trapezoidal rule. The weights are fitted by least squares, because the weights of the trapezoidal rule would need

@@ -26,7 +26,7 @@ from jaxnbv.surfaces.trigonometric import NonuniformTransform, solve_poisson
 
 
 class NormalDraws(NamedTuple):
-    """Draws from the prior: coefficients of the normal field v, and v(X) plus noise at the points X of D."""
+    """Prior draws: coefficients of the normal field v, and v(X) plus noise at the cloud's points X."""
 
     coefficients: Float[Array, "s 3 a a a"]
     noisy_normals: Float[Array, "s n 3"]
@@ -72,7 +72,7 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
     @on_torus
     @program
     def covariance(self, x: Float[AnyArray, "n 3"], y: Float[AnyArray, "m 3"]) -> Float[Array, "n m"]:
-        """Return Cov(f(x), f(y)) between points in scene coordinates. All points are processed at once."""
+        """Return the posterior Cov(f(x), f(y)) of all pairs of points (scene coordinates), computed at once."""
         x, y = (jnp.asarray(points, dtype=self.weights.dtype) for points in (x, y))
         explained = jnp.einsum("djn,djm->nm", *map(self.solver.whitened_cross, (x, y)), precision="highest")
         return function_covariance(x, y, self.spectrum) - explained
@@ -84,7 +84,7 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
         return -0.5 * (fit + 3.0 * self.solver.factor.log_determinant + 3.0 * count * jnp.log(2.0 * jnp.pi))
 
     def data_points(self) -> DataPoints:
-        """Return the cloud's points twice. Mean functions need gradients and values at all of them."""
+        """Return the cloud's points twice: `sample_about` needs gradients and values at all of them."""
         points = fill_rows(self.cloud.points, self.cloud.mask)
         return DataPoints(points, points)
 
@@ -98,7 +98,7 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
         return jnp.mean(means.values, axis=1, where=self.cloud.mask) - explained
 
     def prior_draws(self, key: PRNGKeyArray, num_samples: int) -> NormalDraws:
-        """Draw the normal field v and the noise of the normals."""
+        """Draw the normal field v, and v(X) plus noise at the cloud's points X, for each sample."""
         scale, dtype = jnp.sqrt(mode_variance(self.spectrum)), self.weights.dtype
         modes, shape = scale.shape[0], self.cloud.points.shape
         transform = NonuniformTransform(self.cloud.points, self.truncation)
@@ -115,7 +115,7 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
     def condition_draws(self, draws: NormalDraws, means: MeansAtData) -> Float[Array, "s a a a"]:
         """Condition the draws on the normals, and return the coefficients of the samples.
 
-        A sample is Poisson(v + k(., X) A^-1 (n - grad m(X) - v(X) - eps)), with a mean function m.
+        A sample is Poisson(v + k(., X) A^-1 (n - grad m(X) - v(X) - eps)), where m is its mean function.
         """
         return self._reconstruct_samples(draws.coefficients, self.solver.solve(self._residual(draws, means)))
 
@@ -123,7 +123,7 @@ class GeometricSPSRPosterior(TrigonometricPosterior):
         return jnp.where(self.cloud.mask[:, None], self.cloud.normals - means.gradients - draws.noisy_normals, 0.0)
 
     def whitened_residual(self, draws: NormalDraws, means: MeansAtData) -> Float[Array, "s n 3"]:
-        """Return C^-1 (n - grad m(X) - v(X) - eps) for each sample, where A = C C^T."""
+        """Return C^-1 (n - grad m(X) - v(X) - eps) for each sample, where A = C C^T is the covariance of n."""
         return self.solver.whiten(self._residual(draws, means))
 
     def update_draws(
@@ -168,7 +168,7 @@ def reconstruct(
 def mean_at_data(
     transform: NonuniformTransform, coefficients: Float[Array, "a a a"], cloud: PointCloud
 ) -> Float[Array, ""]:
-    """Return a function's mean over the points of a cloud, which must be the points of the transform."""
+    """Return a function's mean over the filled rows of a cloud, whose points are those of the transform."""
     values = transform.evaluate(coefficients[None])[:, 0]
     return jnp.sum(jnp.where(cloud.mask, values, 0.0)) / jnp.sum(cloud.mask)
 

@@ -54,10 +54,10 @@ class _Grid:
 
 
 def _difference(one: _Grid, other: _Grid, ratio: float) -> float:
-    """Return the largest difference of signed distances to two centred shapes, near the surface of `one`.
+    """Return the largest difference between the signed distances of two shapes, near the surface of `one`.
 
-    The shape `other` is scaled by `ratio`, and rotated by the right angles for which the difference is smallest. The
-    result is infinite if the side lengths differ in every rotation.
+    Both shapes are centred. The shape `other` is scaled by `ratio`, and rotated by the right angles for which the
+    difference is smallest. The result is infinite if the side lengths differ in every rotation.
     """
     smallest, points = np.inf, None
     for rotation in _ROTATIONS:

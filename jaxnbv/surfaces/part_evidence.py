@@ -79,7 +79,7 @@ class Rays(NamedTuple):
     @classmethod
     @program
     def of(cls, observations: Observations, box: Box) -> "Rays | None":
-        """Return the rays of all views that enter a box, or None if the observations do not store rays."""
+        """Return up to 4096 rays that enter a box, from all views; None if the observations store no rays."""
         looks, poses = observations.looks, observations.poses
         if looks is None or observations.empty_nodes is None:
             return None
@@ -129,8 +129,8 @@ def _estimate_noise(
 ) -> Float[Array, ""]:
     """Return the standard deviation of the noise in the ray lengths on the object, or zero without data.
 
-    It is computed from third differences along rows and columns of an image. Without noise, these would be near zero on
-    a surface of low curvature.
+    It is computed from third differences of the lengths along rows and columns of an image. Without noise, these
+    differences are near zero on a surface of low curvature.
     """
     images = jnp.where(is_object, sight.reshape(-1), jnp.nan).reshape(-1, camera.height, camera.width)
     differences = [jnp.diff(images, 3, axis=axis).reshape(-1) for axis in (1, 2)]
@@ -162,7 +162,7 @@ def evidence(bank: ShapeBank, hypotheses: Hypotheses, rays: Rays) -> tuple[Float
 
 
 def ray_weight(distance: Float[Array, ""], camera: Camera) -> Float[Array, ""]:
-    """Return how many independent rays one ray of a camera stands for, at this distance of the object.
+    """Return how many independent rays one ray of a camera stands for, if the object is at this distance.
 
     It is the ray's area on the object divided by the area within which rays have dependent errors.
     """
@@ -178,10 +178,10 @@ def misfit_of(distance: Float[Array, "*n"], tau: Float[Array, ""]) -> Float[Arra
 def _deepest_penetration(
     distance: Callable[[Float[Array, "n 3"]], Float[Array, " n"]], rays: Rays
 ) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
-    """Return the smallest signed distance to a solid along each ray, and whether it is evidence.
+    """Return the smallest signed distance to a solid along each ray, and whether it counts as evidence.
 
-    The distance is zero if the ray misses the solid. It is evidence if the ray has a return, or if the point with the
-    smallest distance was seen to be empty.
+    A ray ends at its measured point. The distance is zero if the ray misses the solid. The distance counts as evidence
+    if the ray has a return, or if the point with the smallest distance was seen to be empty.
     """
 
     def stride(state, _):

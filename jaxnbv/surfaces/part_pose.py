@@ -59,10 +59,11 @@ def object_pose(hypotheses: PartHypotheses, observations: Observations, frame: F
 
 
 def surface_error(hypotheses: PartHypotheses, observations: Observations) -> float:
-    """Return the expected distance of the most likely part's surface from the true one, in scene units.
+    """Return the expected distance (scene units) of the most likely part's surface from the true surface.
 
-    It is a root mean square over points of the part's surface. The mean square is the sum of two: the variance due to
-    errors of the scanned points, and the squared distance to the surface of each hypothesis, weighted by probability.
+    It is a root mean square over points of the part's surface. The mean square is the sum of two terms: the variance
+    due to errors of the scanned points, and the squared distance to the surface of each hypothesis, weighted by the
+    hypothesis's probability.
     """
     part, placement = hypotheses.most_likely
     shape = hypotheses.bank.shape(jnp.asarray(part))
@@ -117,7 +118,7 @@ def _max_change(shape: Shape, rotations: Float[Array, "n 3 3"], probes: Float[Ar
 
 
 def _covariance(shape: Shape, placement: Placement, targets: FitTargets) -> Float[np.ndarray, "6 6"]:
-    """Return the joint covariance of the rotation about the part's centre and of the shift, in the scene.
+    """Return the joint covariance of rotation about the part's centre (radians) and shift (scene units).
 
     It is (J^T J / s^2 + P)^-1, where J is the derivative of the distances from the points to the part, s the standard
     deviation of these distances, and P the precision of a broad prior.

@@ -100,7 +100,7 @@ def search_parts(
 
 
 def _group(hypotheses: Hypotheses, num_shapes: int) -> Hypotheses:
-    """Reshape hypotheses to a first axis of shapes, and a second axis of the hypotheses of one shape.
+    """Split the axis of hypotheses in two: shapes, and the hypotheses of each shape.
 
     The hypotheses must be sorted by shape, with the same number for each shape.
     """
@@ -124,7 +124,9 @@ def _starts(bank: ShapeBank, prior: Prior, targets: FitTargets, num_starts: int)
 
     At the first position of a rotation, the side of the shape's bounding box that faces the sensor touches the scan,
     and the box is centred on the scan in the two directions across the line of sight. The other positions are spread
-    over all positions at which the box, if large enough, contains the scan.
+    over all positions at which the bounding box contains the scan (or, along an axis on which the box is shorter than
+    the scan, lies within the scan). Positions at which the shape would leave
+    `prior.box` by more than a margin are clipped.
     """
     dtype = targets.points.dtype
     rotations = jnp.asarray(prior.poses.rotations_of(len(bank), max(1, num_starts // _NUM_POSITIONS)), dtype)
@@ -171,7 +173,7 @@ def _axes_of_sight(targets: FitTargets) -> Float[Array, "3 3"]:
 
 
 def _mark_repeats(bank: ShapeBank, box: Box, hypotheses: Hypotheses) -> Hypotheses:
-    """Mark each hypothesis that has the same surface as an earlier one of the same part.
+    """Mark each hypothesis that has the same part and the same surface as an earlier hypothesis.
 
     A marked hypothesis has `is_distinct` False and infinite misfit. The hypotheses must be sorted, best first.
     """

@@ -58,7 +58,7 @@ class FitTargets(NamedTuple):
 
     @classmethod
     def of(cls, observations: Observations) -> "FitTargets":
-        """Choose points of the cloud by farthest point sampling, and random nodes where no object can be."""
+        """Choose cloud points by farthest point sampling, and random nodes that are empty or in an obstacle."""
         cloud = farthest_point_subsample(observations.cloud, NUM_POINTS)
         empty, is_empty = _choose_empty_points(observations)
         return cls(cloud.points, cloud.normals, cloud.mask, empty.astype(cloud.points.dtype), is_empty)
@@ -83,7 +83,10 @@ def _choose_empty_points(observations: Observations) -> tuple[Float[Array, "m 3"
 def _first_empty_nodes(
     empty_nodes: Bool[Array, "g g g"], order: Int[Array, " nodes"]
 ) -> tuple[Int[Array, "m 3"], Bool[Array, " m"]]:
-    """Return the grid indices of the first 512 empty nodes in this order, and a mask of the filled rows."""
+    """Return the grid indices of the first 512 empty nodes, and a mask of the filled rows.
+
+    - `order`: a permutation of the flat node indices, in which nodes are tried.
+    """
     is_empty = empty_nodes.reshape(-1)[order]
     row = jnp.where(is_empty, jnp.cumsum(is_empty) - 1, _NUM_EMPTY)
     indices = jnp.zeros(_NUM_EMPTY, jnp.int32).at[row].set(order, mode="drop")
@@ -123,11 +126,11 @@ class Prior(NamedTuple):
 
     @property
     def step_basis(self) -> Float[np.ndarray, "9 k"]:
-        """See `ShapePoses.step_basis`."""
+        """Basis, as columns, of the possible steps of `Placement.moved`, without scaling if at true size."""
         return self.poses.rigid_basis if self.is_true_size else self.poses.step_basis
 
     def fill_box(self, shape: Shape, rotation: Float[Array, "3 3"]) -> Placement:
-        """Return the placement with this rotation that centres the shape in the box, as large as fits."""
+        """Return the placement with this rotation at which the shape is centred in the box, as large as fits."""
         extremes = jnp.matmul(shape.extremes, rotation.T, precision="highest")
         low, high = jnp.min(extremes, axis=0), jnp.max(extremes, axis=0)
         box_low, box_high = jnp.asarray(self.box.low, extremes.dtype), jnp.asarray(self.box.high, extremes.dtype)
@@ -135,9 +138,9 @@ class Prior(NamedTuple):
         return Placement(rotation, 0.5 * (box_low + box_high) - 0.5 * scale * (low + high), jnp.broadcast_to(scale, 3))
 
     def deviation(self, shape: Shape, placement: Placement) -> Float[Array, "9"]:
-        """Return the shift and scaling from `fill_box`, with the same rotation, to a placement.
+        """Return the step of `Placement.moved` from `fill_box`, with the same rotation, to a placement.
 
-        The result is a step of `Placement.moved` without rotation. For shapes at true size it is zero.
+        The step shifts and scales, but does not rotate. For shapes at true size it is zero.
         """
         if self.is_true_size:
             return jnp.zeros(9, placement.shift.dtype)
@@ -146,7 +149,7 @@ class Prior(NamedTuple):
         return jnp.concatenate([jnp.zeros_like(shift), shift, stretch])
 
     def clip_scale(self, shape: Shape, placement: Placement) -> Placement:
-        """Return the placement with its scale clipped to the possible range."""
+        """Return the placement with its scale clipped to the range of `ShapePoses.scale`."""
         if self.is_true_size:
             return placement
         reference = self.fill_box(shape, placement.rotation).scale
@@ -192,7 +195,7 @@ def _rotated_starts(bank: ShapeBank, prior: Prior, targets: FitTargets, num_star
 def _swap_shapes(bank: ShapeBank, prior: Prior, hypotheses: Hypotheses, targets: FitTargets) -> Hypotheses:
     """Compute the misfit of each shape in the placements of the best hypotheses with distinct rotations.
 
-    A shape takes the rotation of a hypothesis, and its shift and scale relative to `Prior.fill_box`.
+    A shape takes the rotation of the hypothesis, and the hypothesis's shift and scale relative to `Prior.fill_box`.
     """
     hypotheses = hypotheses.best(len(hypotheses.misfit))
     is_distinct = _find_distinct(jnp.zeros_like(hypotheses.shape), hypotheses.placement.rotation)
@@ -207,7 +210,10 @@ def _swap_shapes(bank: ShapeBank, prior: Prior, hypotheses: Hypotheses, targets:
 
 
 def evaluate(bank: ShapeBank, prior: Prior, placements: Placement, targets: FitTargets) -> Hypotheses:
-    """Compute the misfit of each shape (first axis) at each of its placements (second axis)."""
+    """Compute the misfit E, at the first tau, of each shape (axis 0) at each of its placements (axis 1).
+
+    The result has one axis, sorted by shape.
+    """
     num_shapes, count = placements.scale.shape[:2]
 
     def misfits_of_shape(one):
@@ -300,7 +306,7 @@ def _newton_step(
 ) -> tuple[Float[Array, "9"], Float[Array, ""]]:
     """Return a damped Gauss-Newton step of limited size, and the misfit E of `placement` at the last tau.
 
-    The step's term for the normals n is |n - grad d|^2 / 4. See `ShapePoses.step_basis` for `basis`.
+    In place of E's term for a normal n, the step minimises |n - grad d|^2 / 4. See `ShapePoses.step_basis` for `basis`.
     """
     points = jnp.concatenate([targets.points, targets.empty])
     distance, gradient = values_and_gradients(lambda x: placement.distance(shape.solid, x), points)
@@ -349,7 +355,7 @@ def _newton_step(
 
 
 def _find_distinct(shape: Int[Array, " h"], rotation: Float[Array, "h 3 3"]) -> Bool[Array, " h"]:
-    """Return a mask that keeps a hypothesis unless a better kept one of its shape is within 15 degrees.
+    """Return a mask that drops a hypothesis if a better one with its shape, within 15 degrees, is kept.
 
     The hypotheses must be sorted, best first.
     """
@@ -357,13 +363,13 @@ def _find_distinct(shape: Int[Array, " h"], rotation: Float[Array, "h 3 3"]) -> 
 
 
 def similar_rotations(rotation: Float[Array, "h 3 3"]) -> Bool[Array, "h h"]:
-    """Return for each pair of rotations whether they differ by less than 15 degrees."""
+    """Return, for each pair of rotations, whether the two differ by less than 15 degrees."""
     trace = jnp.einsum("aij,bij->ab", rotation, rotation, precision="highest")
     return 0.5 * (trace - 1.0) > np.cos(np.radians(15.0))
 
 
 def keep_first(is_same: Bool[Array, "h h"]) -> Bool[Array, " h"]:
-    """Return a mask that keeps a row unless it is the same as an earlier kept row."""
+    """Return a mask that keeps a row unless `is_same` pairs it with an earlier row that is kept."""
     order = jnp.arange(is_same.shape[0])
 
     def keep(is_first, index):

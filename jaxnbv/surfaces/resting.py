@@ -32,7 +32,7 @@ class Resting(ShapePoses):
 
     @classmethod
     def of(cls, bank: ShapeBank) -> "Resting":
-        """Compute the stable poses of a bank's parts, as solids of uniform density, from their convex hulls.
+        """Compute the stable poses of each part of a bank, as a solid of uniform density on its convex hull.
 
         **Raises:** `ValueError` for an empty bank.
         """
@@ -44,7 +44,7 @@ class Resting(ShapePoses):
         return cls(jnp.asarray(np.stack(rows), jnp.result_type(float)))
 
     def rotations(self, count: int) -> Float[AnyArray, "m 3 3"]:
-        """Return the start rotations of the first part."""
+        """Return at most `count` start rotations of the first part."""
         return self.rotations_of(1, count)[0]
 
     def rotations_of(self, num_shapes: int, count: int) -> Float[AnyArray, "k m 3 3"]:

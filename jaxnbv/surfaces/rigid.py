@@ -1,4 +1,4 @@
-"""Registration of a partial scan to a mesh of its size: iterative closest points from many starts.
+"""Registration of a partial scan to a mesh of equal scale: iterative closest points from many starts.
 
 A motion x -> R x + t maps the points p and normals n of the scan to the mesh. Let c be the point of the mesh nearest to
 R p + t, and m the normal at c. A Gauss-Newton step reduces
@@ -63,6 +63,8 @@ class Registration(NamedTuple):
 
 
 class _Motions(NamedTuple):
+    """Rigid motions x -> R x + t from the scan to the mesh, with rotations R and shifts t."""
+
     rotations: Float[np.ndarray, "s 3 3"]
     shifts: Float[np.ndarray, "s 3"]
 
@@ -137,7 +139,7 @@ class _Stage(NamedTuple):
         return motions.take(rows)
 
     def rotate_about_weakest_axis(self, motion: _Motions) -> _Motions:
-        """Return copies of a motion, each followed by a turn about the least constrained screw axis."""
+        """Return copies of a motion, each turned about the screw axis that the scan constrains least."""
         weakest = np.linalg.eigh(self.equations(motion).matrix[0])[1][:, 0]
         twist = np.zeros((4, 4))
         twist[:3, :3], twist[:3, 3] = np.cross(np.eye(3), weakest[:3]), weakest[3:]
@@ -150,7 +152,8 @@ def orient_outward(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, bool]:
     """Return a copy of a mesh with faces wound outward, and whether the mesh is a solid.
 
     Duplicate vertices and faces of zero area are removed. Winding numbers on both sides of the surface distinguish a
-    solid, which may have holes, from a sheet. A sheet is wound consistently, but to either side.
+    solid, which may have holes, from a sheet. The normals of a sheet agree with each other, but may point to either
+    side.
     """
     mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     mesh.merge_vertices()
@@ -242,7 +245,10 @@ def _initial_motions(
 ) -> _Motions:
     """Return the initial motions: rotations, each with a few shifts that put the scan in the mesh's box.
 
-    The first shift centres the scan, and moves it along its mean normal to the mesh's front. Other shifts are random.
+    The first shift centres the scan, and moves it along its mean normal to the front of the mesh. The other shifts are
+    random.
+
+    - `samples`: points of the mesh.
     """
     rotations = FreeRotation().rotations(_NUM_ROTATIONS)
     rotated = np.einsum("nj,sij->sni", points[:_THIRD], rotations)
@@ -260,9 +266,12 @@ def _initial_motions(
 
 
 def _mesh_distance(first: _Motions, second: _Motions, samples: Float[np.ndarray, "m 3"], nearest: Nearest) -> float:
-    """Return the mean distance of the mesh placed by `second` from the mesh placed by `first`.
+    """Return how far apart two motions place the mesh, as a mean distance.
 
-    A motion's inverse places the mesh at the scan. `samples` are points of the mesh.
+    `first` and `second` each hold one motion from the scan to the mesh, so the inverse of a motion places the mesh at
+    the scan. The mean is over points of the mesh placed by `second`, and their distances to the mesh placed by `first`.
+
+    - `samples`: points of the mesh.
     """
     moved = (samples - second.shifts[0]) @ second.rotations[0] @ first.rotations[0].T + first.shifts[0]
     return float(np.mean(np.linalg.norm(moved - nearest(moved)[0], axis=1)))

@@ -139,7 +139,7 @@ def _condition(
 
 
 def _value_unit(base: GeometricSPSRPosterior, offset: float) -> Float[Array, ""]:
-    """Return h, see `ScreenedSPSR.offset`."""
+    """Return h, the unit of observed values, see `ScreenedSPSR.offset`."""
     rows = some_rows(base.cloud, _NUM_UNIT_POINTS)
     points, step = base.cloud.points[rows], offset * base.cloud.normals[rows]
     mean = base.mean_field
@@ -214,7 +214,7 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
         return ScreenedDraws(normals, level, noise)
 
     def condition_draws(self, draws: ScreenedDraws, means: MeansAtData) -> Float[Array, "s a a a"]:
-        """Condition the draws on the normals and then on the values. Return the coefficients of samples of g."""
+        """Return the coefficients of samples of g: the draws conditioned on normals, and then on values."""
         residual = self.base.whitened_residual(draws.normals, means)
         coefficients, level, noise = draws.normals.coefficients, draws.level, draws.noise
         transform = NonuniformTransform(self.rows.points, self.model.base.truncation)

@@ -40,6 +40,7 @@ class ShapeBank(eqx.Module):
     """Known shapes, each centred in its own frame. Shapes of the same kind are oriented alike.
 
     - `solids`: all shapes as one batch, whose arrays have a leading axis of shapes; None for an empty bank.
+    - `extremes`: points on the surface of each shape, see `Shape`.
     - `codes`: the names in UTF-8. They are an array, so that compiled programs do not depend on the names.
     - `from_mesh`: (k, 4, 4) similarity transforms from the coordinates of each mesh to the coordinates of its shape;
       None if the shapes do not come from meshes.
@@ -119,7 +120,7 @@ class ShapeBank(eqx.Module):
           matter. Their longest side then becomes 2.5.
         - `up`: the upward axis of the meshes, see `Frame`.
 
-        A `UserWarning` names each unusable mesh, which is left out, and each pair of parts at true size that are equal.
+        A `UserWarning` names each unusable mesh, which is left out, and with `scale` also each pair of equal parts.
 
         **Raises:** `ValueError` if no mesh can be used, if the number of names differs from the number of meshes, for
         numbers out of range, or for an unknown unit.
@@ -146,7 +147,7 @@ class ShapeBank(eqx.Module):
         return dataclasses.replace(bank, is_true_size=True)._resize(sizes)
 
     def in_scene(self, frame: Frame) -> "ShapeBank":
-        """Return a copy with true sizes, if the bank has them, in scene units instead of world units."""
+        """Return a copy with true sizes, if the bank has them, converted from world to scene units."""
         return self._resize(jnp.full(len(self), frame.scale)) if self.is_true_size else self
 
     def _resize(self, factors: Float[Array, " k"]) -> "ShapeBank":
@@ -223,7 +224,7 @@ def encode_names(names: Sequence[str]) -> UInt8[Array, "k c"]:
 
 @program
 def _extremes(solids: SignedDistance) -> Float[Array, "k p 3"]:
-    """Return points on each solid's surface, by Newton steps on its distance, from a large sphere."""
+    """Return points on each solid's surface, which Newton steps on the distance reach from a large sphere."""
     start = fibonacci_sphere(NUM_EXTREMES, _START_RADIUS)
 
     def of_solid(solid):
@@ -243,7 +244,7 @@ def _extremes(solids: SignedDistance) -> Float[Array, "k p 3"]:
 def values_and_gradients(
     function: Callable[[Float[Array, "n 3"]], Float[Array, " n"]], points: Float[Array, "n 3"]
 ) -> tuple[Float[Array, " n"], Float[Array, "n 3"]]:
-    """Return a function's values and gradients at points. A value must depend on its own point alone."""
+    """Return a function's values and gradients at points. Each value must depend on one point alone."""
     values, derivative = jax.linearize(function, points)
     columns = [derivative(jnp.broadcast_to(direction, points.shape)) for direction in jnp.eye(3, dtype=points.dtype)]
     return values, jnp.stack(columns, axis=-1)

@@ -21,7 +21,10 @@ _FURNITURE = Upright(by_axis=True)
 
 
 class ShippedBank(NamedTuple):
-    """Description of a shipped bank: `form()` returns a solid with the PyTree structure of its solids."""
+    """Description of a shipped bank: how to read its solids, and the possible placements of its shapes.
+
+    - `form`: returns a solid with the same PyTree structure as the bank's solids.
+    """
 
     form: Callable[[], SignedDistance]
     poses: ShapePoses

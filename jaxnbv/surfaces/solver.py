@@ -53,18 +53,21 @@ class Solver(eqx.Module):
 
     @abstractmethod
     def solve(self, matrices: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
-        """Apply A^-1 to the columns of matrices that are zero in unfilled rows."""
+        """Apply A^-1 to each column of each matrix.
+
+        Row i of a matrix belongs to row i of the cloud, and must be zero if the cloud's row i is unfilled.
+        """
 
     @abstractmethod
     def explained_variance(self, x: Float[Array, "n 3"]) -> Float[Array, " n"]:
         """Return how much the data reduce Var f(x), at points in scene coordinates."""
 
     def whiten(self, matrices: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
-        """Apply C^-1 to columns that are zero in unfilled rows, where C is the Cholesky factor of A."""
+        """Apply C^-1 to each column, with A = C C^T (Cholesky). See `solve` for `matrices`."""
         return _apply_to_leading_rows(CholeskyFactor.whiten, self.factor, self.cloud, matrices)
 
     def unwhiten(self, matrices: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
-        """Apply C^-T to columns that are zero in unfilled rows, where C is the Cholesky factor of A."""
+        """Apply C^-T to each column, with A = C C^T (Cholesky). See `solve` for `matrices`."""
         return _apply_to_leading_rows(CholeskyFactor.unwhiten, self.factor, self.cloud, matrices)
 
     def whitened_cross(self, x: Float[Array, "n 3"]) -> Float[Array, "3 capacity n"]:
@@ -92,7 +95,7 @@ class DenseSolver(Solver):
 
     @classmethod
     def of(cls, cloud: PointCloud, spectrum: Spectra, noise: Scalar) -> "DenseSolver":
-        """Return a solver with the Cholesky factor of A, the covariance of the normals. See `Solver`."""
+        """Return a solver with the Cholesky factor of A. See `Solver` for the arguments."""
         capacity = cloud.capacity
 
         def factorise(size: int):
@@ -174,7 +177,7 @@ def solver_of(cloud: PointCloud, spectrum: Spectra, noise: Scalar) -> Solver:
 
 
 def points_per_batch(count: int, capacity: int) -> int:
-    """Return how many of `count` points to process together, so that memory stays bounded."""
+    """Return how many of `count` points to process together, if each needs memory for `capacity` rows."""
     return max(1, min(count, _CHUNK_VALUES // capacity))
 
 
@@ -200,7 +203,14 @@ def _apply_to_leading_rows(
     cloud: PointCloud,
     matrices: Float[Array, "s n k"],
 ) -> Float[Array, "s n k"]:
-    """Apply `function(factor, columns)` to the columns of matrices that are zero in unfilled rows."""
+    """Apply a method of `CholeskyFactor` to each column of each matrix, on as few rows as hold the cloud.
+
+    Row i of a matrix belongs to row i of the cloud, and must be zero if the cloud's row i is unfilled. The leading rows
+    that hold all points are passed on, and the other rows of the result are zero.
+
+    - `function`: called as `function(factor, columns)`, with the factor of the leading rows.
+    - `factor`: the factor for all rows.
+    """
 
     def apply(size: int):
         columns = functools.partial(function, factor.leading(size))
@@ -214,6 +224,6 @@ def _pad_rows(matrices: Float[Array, "s size k"], cloud: PointCloud) -> Float[Ar
 
 
 def _apply_to_columns(function: Callable[[Array], Array], matrices: Float[Array, "s n k"]) -> Float[Array, "s n k"]:
-    """Call a function once, on the columns of all matrices together, and return the results as matrices."""
+    """Apply a function to one matrix with the columns of all matrices, and split the result again."""
     columns = jnp.moveaxis(matrices, 0, 1)
     return jnp.moveaxis(function(columns.reshape(len(columns), -1)).reshape(columns.shape), 1, 0)

@@ -111,7 +111,8 @@ class GeometricSPSR(SurfaceModel):
     def check(self, cloud: PointCloud) -> None:
         """Warn if the median distance between neighbouring points exceeds 2.5 times the longest lengthscale.
 
-        At the data, the standard deviation of f minus its level is then at least 0.9 times that of the prior.
+        Then the data hardly constrain the samples: at the data, the posterior standard deviation of f minus its level
+        is at least 0.9 times the prior standard deviation.
         """
         points, _ = cloud.to_numpy()
         if len(points) < 2 or is_traced(self):
