@@ -37,12 +37,12 @@ Holds: TypeAlias = Callable[[Sure, int], bool]
 
 
 class Chart(NamedTuple):
-    """Data of a line chart: named numbers with a value after each view.
+    """Data of a line chart over the views, with one line for each name.
 
     - `label`: label of the vertical axis, with the unit.
     - `true`: the values if all of the surface had been seen. None if they are unknown.
     - `marks_true_name`: whether `true` is 1 for the true name and 0 for all others.
-    - `goal`: a value that the numbers should reach.
+    - `goal`: a value that the lines should reach, drawn as a dotted line.
     """
 
     label: str
@@ -139,7 +139,7 @@ class _ClassWords(Words):
         return name if p == 1.0 else f"{name}, probability {p:.2f}"
 
     def settled(self, answers: Sequence[Answer], holds: Holds) -> list[bool]:
-        """Return, for each view, whether `Sure` holds and did not hold for a different class one view earlier."""
+        """Return, for each view, whether `Sure` holds, unless it held for a different class one view earlier."""
         is_sure = [holds(self.rule, index) for index in range(len(answers))]
         best = [int(np.argmax(answer.values)) for answer in answers]
         is_contradicted = [False, *(was and a != b for was, (a, b) in zip(is_sure, pairwise(best), strict=False))]
@@ -160,7 +160,7 @@ class _IdentityWords(_ClassWords):
         return super().settled(answers, lambda _, index: bool(answers[index].values.max() >= self.min_probability))
 
     def charts(self, answers: Sequence[Answer], truth: Answer | None) -> tuple[Chart, ...]:
-        """Return a chart of at most six parts, which had the highest probabilities after any of the views."""
+        """Return a chart of the six parts that reached the highest probabilities after any view."""
         values = _rows(answers)
         rows = np.sort(np.argsort(-values.max(axis=0), kind="stable")[:_MAX_PARTS])
         names = tuple(self.answer.names[index] for index in rows)
@@ -229,12 +229,13 @@ class _ColdestWords(Words):
 
 
 class CoverageAnswer(Answer):
-    """Surface seen: percent of the true surface, or an area in `unit`. `amount` is a text, such as "63 %"."""
+    """How much surface was seen: percent of the true surface, or an area in `unit`."""
 
     unit: str = "%"
 
     @property
     def amount(self) -> str:
+        """The amount as text, such as "63 %"."""
         value = float(self.values[0])
         return f"{value:.0f} %" if self.unit == "%" else f"{number_text(value)} {self.unit}"
 
@@ -269,7 +270,7 @@ def point_text(point: Float[np.ndarray, "3"], frame: Frame = Frame()) -> str:  #
 
 
 def length_text(length: float, frame: Frame) -> str:
-    """Return a length in world units as text, with decimals down to a hundredth of a scene unit or finer."""
+    """Return a length in world units as text, with enough decimals to show a hundredth of a scene unit."""
     return f"{length:.{max(0, 2 + math.ceil(math.log10(frame.scale)))}f}".replace("-", "−")
 
 
@@ -285,7 +286,10 @@ def number_text(value: float) -> str:
 
 
 def kinds_text(kinds: Sequence[tuple[str, float]]) -> str:
-    """Return a sentence with the probabilities of the kinds of known shapes, the likeliest first."""
+    """Return a sentence with the probabilities of the likeliest kinds of known shapes.
+
+    - `kinds`: name and probability of every kind, the likeliest first.
+    """
     named = [f"{name} {100 * weight:.0f} %" for name, weight in kinds[:_NUM_KINDS_NAMED]]
     rest = sum(weight for _, weight in kinds[_NUM_KINDS_NAMED:])
     return f"Imagined, as known shapes fit: {', '.join(named)}{f', others {100 * rest:.0f} %' if rest else ''}."

@@ -14,7 +14,7 @@ from jaxnbv.viz.choice import descending_values
 from jaxnbv.viz.data import ReportData
 from jaxnbv.viz.style import GREY, INK, LINE, NEW, SERIES
 
-# Largest numbers of lines, of letters in a name, and of views for which a chart prints the values.
+# Largest numbers of lines in a chart, of letters in a name, and of views up to which the chart prints values.
 _MAX_LINES, _MAX_LETTERS, _MAX_VIEWS = 6, 22, 10
 # Lines that differ by less than this fraction of the range of values look like one line.
 _MIN_DIFFERENCE = 0.02
@@ -47,7 +47,8 @@ def visible_lines(chart: Chart) -> dict[int, int]:
 def draw_chart(axes: Axes, chart: Chart, rival: Chart | None = None, rival_name: str = "") -> list[Line2D]:
     """Draw the numbers and their true values as lines over the views, and return the entries of a legend.
 
-    - `rival`: chart of a different search. Only its line for the true name is drawn, or its only line.
+    - `rival`, `rival_name`: the chart of a different search, and the name of that search. If the chart has several
+      lines, only the line of the true name is drawn.
     """
     views, is_one = np.arange(1, len(chart.values) + 1), len(chart.names) == 1
     true_index = None if chart.true is None or not chart.marks_true_name else int(np.argmax(chart.true))
@@ -111,14 +112,14 @@ def draw_values(axes: Axes, data: ReportData) -> list[Line2D]:
 
 
 def task_charts(data: ReportData) -> list[tuple[str, Figure]]:
-    """Return the titles and charts of the task."""
+    """Return the title and the figure of each chart of the task."""
     task, size = data.task, _LARGE if len(data.task.charts) == 1 else _SMALL
     others = [None] * len(task.charts) if task.rival is None else task.rival.charts
     return [_labelled_figure(data, chart, other, size) for chart, other in zip(task.charts, others, strict=True)]
 
 
 def other_charts(data: ReportData) -> list[tuple[str, Figure]]:
-    """Return titles and charts: surface seen (unless that is the task), and values of the chosen views."""
+    """Return title and figure of two more charts: surface seen (unless it is the task), and values of views."""
     rival = None if data.task.rival is None else data.task.rival.coverage_chart
     charts = [] if data.task.is_coverage else [_labelled_figure(data, data.task.coverage_chart, rival, _LARGE)]
     if data.proposals:

@@ -32,10 +32,12 @@ _LARGE_RATIO, _SMALL_RATIO = 8.0, 50.0
 _MIN_DISTANCE, _MAX_DISTANCE, _POOR_MEDIAN = 0.05, 0.05, 0.02
 # Number of nearest points over which a median smooths the deviation.
 _NEIGHBOURS = 9
-# A place on the CAD is covered if at least this many points lie within a radius, given relative to the distance between
-# a point and its fourth neighbour. The cosine between the normals of place and point must exceed the last value.
+# A place on the CAD is covered if at least this many points lie within a radius. The radius is the second number times
+# the distance from a point to its fourth neighbour. The cosine between the normals of place and point must exceed the
+# third number.
 _MIN_COVERING, _RADIUS, _MIN_COSINE = 3, 1.5, 0.3
-# Numbered places have at least this many times the median deviation. End of the colours if nothing deviates.
+# Numbered places have at least this many times the median deviation. Largest deviation of the colour scale if the scan
+# does not deviate at all.
 _MIN_OUTLIER_RATIO, _MIN_LIMIT = 4.0, 1e-9
 
 _Mesh: TypeAlias = trimesh.Trimesh | trimesh.Scene | str | Path

@@ -24,7 +24,7 @@ from jaxnbv.viz.style import INK
 _COLOURS, _BLANK = mpl.colormaps["RdBu_r"], "#76808f"
 # Pixels along each side of a picture. Width and height of the figure in inches.
 _SIZE, _WIDTH, _HEIGHT = 640, 7.2, 3.7
-# Number of viewing directions to choose from, and largest height of these unit vectors. Number of points on the CAD
+# Number of viewing directions to choose from, and largest height |y| of these unit vectors. Number of points on the CAD
 # whose visibility decides, and distance from the surface at which their rays to the viewer start.
 _NUM_EYES, _MAX_HEIGHT, _NUM_SAMPLES, _CLEARANCE = 120, 0.7, 400, 0.02
 # Weight of a numbered place's visibility, where a fully scanned surface has weight 1 in total. Weight of a point that
@@ -78,7 +78,10 @@ def deviation_figure(
 def _two_eyes(
     scene: TriangleMesh, values_at: Values, positions: Float[np.ndarray, "k 3"], outward: Float[np.ndarray, "k 3"]
 ) -> Float[np.ndarray, "2 3"]:
-    """Return two viewing directions that show most of the scan and of the places to number (scene coordinates)."""
+    """Return unit vectors toward two viewers, who together see most of the scan and of the numbered places.
+
+    - `positions`, `outward`: numbered places and the outward normals there, in scene coordinates.
+    """
     mesh = scene.to_trimesh()
     samples, rows = trimesh.sample.sample_surface(mesh, _NUM_SAMPLES, seed=0)
     normals = mesh.face_normals[rows]

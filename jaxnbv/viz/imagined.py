@@ -28,7 +28,8 @@ Triangles: TypeAlias = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
 
 NUM_SHOWN = 4
 _PIXELS = 96
-# Colours of surface seen before, and of other imagined surface. The latter is light, so that its shape shows.
+# Colours of surface that an earlier view saw, and of other imagined surface. The second is light, so that shading shows
+# the shape.
 _SEEN_COLOUR, _UNSEEN_COLOUR = "#c3c9d2", "#5b8fc7"
 # A point counts as seen before if its distance to the cloud is below this (scene units) or this many point spacings.
 _MAX_DISTANCE, _MAX_SPACINGS = 0.05, 3.0
@@ -45,7 +46,7 @@ class ShadedImage(eqx.Module):
 class Imagined(eqx.Module):
     """Pictures of the surfaces that a step imagined, before its view was taken.
 
-    - `samples`, `names`: some sampled surfaces or the likeliest parts, seen from the chosen pose.
+    - `samples`, `names`: pictures and names of some sampled surfaces or of the likeliest parts, from the chosen pose.
     - `kinds`: kinds of known shapes with their probabilities. Empty without known shapes.
     """
 
@@ -131,7 +132,7 @@ def _fine_camera(camera: Camera) -> Camera:
 
 
 def colour_image(image: ShadedImage, new_colour: str = BEFORE, is_plain: bool = False) -> UInt8[np.ndarray, "h w 3"]:
-    """Colour a surface grey where seen before (everywhere if `is_plain`), else in `new_colour`."""
+    """Colour a picture: grey where an earlier view saw the surface, or if `is_plain`; else `new_colour`."""
     tints = np.array([mpl.colors.to_rgb(colour) for colour in (new_colour, _SEEN_COLOUR)])
     colours = tints[(image.is_seen | is_plain).astype(int)] * (0.25 + 0.75 * image.brightness[..., None])
     return np.round(255.0 * np.where(image.mask[..., None], colours, 1.0)).astype(np.uint8)

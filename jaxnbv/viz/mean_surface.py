@@ -22,9 +22,10 @@ from jaxnbv.scanning.mesh import level_triangles
 _DEVIATION_ANCHORS = 256
 _SLOPE_ANCHORS = 1024
 _SLOPE_STEP = 0.005
-# Deviation as a fraction of the distance to the nearest point. On a cow after one to five views, at distances of
-# 0.1 to 0.4 scene units, the surface's root mean square error is 0.2 to 0.3 of the distance, two to three of the
-# posterior's standard deviations. Measured from the truth to the surface, which may lack a part, it is 0.4 to 0.7.
+# Deviation that `near_points` adds, as a fraction of the distance r to the nearest point. On a cow after one to five
+# views, at r = 0.1 to 0.4 scene units, the surface's root mean square error is 0.2 r to 0.3 r, two to three times the
+# posterior's standard deviation. Measured from the truth to the surface, which may lack a part of the object, the error
+# is 0.4 r to 0.7 r.
 _DEVIATION_PER_DISTANCE = 0.25
 # A piece of the surface is kept if a point of the cloud is nearer than this, in scene units.
 _MAX_DISTANCE = 0.1
@@ -49,7 +50,10 @@ class MeanSurface(eqx.Module):
         return trimesh.Trimesh(self.vertices, self.faces, process=False)
 
     def part(self, is_kept: Bool[np.ndarray, " v"]) -> "MeanSurface | None":
-        """Return the part with the vertices `is_kept`, which must form whole pieces. None if it has no faces."""
+        """Return the pieces whose vertices are marked in `is_kept`; None if no face is left.
+
+        - `is_kept`: mask of the vertices, with the same value for all vertices of a connected piece.
+        """
         faces = self.faces[is_kept[self.faces[:, 0]]]
         if len(faces) == 0:
             return None
@@ -121,13 +125,19 @@ def padded(rows: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "m d"]:
 
 
 def _farthest_rows(features: Float[np.ndarray, "n d"], count: int) -> Int[np.ndarray, " count"]:
-    """Return indices of rows far from each other, in order of choice. The first is repeated if there are too few."""
+    """Return indices of `count` rows by farthest point sampling, in the order in which they are chosen.
+
+    If there are too few rows, the first is repeated.
+    """
     rows = jnp.asarray(padded(features.astype(np.float32)))
     return np.asarray(farthest_point_indices(rows, jnp.arange(len(rows)) < len(features), count))
 
 
 def _interpolate(features: np.ndarray, anchors: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Interpolate positive values from anchor rows to all rows, as a weighted mean of their logarithms."""
+    """Interpolate positive values from some rows of `features` to all rows, as weighted means of logarithms.
+
+    - `anchors`, `values`: indices of rows, and the values there.
+    """
     distance, neighbours = cKDTree(features[anchors]).query(features, k=min(8, len(anchors)))
     width = 0.5 * distance[:, -1:] + 1e-12
     weight = np.exp(-0.5 * (distance / width) ** 2) + 1e-12

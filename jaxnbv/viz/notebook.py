@@ -84,7 +84,7 @@ def html_of(value: Any) -> str:
 
 @functools.singledispatch
 def drawing_of(value: Any) -> Drawing:
-    """Return the drawing of an object, which depends on its type."""
+    """Return how to draw an object, and its caption. Dispatches on the type of the object."""
     return Drawing(None, repr(value))
 
 

@@ -32,11 +32,14 @@ _Values: TypeAlias = Float[np.ndarray, "_ _ _"]
 # Nodes along each axis of the grids for the surface of a shape, for its disputed space, and for the distances to the
 # hypotheses. Half extent of the grids relative to the half extent of the shapes.
 _NODES, _FINE_NODES, _COARSE_NODES, _MARGIN = 128, 96, 48, 1.05
-# No shape is drawn if the probability of "none of these" exceeds this. Few objects fit a shape of a bank exactly.
+# No shape is drawn if the probability of "none of these" exceeds this. It is high, because few objects fit a shape of a
+# bank exactly.
 _MAX_NONE_PROBABILITY = 0.9
-# Largest number of hypotheses to compare. Space is disputed if this fraction of their probability fills it.
+# Largest number of hypotheses to compare. Space outside the shape is disputed if hypotheses that fill it have at least
+# this fraction of the probability.
 _MAX_HYPOTHESES, _MIN_DISPUTED = 12, 0.1
-# Surfaces of two hypotheses agree within twice this distance. Softness of a surface's step. Both in scene units.
+# Surfaces of two hypotheses agree up to about twice this distance. Softness of the step from inside to outside. Both in
+# scene units.
 _TOLERANCE, _SOFTNESS = 0.05, 0.012
 # Pieces of disputed space smaller than this fraction of the shape's area are left out.
 _MIN_PIECE = 0.01
@@ -70,7 +73,10 @@ class PlacedShape(MeanSurface):
 
 
 def _select(tree: T, rows: int | list[int]) -> T:
-    """Return rows of all leaves. JAX's own indexing would compile a program for each shape of a leaf."""
+    """Return the tree with only these rows of each leaf.
+
+    NumPy selects the rows, because JAX would compile a program for each shape of a leaf.
+    """
     return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[rows]), tree)
 
 
@@ -111,8 +117,9 @@ def likeliest_shape(
     """Return the likeliest shape of the likeliest kind; None if "none of these" is nearly certain.
 
     - `hypotheses`, `weights`: the registered shapes and their weights. The last weight is that of "none of these".
-    - `answer`: probabilities of classes. If every kind is one of the classes, its weight is multiplied by the class's
-      probability and normalised, so that a picture does not contradict the answer beside it.
+    - `answer`: probabilities of classes. If every kind is one of the classes, the weight of each kind is multiplied by
+      the probability of its class, and the weights are normalised. Otherwise a picture could contradict the answer
+      beside it.
     """
     weights = np.asarray(weights, np.float64)
     if weights[-1] > _MAX_NONE_PROBABILITY:

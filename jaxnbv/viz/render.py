@@ -108,7 +108,10 @@ class Still:
         colours: Float[np.ndarray, "hits 4"],
         depth: Float[np.ndarray, " hits"],
     ) -> tuple[Bool[np.ndarray, " rays"], Float[np.ndarray, "all 4"], Float[np.ndarray, " all"]]:
-        """Blend a translucent surface, which hides no points, into results of `_trace`."""
+        """Blend the disputed space, translucent, into the results of `_trace`. It hides no points.
+
+        - `mask`, `colours`, `depth`: results of `_trace` for the opaque surface.
+        """
         is_disputed, over, disputed_depth = self._trace(disputed_space, None)
         under, front = np.zeros((len(mask), 4)), np.zeros((len(mask), 4))
         deep, near = np.full(len(mask), np.inf), np.full(len(mask), np.inf)
@@ -287,7 +290,7 @@ def _draw_segments(
 
 
 def crop(axes: Axes, still: Still, content: list[Float[np.ndarray, "_ 2"]], aspect: float = 1.0) -> None:
-    """Crop the picture to the region of these pixels. The width is `aspect` times the height."""
+    """Crop the axes to the region of the pixels in `content`. The width is `aspect` times the height."""
     pixels = np.concatenate(content)
     (left, top), (right, bottom) = pixels.min(axis=0), pixels.max(axis=0)
     half = 0.53 * max((right - left) / aspect, bottom - top) + 0.03 * still.size

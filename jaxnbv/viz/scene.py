@@ -41,7 +41,12 @@ def scene_items(
     camera: Camera,
     depth: float = FRUSTUM_DEPTH,
 ) -> tuple[Points | Cameras, ...]:
-    """Return what to draw: points before the last view, points of this view, and the cameras."""
+    """Return what to draw after a view: points and cameras. Those of this view have their own colour.
+
+    - `before`, `new`: points of the cloud before this view, and points of this view.
+    - `poses`: poses of all views so far, the last of this view.
+    - `depth`: depth to which fields of view are drawn.
+    """
     return (
         Points("points before", before, BEFORE, 0.7),
         Points("new points", new, NEW, 1.1),

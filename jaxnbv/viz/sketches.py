@@ -59,7 +59,7 @@ def sketches_of(
 
     - `all_observations`, `answers`: observations and answer after each view.
     - `by_view`: sketches that exist already, keyed by the index of the step's view.
-    - `imagine`: whether new sketches have more than the surface.
+    - `imagine`: whether new sketches have `imagined` and `unmeasured`, not only `surface`.
     """
     planner, sampler = episode.planner, episode.planner.sampler
     for index, (observations, answer) in enumerate(zip(all_observations, answers, strict=True), start=1):

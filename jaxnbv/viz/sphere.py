@@ -27,8 +27,8 @@ def smooth_map(
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " n"], Float[np.ndarray, "n m"]]:
     """Interpolate the candidates' values over the map. Return longitudes, latitudes, and values there.
 
-    The interpolant is a spline through the values that are not NaN, and stays within their range. It is NaN where the
-    nearest candidate is farther away than 90 % of the candidates are from their own nearest neighbour.
+    The interpolant is a spline through the values that are not NaN, and stays within their range. It is NaN where no
+    candidate is near: the limit is the 90th percentile of the distances between neighbouring candidates.
     """
     longitudes = np.pi * ((np.arange(2 * _ROWS) + 0.5) / _ROWS - 1.0)
     latitudes = np.pi * ((np.arange(_ROWS) + 0.5) / _ROWS - 0.5)

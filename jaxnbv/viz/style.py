@@ -13,7 +13,8 @@ from jaxnbv.storage.files import write_whole
 
 INK, GREY, LINE = "#1f2733", "#7a8494", "#d9dee6"
 BEFORE, NEW = "#26344d", "#d55e00"
-# Colours of a known shape: scanned, imagined, different in other hypotheses. Colour of space that only these fill.
+# Colours of a known shape: scanned, imagined, different in other hypotheses. Colour of space that only other hypotheses
+# fill.
 PART, IMAGINED, OPEN, DISPUTED = "#6cc5a6", "#d7efe6", "#d5d0ec", "#8c7fc0"
 # Colours of several lines in one chart (Okabe and Ito). NEW is not among them, because it marks the true line.
 SERIES = ["#0072b2", "#56b4e9", "#009e73", "#e69f00", "#cc79a7", "#7a8494", "#26344d", "#b8b04a"]
@@ -42,7 +43,7 @@ def gradient(colours: Colormap) -> str:
 
 
 def middle_range(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
-    """Return the 2nd and 98th percentile of positive values, widened to 1, 2 or 5 times a power of ten."""
+    """Return the 2nd and 98th percentile of positive values, rounded outward to 1, 2 or 5 x 10^n."""
     low, high = np.percentile(values, [2.0, 98.0])
     ticks = log_ticks(low / 10.0, high * 10.0)
     return float(ticks[ticks <= low * 1.0001].max()), float(ticks[ticks >= high * 0.9999].min())

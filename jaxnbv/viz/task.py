@@ -71,7 +71,7 @@ def task_of(
     all_observations: Sequence[Observations] | None = None,
     true_surface: TriangleMesh | None = None,
 ) -> TaskReport:
-    """Return the task of an episode: the acquisition's, or coverage if the acquisition has no answers.
+    """Return the report of an episode's task. If the acquisition has no answers, the task is coverage.
 
     - `truth`: points of the true surface, in scene coordinates.
     - `rival`: an episode of a different search from the same first view.
@@ -119,8 +119,8 @@ def coverage_answers(
     """Return how much of the surface was seen after each view.
 
     Given points of the true surface (`truth`), this is the percentage of these points that was seen. Otherwise it is
-    the total new area in the scans, in squared world units. The acquisition if it is a `NewSurface`, or else
-    `NewSurface()`, defines what is new, but the cosine in a pixel's area is clipped to at least 0.2 instead of 0.5.
+    the total new area in the scans, in squared world units. New area is computed as in the acquisition if this is a
+    `NewSurface`, else as in `NewSurface()`. But the cosine in a pixel's area is clipped to at least 0.2, not 0.5.
     """
     views, acquisition = episode.views, episode.planner.acquisition
     if truth is not None:

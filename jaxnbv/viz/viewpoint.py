@@ -10,8 +10,8 @@ from jaxnbv.planning.episode import Episode
 from jaxnbv.scanning.triangle_rays import first_faces
 from jaxnbv.viz.sphere import unit
 
-# Drawn fields of view: their depth, in radii of the object, and the distance of their ends from the origin, relative to
-# the object's extent in this direction. Least value of this extent, in radii.
+# Depth of drawn fields of view, in radii of the object. A field of view ends at this multiple of the object's extent in
+# the direction of the camera. Least value of this extent, in radii.
 _FRUSTUM_DEPTH, _END_DISTANCE, _MIN_EXTENT = 0.2, 1.06, 0.35
 _RADIUS_PERCENTILE, _MAX_OUTLINE_POINTS = 99.0, 1000
 _NUM_DIRECTIONS, _MAX_HEIGHT = 80, 0.8
@@ -66,8 +66,11 @@ def viewpoint_of(episode: Episode, surfaces: list[trimesh.Trimesh]) -> Viewpoint
 def _visible_fraction(
     episode: Episode, surface: trimesh.Trimesh | None, eyes: Float[np.ndarray, "e 3"], clearance: float
 ) -> Float[np.ndarray, " e"]:
-    """Return the fraction of the chosen views' points that face each of `eyes` and that the surface does not hide.
+    """Return, for each of `eyes`, the fraction of the chosen views' points that are visible from there.
 
+    A point is visible if its normal faces the eye and the surface does not hide it.
+
+    - `eyes`: unit vectors from the origin toward possible viewers.
     - `clearance`: distance in front of a point at which the ray to the viewer starts.
     """
     first, *later = (view.scan.to_numpy() for view in episode.views)
