@@ -48,7 +48,7 @@ class Camera(eqx.Module):
       units. `nearest=0` and `farthest=None` mean no limit. A hit nearer than `nearest` is invalid. A ray without a hit
       up to `farthest` counts as a miss: the space along it is empty up to `farthest`.
     - `max_incidence`: largest angle between a ray and the normal of a measured hit, in radians within (0, pi/2].
-    - `distortion`: coefficients, see `from_intrinsics`. Rays ignore them. `PointCloud.from_depth` undoes distortion.
+    - `distortion`: lens coefficients, see `from_intrinsics`. Rays ignore them; `PointCloud.from_depth` undoes them.
 
     The defaults are the paper's: 30 degrees, 50 x 50 pixels, no limits.
 
@@ -141,7 +141,7 @@ class Camera(eqx.Module):
 
     @checked
     def strided(self, stride: int) -> "Camera":
-        """Return the camera of an image's every `stride`-th row and column, starting at `stride // 2`.
+        """Return the camera whose image has every `stride`-th row and column, starting at `stride // 2`.
 
         **Raises:** `ValueError` for a stride that is below one or leaves no pixel.
         """
@@ -169,7 +169,7 @@ class Camera(eqx.Module):
 
     @property
     def edges(self) -> tuple[float, float, float, float]:
-        """Left, top, right and bottom coordinate of the image in the plane z = 1 of the camera's frame."""
+        """Coordinates of the image's left, top, right and bottom edge in the camera's plane z = 1."""
         (fx, fy), (cx, cy) = self.focal_lengths, self.center
         return -cx * self.width / fx, -cy * self.height / fy, (1 - cx) * self.width / fx, (1 - cy) * self.height / fy
 
@@ -204,12 +204,12 @@ class Camera(eqx.Module):
 
 
 def _check_image_size(matrix: np.ndarray, height: int, width: int, center: tuple[float, float]) -> None:
-    """Warn if an intrinsic matrix is probably for an image of another size, judged by its principal point.
+    """Warn if the principal point suggests that an intrinsic matrix is for an image of another size.
 
     - `center`: the principal point, as fractions of the width and the height.
 
-    **Raises:** `ValueError` instead of the warning if the principal point is at the image's lower right corner or
-    beyond it. Also if it lies outside the image and the image would extend more than 70 degrees off the axis.
+    **Raises:** `ValueError` instead of the warning if the principal point is near the image's lower right corner or
+    beyond. Also raises it if the principal point is outside the image and a pixel is over 70 degrees off the axis.
     """
     (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
     tangent_x, tangent_y = (

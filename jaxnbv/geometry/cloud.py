@@ -42,10 +42,10 @@ class PointCloud(eqx.Module):
     - `points`: positions, in scene units unless stated otherwise.
     - `normals`: unit outward normals.
     - `mask`: whether each row holds a point.
-    - `missed`: for a sensor's scan, which has one row per pixel, whether each ray met nothing and so crossed only empty
-      space. A row that is neither filled nor missed is invalid. None for a cloud that is not a sensor's image.
-    - `sight`: for a sensor's scan, the distance that the camera measured along each ray, in units of the points, even
-      if the hit is not a point of the cloud; infinite if it measured none. None if unknown.
+    - `missed`: whether each ray met nothing, so that the space along it is empty. Only a sensor's scan, which has one
+      row per pixel, has this array; other clouds have None. A row that is neither filled nor missed is invalid.
+    - `sight`: distance that the camera measured along each ray of a scan, in units of the points; infinite if it
+      measured none. The hit need not be a point of the cloud. None if unknown.
     """
 
     points: Float[Array, "*batch n 3"] = eqx.field(converter=native)
@@ -149,11 +149,12 @@ class PointCloud(eqx.Module):
         sensors mix the depths of two surfaces at edges. If the valid pixels have gaps between them, as in a lidar's
         image, planes are fitted to one pixel per block of the gap's size. Each point lies on the ray of its own pixel.
 
-        - `depth`: depths along the camera's forward axis. The noise of integer depths is at least their rounding.
+        - `depth`: depths along the camera's forward axis. Integer depths have at least the noise of their rounding.
         - `depth_scale`: factor from the unit of `depth` to the unit of the pose, of the camera's range and of the box,
           such as 0.001 for an image in millimetres and a pose in metres.
         - `stride`: keep every `stride`-th row and column, as `camera.strided` does. Planes are fitted to all pixels.
-        - `box`: keep only points inside. A hit behind the box makes its ray missed, a hit in front makes it invalid.
+        - `box`: keep only points inside. A pixel with a hit outside the box becomes invalid if the hit is in front of
+          the box, else missed.
 
         **Raises:** `ValueError` if the image's shape differs from the camera's, all depths are outside the camera's
         range, the box is behind the camera, or depths and the distance of the box differ by orders of magnitude.
@@ -203,7 +204,7 @@ class PointCloud(eqx.Module):
 
 
 def some_rows(cloud: PointCloud, count: int) -> Int[Array, " count"]:
-    """Return the indices of `count` evenly spaced filled rows, which repeat if too few rows are filled."""
+    """Return the indices of `count` evenly spaced filled rows. Indices repeat if fewer rows are filled."""
     order = jnp.argsort(~cloud.mask, stable=True)
     return order[(jnp.arange(count) * cloud.count) // count]
 
@@ -296,7 +297,7 @@ def limit_capacity(cloud: PointCloud, capacity: int) -> PointCloud:
 
 
 def _take(cloud: PointCloud, rows: Int[Array, " m"]) -> PointCloud:
-    """Return a cloud of the given rows, of which the first `cloud.count` are filled and the others empty."""
+    """Return a cloud of the rows with these indices, of which the first `cloud.count` count as filled."""
     is_filled = jnp.arange(len(rows)) < cloud.count
     points, normals = (jnp.where(is_filled[:, None], array[rows], 0.0) for array in (cloud.points, cloud.normals))
     return PointCloud(points, normals, is_filled)

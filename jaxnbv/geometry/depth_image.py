@@ -86,7 +86,9 @@ def _points_and_normals(
     rounding: Float[Array, ""],
     block_side: int,
 ) -> tuple[Rows, Float[Array, " n"]]:
-    """Return the cloud's rows, and a lower bound on the depth around each pixel (-inf if it has no depth).
+    """Return the arrays of a cloud, and a lower bound on the depth near each of its points.
+
+    All arrays have one entry for every `stride`-th row and column. The bound is -inf where no depth is measured.
 
     - `rounding`: standard deviation of the rounding of depths.
     """
@@ -113,9 +115,9 @@ def _points_and_normals(
 def _in_box(
     points: Float[Array, "n 3"], nearest: Float[Array, " n"], box: Box, camera: Camera, pose: Pose, stride: int
 ) -> tuple[Bool[Array, " n"], Bool[Array, " n"]]:
-    """Return whether each point lies in a box, and whether each ray went past the box before it hit.
+    """Return whether each point lies in a box, and whether each ray hit something behind or beside it.
 
-    - `nearest`: see `_points_and_normals`.
+    - `points`, `nearest`: point of each ray, and lower bound on the depth near it, see `_points_and_normals`.
     """
     is_beyond = (nearest > -jnp.inf) & (nearest >= _depth_behind(box, camera.strided(stride), pose))
     return box(points) <= 0, is_beyond
@@ -124,11 +126,15 @@ def _in_box(
 def _strided_samples(
     depth: Float[Array, "h w"], valid: Bool[Array, "h w"], stride: int, block_side: int
 ) -> tuple[Float[Array, "k l"], Bool[Array, "k l"], Float[Array, "k l"]]:
-    """Return three arrays about the block of `block_samples` that holds each `stride`-th pixel.
+    """Return three arrays with one entry for every `stride`-th row and column of a depth image.
+
+    `block_samples` divides the image into square blocks and chooses a valid pixel, the sample, in each. The entry of a
+    pixel depends on the block that holds the pixel:
 
     1. depth of the block's sample.
     2. whether the block has a sample.
-    3. lower bound on the depth: the least sample of the block and, if `block_side` > 1, of the eight around it.
+    3. lower bound on the depth near the pixel: the least sample of the block and, if `block_side` > 1, of the eight
+       blocks around it; infinite without a sample.
     """
     samples, is_sample, _ = block_samples(depth, valid, block_side)
     nearest = jnp.where(is_sample, samples, jnp.inf)
@@ -149,7 +155,9 @@ def _depth_behind(box: Box, camera: Camera, pose: Pose) -> Float[Array, " n"]:
 def without_sentinels(
     depth: Real[np.ndarray, "height width"], camera: Camera, pose: Pose, scale: float, box: Box
 ) -> Real[np.ndarray, "height width"]:
-    """Return the depth image with zeros in place of the sentinels that `points_of_depth` finds.
+    """Return the depth image with zeros for values that mean "not measured" (see `sentinel_pixels`).
+
+    - `scale`: factor from the unit of `depth` to the unit of the camera's range, the pose and the box.
 
     **Raises:** `ValueError` if the box lies behind the camera.
     """
@@ -165,7 +173,7 @@ def _is_sentinel(
 
 
 def _depth_range(box: Box, pose: Pose) -> tuple[float, float]:
-    """Return the least and greatest depth of a box's corners. Their ratio is limited to 1,000."""
+    """Return the least (but at least 0.001 of the greatest) and the greatest depth of a box's corners."""
     corners = np.stack(np.meshgrid(*zip(box.low, box.high, strict=True)), axis=-1).reshape(-1, 3)
     depths = (corners - np.asarray(pose.position)) @ np.asarray(pose.forward)
     farthest = float(depths.max())

@@ -49,16 +49,16 @@ def undistort_points(
 def pixels_of(
     plane_points: Float[AnyArray, "*n 2"], matrix: Float[AnyArray, "3 3"], coefficients: tuple[float, ...]
 ) -> tuple[Float[AnyArray, "*n"], Float[AnyArray, "*n"]]:
-    """Return the column and row at which a lens shows points of the plane Z = 1, by intrinsic `matrix`."""
+    """Return the column and row at which a distorted image shows each point (x, y) of the plane Z = 1."""
     x, y = distort_points(plane_points[..., 0], plane_points[..., 1], coefficients)
     return x * matrix[0, 0] + matrix[0, 2], y * matrix[1, 1] + matrix[1, 2]
 
 
 def check_distortion(coefficients: tuple[float, ...], radius: float) -> None:
-    """Check that the coefficients of a lens are valid up to a `radius` about the axis, in the plane Z = 1.
+    """Check that distortion coefficients are valid within `radius` of the axis, in the plane Z = 1.
 
-    **Raises:** `ValueError` for a number of coefficients other than four, five and eight, a coefficient that is not
-    finite, or if the distorted distance from the axis does not grow with the true distance.
+    **Raises:** `ValueError` if there are not four, five or eight coefficients, if one is not finite, or if the
+    distorted distance from the axis does not grow with the true distance.
     """
     array = as_numbers(coefficients, "the distortion", np.float64)
     require(
@@ -84,10 +84,10 @@ def undistort_image(
 ) -> tuple[Float[Array, "h w"], Bool[Array, "h w"]]:
     """Return a depth image with its distortion removed, and whether each ray of the new image met nothing.
 
-    Each new depth is interpolated linearly in 1 / depth between the four nearest pixels of the distorted image. If they
-    are not on one surface, the new depth is that of the nearest. It is 0 outside the distorted image.
+    Each new depth is interpolated linearly in 1 / depth between the four nearest pixels of the distorted image. If
+    these pixels are not on one surface, the depth of the nearest pixel is taken. It is 0 outside the distorted image.
 
-    - `depth`, `missed`: depths of the distorted image, positive and finite if valid, and whether its rays met nothing.
+    - `depth`, `missed`: depths of the distorted image (positive and finite if valid), and whether its rays met nothing.
     - `plane_points`: positions of the new image's pixels in the plane Z = 1.
     - `matrix`: intrinsic matrix of both images.
     """

@@ -12,10 +12,10 @@ from jaxnbv.checks import require
 
 @functools.partial(jax.jit, static_argnames="count")
 def farthest_point_indices(points: Float[Array, "n d"], mask: Bool[Array, " n"], count: int) -> Int[Array, " count"]:
-    """Return the indices of `count` rows, each chosen as far as possible from all earlier chosen rows.
+    """Return the indices of `count` filled rows, each as far as possible from all rows chosen before it.
 
-    The first filled row (`mask` is True) is chosen first. Ties go to the first row. No row is chosen twice while an
-    unchosen filled row is left, even if points coincide. After that, the first filled row is repeated.
+    Rows are filled where `mask` is True. The first choice is the first filled row, and ties go to the first row. Every
+    filled row is chosen once, even if points coincide, before the first filled row is repeated.
 
     **Raises:** `ValueError` if `count` < 1.
     """

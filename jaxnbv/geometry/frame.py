@@ -60,7 +60,9 @@ class Frame(eqx.Module):
     @classmethod
     @checked
     def fit(cls, points: Float[AnyArray, "n 3"], longest_side: float = 2.5, up: str = "y") -> "Frame":
-        """Return the frame that centres the bounding box of world points and scales it to `longest_side`.
+        """Return the frame that centres the bounding box of points (world), and scales its longest side.
+
+        The longest side becomes `longest_side`, in scene units.
 
         **Raises:** `ValueError` if there are no points, if all points coincide, or if a point is not finite.
         """
@@ -131,7 +133,7 @@ class Frame(eqx.Module):
 
 
 def _apply(value, map_points, map_directions, scale: float):
-    """Convert a value by a function of points, a function of directions and a factor (`scale`) of lengths."""
+    """Convert a value by a function for points, a function for directions, and a factor for lengths."""
     if isinstance(value, PointCloud | Pose):
         xp, arrays = jnp if is_traced(value) else np, on_host(value)
     if isinstance(value, PointCloud):

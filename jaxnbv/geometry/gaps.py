@@ -1,4 +1,4 @@
-"""Sampling of depth images with gaps between valid pixels: of a lidar, or aligned to a finer camera."""
+"""Sampling of depth images with gaps between valid pixels, such as images of a lidar."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,11 +14,11 @@ _MIN_PLANE_FRACTION, _MIN_PLANE_PIXELS = 0.8, 4
 
 
 def find_block_side(valid: Bool[np.ndarray, "h w"]) -> int:
-    """Return the smallest side, in pixels, of square blocks that rarely lack a valid pixel.
+    """Return the side, in pixels, of square blocks that are as large as the gaps between valid pixels.
 
-    The side is 1 if most valid pixels have enough neighbours for a plane, even if the image has holes. Otherwise blocks
-    of this side contain a valid pixel about as often as blocks of four times the side. If only every eighth row is
-    valid, the side is 8.
+    The side is 1 if most valid pixels have enough valid neighbours for a plane, even if the image has holes. Otherwise
+    it is the smallest side for which blocks contain a valid pixel about as often as blocks of four times the side. For
+    example, it is 8 if only every eighth row is valid.
     """
     num_valid = correlate(valid.astype(np.uint8), np.ones((3, 3), np.uint8), mode="constant")
     if not valid.any() or np.mean(num_valid[valid] >= _MIN_PLANE_PIXELS) >= _MIN_PLANE_FRACTION:
@@ -37,9 +37,9 @@ def find_block_side(valid: Bool[np.ndarray, "h w"]) -> int:
 def block_samples(
     depth: Float[Array, "h w"], valid: Bool[Array, "h w"], side: int
 ) -> tuple[Float[Array, "k l"], Bool[Array, "k l"], Int[Array, "k l 2"]]:
-    """Return the sample of each square block of an image: the valid pixel nearest to its middle.
+    """Choose a sample in each square block of an image: the valid pixel nearest to the block's middle.
 
-    The results are the sample's depth, whether there is a sample, and the sample's column and row within the block.
+    Return the depth of each block's sample, whether there is a sample, and its column and row within the block.
     """
     if side == 1:
         return depth, valid, jnp.zeros((*depth.shape, 2), int)

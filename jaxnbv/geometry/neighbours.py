@@ -32,7 +32,7 @@ def spacing(cloud: PointCloud) -> Float[Array, ""]:
 
 
 def distance_to_others(cloud: PointCloud, rows: Int[Array, " r"]) -> Float[Array, " r"]:
-    """Return the distance from the point of each given row to the nearest other point; infinite if none."""
+    """Return the distance from the point in each of `rows` to the nearest other point; infinite if none."""
     offsets = cloud.points[rows, None] - cloud.points
     is_other = cloud.mask & (jnp.arange(cloud.capacity) != rows[:, None])
     return jnp.sqrt(jnp.min(jnp.where(is_other, jnp.sum(offsets**2, axis=-1), jnp.inf), axis=1))

@@ -31,7 +31,7 @@ _MAX_SLOPE_ERROR = math.radians(2.5)
 _MAX_SLOPE, _MAX_DEVIATIONS = 4.0, 6.0
 _MIN_PIXELS = 4
 # The depths of two pixels of one surface rarely differ by more than `_MAX_DIFFERENCE` standard deviations of the noise.
-# A pixel that differs by more from over `_MAX_UNLIKE` of its eight neighbours mixes a near and a far surface.
+# If a pixel differs by more from more than `_MAX_UNLIKE` of its eight neighbours, it mixes a near and a far surface.
 _MAX_DIFFERENCE, _MAX_UNLIKE = 3.0 * math.sqrt(2.0), 5
 
 
@@ -43,11 +43,12 @@ def fit_planes(
     min_noise: float | Float[Array, ""],
     block_side: int = 1,
 ) -> tuple[Float[Array, "k l"], Float[Array, "k l 3"], Bool[Array, "k l"]]:
-    """Fit a plane to a window of pixels around every `stride`-th row and column.
+    """Fit a plane to the window around each pixel of every `stride`-th row and column.
 
-    Return the plane's depth and normal at the middle of the window, and whether the window has enough points.
-    Normals are in the camera's frame and point towards the camera. In an image without gaps, the returned depth differs
-    from the measured depth by at most three standard deviations of the noise.
+    Return, for each of these pixels, the plane's depth and normal at the pixel, and whether there is a plane. There is
+    none if the window has too few pixels or only pixels along a line, or if the pixel mixes two surfaces. Normals are
+    in the camera's frame and point towards the camera. In an image without gaps, the returned depth differs from the
+    measured depth by at most three standard deviations of the noise.
 
     - `depth`: depths, positive and finite where `valid`.
     - `camera`: the camera of the whole image.
@@ -74,9 +75,11 @@ def fit_planes(
     width = 2 * jnp.max(jnp.where(has_middle, radius, 1)) + 1
 
     def add(index, sums):
-        """Add one neighbour of each pixel to the pixel's normal equations, if both can be on one surface.
+        """Add one neighbour of each pixel to the sums of that pixel, if both can be on one surface.
 
-        `index` is the neighbour's index in the window. Positions are in units of the window's radius.
+        - `index`: index of the neighbour in the window.
+        - `sums`: matrix and right-hand side of the normal equations, and number of adjacent pixels that differ by more
+          than noise. Positions are in units of the window's radius.
         """
         row_step, column_step = index // width - width // 2, index % width - width // 2
         neighbour = padded[(rows + row_step)[:, None], (columns + column_step)[None]]
@@ -111,9 +114,10 @@ def fit_planes(
 
 
 def _radius(spacing: Float[Array, "k l"], sigma: Float[Array, "k l"]) -> Int[Array, "k l"]:
-    """Return the radius, up to `_MAX_RADIUS`, of the smallest window that gives an accurate slope.
+    """Return each pixel's radius (up to `_MAX_RADIUS`) of the smallest window with an accurate slope.
 
-    - `spacing`, `sigma`: distance between neighbouring pixels on the surface, and standard deviation of their depths.
+    - `spacing`: distance between neighbouring pixels on the surface.
+    - `sigma`: standard deviation of the noise of the depth.
     """
     radii = jnp.arange(1, _MAX_RADIUS + 1)
     error = math.sqrt(3.0) * sigma[..., None] / (spacing[..., None] * radii * (2 * radii + 1))

@@ -135,9 +135,9 @@ def _axes(convention: str) -> np.ndarray:
 def rigid_matrices(
     matrices: Float[np.ndarray, "n 4 4"],
 ) -> tuple[Float[np.ndarray, "n 4 4"], Bool[np.ndarray, " n"]]:
-    """Return matrices [[R, t], [0, 1]] with R made orthonormal, and whether each is a rigid motion.
+    """Return the matrices [[R, t], [0, 1]] with R made orthonormal, and whether each is a rigid motion.
 
-    R may be rounded to three digits. Matrices that are not rigid motions are returned unchanged.
+    R may be a rotation that was rounded to three digits. A matrix that is no rigid motion is returned unchanged.
     """
     is_rigid = np.isfinite(matrices).all(axis=(1, 2)) & (_rotation_error(matrices[:, :3, :3]) <= _MAX_ROUNDING)
     is_rigid &= (np.abs(matrices[:, 3] - [0.0, 0.0, 0.0, 1.0]) < 1e-6).all(axis=1)
@@ -175,8 +175,8 @@ def look_at(position, target=(0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0)) -> Pose:
     """Return the pose at `position` whose forward axis points to `target`, in scene coordinates.
 
     - `position`, `target`: (*batch, 3) and (3,).
-    - `up`: the direction that is up in the image, (3,). If the camera looks along `up`, the coordinate axis in which
-      `up` has its smallest component is used instead.
+    - `up`: the direction that is up in the image, (3,). If the camera looks along `up`, it is replaced by the
+      coordinate axis along which `up` has its smallest component.
 
     **Raises:** `ValueError` for other shapes, entries that are not finite, equal `position` and `target`, or zero `up`.
     """
@@ -227,7 +227,7 @@ def _look_rotation(
 def fibonacci_sphere(count: int, radius: float = 1.0, min_elevation: float = -0.5 * math.pi) -> Float[Array, "count 3"]:
     """Return `count` almost evenly spaced points on a sphere, the Fibonacci lattice (Gonzalez 2010).
 
-    - `min_elevation`: least elevation of the points above the plane y = 0, in radians. The default is the whole sphere.
+    - `min_elevation`: least angle of a point above the plane y = 0, in radians. The default is the whole sphere.
 
     **Raises:** `ValueError` if `count` < 1, `radius` <= 0 or the elevation is not within [-pi/2, pi/2).
     """

@@ -60,6 +60,6 @@ class PoseList(eqx.Module):
 
 
 def is_same_view(poses: Pose, others: Pose) -> Bool[Array, "*batch"]:
-    """Return whether poses (broadcast) agree to 1e-3 in position (scene units) and viewing direction."""
+    """Return whether poses (broadcast) agree to 1e-3 in position (scene units) and in viewing direction."""
     is_near = jnp.linalg.norm(poses.position - others.position, axis=-1) < _MAX_DIFFERENCE
     return is_near & (jnp.linalg.norm(poses.forward - others.forward, axis=-1) < _MAX_DIFFERENCE)

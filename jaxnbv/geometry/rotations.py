@@ -1,4 +1,4 @@
-"""Rotations, and norms and directions of vectors, with derivatives that are finite at the zero vector."""
+"""Rotations, and lengths and directions of vectors whose derivatives at the zero vector are finite."""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ from jaxnbv.checks import AnyArray
 
 @jax.custom_jvp
 def safe_norm(*components: Float[AnyArray, "*#n"]) -> Float[Array, "*n"]:
-    """Return the length of the vectors with these components. Its derivative at the zero vector is zero."""
+    """Return the lengths of vectors, whose components are separate arrays. The derivative at zero is zero."""
     return jnp.sqrt(sum(c * c for c in components))
 
 
@@ -81,7 +81,7 @@ def rotation_from_6d(columns: Float[AnyArray, "*batch 6"]) -> Float[Array, "*bat
 def rotation_between(
     start: Float[AnyArray, "*batch 3"], end: Float[AnyArray, "*batch 3"]
 ) -> Float[Array, "*batch 3 3"]:
-    """Return the smallest rotation from one unit vector to another, or one of many if they are opposite."""
+    """Return the smallest rotation from unit vector `start` to `end`, or one of many if they are opposite."""
     start, end = jnp.asarray(start), jnp.asarray(end)
     halfway = normalise(start + end, _any_orthogonal(start), _rounding(start))
     # The sum of nearly opposite vectors has lost digits, but their difference has not. The exact sum is orthogonal to
@@ -113,7 +113,7 @@ def normalise(
 
 
 def _rounding(unit: Float[Array, "*batch n"]) -> float:
-    """Return the length below which rounding may hide the direction of a sum of unit vectors."""
+    """Return the length below which the direction of a sum of unit vectors may be a rounding error."""
     return 16.0 * float(jnp.finfo(unit.dtype).eps)
 
 

@@ -5,9 +5,9 @@ import warnings
 import numpy as np
 from jaxtyping import Bool, Real
 
-# A sentinel fills more pixels than `_MIN_ROWS` rows or columns. No value in a noise-free image of a floor does. A
-# sentinel also fills at least `_MIN_COUNT_RATIO` times as many pixels as any value that differs from it by at most the
-# fraction `_MAX_DIFFERENCE`.
+# A sentinel fills more pixels than `_MIN_ROWS` rows or columns. Even in a noise-free image of a floor, no depth fills
+# so many. A sentinel also fills at least `_MIN_COUNT_RATIO` times as many pixels as any value that differs from it by
+# at most the fraction `_MAX_DIFFERENCE`.
 _MIN_ROWS, _MIN_COUNT_RATIO, _MAX_DIFFERENCE = 2, 20, 0.05
 # If the largest relevant depth is unknown, a sentinel must exceed any other value by at least this factor.
 _MIN_VALUE_RATIO = 2.0
@@ -16,12 +16,12 @@ _MIN_VALUE_RATIO = 2.0
 def sentinel_pixels(image: Real[np.ndarray, "h w"], max_depth: float) -> Bool[np.ndarray, "h w"]:
     """Return, for each pixel, whether it holds a sentinel: a value that means "not measured".
 
-    Sentinels are the largest value of an integer type and, with a `UserWarning`, a value beyond `max_depth` that fills
-    far more pixels than any similar value. A value that all measured pixels have is not a sentinel, because the image
-    may show a wall.
+    There are two kinds of sentinels: the largest value of an integer type, and a value above `max_depth` that fills far
+    more pixels than any similar value. The second kind gives a `UserWarning`. A value that all measured pixels have is
+    not of the second kind, because the image may show a wall.
 
-    - `max_depth`: the largest relevant depth, in the image's units. If it is infinite (unknown), a sentinel of the
-      second kind must be more than twice any other value.
+    - `max_depth`: greatest depth at which a surface matters, in the image's units. If it is infinite (unknown), a
+      sentinel of the second kind must be more than twice any other value.
     """
     is_integer = np.issubdtype(image.dtype, np.integer)
     is_largest = image == np.iinfo(image.dtype).max if is_integer else np.zeros(image.shape, bool)

@@ -12,7 +12,7 @@ from jaxnbv.checks import AnyArray
 def on_tensor_grid(
     function: Callable[[Float[Array, "n 3"]], Shaped[Array, "*s n"]], axis: Float[AnyArray, " g"]
 ) -> Shaped[Array, "*s g g g"]:
-    """Return a function's values at the nodes of a cubic grid, whose x, y and z coordinates are `axis`."""
+    """Return the values of a function at the nodes (x, y, z) of a grid, for all x, y and z in `axis`."""
     axis = jnp.asarray(axis)
     y, z = jnp.meshgrid(axis, axis, indexing="ij")
 
