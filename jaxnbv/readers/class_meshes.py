@@ -13,8 +13,8 @@ from jaxnbv.networks.categories import CATEGORIES
 from jaxnbv.scanning import TriangleMesh, load_mesh
 
 _T = TypeVar("_T")
-# For each layout of a class's folder, in the order in which the layouts are tried: pattern of the mesh files, and their up
-# axis. {name} stands for the name of the folder.
+# Layouts of a class's folder, in the order in which they are tried: pattern of the mesh files, and up axis in them.
+# {name} stands for the name of the folder.
 _LAYOUTS = {
     "test/{name}_[0-9]*.off": "z",  # ModelNet
     "*/Scan/Scan.obj": "y",  # OmniObject3D
@@ -28,7 +28,7 @@ _SYNSETS = {category.name: category.synset for category in CATEGORIES}
 
 
 class MeshFile(NamedTuple):
-    """A mesh file of one object: its class index (`label`), name, path, and upward axis `up` (see `Frame`)."""
+    """A mesh file of one object: class index (`label`), name, path, and upward axis `up` (see `Frame`)."""
 
     label: int
     name: str

@@ -32,10 +32,10 @@ from jaxnbv.tasks import ColdestPoint, Coverage, body_temperature
 from jaxnbv.tasks.diffusion import HeatProblem
 from jaxnbv.viz.render import Still
 
-# Methods whose acquisition values the coldest point.
+# Methods whose utility is `ColdestPoint`.
 HEAT_METHODS = ("heat", "heat-reached", "heat-halving")
 _OTHERS = ("coverage", *BASELINES)
-# The two estimates of the coldest point, and the points of the cloud among which each finds it.
+# Names of the two estimates of the coldest point, and the points of the cloud to which each is restricted.
 ESTIMATES = {"all": "of all points", "reached": "of the warmed points"}
 # Points count as coldest if their temperature exceeds the lowest by at most this fraction of the temperature range.
 # Several may count, because objects have symmetries, and because the inner floor of a mug is equally cold.

@@ -76,7 +76,7 @@ def read_recording(source: tuple[Any, ...], box: Box, voxel: float, scan_box: Bo
         # Scans use every `stride`-th pixel. Use all pixels here, because fewer would miss voxels that the frame shows.
         points = _points(frames, index, 1)
         points = points[np.all((points >= box.low) & (points <= box.high), axis=1)]
-        # A frame without points in the box gives an empty scan, which does not carve either.
+        # A frame without points in the box gives an empty scan, by which nothing is carved.
         scan = PointCloud(zeros, zeros, is_point, is_point, jnp.zeros(count))
         if len(points) > 0:
             image = frames.depth(index), frames.camera, poses[index], frames.depth_scale, stride

@@ -107,7 +107,10 @@ class ClassAcquisition(Acquisition):
 
     @abstractmethod
     def compare(self, log_p: Float[Array, " classes"], log_q: Float[Array, " classes"]) -> Float[Array, "*values"]:
-        """Return the value of a scan in nats, from the log-probabilities before and after the scan is added."""
+        """Return the value of a scan in nats.
+
+        - `log_p`, `log_q`: log-probabilities of the classes before and after the scan is added to the cloud.
+        """
 
     def score(self, context: Context, view: ImaginedView) -> Float[Array, "*values"]:
         """Return the result of `compare` for the cloud without and with the scan, or zero for an empty scan."""
@@ -159,7 +162,7 @@ class CrossEntropy(ClassAcquisition):
     and a simulated scan.
 
     - `classifier`: a `Classifier`, or a function from a cloud to log-probabilities.
-    - `num_points`: number of points to which D is thinned by farthest point sampling, once for each proposal.
+    - `num_points`: number of points to which farthest point sampling thins D, once for each proposal.
     """
 
     def compare(self, log_p: Float[Array, " classes"], log_q: Float[Array, " classes"]) -> Float[Array, ""]:

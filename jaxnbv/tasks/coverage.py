@@ -58,10 +58,11 @@ class Coverage(Acquisition):
 
 
 class Newness(eqx.Module):
-    """A function from points to the newness of the surface there, given the observations.
+    """Newness clip(d / s - 1, 0, 1) of a surface, as a function of points on it, see `NewSurface`.
 
-    - `distances`: distance to the nearest hit of earlier views, or to the nearest point of the cloud without `Looks`.
-    - `size`: the length s of `NewSurface`, in scene units.
+    - `distances`: function from points to d, the distance to the nearest hit of earlier views. For observations without
+      `Looks`, d is the distance to the nearest point of the cloud.
+    - `size`: the length s, in scene units.
     """
 
     distances: Looks | DistanceField
@@ -78,14 +79,14 @@ class NewSurface(Acquisition):
         alpha(D, scan) = sum_x a(x) clip(d(x) / s - 1, 0, 1),   a(x) = r^2 omega / cos
 
     The sum is over the hits x of the scan. d(x) is the distance from x to the nearest hit of any earlier view, see
-    `Looks`. A hit x counts as seen if d(x) <= s, as new if d(x) >= 2 s, and in part in between. a(x) is the area of the
-    pixel on the surface: omega is the pixel's solid angle, r the distance from the camera, and cos the cosine of the
-    angle of incidence, clipped to at least 0.5. Rays of one scan do not overlap, so no surface counts twice. In the
-    paper's `Coverage`, near surfaces may dominate because they fill more pixels, and so may a single far point. Here
-    neither does.
+    `Looks`. A hit x counts as seen if d(x) <= s, as new if d(x) >= 2 s, and as partly new in between. a(x) is the area
+    of the pixel on the surface: omega is the pixel's solid angle, r the distance from the camera, and cos the cosine of
+    the angle of incidence, clipped to at least 0.5. Rays of one scan do not overlap, so no surface counts twice. In the
+    paper's `Coverage`, near surfaces may dominate because they fill more pixels, and a single far point may dominate
+    too. In `NewSurface`, neither does.
 
     Use a search over candidates. `NewSurface` is differentiable in the pose wherever `Coverage` is, but most of its
-    gain comes from rays that jump to a different surface, which the derivative ignores.
+    gain comes from rays that jump to a different surface, and the derivative ignores such jumps.
 
     - `size`: the length s in scene units, even in sessions. The default is the spacing of the grid of `Looks`. A
       smaller size is raised to this spacing.
@@ -140,11 +141,11 @@ def seen_share(
     views: PoseList,
     barrier: Float[Array, "poses rays"] | None = None,
 ) -> Float[Array, ""]:
-    """Return the fraction of the visible area that earlier views have seen.
+    """Return the fraction of the visible area that earlier views have seen; 1 if nothing is visible.
 
-    The visible area is the part of the sampled surfaces that is visible from `poses`. A point has been seen if its
-    newness is zero. For observations with `Looks`, the point must also be visible from an earlier view, because it may
-    be hidden behind an edge although a point near it was measured.
+    The visible area is the part of the sampled surfaces that is visible from any of `poses`. A point has been seen if
+    its newness is zero. For observations with `Looks`, the point must also be visible from an earlier view. Otherwise a
+    point hidden behind an edge would count as seen because a point near it was measured.
 
     - `surfaces`: posterior samples, along a leading axis.
     - `views`: poses of the views so far.

@@ -67,12 +67,13 @@ class HeatProblem(eqx.Module):
         return self.initial + self.duration * max(0.0, self.power)
 
     def heating(self, points: Float[np.ndarray, "n 3"], areas: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """Return the heating f at points: `power` times the fraction of a point's disc in the heated ball.
+        """Return the heating f of each point.
 
-        The disc has the area of the point. The fraction is approximated by 1/2 + (radius - d) / (2 rho), clipped to
-        [0, 1], where d is the distance from the source and rho the radius of the disc. The authors' code uses only 0
-        and 1, which makes no difference for dense points. With 1,024 points on an object, the lowest temperatures of
-        two random samplings differ by a third with the authors' code, and by a tenth with fractions.
+        A point stands for a disc of its area (`areas`). f is `power` times the fraction of the disc in the heated ball.
+        This fraction is approximated by 1/2 + (radius - d) / (2 rho), clipped to [0, 1], where d is the distance of the
+        point from the source and rho the radius of the disc. In the authors' code, the fraction is 0 or 1. That makes
+        no difference for dense points. But with 1,024 points on an object, the lowest temperatures of two random
+        samplings differ by a third with the authors' code, and by a tenth with fractions.
         """
         distance = np.linalg.norm(points - np.asarray(self.source, np.float64), axis=1)
         return self.power * np.clip(0.5 + 0.5 * (self.radius - distance) / np.sqrt(areas / np.pi), 0.0, 1.0)
@@ -93,14 +94,17 @@ class Temperature(NamedTuple):
     """The solution of a `HeatProblem` after its duration.
 
     - `values`: temperature of each point, in degrees.
-    - `reached`: mask of the points that are connected to a heated point. All others keep the initial temperature.
+    - `reached`: mask of the points that are connected to a heated point. Other points keep the initial temperature.
     """
 
     values: Float[np.ndarray, " n"]
     reached: Bool[np.ndarray, " n"]
 
     def coldest(self, reached_only: bool) -> int | None:
-        """Return the index of the coldest point, or of the coldest `reached` point; None without a point."""
+        """Return the index of the coldest point; None if there is none.
+
+        - `reached_only`: whether to consider only `reached` points.
+        """
         candidates = np.flatnonzero(self.reached) if reached_only else np.arange(len(self.values))
         return int(candidates[np.argmin(self.values[candidates])]) if len(candidates) else None
 
@@ -108,9 +112,9 @@ class Temperature(NamedTuple):
 def cloud_laplacian(points: Float[np.ndarray, "n 3"]) -> Laplacian:
     """Return the Laplacian of a point cloud without coincident points.
 
-    A point is connected to some of its 30 nearest neighbours, or of all other points if there are fewer, at any
-    distance. Therefore two groups of points are disconnected only if they are far apart and each has more than 30
-    points. Points without a triangle, such as points on a single line, conduct no heat.
+    Each point is connected to some of its 30 nearest neighbours (fewer in a small cloud), however far away they are.
+    Therefore two groups of points are disconnected only if they are far apart and each has more than 30 points. Points
+    without a triangle, such as points on a single line, conduct no heat.
     """
     if len(points) == 3:
         # The library reads uninitialised memory if there are only two neighbours.
@@ -140,7 +144,8 @@ def _assemble(build: Callable, count: int) -> Laplacian:
         if "unreferenced vertex" not in str(error):
             raise
         return _insulator(count)
-    # The library couples a point without triangles to zero degrees. With rows that sum to zero, the point is isolated.
+    # The library returns a row that does not sum to zero for a point without triangles, as if it were in contact with a
+    # body at zero degrees. Set the diagonal so that all rows sum to zero, which isolates the point.
     flow = weak - sparse.diags(weak.diagonal())
     flow.eliminate_zeros()
     return Laplacian((flow - sparse.diags(np.asarray(flow.sum(axis=1)).ravel())).tocsc(), mass.diagonal())

@@ -39,9 +39,9 @@ class ColdestPoint(Utility):
 
     - `heat`: a `HeatProblem`, or only its source (3,) in scene coordinates, with the authors' values for the rest.
       Problems that differ only in the source share one compiled program.
-    - `reached_only`: take the minimum only over points that are connected to a heated point. The paper takes it over
-      all points. If a point is not connected to the source, the minimum is then the initial temperature, and no view
-      can improve it.
+    - `reached_only`: take the minimum only over points that are connected to a heated point. By default it is taken
+      over all points, as in the paper. One point that is not connected to the source then keeps the minimum at the
+      initial temperature, and no view can improve it.
     - `workers`: number of processes that share the clouds, by default one for each core. With 1, this process does all.
 
     **Raises:** `ValueError` for fewer than one worker, an invalid source, or an attempt to differentiate the utility.
@@ -68,8 +68,8 @@ class ColdestPoint(Utility):
     def __call__(self, cloud: PointCloud) -> Float[Array, ""]:
         """Return the negative lowest temperature of one cloud, in degrees.
 
-        Under `vmap`, all clouds are computed in one call on the host. If there is no point to take the minimum over,
-        `HeatProblem.highest` replaces the minimum, so that any point of a later scan improves the utility.
+        Under `vmap`, one call on the host computes all clouds. If there is no point to take the minimum over,
+        `HeatProblem.highest` takes its place, so that any point of a later scan improves the utility.
         """
         source = jnp.asarray(self.heat.source, cloud.points.dtype)
         # The source may be traced, so it is passed as an array together with the cloud.
@@ -128,7 +128,7 @@ class Coldest(Answer):
     """The coldest point of a body. The answer's only value is the temperature there, in degrees.
 
     - `point`: the coldest point, in scene coordinates.
-    - `frame`: frame of the world in which texts of the answer give the point.
+    - `frame`: frame of the world coordinates in which the text of the answer gives the point.
     """
 
     point: Float[np.ndarray, "3"] = eqx.field(default_factory=lambda: np.zeros(3))

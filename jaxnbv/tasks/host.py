@@ -46,8 +46,8 @@ class HostClassifier(Classifier):
 class HostSegmenter(Segmenter):
     """A segmenter that runs outside JAX, for example a PyTorch model. Gradient searches cannot use it.
 
-    - `function`: function of the same arrays as in `HostClassifier` that returns part probabilities (b, n, num_parts).
-      Rows of the result for which the mask is False are ignored.
+    - `function`: function that returns the part probabilities (b, n, num_parts), given the same arrays as in
+      `HostClassifier`. Rows of the result for which the mask is False are ignored.
     - `version`: see `HostClassifier`.
 
     **Raises:** `ValueError` for an attempt to differentiate. If the function fails, JAX raises a `RuntimeError`.
@@ -75,10 +75,10 @@ def call_on_host(
 ) -> Float[Array, "..."]:
     """Call a NumPy function with JAX arrays, also under `jit` and `vmap`, and return the result.
 
-    The function gets the arrays with an additional leading axis, over the entries of `vmap`. Its length is one outside
-    `vmap`.
+    The function gets each array with one more leading axis, the batch of `vmap`, and returns a result with this axis.
+    Outside `vmap`, the axis has length one.
 
-    - `shape`: shape of the result for one entry. The result has the dtype of the first array.
+    - `shape`: shape of the result without the leading axis. The result has the dtype of the first array.
     - `name`: name of the caller for error messages.
 
     **Raises:** `ValueError` for an attempt to differentiate the result.

@@ -135,7 +135,7 @@ class SoftPartCount(Utility):
     def true_answer(self, scene: Surface, cloud: PointCloud) -> "PartAnswer":
         """Return the number of surface points of each part, from the scene's labels or else the segmenter.
 
-        The answer's `target` is 1, because a part with at least one point is present.
+        The answer's `target` is 1, because one point is enough to show that the object has the part.
 
         - `cloud`: points on the whole surface.
         """
@@ -170,6 +170,9 @@ def _counts(segmenter: Segmenter, cloud: PointCloud) -> Int[Array, " parts"]:
 
 
 def part_counts(p: Float[Array, "points parts"]) -> Int[Array, " parts"]:
-    """Return the number of points whose most probable part is each part. Rows of zeros do not count."""
+    """Return, for each part, the number of points whose most probable part it is.
+
+    Rows of zeros hold no point, and do not count.
+    """
     predicted = jax.nn.one_hot(jnp.argmax(p, axis=1), p.shape[1], dtype=jnp.int32)
     return jnp.sum(jnp.where(jnp.any(p > 0, axis=1)[:, None], predicted, 0), axis=0)

@@ -24,8 +24,8 @@ def episode_record(
 ) -> Record:
     """Run an episode and return its record.
 
-    The record holds the poses of the views, the value and the time (seconds) of each proposal, and what `follow`
-    returns. The episode ends after `views` views, or earlier if `follow` stops drawing steps.
+    The record holds the poses of the views, the value and the time (seconds) of each proposal, and the entries that
+    `follow` returns. The episode ends after `views` views, or earlier if `follow` takes fewer steps from its iterator.
 
     - `first`: pose of the first view; `camera`: camera of the sensor.
     """

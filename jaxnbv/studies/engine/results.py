@@ -46,7 +46,10 @@ def results(records: Sequence[Record], study: type[Study]) -> pd.DataFrame:
 
 
 def _statistics(values: pd.DataFrame, reference: str) -> pd.DataFrame:
-    """Return the rows of `results` for one measure at one key, from the column `value` of `values`."""
+    """Return the rows of `results` for one group, measure and key, one row per method.
+
+    - `values`: data frame with one row per scene and method, in the columns `scene`, `method` and `value`.
+    """
     table = values.pivot(index="scene", columns="method", values="value")[values["method"].unique()]
     table = table.dropna(axis="columns", how="all").dropna()
     table = table if len(table) else table[[]]
@@ -78,10 +81,12 @@ def groups_of(table: pd.DataFrame) -> dict[str, int]:
 
 
 def tables(table: pd.DataFrame, study: type[Study], group: str = _ALL) -> list[tuple[str, pd.DataFrame]]:
-    """Return two tables of formatted text for each measure, each as a title and a data frame.
+    """Return the titles and cells (text) of two tables for each measure.
 
-    `table` comes from `results`. Rows are methods, and columns are views or other keys. The first table has the means
-    of the methods. The second has the leads: the reference's mean minus another method's. Empty tables are left out.
+    In both, rows are methods, and columns are views or other keys. The first table has the means of the methods. The
+    second has the leads: the reference's mean minus another method's. Empty tables are left out.
+
+    - `table`: result of `results`.
     """
     texts = []
     for measure in study.measures:
@@ -103,7 +108,7 @@ def tables(table: pd.DataFrame, study: type[Study], group: str = _ALL) -> list[t
 
 
 def _means(rows: pd.DataFrame, measure: Measure, best: pd.Series) -> list[str]:
-    """Format means, with intervals if in percent, else with standard errors. A star marks the best mean."""
+    """Format means in percent with intervals, other means with standard errors. A star marks the best."""
     texts = []
     for row, star in zip(rows.itertuples(), best, strict=True):
         if measure.unit == "%":
@@ -149,7 +154,7 @@ def table_legend(study: type[Study]) -> str:
 class Verdict(NamedTuple):
     """Result of the check of one claim.
 
-    - `num_methods`: number of methods compared with the reference; `num_held`: how many of them the claim holds for.
+    - `num_methods`: number of methods compared with the reference; `num_held`: for how many of them the claim holds.
     - `sentence`: text that lists the methods that the reference is ahead of, level with or behind.
     """
 

@@ -52,8 +52,8 @@ class NearestPart(Segmenter):
 
         p_ic proportional to exp(-d_ic^2 / 2 w^2),   w = 0.02 scene units,
 
-    where d_ic is the distance of point i from the true part c. Objects with the same number of parts share one
-    compilation, so `of` adds absent parts.
+    where d_ic is the distance of point i from the true part c. `of` adds absent parts, so that all objects have the
+    same number of parts and share one compiled program.
 
     - `distances`: distance of each node of `grid` from each part, interpolated linearly between nodes.
     - `num_points`: number of points to segment. Farthest point sampling chooses them from the cloud.
@@ -71,13 +71,13 @@ class NearestPart(Segmenter):
         return cls(jnp.pad(distances, padding, constant_values=_ABSENT_DISTANCE), grid, num_points)
 
     def __call__(self, cloud: PointCloud) -> Float[Array, "num_points parts"]:
-        """Return the probability that each point belongs to each part; zeros in rows without a point."""
+        """Return the part probabilities of the `num_points` chosen points; zeros in rows without a point."""
         subsample = farthest_point_subsample(cloud, self.num_points)
         p = jax.nn.softmax(-0.5 * (self.distances_at(subsample.points) / _WIDTH) ** 2, axis=-1)
         return jnp.where(subsample.mask[:, None], p, 0.0)
 
     def predict(self, cloud: PointCloud) -> tuple[PointCloud, Int[Array, " num_points"]]:
-        """Return the segmented points, and the index of the nearest part for each; -1 in rows without a point."""
+        """Return the chosen points, and the index of the part nearest to each; -1 in rows without a point."""
         subsample = farthest_point_subsample(cloud, self.num_points)
         return subsample, jnp.where(subsample.mask, self.nearest(subsample.points), -1)
 
@@ -86,7 +86,7 @@ class NearestPart(Segmenter):
         return jnp.argmin(self.distances_at(points), axis=-1).astype(jnp.int32)
 
     def distances_at(self, points: Float[Array, "n 3"]) -> Float[Array, "n parts"]:
-        """Return the distance of each point from each part. Points outside the grid count as on its border."""
+        """Return the distance of each point from each part. A point outside the grid is moved to its border."""
         coordinates = list((points.T + self.grid.half_extent) / self.grid.spacing)
 
         def interpolate(values):
@@ -99,9 +99,11 @@ PartSegmenter: TypeAlias = CloudSegmenter | NearestPart
 
 
 def discovery_time(counts: Int[np.ndarray, "views parts"], target: int) -> int | None:
-    """Return the paper's T_discovery: the first view after which all parts have `target` points, or None.
+    """Return the paper's T_discovery: the first view (from 1) after which all parts have `target` points.
 
-    - `counts`: number of points assigned to each part after each view. The first view has the number 1.
+    Returns None if there is no such view.
+
+    - `counts`: number of points assigned to each part after each view.
     """
     is_complete: Bool[np.ndarray, " views"] = np.all(np.asarray(counts) >= target, axis=1)
     return int(np.argmax(is_complete)) + 1 if is_complete.any() else None
@@ -130,8 +132,8 @@ class PartDiscoveryStudy(Study):
     It has the settings of `Study`, and:
 
     - `imagined_rays`: rays along each side of an imagined scan. True scans have 64 x 64 rays.
-    - `num_points`: number of points of the cloud joined with an imagined scan that the segmenter gets. The utility's
-      number of points per part (N_target) is scaled in proportion to this number.
+    - `num_points`: number of points that the segmenter gets after an imagined scan has been added to the cloud. The
+      utility's N_target is scaled in proportion.
     """
 
     title: ClassVar[str] = "Views until all parts are found"
@@ -167,7 +169,7 @@ class PartDiscoveryStudy(Study):
 
     @abstractmethod
     def segmenter_of(self, scene: Scene, num_points: int | None = None) -> PartSegmenter:
-        """Return the segmenter for a scene. It gets `num_points` points; default: as many as for a true cloud."""
+        """Return the segmenter for a scene and `num_points` points; default: as many as for true scans."""
 
     @abstractmethod
     def true_parts(self, scene: Scene, points: Float[Array, "n 3"]) -> Int[Array, " n"]:

@@ -55,7 +55,10 @@ class SolidObject(ClassObject):
 
 
 class ClassSet(NamedTuple):
-    """Names of classes, and a function from split, index and framing to an object; None if all are meshes."""
+    """Names of classes, and the procedural objects of these classes.
+
+    - `scene`: function from split, index and framing to an object; None if all objects are meshes.
+    """
 
     classes: tuple[str, ...]
     scene: Callable[..., ClassObject] | None = None

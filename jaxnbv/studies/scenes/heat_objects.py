@@ -54,7 +54,7 @@ def heat_scene(index: int, is_rotated: bool = True) -> HeatScene:
 
 
 def source_view(scene: HeatScene, key: PRNGKeyArray, num_candidates: int = 100, radius: float = 3.0) -> Pose:
-    """Return a random candidate pose on a sphere that shows the heat source, drawn uniformly.
+    """Return a pose from which the heat source is visible, drawn uniformly from candidates on a sphere.
 
     **Raises:** `ValueError` if there is no such candidate.
     """

@@ -25,7 +25,7 @@ _IDENTITY = np.eye(3)
 
 @dataclasses.dataclass(frozen=True)
 class Primitive:
-    """One primitive of a `LabelledSolid`, as NumPy arrays on the host. See there for the fields."""
+    """One primitive, as NumPy arrays on the host. For the fields see `LabelledSolid`."""
 
     label: int
     centre: np.ndarray
@@ -140,7 +140,7 @@ def _upright(axis):
 
 
 def assemble(primitives: list[Primitive], rotation_angle: float = 0.0, longest_side: float = 2.5) -> LabelledSolid:
-    """Return the union of primitives, rotated about the y axis (radians), then moved and scaled.
+    """Return the union of primitives, rotated about the y axis by an angle in radians, moved and scaled.
 
     The bounding box of the result is centred at the origin, and its longest side is `longest_side`.
     """

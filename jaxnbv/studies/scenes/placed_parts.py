@@ -71,7 +71,10 @@ def parts_in(files: tuple[MeshFile, ...]) -> Parts:
 
 
 def confusable_parts(index: int) -> tuple[str, Parts, int]:
-    """Return name and parts of the set `CONFUSABLE_SETS[index % 10]`, and the index of the scene's part."""
+    """Return name and parts of a set of look-alike parts, and which part the scene with this index shows.
+
+    The set is `CONFUSABLE_SETS[index % 10]`.
+    """
     cycle, set_index = divmod(index, len(CONFUSABLE_SETS))
     name = CONFUSABLE_SETS[set_index]
     order = np.random.default_rng(_ORDER_SEED + set_index).permutation(PARTS_OF_SET)
@@ -128,7 +131,10 @@ def place_part(parts: Parts, part: int, setup: Setup, key: PRNGKeyArray) -> Plac
 
 
 def _resting(vertices: Float[np.ndarray, "v 3"], random: np.random.Generator) -> Float[np.ndarray, "3 3"]:
-    """Draw a stable pose on a table (y is up), with the probability that a dropped part rests in it."""
+    """Return the rotation of a random stable pose on a table (y is up).
+
+    The probability of a pose is that of a dropped part to come to rest in it. The angle about y is uniform.
+    """
     hull = trimesh.Trimesh(vertices, process=False).convex_hull
     matrices, probabilities = trimesh.poses.compute_stable_poses(hull)
     rest_rotation = matrices[random.choice(len(probabilities), p=probabilities / probabilities.sum())][:3, :3]
@@ -138,7 +144,10 @@ def _resting(vertices: Float[np.ndarray, "v 3"], random: np.random.Generator) ->
 
 
 def _obstacles(half: Float[np.ndarray, "3"], has_box: bool, random: np.random.Generator) -> Obstacles:
-    """Return a table below a part of these half sizes and, if `has_box`, a box that hides half a side."""
+    """Return a table below a part and, if `has_box`, a box beside the part that hides half of one side.
+
+    - `half`: half sizes of the part's bounding box, in scene units.
+    """
     table = HalfSpace(np.array([0.0, -half[1], 0.0]), np.array([0.0, 1.0, 0.0]))
     if not has_box:
         return Obstacles((table,))

@@ -42,7 +42,7 @@ def placement_on_bed(
 ) -> tuple[float, Float[np.ndarray, "3"]]:
     """Return a scale and a shift that place a cargo at a random position on the floor of a bed.
 
-    The scale is 85 to 95 %, chosen at random, of the largest scale at which the cargo fits above the bed.
+    The scale is a random fraction (85 to 95 %) of the largest scale at which the cargo fits above the bed.
 
     - `bed`, `cargo`: bounding boxes (lowest and highest corner) of the space above the bed and of the cargo.
     """

@@ -12,7 +12,7 @@ from jaxnbv.studies.scenes.class_object import ClassMesh
 from jaxnbv.studies.scenes.labelled import generator, rotation_about
 from jaxnbv.studies.scenes.truck import placement_on_bed, random_rotation
 
-# A grid with this number of rows and of columns of rays is traced down onto the truck.
+# Number of rows, and of columns, in the grid of rays that are traced down onto the truck.
 _NUM_LINES = 96
 # Fractions of a truck's height: lowest and highest floor of a bed, and largest range of heights within one floor.
 _MIN_FLOOR, _MAX_FLOOR, _MAX_UNEVENNESS = 0.15, 0.85, 0.02
