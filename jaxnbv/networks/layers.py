@@ -72,7 +72,7 @@ class SetAbstraction(eqx.Module):
 
     - `branches`, `radii`: perceptrons, and radii of their balls in units of the points.
     - `members`: number of points in a group, for each radius.
-    - `centers`: number of centres, around each of which the points within each radius form a group.
+    - `centers`: number of centres, each with one group per radius.
     """
 
     branches: tuple[PooledMLP, ...]

@@ -31,7 +31,7 @@ _EPSILON = 1e-5
 def published_network(tensors: Tensors) -> PointNet2Classifier | PointNet2PartSegmenter:
     """Make the network with these tensors: a part segmenter if a name begins with fp, else a classifier.
 
-    **Raises:** `ValueError` that names the tensor, if it is missing, unexpected, of a wrong shape or not finite.
+    **Raises:** `ValueError` if a tensor is missing, unexpected, of a wrong shape or not finite.
     """
     state = _State(tensors)
     segments = any(name.startswith("fp") for name in tensors)

@@ -44,6 +44,7 @@ def short_ranged(longest_side: float = 2.5, truncation: int = 32) -> ScreenedSPS
     """Return the default model of the difference between an object and a known shape.
 
     - `longest_side`: longest side of the object's bounding box, in scene units.
+    - `truncation`: upper limit of the model's truncation, which rises for smaller objects.
     """
     scale = longest_side / 2.5
     # Long lengthscales, or values at points off the surface, would change the shape far from the scan. `noise` covers
@@ -110,7 +111,7 @@ class KnownShapes(SurfaceModel):
         )
 
     def fit(self, observations: Observations) -> tuple[Hypotheses, Float[Array, " h_and_none"]]:
-        """Return the shapes registered to the scan, and their weights. The last weight is of "none of these"."""
+        """Return the shapes registered to the scan, and their weights. The last weight is for "none of these"."""
         fits = register(self.bank, Prior(self.poses, self.box), FitTargets.of(observations), self.num_starts)
         return fits, _weights(fits, self.inverse_temperature, self.misfit_of_none)
 
@@ -245,7 +246,7 @@ def _sample(posterior: KnownShapesPosterior, key: PRNGKeyArray, num_samples: int
 
 @program
 def _draw_indices(posterior: KnownShapesPosterior, key: PRNGKeyArray, num_samples: int) -> Int[Array, " s"]:
-    """Draw the index of each sample's hypothesis. The last index is "none of these"."""
+    """Draw the row of `posterior.fits` for each sample. The number of rows stands for "none of these"."""
     shape_key, order_key = jax.random.split(jax.random.split(key, 3)[0])
     index = systematic_resampling(shape_key, posterior.weights, num_samples)
     # The indices are sorted. Shuffle them, because the first few samples should vary as much as all.
@@ -261,7 +262,10 @@ def kind_of(name: str) -> str:
 def systematic_resampling(
     key: PRNGKeyArray, weights: Float[Array, " n"], num_samples: int
 ) -> Int[Array, " num_samples"]:
-    """Draw indices by weight. The count of each is within one of its expected value (Kitagawa 1996)."""
+    """Draw sorted indices with probabilities proportional to weights (Kitagawa 1996).
+
+    How often an index is drawn differs from its expected count by less than one.
+    """
     positions = (jnp.arange(num_samples) + jax.random.uniform(key)) / num_samples
     total = jnp.cumsum(weights)
     return jnp.clip(jnp.searchsorted(total / total[-1], positions, side="right"), 0, len(weights) - 1)
@@ -291,7 +295,7 @@ class PlacedShapes(Fields):
 class MixtureFields(Fields):
     """A batch of samples in which each sample comes from one of two batches of the same size.
 
-    - `level`: the level of `of_none`. It is subtracted from the values of `of_none`.
+    - `level`: the level of `of_none`, which is subtracted from its values, so that every surface is at zero.
     - `is_none`: for each sample, whether it comes from `of_none`.
     """
 

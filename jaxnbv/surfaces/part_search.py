@@ -125,8 +125,8 @@ def _starts(bank: ShapeBank, prior: Prior, targets: FitTargets, num_starts: int)
     At the first position of a rotation, the side of the shape's bounding box that faces the sensor touches the scan,
     and the box is centred on the scan in the two directions across the line of sight. The other positions are spread
     over all positions at which the bounding box contains the scan (or, along an axis on which the box is shorter than
-    the scan, lies within the scan). Positions at which the shape would leave
-    `prior.box` by more than a margin are clipped.
+    the scan, lies within the scan). Positions at which the shape would leave `prior.box` by more than a margin are
+    clipped.
     """
     dtype = targets.points.dtype
     rotations = jnp.asarray(prior.poses.rotations_of(len(bank), max(1, num_starts // _NUM_POSITIONS)), dtype)

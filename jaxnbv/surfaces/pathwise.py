@@ -39,7 +39,7 @@ class DataPoints(NamedTuple):
     """The points at which `sample_about` evaluates mean functions.
 
     - `gradient_points`: the points of the observed normals, where it needs gradients.
-    - `value_points`: the points of the observed values of f or of the level, where it needs values.
+    - `value_points`: the points of the observed values of f, or those that define the level, where it needs values.
     """
 
     gradient_points: Float[Array, "n 3"]
@@ -156,7 +156,7 @@ class TrigonometricPosterior(SurfacePosterior):
 
     @abstractmethod
     def prior_draws(self, key: PRNGKeyArray, num_samples: int) -> Any:
-        """Draw from the prior and from the noise of the data. Each array has mean zero and axis 0 of samples."""
+        """Draw from the prior and the noise of the data: arrays of mean zero, with samples along axis 0."""
 
     @abstractmethod
     def condition_draws(self, draws: Any, means: MeansAtData) -> Float[Array, "s a a a"]:

@@ -32,7 +32,9 @@ class Resting(ShapePoses):
 
     @classmethod
     def of(cls, bank: ShapeBank) -> "Resting":
-        """Compute the stable poses of each part of a bank, as a solid of uniform density on its convex hull.
+        """Compute the stable poses of each part of a bank, treated as a solid of uniform density.
+
+        A part rests on a face of its convex hull.
 
         **Raises:** `ValueError` for an empty bank.
         """

@@ -269,9 +269,8 @@ def _mesh_distance(first: _Motions, second: _Motions, samples: Float[np.ndarray,
     """Return how far apart two motions place the mesh, as a mean distance.
 
     `first` and `second` each hold one motion from the scan to the mesh, so the inverse of a motion places the mesh at
-    the scan. The mean is over points of the mesh placed by `second`, and their distances to the mesh placed by `first`.
-
-    - `samples`: points of the mesh.
+    the scan. `samples` are points of the mesh. The result is the mean distance from the samples, placed by `second`, to
+    the mesh, placed by `first`.
     """
     moved = (samples - second.shifts[0]) @ second.rotations[0] @ first.rotations[0].T + first.shifts[0]
     return float(np.mean(np.linalg.norm(moved - nearest(moved)[0], axis=1)))
