@@ -48,15 +48,18 @@ class Search(eqx.Module):
         return acquisition.quantity
 
     def poses_around(self) -> Pose:
-        """Return poses around the object. Surface that any of them sees counts as visible."""
+        """Return poses around the object. `Covered` counts surface as visible if one of these poses sees it."""
         return SphereCandidates().poses()
 
     def upper_half(self) -> "Search":
-        """Return a copy with only the upper half of the candidates, or `self` if they are not a whole sphere."""
+        """Return a copy with as many candidates, on the upper half of the sphere only.
+
+        A search whose candidates are not a whole sphere is returned unchanged.
+        """
         return self
 
     def over(self, poses: Pose) -> "Search":
-        """Return a copy whose candidates are the poses of a batch (n,).
+        """Return a copy whose candidates are `poses`, a batch (n,).
 
         **Raises:** `ValueError` if the search has no candidates to replace.
         """
@@ -73,7 +76,7 @@ class Search(eqx.Module):
 class CandidateSearch(Search):
     """Base class of searches that score all candidates, then pick one of them.
 
-    A study can compute the scores of `acquisitions` once, and call `pick` of several searches with them.
+    A study can compute the scores of `acquisitions` once, and pass them to `pick` of several searches.
 
     - `candidates`: `Candidates`, a number of `SphereCandidates`, or a batch of poses.
     """
@@ -94,7 +97,7 @@ class CandidateSearch(Search):
         return (acquisition,)
 
     def score(self, problem: Problem, candidates: Pose) -> Scores:
-        """Return the scores of the candidates, which `pick` needs."""
+        """Return the scores that `pick` needs, one for each acquisition, sample and candidate."""
         acquisitions = self.acquisitions(problem.acquisition)
         if not acquisitions:
             return jnp.zeros((0, 0, self.candidates.count))
@@ -104,7 +107,7 @@ class CandidateSearch(Search):
 
     @abstractmethod
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
-        """Propose a candidate, given the scores from `score`, or at random from the key."""
+        """Propose a candidate, given the result of `score`. The key is for searches with random choices."""
 
     def propose(self, problem: Problem, key: PRNGKeyArray) -> Proposal:
         candidates = self.candidates.poses()
@@ -137,8 +140,9 @@ def best_unvisited(
 ) -> Proposal:
     """Propose the candidate with the highest value among those that `problem` does not exclude.
 
-    - `tie`: relative difference up to which values tie, and the first is proposed. The default exceeds rounding errors.
-    - `scores`: scores whose means are `values`, for the proposal's standard errors.
+    - `tie`: values within this fraction of the highest value tie with it. The first of the tied candidates is proposed.
+      The default exceeds rounding errors.
+    - `scores`: scores whose means over the samples are `values`. They determine the proposal's standard errors.
     """
     values = jnp.where(problem.is_excluded(candidates), -jnp.inf, values)
     index = first_best(values, tie)
@@ -152,22 +156,24 @@ def best_unvisited(
 
 
 def best_or_farthest(problem: Problem, candidates: Pose, scores: Float[Array, "samples candidates"]) -> Proposal:
-    """Propose the best candidate or, among candidates tied with it, the farthest from earlier cameras.
+    """Propose the candidate farthest from earlier cameras among those tied with the best.
 
-    The distance counts only if a second view from the same pose gains nothing (`Acquisition.gains_once`), and if there
-    is no cost, because a cost favours near candidates.
+    Propose the best candidate itself if a second view from the same pose may gain something (see
+    `Acquisition.gains_once`), or if there is a cost, because a cost favours near candidates.
+
+    - `scores`: scores of the acquisition. Their means over the samples are the values of the candidates.
     """
     proposal = best_unvisited(problem, candidates, jnp.mean(scores, axis=0), scores=scores)
     if not problem.acquisition.gains_once or problem.cost is not None:
         return proposal
     proposal = dataclasses.replace(proposal, value_at_visited=problem.value_at_visited())
     visited_poses = problem.observations.poses
-    # Without earlier cameras there is no distance, so the candidate of the highest value is preferred.
+    # Without earlier cameras all distances are infinite, so the candidate of the highest value is preferred.
     return preferred(proposal, jnp.where(visited_poses.count > 0, visited_poses.distance(candidates), proposal.values))
 
 
 def preferred(proposal: Proposal, preference: Float[Array, " candidates"]) -> Proposal:
-    """Change a proposal to the candidate of highest `preference` among those that tie with the best."""
+    """Return a copy that proposes the candidate of highest `preference` among those tied with the best."""
     is_tied, errors = proposal.tied_with_best(), proposal.standard_errors
     assert is_tied is not None
     assert errors is not None

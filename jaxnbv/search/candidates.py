@@ -32,11 +32,11 @@ class Candidates(eqx.Module):
         """Return the poses (count,). Every call returns the same poses."""
 
     def upper_half(self) -> "Candidates":
-        """Return the upper half of candidates on a whole sphere; other candidates are returned unchanged."""
+        """Return `self`, or as many candidates on the upper half if the candidates are a whole sphere."""
         return self
 
     def where(self, allowed: Callable[[Pose], Bool[AnyArray, ""] | bool]) -> "GivenPoses":
-        """Return the candidates that `allowed`, a function of one pose, accepts, such as a robot's reach.
+        """Return the candidates for which `allowed`, a function of one pose, returns True.
 
         **Raises:** `ValueError` if no candidate is allowed, or if the function does not return a single bool.
         """
@@ -54,9 +54,9 @@ class Candidates(eqx.Module):
 class SphereCandidates(Candidates):
     """The paper's candidates: cameras on a sphere or part of a sphere, all looking at the origin.
 
-    - `count`: number of cameras. They form a Fibonacci sphere, evenly spaced above `min_elevation`.
+    - `count`: number of cameras. They are spaced evenly above `min_elevation` (a Fibonacci sphere).
     - `radius`: radius in scene units.
-    - `min_elevation`: smallest elevation over the horizontal plane through the origin, in radians; 0 for a dome.
+    - `min_elevation`: smallest angle of a camera above the horizontal plane through the origin, in radians; 0 for a dome.
     - `up`: upward direction in the scene and in the images.
 
     **Raises:** `ValueError` for no cameras, a radius that is not positive and finite, an elevation outside
@@ -86,9 +86,10 @@ class SphereCandidates(Candidates):
 class Reach(Candidates):
     """Cameras within an arm's reach: between two distances and two elevations, all looking at the origin.
 
-    - `count`: number of cameras. Their directions are a Fibonacci sphere, and they fill the volume evenly.
+    - `count`: number of cameras. They fill the volume between these limits evenly.
     - `nearest`, `farthest`: smallest and largest distance from the origin, in scene units.
-    - `min_elevation`, `max_elevation`: limits of the elevation over the horizontal plane of the origin, in radians.
+    - `min_elevation`, `max_elevation`: smallest and largest angle of a camera above the horizontal plane through the
+      origin, in radians. Angles below the plane are negative.
     - `up`: upward direction in the scene and in the images.
 
     **Raises:** `ValueError` for no cameras, distances or elevations in the wrong order, or a zero `up`.
@@ -123,7 +124,7 @@ class Reach(Candidates):
 
 
 class GivenPoses(Candidates):
-    """Candidates from a `batch` of poses.
+    """Candidates that are the poses of a `batch`.
 
     **Raises:** `ValueError` unless the poses are a batch (n,) with n >= 1.
     """
@@ -154,7 +155,7 @@ def _check_positions(count: int, nearest: float, farthest: float, up: tuple[floa
 
 
 def _look_at_origin(positions: Float[Array, "n 3"], up: tuple[float, float, float]) -> Pose:
-    """Rotate `positions` so that the y axis maps to `up`, and return poses there that look at the origin."""
+    """Rotate `positions` so that the y axis becomes `up`. Return poses there that look at the origin."""
     axis = jnp.asarray(up, positions.dtype)
     if up[0] or up[2] or up[1] < 0:
         rotation = rotation_between(jnp.asarray([0.0, 1.0, 0.0], positions.dtype), axis / jnp.linalg.norm(axis))

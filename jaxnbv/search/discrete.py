@@ -17,10 +17,10 @@ from jaxnbv.search.proposal import Proposal
 class DiscreteSearch(CandidateSearch):
     """Search that proposes the candidate of the highest value.
 
-    If a second view from the same pose gains nothing (`Acquisition.gains_once`, as for `NewSurface`), it proposes the
-    tied candidate that is farthest from the earlier cameras. A candidate is tied if its value differs from the best by
-    at most two standard errors of the difference, plus the mean value expected at visited poses. Since the true value
-    at visited poses is zero, this mean is an error, which may be as large at other poses.
+    If a second view from the same pose gains nothing (`Acquisition.gains_once`, as for `NewSurface`), and moves have no
+    cost, it proposes the tied candidate that is farthest from the earlier cameras. A candidate is tied if its value
+    differs from the best by at most two standard errors of the difference, plus the mean value estimated at visited
+    poses. The true value at visited poses is zero, so this mean shows how large errors may be at other poses.
     """
 
     uses_samples: ClassVar[bool] = True
@@ -33,9 +33,9 @@ class TieBreakSearch(CandidateSearch):
     """Search with two acquisitions, where the second decides between candidates that tie in the first.
 
     Until a view has shown the relevant part of the object, the samples do not contain it either. The values of the
-    first acquisition are then mostly noise, and their maximum is a random view. Candidates are tied if their values
-    differ from the best by at most two standard errors of the difference (`Proposal.tied_with_best`). So the second
-    acquisition decides in the first steps, and the first one as soon as its values differ.
+    first acquisition are then mostly noise, and their maximum is a random view. A candidate is tied if its value
+    differs from the best by at most two standard errors of the difference (`Proposal.tied_with_best`). So the second
+    acquisition decides in the first steps. The first acquisition decides once its values differ by more than noise.
 
     Both acquisitions score the same simulated scans. The proposal contains the values of the first acquisition.
 

@@ -23,7 +23,7 @@ from jaxnbv.search.problem import Problem
 from jaxnbv.search.proposal import Proposal, Trajectories
 from jaxnbv.search.traceable import check_traceable
 
-# Penalty for each scene unit by which a pose violates the clearance, as a multiple of the range of candidates' values.
+# Penalty for each scene unit by which a camera is too close to an obstacle, in ranges of the candidates' values.
 _PENALTY = 10.0
 
 
@@ -35,19 +35,20 @@ class GradientSearch(Search):
     - `num_starts`: number of starts, the candidates with the highest values.
     - `iterations`: number of steps from each start. Each step evaluates the acquisition and its gradient once.
     - `learning_rate`: learning rate of Adam, in the units of the parameters (roughly radians or scene units).
-    - `num_candidates`: number of candidates, which are evaluated first. They are spread evenly over the space, and all
-      rotated by the same random rotation. If the number equals `num_starts`, every candidate is a start.
+    - `num_candidates`: number of candidates to evaluate before the ascent. They are spread evenly over the space, and
+      all rotated by the same random rotation. If the number equals `num_starts`, every candidate is a start.
     - `solver`: Optimistix minimiser to use in place of Adam, for example `optimistix.BFGS(rtol=1e-4, atol=1e-4)`. The
-      objective is scaled such that its differences are of order 1.
-    - `candidates`: your own candidates to use in place of `num_candidates`. These are not rotated.
+      objective is scaled so that the candidates' values span a range of 1.
+    - `candidates`: your own candidates to use in place of `num_candidates`. They are not rotated.
 
     The default numbers of starts and steps and the default learning rate are the paper's. The paper starts from six
     random views without evaluating other candidates first, and returns the best final value. `num_candidates=6` is
-    closest to it. Differentiation stores intermediate results for all starts and samples, gigabytes with PointNet++.
+    closest to the paper. Differentiation stores intermediate results for all starts and samples. With PointNet++ these
+    take gigabytes.
 
     **Raises:** `ValueError` for a `dof` other than 2 or 6, for both `dof` and `space`, fewer candidates than starts, no
-    starts or iterations, or a learning rate that is not positive. A `Planner` with this search also raises it for an
-    acquisition that JAX cannot differentiate, or a camera that does not fit the space.
+    starts or iterations, or a learning rate that is not positive. A `Planner` with this search raises `ValueError` for
+    an acquisition that JAX cannot differentiate, or a camera that `PoseSpace.check_camera` refuses.
     """
 
     space: PoseSpace
@@ -182,7 +183,7 @@ class HybridSearch(GradientSearch):
     """Discrete search, followed by gradient ascent from the best candidates.
 
     This is a `GradientSearch` whose defaults are fewer starts and fewer, longer steps. Its candidates are not rotated.
-    On the sphere they are the candidates of a `DiscreteSearch`, so the value is at least that search's best value.
+    By default they are the candidates of `DiscreteSearch()`, so the value is at least the best value of that search.
     """
 
     rotates_candidates: ClassVar[bool] = False

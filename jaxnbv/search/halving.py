@@ -23,9 +23,10 @@ _NO_RANK = np.iinfo(np.int32).max
 class HalvingSearch(CandidateSearch):
     """Successive halving over candidates (Karnin et al. 2013), a faster `DiscreteSearch`.
 
-    All candidates are scored on the first few posterior samples. Each later round keeps the better half, and doubles
-    the number of samples on which they are scored, until all samples are used. For 16 samples and
-    `num_first_samples=2`, a candidate is scored on 5 samples on average. The result may differ from `DiscreteSearch`.
+    All candidates are scored on the first few posterior samples. Each later round keeps the better half of the
+    candidates, and doubles the number of samples on which they are scored, until all samples are used. For 16 samples
+    and `num_first_samples=2`, a candidate is scored on 5 samples on average. The result may differ from that of
+    `DiscreteSearch`.
 
     - `num_first_samples`: number of posterior samples on which every candidate is scored.
     """
@@ -46,7 +47,7 @@ class HalvingSearch(CandidateSearch):
         return self._halve(problem, candidates, score)
 
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
-        """Propose the best candidate of the last round. Others keep the values of their own last round."""
+        """Propose the best candidate of the last round. A candidate dropped earlier keeps its value from then."""
         return self._halve(problem, candidates, lambda rows, sample: scores[0, sample][rows])
 
     def _halve(self, problem: Problem, candidates: Pose, score: Callable) -> Proposal:
@@ -54,7 +55,7 @@ class HalvingSearch(CandidateSearch):
         zeros = jnp.zeros(count, candidates.position.dtype)
 
         def rank(state, num_left):
-            """Return the order, with its first `num_left` candidates sorted by mean score, and all mean scores."""
+            """Return `order` with its first `num_left` candidates sorted by mean score, and all mean scores."""
             order, totals, num_scored = state
             values = jnp.where(is_excluded, -jnp.inf, totals / jnp.maximum(num_scored, 1))
             ranked_values = jnp.where(jnp.arange(count) < num_left, values[order], -jnp.inf)
@@ -84,7 +85,7 @@ class HalvingSearch(CandidateSearch):
         )
 
     def _blocks(self, num_samples: int) -> tuple["_Block", int]:
-        """Return the blocks of all rounds, of equal size, and the number of candidates in the last round."""
+        """Return the equal-sized blocks of all rounds, and the number of candidates in the last round."""
         rounds: list[tuple[int, range]] = []
         num_left, num_scored = self.candidates.count, 0
         while num_scored < num_samples:
@@ -105,10 +106,11 @@ class HalvingSearch(CandidateSearch):
 
 
 class _Block(NamedTuple):
-    """Candidates that are scored together on one posterior sample.
+    """Candidates that are scored together on one posterior sample. `_blocks` stacks several blocks.
 
-    - `num_left`: number of candidates that are still in the search.
-    - `sorts`: whether to sort these candidates by their mean scores before this block is scored.
+    - `sorts`: whether to sort the candidates of the previous round by mean score before this block is scored.
+    - `num_left`: number of candidates of the previous round. In the first round, the number of all candidates.
+    - `sample`: index of the posterior sample.
     - `ranks`: positions, in the sorted order, of the candidates to score; `_NO_RANK` for an unused entry.
     """
 

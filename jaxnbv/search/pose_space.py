@@ -1,6 +1,6 @@
 """Pose spaces of gradient searches: a sphere, all poses, or poses within constraints.
 
-A space moves a start pose by a vector of parameters (a *retraction* in optimisation on manifolds). Zero parameters are
+A space moves a start pose by a vector of parameters (a *retraction* in optimisation on manifolds). Zero parameters give
 the start itself, so no start is near a singularity of the parameters, such as the poles of spherical coordinates.
 """
 
@@ -27,7 +27,7 @@ class PoseSpace(eqx.Module):
 
     @abstractmethod
     def candidates(self, count: int, key: PRNGKeyArray | None) -> Pose:
-        """Return `count` poses spread evenly over the space, rotated at random together if there is a key."""
+        """Return `count` poses spread evenly over the space. With a key, all get the same random rotation."""
 
     @abstractmethod
     def retract(self, start: Pose, parameters: Float[Array, " parameters"]) -> Pose:
@@ -37,7 +37,11 @@ class PoseSpace(eqx.Module):
         """
 
     def check_camera(self, camera: Camera) -> None:
-        """Raise `ValueError` if the camera's field of view is too narrow for the poses."""
+        """Raise `ValueError` if the camera's field of view is too narrow to show the origin from every pose.
+
+        The default accepts every camera. `ConstrainedPoses` needs the check, because its cameras may look past the
+        origin.
+        """
         return
 
 
@@ -45,8 +49,8 @@ class SpherePoses(PoseSpace):
     """2-DOF poses on a sphere of `radius` (scene units) about the origin, all looking at the origin.
 
     The parameters (3,) are added to the unit vector from the origin to the start, and the sum is normalised. The camera
-    turns to the origin by the smallest rotation, without a singularity at the poles. A start off the sphere moves to
-    it.
+    turns to the origin by the smallest rotation, without a singularity at the poles. A start off the sphere moves onto
+    the sphere.
 
     **Raises:** `ValueError` unless the radius is positive and finite.
     """
@@ -70,9 +74,9 @@ class SpherePoses(PoseSpace):
 class FreePoses(PoseSpace):
     """6-DOF poses with any position and rotation.
 
-    Six parameters are added to the first two columns of the start's rotation (Zhou et al. 2019), and three parameters
-    to its position. The camera may turn away from the object or enter it. Candidates lie on a sphere of `radius` (scene
-    units).
+    Six parameters are added to the first two columns of the start's rotation (Zhou et al. 2019), and three to the
+    start's position. The camera may turn away from the object, or enter the object. Candidates lie on a sphere of
+    `radius` (scene units).
 
     **Raises:** `ValueError` unless the radius is positive and finite.
     """
@@ -102,8 +106,8 @@ class ConstrainedPoses(PoseSpace):
     The pose satisfies the constraints for any parameters (8,):
 
     - Three parameters move the direction from the origin, as in `SpherePoses`.
-    - One parameter moves the distance, and two move the image of the origin. The map s / sqrt(1 + s^2) from all numbers
-      s into (-1, 1) keeps both in their ranges.
+    - One parameter moves the distance, and two move the point at which the image shows the origin. The map
+      s / sqrt(1 + s^2) from all numbers s into (-1, 1) keeps the distance and the point in their ranges.
     - Two parameters are added to (1, 0), and the sum is normalised. The result is the cosine and sine of a roll angle.
 
     A start that violates the constraints is first moved to just inside them.
@@ -155,7 +159,7 @@ class ConstrainedPoses(PoseSpace):
         return Pose(_product(_product(rotation, rotation_between(target, to_origin)), roll_matrix), position)
 
     def check_camera(self, camera: Camera) -> None:
-        """Raise `ValueError` if the image is so narrow that the origin could leave it."""
+        """Raise `ValueError` if the origin, up to `off_axis` from the optical axis, could be outside the image."""
         left, top, right, bottom = camera.edges
         half = math.atan(min(-left, -top, right, bottom))
         require(
@@ -166,7 +170,7 @@ class ConstrainedPoses(PoseSpace):
 
 
 def _sphere_poses(count: int, radius: float, key: PRNGKeyArray | None) -> Pose:
-    """Return a Fibonacci sphere of cameras that look at the origin, rotated at random if there is a key."""
+    """Return cameras on a Fibonacci sphere that look at the origin. A key rotates the sphere at random."""
     positions = fibonacci_sphere(count, radius)
     if key is not None:
         rotation = rotation_from_6d(jax.random.normal(key, (6,)))

@@ -19,7 +19,10 @@ from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning import GridSurface, Obstacles, barrier_of
 
 ApplyCost: TypeAlias = Callable[[Float[Array, "*samples poses"], Observations, Pose], Float[Array, "*samples poses"]]
-"""Function of values, observations and poses that includes the cost of the move from the last view in the values."""
+"""Function that combines values of poses with the cost of the move from the last view to each pose.
+
+Its arguments are the values, the observations and the poses. It returns the new values.
+"""
 
 
 class Problem(eqx.Module):
@@ -27,9 +30,9 @@ class Problem(eqx.Module):
 
     - `inputs`: the observations and, if the search uses samples, the posterior and its samples.
     - `camera`: the camera whose scans are simulated.
-    - `cost`: function that changes the values of poses by the cost of moving to them; None to ignore the cost.
-    - `pending`: proposed poses without an image; None if there are none.
-    - `context`: context of the acquisition, computed once from the inputs by `prepared`.
+    - `cost`: function that combines values with the cost of the move; None to ignore the cost.
+    - `pending`: earlier proposals, which are not proposed again even if the view was taken elsewhere.
+    - `context`: context of the acquisition, which `prepared` computes once from the inputs.
     """
 
     inputs: StepInputs
@@ -45,7 +48,7 @@ class Problem(eqx.Module):
         return self.inputs.observations
 
     def prepared(self) -> "Problem":
-        """Return a copy with the acquisition's context, which `scores` needs. It is None without samples."""
+        """Return a copy with the acquisition's context, which `scores` needs. Without samples it is None."""
         context = None if self.inputs.surfaces is None else context_of(self.acquisition, self.inputs)
         return dataclasses.replace(self, context=context)
 
@@ -60,21 +63,27 @@ class Problem(eqx.Module):
     def scores(
         self, poses: Pose, samples: slice | Int[Array, " rows"] = slice(None)
     ) -> Float[Array, "*scores samples poses"]:
-        """Return the score of each sample and pose, with the cost. An `AcquisitionList` adds a leading axis."""
+        """Return the score of each pose on each sample, after the cost is applied.
+
+        An `AcquisitionList` adds a leading axis.
+
+        - `samples`: indices of the samples to score on, by default all.
+        """
         surfaces = jax.tree.map(lambda leaf: leaf[samples], self.surfaces)
         barrier = barrier_of(self.obstacles, self.camera, poses)
         values = self.acquisition.sample_scores(self.context, surfaces, self.camera, poses, barrier)
         return self.apply_cost(jnp.moveaxis(values, (0, 1), (-2, -1)), poses)
 
     def apply_cost(self, values: Float[Array, "*samples poses"], poses: Pose) -> Float[Array, "*samples poses"]:
-        """Return values that include the cost of the move from the last view to each pose, if there is one."""
+        """Return the values after `cost` is applied, or the values themselves without a cost."""
         return values if self.cost is None else self.cost(values, self.observations, poses)
 
     def value_at_visited(self) -> Float[Array, ""]:
         """Return the mean value that the acquisition expects at the visited poses, without the cost of moves.
 
-        If a second view from the same pose gains nothing, this value is an error, which may be as large at other poses.
-        It is zero for one view, whose value is not an error but counts surface seen only at a steep angle.
+        If a second view from the same pose gains nothing, the true value is zero. The result then shows how large
+        errors may be at other poses. After a single view the result is 0, because the value at its pose is no error: it
+        comes from surface that the view saw only at a steep angle.
         """
         visited_poses = self.observations.poses
         without_cost = dataclasses.replace(self, cost=None)

@@ -33,7 +33,7 @@ class Proposal(eqx.Module):
     - `standard_errors`: standard errors of `values`. Each value is a mean over the posterior samples on which the
       candidate was scored. None for a search without scores.
     - `difference_errors`: standard errors of the differences between the values and the best value. They are smaller
-      than `standard_errors`, because the samples are shared. None if not all candidates are scored on all samples.
+      than `standard_errors`, because candidates share samples. None if not all candidates are scored on all samples.
     - `standard_error`: standard error of `value`. NaN for one sample; None for a search without scores.
     - `value_at_visited`: see `Problem.value_at_visited`. None unless the distance from earlier cameras decides ties.
     """
@@ -75,7 +75,7 @@ class Proposal(eqx.Module):
 
         Excluded candidates are left out. The batch is shorter than `count` if there are not enough candidates.
 
-        - `min_angle`: smallest angle in degrees, at the origin, between two candidates of the batch.
+        - `min_angle`: smallest angle, seen from the origin, between two candidates of the batch, in degrees.
 
         **Raises:** `ValueError` for a count below 1, or an angle outside [0, 180].
         """
@@ -92,7 +92,7 @@ class Proposal(eqx.Module):
 
     @property
     def num_tied(self) -> int | None:
-        """Number of other candidates that are tied with the best; None if standard errors are unknown."""
+        """Number of other candidates that are tied with the best; None if `difference_errors` are unknown."""
         is_tied = self.tied_with_best()
         if is_tied is None or bool(jnp.isnan(jnp.asarray(self.difference_errors)).any()):
             return None

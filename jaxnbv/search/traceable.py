@@ -17,7 +17,7 @@ def check_traceable(
     """Check that JAX can trace an acquisition. The check uses only shapes and computes nothing.
 
     - `observations`: observations, or the capacity of a cloud D.
-    - `differentiable`: whether to check that scores have derivatives in the points and normals of a scan.
+    - `differentiable`: whether to check also that JAX can differentiate scores by the points and normals of a scan.
 
     **Raises:** `ValueError` if JAX cannot trace the acquisition (for example a utility in NumPy), or cannot
     differentiate it (because it calls code outside JAX).
