@@ -15,7 +15,8 @@ PARTS = "." + 16 * "[0-9a-f]" + ".partial"
 def write_whole(path: Path, write: Callable[[Any], Any]) -> None:
     """Write a file completely or not at all: a reader finds the old file or the complete new file.
 
-    - `write`: a function that writes to a partial file, open in binary mode. The file is then renamed to `path`.
+    - `write`: function that writes the content to its argument, a partial file that is open in binary mode. The partial
+      file is then renamed to `path`.
 
     **Raises:** `ValueError` if the disk is full, the folder is missing or may not be written, or the name is too long.
     """

@@ -28,8 +28,8 @@ def prediction_picture(
 ) -> ScenePicture:
     """Return a picture of the true surface from each view, with the predicted class and its probability.
 
-    - `scene`: the scene of the record. Its `task` is a `Truth` of `ClassificationStudy`.
-    - `cue`: name of the part of the object that tells its class; "" for none. The part is tinted.
+    - `scene`: the scene of the record. Its `task` is the `Truth` that `ClassificationStudy.scene` makes.
+    - `cue`: name of the part of the object that tells its class, which the picture tints; "" for none.
     """
     runs, truth, camera = record["methods"], record["label"], Camera(height=pixels, width=pixels)
     poses = {method: poses_of(runs[method]) for method in methods}

@@ -42,7 +42,10 @@ def study_sampler(
 
 
 def keep_shapes(sampler: SurfaceSampler, is_selected: Callable[[str], bool]) -> SurfaceSampler:
-    """Return the sampler with only the known shapes whose names are selected, if it has known shapes."""
+    """Return the sampler with only the known shapes whose names `is_selected` accepts.
+
+    A sampler without known shapes is returned unchanged.
+    """
     model = sampler.model
     if not isinstance(model, KnownShapes):
         return sampler
@@ -53,7 +56,7 @@ def keep_shapes(sampler: SurfaceSampler, is_selected: Callable[[str], bool]) -> 
 
 
 def without_own_shape(sampler: SurfaceSampler, files: Sequence[MeshFile], index: int) -> SurfaceSampler:
-    """Return the sampler without the known shape of the mesh `files[index]`, if it has this shape."""
+    """Return the sampler without the known shape made from the mesh `files[index]`, if it has this shape."""
     return keep_shapes(sampler, lambda name: name != _name(files, index))
 
 

@@ -17,8 +17,9 @@ class Measure(NamedTuple):
 
     - `name`: name in files; `title`: name in tables and charts.
     - `compute`: function that takes the record of a scene and the name of a method, and returns the method's values:
-      either a sequence, one per view from the first view on, or a mapping from keys. An undefined value is None or NaN.
-    - `key_name`: name of the keys, such as "view".
+      either a sequence with one value per view, or a mapping from other keys to values. An undefined value is None or
+      NaN.
+    - `key_name`: what the keys are, such as "view".
     - `unit`: unit of the values; "%" for fractions in [0, 1], which are shown in percent.
     - `digits`: decimal places in tables.
     """

@@ -98,7 +98,7 @@ def _user_planner(study: Study, scene: Scene, name: str, make: Factory) -> Plann
 
 
 def replay(study: Study, scene: Scene, run: Record) -> list[tuple[PointCloud, Observations]]:
-    """Return each scan and the observations after it, computed again from a method's record `run`."""
+    """Compute again the scan of each view and the observations after it, from a method's record `run`."""
     # Observations depend only on the capacity and the carving of a planner, which are the same for all methods.
     planner, sensor = study.planner(study.methods[0], scene), study.sensor(scene)
     keys = [view_keys(study.key(scene.index, "episode"), index)[2] for index in range(len(run["views"]))]

@@ -17,7 +17,7 @@ class Split(StrEnum):
 
 
 def scene_key(seed: int, split: Split, index: int | Int[Array, ""]) -> PRNGKeyArray:
-    """Return the random key of a scene with this index in a split. Each kind of scene has its own `seed`.
+    """Return the random key of the scene with this index in a split. Each kind of scene has its `seed`.
 
     **Raises:** `ValueError` if the index is negative.
     """
