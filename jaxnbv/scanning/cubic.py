@@ -36,9 +36,9 @@ def cubic(corners: list, a: list, b: list) -> list[Float[Array, " n"]]:
 def first_bracket(c: list) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
     """Return an s for which [0, s] holds only the first root of each cubic, and whether [0, 1] has a root.
 
-    If a cubic is positive at 0 but not at its local minimum, there is exactly one root before the minimum, and s is the
-    position of the minimum. Otherwise s is 1: a cubic that is positive at 0 then has one root in [0, 1] if it is not
-    positive at 1, else none. A cubic that is not positive at 0 counts as having its first root there.
+    If a cubic is positive at 0 but not at a local minimum in (0, 1), it has exactly one root up to this minimum, and s
+    is the position of the minimum. Otherwise s is 1: a cubic that is positive at 0 then has one root in [0, 1] if it is
+    not positive at 1, else none. A cubic that is not positive at 0 counts as having its first root there.
     """
     discriminant = c[2] * c[2] - 3.0 * c[3] * c[1]
     root = jnp.sqrt(jnp.maximum(discriminant, 0.0))
@@ -53,12 +53,12 @@ def first_bracket(c: list) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
 
 
 def first_root(c: list) -> Float[Array, " n"]:
-    """Return the first root in [0, 1] of each cubic, which must have one.
+    """Return the first root in [0, 1] of each cubic. There must be one.
 
     The root is 0 for a cubic that is not positive at 0. Newton's method finds the root in the interval of
     `first_bracket`. A step that leaves the interval by more than the rounding error is replaced by bisection. Smaller
-    excesses are allowed because compiled code may compute the same value twice with different rounding, so that the
-    interval ends just beside the root.
+    excesses are allowed because compiled code may round the same value in two ways, and the interval may then end just
+    beside the root.
     """
     high, _ = first_bracket(c)
     drop = c[0] - _polynomial(c, high)

@@ -22,7 +22,7 @@ from jaxnbv.geometry.volume import Box, Volume
 from jaxnbv.programs import program
 from jaxnbv.scanning.grid import Grid
 
-# Fraction of points that may lie more than two margins outside the volume. Noise moves fewer points than this so far.
+# Fraction of points that may lie more than two margins outside the volume. Noise moves fewer points that far.
 _MAX_STRAY_FRACTION = 0.01
 
 
@@ -67,7 +67,7 @@ class Carving(eqx.Module):
     ) -> Bool[Array, "g g g"]:
         """Return, for each node, whether one scan shows that the node is empty.
 
-        All nodes are False if the scan is a cloud that is not a sensor's image (`missed` is None).
+        No node counts as empty if the cloud is not a sensor's image (`missed` is None).
 
         - `barrier`: distance along each ray to the first obstacle, which ends the empty space of a ray without a hit.
         """
@@ -88,10 +88,10 @@ class Carving(eqx.Module):
         return on_tensor_grid(self.volume, grid.axis) > self._beyond_volume(grid)
 
     def with_room(self, box: Box, grid: Grid, frame: Frame) -> Box:
-        """Return a box (world) with all faces but the lower one moved outward by two margins / sqrt(3).
+        """Return a box (world) with all faces but the lower one moved outward by 2 / sqrt(3) margins.
 
-        The new corners are at most two margins from `box`, so points in the result still count as inside the volume. A
-        scan that is cropped to the result shows that the surface continues where `box` cuts it.
+        No corner moves by more than two margins. So if `box` lies in the volume, points in the result count as inside.
+        A scan that is cropped to the result shows that the surface continues where `box` cuts it.
         """
         return frame.to_world(frame.to_scene(box).widened(self._beyond_volume(grid) / math.sqrt(3.0)))
 

@@ -26,10 +26,12 @@ _REMEDY = "export the file again without these, for example from Blender"
 
 
 def read_gltf(content: bytes, kind: str, resolver: Resolver) -> trimesh.Scene:
-    """Read the scene of a "gltf" or "glb" file. `resolver` opens the other files that it refers to.
+    """Read the scene of a glTF file of the `kind` "gltf" or "glb".
 
-    **Raises:** `ValueError` if the file has features that trimesh does not read, or if the counts or bounds of the
-    meshes differ from those in the file's header.
+    - `resolver`: opens the other files to which this file refers.
+
+    **Raises:** `ValueError` if the file has features that trimesh does not read, or if the number or the bounds of the
+    meshes that trimesh reads differ from those in the file's header.
     """
     text = content[20 : 20 + struct.unpack("<I", content[12:16])[0]] if kind == "glb" else content
     header = json.loads(text)

@@ -55,7 +55,10 @@ class Grid(eqx.Module):
         return jnp.where(cell < 0, self.resolution, cell)
 
     def check(self, cloud: PointCloud) -> None:
-        """Warn if many points are less than a cell's width away from a point with the opposite normal."""
+        """Warn if the cloud has many points on parts thinner than a cell, which samples may miss.
+
+        A point is on a thin part if a point with an opposite normal is less than a cell's width away.
+        """
         points, normals = cloud.to_numpy()
         pairs = cKDTree(points).query_pairs(self.spacing, output_type="ndarray")
         is_opposite = np.sum(normals[pairs[:, 0]] * normals[pairs[:, 1]], axis=1) < _MAX_OPPOSITE_COSINE
@@ -79,7 +82,7 @@ class GridSurface(Surface):
     Rays are traced exactly, and hit nothing outside the grid's box.
 
     - `values`: values of a function f at the nodes, minus the level of f on the surface; positive outside the solid.
-    - `distance`: `tracing.free_distance` of the values.
+    - `distance`: distance from each cell to the nearest change of sign of the values, see `tracing.free_distance`.
     - `is_void`: whether each cell counts as free of surface. A ray whose first zero is in such a cell misses.
     """
 
@@ -110,7 +113,7 @@ class GridSurface(Surface):
         return cls(relative, distances, grid)
 
     def without_cells(self, cells: Bool[Array, "*s m m m"]) -> "GridSurface":
-        """Return the surface without its parts in these cells. Rays that would hit these parts miss."""
+        """Return the surface without its parts in cells that are True. Rays that would hit these parts miss."""
         return dataclasses.replace(self, is_void=cells if self.is_void is None else self.is_void | cells)
 
     @program
@@ -161,7 +164,7 @@ def scan_samples(
 def samples_at_once(camera: Camera, poses: Pose) -> int:
     """Return the number of sampled surfaces to scan together from a batch of poses.
 
-    It is one on a CPU, so that the scans of a sample stay in the cache. On a GPU it gives up to eight million rays.
+    On a CPU it is one, so that the scans of a sample stay in the cache. On a GPU it is as large as 8e6 rays allow.
     """
     return 1 if on_cpu() else max(1, 2**23 // (poses.position.shape[0] * camera.num_rays))
 
@@ -169,7 +172,10 @@ def samples_at_once(camera: Camera, poses: Pose) -> int:
 @jax.debug_nans(False)
 @program
 def mean_depth(scans: PointCloud, pose: Pose) -> Float[Array, " rays"]:
-    """Return each ray's mean depth in the samples (leading axis) that it hits; NaN if it misses over half."""
+    """Return the mean depth at which each ray hits the samples; NaN if it misses more than half of them.
+
+    - `scans`: scans of all samples (leading axis) from the same pose.
+    """
     depth = jnp.einsum("snd,d->sn", scans.points - pose.position, pose.forward, precision="highest")
     count = jnp.sum(scans.mask, axis=0)
     mean = jnp.sum(jnp.where(scans.mask, depth, 0.0), axis=0) / jnp.maximum(count, 1)
@@ -186,6 +192,6 @@ def _prepare(
 
 
 def touched_cells(nodes: Bool[Array, "*s g g g"]) -> Bool[Array, "*s m m m"]:
-    """Return, for each cell of a grid, whether `nodes` is True at one of its corners."""
+    """Return, for each cell of a grid, whether `nodes` is True at any corner of the cell."""
     windows = (1,) * (nodes.ndim - 3) + (2,) * 3, (1,) * nodes.ndim
     return jax.lax.reduce_window(nodes, False, jax.lax.bitwise_or, *windows, "VALID")

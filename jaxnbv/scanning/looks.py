@@ -64,7 +64,8 @@ class Looks(eqx.Module):
     def with_points(self, cloud: PointCloud, radii: Float[Array, " n"] | float = 0.0) -> "Looks":
         """Return a copy with the points of a cloud added to the measured surface.
 
-        - `radii`: radius of the surface that was measured around each point, in scene units, up to the grid's spacing.
+        - `radii`: radius around each point within which surface counts as measured, in scene units, clipped to the
+          grid's spacing.
         """
         radii = jnp.minimum(radii, self.grid.spacing)
         position = (cloud.points + self.grid.half_extent) / self.grid.spacing
@@ -116,15 +117,15 @@ class Looks(eqx.Module):
 
     @program
     def without_unmeasured(self, surfaces: GridSurface, poses: PoseList) -> GridSurface:
-        """Return a batch of surfaces without the `unmeasured_cells` of all views and the cells next to them."""
+        """Return a batch of surfaces without the `unmeasured_cells` of any view and without adjacent cells."""
         return surfaces.without_cells(shared_map(_unmeasured_by_any, surfaces, self, poses))
 
     def unmeasured_cells(self, surface: Surface, index: Int[Array, ""] | int, pose: Pose) -> Int[Array, "rays 3"]:
         """Return, for each ray of a view, the cell of its hit on a surface if the hit is unmeasured.
 
-        A hit is unmeasured if the view should have measured it, but no measured surface is within one grid spacing. The
-        view should have measured a hit if the surface faces the camera there and the view saw as far as the hit, or if
-        the view's ray passed the hit and went on to something deeper. All other rays get an index beyond the grid.
+        A hit is unmeasured if the view should have measured it, but no measured surface is within one grid spacing of
+        it. The view should have measured a hit if the surface is not steep there and the view saw as far as the hit, or
+        if the view measured something deeper on the same ray. All other rays get an index beyond the grid.
 
         - `index`, `pose`: index of the view, from 0, and its pose.
         """
@@ -133,7 +134,7 @@ class Looks(eqx.Module):
         offset = hits.points - pose.position
         distance = jnp.linalg.norm(offset, axis=-1)
         cosine, sight = -jnp.sum(offset * hits.normals, axis=-1) / distance, self.sight[index]
-        # A steep surface may return no hit. But if the ray hit something deeper, the surface cannot be there.
+        # A steep surface may give no measurement. But if the view measured something deeper, there is no surface here.
         is_passed = jnp.isfinite(sight) & ((sight - distance) * cosine > spacing)
         is_unmeasured = hits.mask & (is_passed | (cosine >= STEEP) & (distance <= sight + spacing))
         is_unmeasured &= self(hits.points) > spacing

@@ -24,15 +24,15 @@ from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.scanning.sdf.sampled import checked_triangles, is_inside
 from jaxnbv.scanning.triangle_rays import FirstFaces, first_faces
 
-# A connected component of a mesh with fewer points nearby may come from stray points alone.
+# A connected component of a mesh that has fewer observed points nearby may come from stray points alone.
 _MIN_POINTS = 4
 
 
 @dataclasses.dataclass(unsafe_hash=True)
 class _Tree:
-    """Cache of the ray tracer for the triangles of the last call.
+    """Cache of the ray tracer for the triangles of the last call. A copy of the cache is empty.
 
-    All instances compare equal, because the cache is a static field and follows from the triangles. A copy is empty.
+    All instances compare equal, so that meshes, of which a `_Tree` is a static field, can differ only in their arrays.
     """
 
     _cache = None
@@ -153,7 +153,7 @@ class TriangleMesh(Surface):
 
     @checked
     def contains(self, points: Float[AnyArray, "n 3"]) -> Bool[np.ndarray, " n"]:
-        """Return, for each point (scene coordinates), whether its winding number has a magnitude above 1/2."""
+        """Return, for each point (scene coordinates), whether the mesh encloses it: |winding number| > 1/2."""
         return is_inside(np.asarray(points, dtype=np.float64), self.vertices, self.faces)
 
     def to_trimesh(self) -> trimesh.Trimesh:
@@ -166,7 +166,7 @@ def level_triangles(
 ) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"], Float[np.ndarray, "v 3"]] | None:
     """Return vertices, faces and unit vertex normals of the zero set of `values`; None for an empty set.
 
-    Marching cubes computes them in scene coordinates. Faces and normals point outward.
+    Marching cubes computes the mesh, which is in scene coordinates. Faces and normals point outward.
 
     - `values`: one value per node of the grid, positive outside the solid.
     """
@@ -184,10 +184,11 @@ def supported_pieces(
     points: Float[np.ndarray, "n 3"],
     max_distance: float,
 ) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "k 3"], int]:
-    """Return the connected components of a mesh that have at least four points nearby.
+    """Return a mesh without the connected components that have fewer than four of the points nearby.
 
-    A point belongs to the component of its nearest vertex, if this vertex is within `max_distance`. If no component has
-    four points, the components with the most points are returned. The third result is the number of other components.
+    Return the vertices and faces of all other components, and the number of components left out. A point belongs to the
+    component of its nearest vertex, if this vertex is within `max_distance`. If no component has four points, only the
+    components with the most points remain.
     """
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
     graph = coo_array((np.ones(len(edges), bool), edges.T), (len(vertices), len(vertices)))

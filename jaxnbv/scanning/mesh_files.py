@@ -39,7 +39,7 @@ def load_mesh(path: str | Path | trimesh.Trimesh | trimesh.Scene, up: str = "y")
 def as_surface(scene: Surface | SignedDistance | trimesh.Trimesh | trimesh.Scene) -> Surface:
     """Convert a scene of any accepted type to a surface.
 
-    A solid gives the `SDFSurface` of its boundary. A trimesh object is converted by `load_mesh` with the y axis up.
+    A solid becomes an `SDFSurface`, and a trimesh object is converted by `load_mesh` with the y axis up.
 
     **Raises:** `ValueError` for the same reasons as `load_mesh`.
     """

@@ -89,7 +89,7 @@ def read_off(content: bytes) -> Triangles:
 
 
 def triangles_of(polygons: Sequence[Sequence[int]] | Sequence[np.ndarray] | np.ndarray) -> Int[np.ndarray, "f 3"]:
-    """Cut each polygon into a fan of triangles about its first corner. Two corners or fewer give none."""
+    """Cut each polygon, a row of vertex indices, into a fan of triangles. Two corners or fewer give none."""
     if isinstance(polygons, np.ndarray):
         groups = [polygons]
     else:

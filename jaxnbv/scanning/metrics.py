@@ -50,8 +50,8 @@ def is_shown(
 ) -> Bool[np.ndarray, " n"]:
     """Return, for each point of the true surface, whether a scan shows the point.
 
-    The point and the hit of its pixel must have the same distance from the camera, up to `size` plus the change of
-    distance across half a pixel on the plane that touches the surface at the hit.
+    A scan shows a point if the point's pixel has a hit that is equally far from the camera. The distances may differ by
+    `size` plus the change of distance over half a pixel's diagonal on the tangent plane at the hit.
 
     **Raises:** `ValueError` if the scan does not have one row per ray of the camera.
     """
@@ -83,7 +83,7 @@ def truth_points(scene: Surface, key: PRNGKeyArray, count: int = SURFACE_POINTS)
 
 
 def true_mesh(scene: Surface) -> TriangleMesh | None:
-    """Return a `TriangleMesh` as it is, and an `SDFSurface` meshed on the default grid; None for others."""
+    """Return a `TriangleMesh` unchanged, the mesh of an `SDFSurface` on the default grid, or else None."""
     if isinstance(scene, SDFSurface):
         return mesh_from_sdf(scene.sdf, Grid())
     return scene if isinstance(scene, TriangleMesh) else None
@@ -105,7 +105,7 @@ class SurfaceDistance(NamedTuple):
 
     @property
     def chamfer(self) -> float:
-        """Chamfer distance: accuracy + completeness. By their size, the paper's values are this sum too."""
+        """Chamfer distance: accuracy + completeness. The paper's values seem to be this sum too."""
         return self.accuracy + self.completeness
 
 

@@ -89,7 +89,7 @@ class Obstacles(eqx.Module):
 
     @program
     def remove_points(self, scan: PointCloud) -> PointCloud:
-        """Remove the points of solids from a scan. If it is a sensor's image, their rays count as missed."""
+        """Remove points within `margin` of a solid from a scan. In a sensor's image, their rays become missed."""
         is_obstacle = scan.mask & (self.distance(scan.points) < self.margin)
         missed = None if scan.missed is None else scan.missed | is_obstacle
         return dataclasses.replace(scan.only(~is_obstacle), missed=missed)

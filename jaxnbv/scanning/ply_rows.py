@@ -42,7 +42,7 @@ def read_ply(content: bytes) -> Triangles:
 
 
 def _header(text: str) -> tuple[str, dict[str, tuple[int, list[_Property]]]]:
-    """Return the encoding of a PLY file, and a dict from element name to row count and properties."""
+    """Return the encoding of a PLY file, and the row count and properties of each element, keyed by name."""
     encoding, elements = "", dict[str, tuple[int, list[_Property]]]()
 
     def kind_of(word: str) -> np.dtype:
@@ -66,9 +66,10 @@ def _header(text: str) -> tuple[str, dict[str, tuple[int, list[_Property]]]]:
 def _element(
     body: bytes, start: int, element: str, count: int, properties: list[_Property]
 ) -> tuple[dict[str, Any], int]:
-    """Return the columns of one element, keyed by property name, and the byte at which the element ends.
+    """Read the `count` rows of an element from byte `start` on.
 
-    A column of lists is an array if all lists have the same length, else a list with one array per row.
+    Return its columns, keyed by property name, and the byte at which it ends. A column of lists is an array if all
+    lists have the same length, else a list with one array per row.
     """
     if count == 0:
         return {name: [] for name, *_ in properties}, start
@@ -92,7 +93,10 @@ def _element(
 
 
 def _row(body: bytes, start: int, properties: list[_Property], message: str) -> tuple[list[np.ndarray], int]:
-    """Return the row at byte `start` and the byte where it ends, or raise with `message` if `body` ends."""
+    """Return the row that begins at byte `start`, and the byte at which it ends.
+
+    **Raises:** `ValueError` with `message` if `body` ends within the row.
+    """
     row: list[np.ndarray] = []
     for _, kind, length in properties:
         parts = [(kind, 1)] if length is None else [(length, 1), (kind, -1)]
@@ -106,7 +110,7 @@ def _row(body: bytes, start: int, properties: list[_Property], message: str) -> 
 
 
 def _strip_triangles(strips: Iterable[np.ndarray]) -> Int[np.ndarray, "f 3"]:
-    """Convert triangle strips, rows of vertex indices with -1 between strips, to triangles.
+    """Convert triangle strips to triangles. Each row of vertex indices holds strips with -1 between them.
 
     Every second triangle of a strip is reversed, so that all triangles have the same winding.
     """

@@ -32,6 +32,7 @@ class Hits(eqx.Module):
 
     - `points`: the hits, in scene coordinates; zero where the ray misses.
     - `normals`: unit normals that point to the side of the ray's origin; zero where the ray misses.
+    - `mask`: whether each ray hits the surface.
     """
 
     points: Float[Array, "rays 3"]
@@ -60,7 +61,7 @@ class Surface(eqx.Module):
         """
 
     def contains(self, points: Float[AnyArray, "n 3"]) -> Bool[AnyArray, " n"]:
-        """Return, for each point (scene coordinates), whether the surface encloses it, by default False."""
+        """Return, for each point (scene coordinates), whether the surface encloses it. The default is False."""
         return np.zeros(len(points), bool)
 
     @property
@@ -195,7 +196,7 @@ Noise: TypeAlias = SensorNoise | DepthNoise
 
 
 def distance_problem(pose: Pose) -> str | None:
-    """Return a message if a pose, or one of a batch, is too far away for its unit to be right; else None."""
+    """Return a message if a camera is so far away that its pose must be in wrong units; else None."""
     distance = float(np.linalg.norm(np.asarray(pose.position), axis=-1).max(initial=0.0))
     if distance <= _MAX_CAMERA_DISTANCE:
         return None
@@ -217,7 +218,7 @@ def scan(
 
     - `barrier`: distance along each ray to the first obstacle. A ray that reaches it before the surface is missed.
 
-    Runs under `jit` if `surface.in_jit`. Warns if nothing is seen from so far away that the pose's unit must be wrong.
+    Runs under `jit` if `surface.in_jit`. Warns if the scan is empty and the pose seems to be in wrong units.
     """
     origins, directions = camera.rays(pose)
     hits = surface.trace(origins.reshape(-1, 3), directions.reshape(-1, 3))
@@ -286,7 +287,7 @@ def _implicit_depth_jvp(primals, tangents):
 
 
 def pixel_area(scan: PointCloud, camera: Camera, pose: Pose, least_cosine: float) -> Float[Array, " rays"]:
-    """Return the surface area that each pixel shows, in squared scene units; zero without a point.
+    """Return the surface area that each pixel shows, in squared scene units; zero if it has no point.
 
     The area is r^2 omega / cos = z^3 / (r fx fy cos), with the pixel's distance r, depth z and solid angle omega, the
     focal lengths fx and fy in pixels, and the cosine of incidence cos.

@@ -21,7 +21,7 @@ def scene_batch(scenes: Any, count: int) -> Surface:
 
     - `scenes`: a list of scenes, or one scene whose arrays already have this leading axis.
 
-    **Raises:** `ValueError` for a scene that JAX cannot trace, not `count` scenes, or scenes of different structures.
+    **Raises:** `ValueError` if JAX cannot trace a scene, there are not `count` scenes, or their structures differ.
     """
     if not isinstance(scenes, Sequence):
         batch = _traceable(scenes, "the scene")
@@ -57,7 +57,7 @@ def _traceable(scene: Any, name: str) -> Surface:
 
 
 def _structure(surface: Surface) -> Any:
-    """Return the structure, array shapes and static values, which surfaces must share to be stacked."""
+    """Return what surfaces must have in common to be stacked: structure, array shapes and static values."""
     arrays, rest = eqx.partition(surface, eqx.is_array)
     return jax.tree.structure(arrays), list(map(np.shape, jax.tree.leaves(arrays))), jax.tree.leaves(rest)
 

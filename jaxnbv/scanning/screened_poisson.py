@@ -26,7 +26,7 @@ def screened_poisson(cloud: PointCloud, depth: int = 8) -> TriangleMesh:
     are wound outward, and every run gives the same mesh. It bridges gaps in the scan, and is open where the surface
     leaves a cube of 1.1 times the cloud's size.
 
-    - `depth`: depth of the octree. The smallest details are 1 / 2^depth of the cloud's size, if points are that dense.
+    - `depth`: depth of the octree. For dense points, the smallest details have 1 / 2^depth of the cloud's size.
 
     **Raises:** `ValueError` if `pymeshlab`, an optional dependency (GPL), is not installed, if the depth is not within
     [1, 12], if the cloud has fewer than four points or an entry that is not finite, or if there is no surface.

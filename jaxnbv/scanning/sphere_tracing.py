@@ -93,7 +93,7 @@ class _DistanceAlongRay(eqx.Module):
         return self.sdf(self.points(depth))
 
     def newton(self, depth: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Return depths after one Newton step, exact to rounding except for grazing rays."""
+        """Return depths after a Newton step from near a root, exact to rounding except for grazing rays."""
         value, slope = jax.jvp(self, (depth,), (jnp.ones_like(depth),))
         return depth - value / (jnp.where(slope < 0, -1.0, 1.0) * jnp.maximum(jnp.abs(slope), _MIN_SLOPE))
 
@@ -101,7 +101,10 @@ class _DistanceAlongRay(eqx.Module):
 def _first_root(
     sdf: SignedDistance, origins: Float[Array, "n 3"], directions: Float[Array, "n 3"], radius: float
 ) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
-    """Return the depth at which each ray first crosses the boundary within a ball, and whether it does."""
+    """Return the depth of each ray's first crossing of the boundary, and whether there is such a crossing.
+
+    Only crossings within `radius` of the origin count.
+    """
     middle = -jnp.sum(origins * directions, axis=-1)
     squared = middle**2 - jnp.sum(origins**2, axis=-1) + radius**2
     half_chord = jnp.sqrt(jnp.maximum(squared, 0.0))
@@ -144,7 +147,12 @@ class _March(eqx.Module):
 
 
 def _advance(sdf: SignedDistance, march: _March, count, max_unfinished: int):
-    """Advance the rays until at most `max_unfinished` are left or the stride `count` is `_MAX_STRIDES`."""
+    """Advance all unfinished rays, stride by stride, until at most `max_unfinished` rays are unfinished.
+
+    Return the rays and the number of strides. The rays also stop once this number is `_MAX_STRIDES`.
+
+    - `count`: number of strides so far.
+    """
     distance = _DistanceAlongRay(sdf, march.origins, march.directions)
 
     def body(carry):
@@ -163,7 +171,7 @@ def _advance(sdf: SignedDistance, march: _March, count, max_unfinished: int):
 
 
 def _refine(sdf: SignedDistance, march: _March) -> Float[Array, " n"]:
-    """Return the depth of the root within each ray's last stride, by regula falsi, exact to rounding."""
+    """Return the depth of the root in each ray's last stride, exact to rounding, by the regula falsi."""
     distance = _DistanceAlongRay(sdf, march.origins, march.directions)
 
     def chord(_, bracket):

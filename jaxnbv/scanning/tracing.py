@@ -18,8 +18,8 @@ from jaxnbv.geometry.volume import ray_interval
 from jaxnbv.scanning.cubic import CORNERS, cubic, first_bracket, first_root
 from jaxnbv.scanning.scanner import implicit_depth
 
-# Once at most a fifth of the rays of a march is unfinished, the march continues with these only. Each further batch
-# size takes most of a second to compile, so small batches are not reduced. A quarter would be no faster than a fifth.
+# Once at most a fifth of the rays of a march is unfinished, the march continues with these rays only. Each batch size
+# takes most of a second to compile, so small batches are not reduced further.
 _SHRINK_FACTOR = 5
 _MIN_BATCH = 4000
 
@@ -186,7 +186,7 @@ def smooth_gradient(field: GridField, x: Triple) -> Triple:
 
 
 def enter(u: Triple, du: Triple, field: GridField) -> tuple[March, Float[Array, " n"]]:
-    """Return a march that starts at t = 0 where the rays u + s du enter the grid's box, and this s."""
+    """Return a march with t = 0 where each ray u + s du enters, or starts in, the grid's box, and this s."""
     # The box is smaller than the grid by a sliver, so that no position lies outside the grid after it is rounded and
     # moved forward.
     low, high = 2 * field.offset, field.resolution - 1 - 2 * field.offset
@@ -240,7 +240,7 @@ def _stride(rays: March, field: GridField) -> March:
 
 
 def _search_cell(rays: March, field: GridField) -> March:
-    """Stop each ray whose cell holds its first zero. Other rays leave a cell that has a change of sign."""
+    """Stop each ray whose cell holds its first zero. Move other rays out of a cell with a sign change."""
     local, cell = cell_at(rays, field)
     distance = _take(field.cell_distance, _flat(cell, field.resolution - 1))
     has_sign_change = rays.is_unfinished & (distance * rays.sign <= 0)
@@ -260,7 +260,10 @@ def _search_cell(rays: March, field: GridField) -> March:
 
 
 def cell_at(rays: March, field: GridField) -> tuple[Triple, list[Int[Array, " n"]]]:
-    """Return each ray's position within its cell, in [0, 1]^3, and the cell; on a border, the cell ahead."""
+    """Return each ray's position within its cell, in [0, 1]^3, and the index of this cell.
+
+    On the border of two cells, it is the cell ahead.
+    """
     position = [x + rays.t * d for x, d in zip(rays.entry, rays.direction, strict=True)]
     cell = [
         jnp.floor(x + jnp.where(d > 0, field.offset, -field.offset)).astype(jnp.int32)

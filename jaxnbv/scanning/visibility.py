@@ -77,7 +77,7 @@ def is_visible(
 ) -> Bool[Array, "poses n"]:
     """Return, for each pose of a batch and each point of a surface, whether a camera sees the point.
 
-    A camera sees a point if the point lies in its image and range, is not at a grazing angle, and nothing hides it.
+    A camera sees a point that lies in the camera's image and range, is not at a grazing angle, and is not hidden.
 
     - `tolerance`: the surface hides a point if a ray hits it more than this length (scene units) before the point.
     - `barrier`: distance along each ray of the camera to an obstacle, see `Obstacles.barrier`.

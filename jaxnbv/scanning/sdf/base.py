@@ -63,10 +63,10 @@ def greatest(a, b):
 
 @jax.custom_jvp
 def least_of_last(values):
-    """Return the minimum along the last axis. Its derivative is that of the first least entry.
+    """Return the minimum along the last axis. Its derivative is that of the first smallest entry.
 
-    The derivative of `jnp.min` compares the values with their minimum. If both are compiled separately, they can differ
-    in the last bit, and the derivative is then 0 / 0.
+    The derivative of `jnp.min` divides by the number of values that equal the minimum. If values and minimum are
+    compiled separately, all can differ from it in the last bit, and the derivative is then 0 / 0.
     """
     return jnp.min(values, axis=-1)
 
@@ -79,7 +79,7 @@ def _least_of_last_jvp(values, tangents):
 
 
 def corner_distance(*q):
-    """Return the signed distance to the solid behind orthogonal planes, from the distances q to each."""
+    """Return the signed distance to the solid behind orthogonal planes, given the signed distance to each."""
     outside = safe_norm(*(greatest(c, 0.0) for c in q))
     return outside + least(functools.reduce(greatest, q), 0.0)
 
@@ -166,7 +166,7 @@ class SignedDistance(eqx.Module):
 
 
 class Union(SignedDistance):
-    """The union of two solids: the smaller of their distances, exact outside, a lower bound inside."""
+    """The union of two solids. The smaller of their distances is exact outside, else a lower bound."""
 
     first: SignedDistance
     second: SignedDistance
@@ -178,7 +178,7 @@ class Union(SignedDistance):
 class SmoothUnion(SignedDistance):
     """The union of two solids with a fillet where their distances a and b differ by less than `width`.
 
-    The distance is min(a, b) - h^2 / (4 width), with h = max(width - |a - b|, 0), a lower bound.
+    The distance is min(a, b) - h^2 / (4 width) with h = max(width - |a - b|, 0). It is a lower bound.
     """
 
     first: SignedDistance
@@ -192,7 +192,7 @@ class SmoothUnion(SignedDistance):
 
 
 class Intersection(SignedDistance):
-    """The intersection of two solids: the larger of their distances, exact inside, a lower bound outside."""
+    """The intersection of two solids. The larger of their distances is exact inside, else a lower bound."""
 
     first: SignedDistance
     second: SignedDistance
@@ -202,7 +202,7 @@ class Intersection(SignedDistance):
 
 
 class Difference(SignedDistance):
-    """The first solid without the second: max(first, -second), exact inside, a lower bound outside."""
+    """The first solid without the second. max(first, -second) is exact inside, else a lower bound."""
 
     first: SignedDistance
     second: SignedDistance
@@ -222,7 +222,7 @@ class Translated(SignedDistance):
 
 
 class Rotated(SignedDistance):
-    """A solid rotated about the origin by a matrix. The distance is exact if that of `solid` is exact.
+    """A solid rotated about the origin by a matrix. The distance is exact if `solid` has an exact distance.
 
     **Raises:** `ValueError` if the matrix is not a rotation, or for the same reasons as `SignedDistance`.
     """
@@ -240,7 +240,7 @@ class Rotated(SignedDistance):
 
 
 class Scaled(SignedDistance):
-    """A solid scaled about the origin by `factor`. The distance is exact if that of `solid` is exact.
+    """A solid scaled about the origin by `factor`. The distance is exact if `solid` has an exact distance.
 
     **Raises:** `ValueError` if the factor is not positive.
     """

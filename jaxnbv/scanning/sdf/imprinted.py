@@ -39,7 +39,7 @@ class ImprintedPyramid(SignedDistance):
         return self.scale * jnp.maximum(jnp.maximum(sides, -w), -self._imprint(u, v, w))
 
     def imprint(self, x: Float[AnyArray, "*n 3"]) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
-        """Return the signed distance to the prism pressed into the base, and the height above the base."""
+        """Return the signed distance of points x to the pressed-in prism, and their height above the base."""
         u, v, w = self._local(x)
         return self.scale * self._imprint(u, v, w), self.scale * w
 
@@ -50,7 +50,7 @@ class ImprintedPyramid(SignedDistance):
         return local[..., 0], local[..., 1], local[..., 2]
 
     def _imprint(self, u, v, w):
-        """Return the signed distance to the prism, endless below the base, in the pyramid's frame."""
+        """Return the signed distance, in the pyramid's frame, to the prism, which has no end below the base."""
         c, s = jnp.cos(self.turn) / self.size, jnp.sin(self.turn) / self.size
         u, v = u - self.place[0], v - self.place[1]
         flat = self.size * pattern_distance(self.pattern, c * u + s * v, c * v - s * u)

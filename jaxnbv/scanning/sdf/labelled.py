@@ -1,4 +1,4 @@
-"""Unions of labelled primitives, all of one type, so that one compiled program scans any of them."""
+"""Unions of labelled primitives. All unions have arrays of the same shapes, so they share compiled programs."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -7,7 +7,7 @@ from jaxnbv.checks import AnyArray
 from jaxnbv.geometry.rotations import safe_norm
 from jaxnbv.scanning.sdf.base import SignedDistance, corner_distance, least_of_last, nonnegative, parameter
 
-# Label of an unused slot. All unions have arrays with the same number of slots, and each primitive takes one slot.
+# Label of an unused slot. All unions have the same number of slots, and each primitive takes one slot.
 UNUSED = -1
 
 

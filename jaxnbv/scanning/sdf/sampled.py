@@ -21,6 +21,7 @@ class Sampled(SignedDistance):
 
     The distance is accurate to about a cell inside the grid, and a lower bound outside the grid.
 
+    - `values`: signed distances at the nodes.
     - `low`, `spacing`: position of the first node, and the distance between neighbouring nodes.
     - `padding`: width of the empty space between the solid and the sides of the grid.
     """
@@ -97,7 +98,7 @@ def _signed_distance(
 def is_inside(
     points: Float[np.ndarray, "n 3"], vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Bool[np.ndarray, " n"]:
-    """Return whether triangles, in any winding, enclose each point. Open sheets enclose nothing."""
+    """Return, for each point, whether triangles of any winding enclose it. Open sheets enclose nothing."""
     return np.abs(winding_number(points, vertices, faces)) > 0.5
 
 
