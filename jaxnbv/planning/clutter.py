@@ -17,7 +17,8 @@ from jaxnbv.scanning.sdf import Sampled
 
 # Number of cells along a side of the cube of cells. A cell is then about 1.5 cm wide for an object of 20 cm.
 _NUM_CELLS = 48
-# An image occupies a cell that contains at least this many of its points. Fewer may be flying pixels at a depth edge.
+# An image shows a cell as occupied if at least this many of the image's points lie in the cell. Fewer points may be
+# flying pixels at a depth edge.
 _MIN_POINTS = 5
 # Largest normalised image coordinate (x / z or y / z) for which the distortion formula is used.
 _MAX_COORDINATE = 3.0
@@ -26,7 +27,7 @@ _MAX_COORDINATE = 3.0
 class Clutter(NamedTuple):
     """Occupancy votes for the cells of a cube about the middle of the scene, in scene coordinates.
 
-    - `votes`: for each cell, the number of images that occupy it minus the number that see through it.
+    - `votes`: for each cell, the number of images that show it as occupied minus the number that see through it.
     - `half_extent`: half the side of the cube.
     - `box`: box of the object. Cells in or near the box get no votes.
     """
@@ -43,7 +44,7 @@ class Clutter(NamedTuple):
     def with_image(self, image: Image, camera: Camera, pose: Pose, frame: Frame, obstacles: Obstacles) -> "Clutter":
         """Return a copy with the votes of one more image. Cells in or next to an obstacle get no votes.
 
-        Camera and pose are in world units, obstacles in scene units.
+        The camera and its pose are in world units, the obstacles in scene units.
         """
         depth = image.world_depth if image.robot is None else np.where(image.robot, 0.0, image.world_depth)
         points = np.asarray(frame.to_scene(image.points(camera, pose)[depth > 0]), np.float64)
@@ -80,7 +81,7 @@ class Clutter(NamedTuple):
     def _is_seen_through(
         self, depth: Float[np.ndarray, "height width"], camera: Camera, pose: Pose, frame: Frame
     ) -> Bool[np.ndarray, "n n n"]:
-        """Return a mask of the cells that lie more than a cell's side in front of the depth at their pixel."""
+        """Return a mask of the cells that are nearer than the depth measured at their pixel, by over a cell."""
         cell = frame.length_to_world(self.spacing)
         centers = np.asarray(frame.to_world(self._centers().reshape(-1, 3)), np.float64)
         local = (centers - np.asarray(pose.position, np.float64)) @ np.asarray(pose.rotation, np.float64)

@@ -89,7 +89,7 @@ class Episode(eqx.Module):
         """Load a saved episode, or the views that `simulate` has stored so far.
 
         - `planner`, `scene`: planner and scene to use if the stored ones hold a function or network that cannot be
-          restored. The descriptions must be the same.
+          restored. Their descriptions must equal the stored descriptions.
 
         **Raises:** `ValueError` if the folder holds no episode or no view, or if its planner or scene cannot be
         restored.

@@ -35,7 +35,7 @@ class ViewRecord(NamedTuple):
 
 
 def answers_by_parts(planner: Planner) -> bool:
-    """Return whether `View.answer` gives probabilities of parts because the acquisition has no answer."""
+    """Return whether `View.answer` gives the probability of each part, because the acquisition has no answer."""
     return type(planner.acquisition).answer is Acquisition.answer and planner.sampler.model.carries_hypotheses
 
 
@@ -49,7 +49,9 @@ def run(
 ) -> tuple[ViewRecord, PointCloud, Bool[Array, " episodes"]]:
     """Return records of the episodes' views, the last clouds, and whether each first view sees the object.
 
-    - `views`: number of views of each episode. The records are arrays (episodes, max_views), zero after this number.
+    The records' arrays have axes (episodes, max_views), and are zero after the last view.
+
+    - `views`: number of views of each episode.
     - `rows`: scene, first pose and random key of each episode. The leading axis is split among the devices.
     - `at_once`: number of episodes that a device computes together.
     """

@@ -101,8 +101,8 @@ class Image(NamedTuple):
     def is_blank(self, cloud: PointCloud) -> bool:
         """Return whether the image has no measurement.
 
-        True if `cloud` (the points in the box) is empty, and either all its rays are invalid or all measured pixels
-        have the same value, which then means "not measured".
+        True if `cloud` (the points in the box) is empty, and either all its rays are invalid or all positive pixels
+        have the same finite value, which then means "not measured".
         """
         if bool(cloud.mask.any()):
             return False
@@ -126,10 +126,10 @@ class Image(NamedTuple):
 
 
 def only_where(cloud: PointCloud, pixels: Bool[np.ndarray, "height width"], camera: Camera, stride: int) -> PointCloud:
-    """Return a cloud with only the points of some pixels. Its rays (`sight`, `missed`) do not change.
+    """Return an image's cloud with only the points of some pixels. Its `sight` and `missed` do not change.
 
-    - `pixels`: mask of the pixels to keep, at full resolution.
-    - `stride`: stride of the rows and columns that the cloud was made from.
+    - `pixels`: mask of the pixels whose points are kept, at full resolution.
+    - `stride`: stride of the image's rows and columns from which the cloud was made.
     """
     if camera.distortion:
         # The rays of a cloud belong to a camera without distortion, so the mask must be resampled.

@@ -37,7 +37,7 @@ class Intake:
         self.images: tuple[Image, ...] = ()
         self.mount_error = MountError(camera, convention)
         self.table: Obstacles | None = None
-        # The other upward axes with which a table would be detected, if none is detected with the session's axis.
+        # If no table is detected with the session's upward axis, the other axes with which one would be.
         self.other_ups: tuple[str, ...] = ()
         self.clutter = self._no_clutter()
 
@@ -48,7 +48,7 @@ class Intake:
         return intake
 
     def add(self, loop: Loop, image: Image, on_accept: Callable[[], None] = lambda: None) -> Loop | None:
-        """Add an image to the loop, and return the loop; None for a blank image that is not the first.
+        """Add an image to the loop as a view, and return the loop; None for a blank image after the first.
 
         - `on_accept`: function that is called after all checks and before the view is added.
 

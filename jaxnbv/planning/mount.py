@@ -11,7 +11,7 @@ from jaxnbv.planning.alignment import Alignment, align_views, errors_of
 from jaxnbv.planning.images import Image, stride_of
 from jaxnbv.planning.session_warnings import warn_of_mount
 
-# Images are compared at every third of the rows and columns that planning uses.
+# Planning uses some rows and columns of an image. Images are compared at every third of these rows and columns.
 _STRIDE = 3
 # Smallest number of views for a correction or warning. Two views may disagree by chance.
 _MIN_VIEWS = 3
@@ -22,6 +22,7 @@ _MIN_CHANGE = 0.5
 class MountError:
     """Alignment of a session's images, and the pose corrections that the session currently uses.
 
+    - `camera`, `convention`: as in the session.
     - `corrections`: (views, 4, 4), the correction X of each image. The true pose of the camera is `matrix @ X`, in
       OpenCV's axes.
     """

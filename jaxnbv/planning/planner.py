@@ -234,6 +234,7 @@ class Planner(eqx.Module):
         """Search for the next pose, given the inputs of the search.
 
         - `inputs`: result of `step_inputs`, or inputs with samples of your own.
+        - `pending`: as for `propose`.
 
         **Raises:** `ValueError` if every candidate has been visited, or if the value of a candidate is not finite.
         """
@@ -249,7 +250,7 @@ class Planner(eqx.Module):
     @jax.debug_nans(False)
     @program
     def values_at(self, inputs: StepInputs, poses: Pose) -> Float[Array, " poses"]:
-        """Return the values that the search maximises, including the cost of the move, at scene poses (n,).
+        """Return the acquisition's expected value at scene poses (n,), after the cost of the move is applied.
 
         **Raises:** `ValueError` for inputs without samples.
         """
@@ -299,7 +300,7 @@ def _propose(search: Search, problem: Problem, key: PRNGKeyArray) -> Proposal:
 
 
 def _checked_proposal(planner: Planner, problem: Problem, proposal: Proposal) -> Proposal:
-    """Return the proposal, or raise `ValueError` that names the cause if its value is not finite."""
+    """Return the proposal if its value is finite. Otherwise raise `ValueError` with the cause."""
     if is_traced(proposal):
         return proposal
     value, search = float(proposal.value), planner.search
@@ -320,7 +321,7 @@ def _checked_proposal(planner: Planner, problem: Problem, proposal: Proposal) ->
 
 
 def _check_parts(planner: Planner, problem: Problem, proposal: Proposal) -> None:
-    """Raise `ValueError` that names what is not finite: the cost, or a component of the acquisition."""
+    """Raise `ValueError` with the name of what is not finite: the cost, or a component of the acquisition."""
     values = proposal.values
     is_invalid = jnp.isnan(values) | (values == jnp.inf)
     pose = proposal.candidates[int(jnp.argmax(is_invalid))] if bool(is_invalid.any()) else proposal.pose

@@ -14,7 +14,7 @@ from jaxnbv.sharding import on_cpu
 
 
 def in_parts(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Compute `function(*arguments)` under `jit`, on a CPU with the same bits as outside `jit`.
+    """Compute `function(*arguments)` under `jit`. On a CPU, the bits are the same as outside `jit`.
 
     Outside `jit`, each operation and each jitted function that `function` calls is a separate program. In a single
     program, XLA would fuse operations. Fusion changes the bits, because a fused product and sum are rounded only once.

@@ -1,4 +1,4 @@
-"""Choice of the best pose that an arm can reach, by a function of the user that checks poses."""
+"""Choice of the best pose that an arm can reach. A function of the user tells which poses those are."""
 
 import dataclasses
 import math
@@ -22,13 +22,13 @@ from jaxnbv.search import Proposal
 Reachable: TypeAlias = Callable[[Float[np.ndarray, "n 4 4"]], Any]
 """Function of camera-to-world matrices (n, 4, 4) that returns, for each matrix, whether the arm can reach the pose.
 
-An answer is a bool, or a score from 0 (not reachable) to 1 that multiplies the value of the pose. It may also be a
-reason why the arm cannot reach the pose, such as "joint limit", or None if there is no such reason.
+An answer is a bool, or a score from 0 (not reachable) to 1 that multiplies the value of the pose. It may also be the
+reason why the arm cannot reach the pose, such as "joint limit", or None if the arm can reach the pose.
 """
 
 # Number of poses in each call of the user's function.
 _BATCH_SIZE = 8
-# Rotations about the optical axis, in degrees, that are tried if the arm cannot reach the pose itself.
+# If the arm cannot reach a pose, these rotations of the pose about the optical axis are tried (degrees).
 _ROLLS = (45.0, -45.0, 90.0, -90.0, 135.0, -135.0, 180.0)
 _NO_REASON = "not reachable"
 
@@ -41,7 +41,7 @@ class RefusedPose(NamedTuple):
 
 
 class _Option(NamedTuple):
-    """A pose that can be reached, its value, and the score from the user's function."""
+    """A pose that the arm can reach, its value, and its score from the user's function."""
 
     pose: Pose
     value: float
@@ -58,12 +58,12 @@ def best_reachable(
     """Propose the pose with the highest product of value and score, among poses that the arm can reach.
 
     This pose and its value become the loop's proposal. Return the proposal and, for each reason, the number of poses
-    that cannot be reached. The poses that the search evaluated are checked in batches, highest value first, until no
+    rejected for this reason. The poses that the search evaluated are checked in batches, highest value first, until no
     unchecked pose can be better. If the arm cannot reach a pose, rotations of it about the optical axis are tried.
 
     - `reachable`: the user's function; None if all poses can be reached.
     - `to_matrices`: function that converts scene poses to the matrices for `reachable`.
-    - `refused_poses`: poses that are excluded, also with the camera rotated about its optical axis.
+    - `refused_poses`: poses that are excluded at any rotation about their optical axis.
     - `seconds`: time after which the best pose so far is used.
 
     **Raises:** `ValueError` if no pose can be reached, if `reachable` returns an invalid answer, and whenever
@@ -115,7 +115,8 @@ def _options(
     The only option is the pose itself if the arm can reach it. Otherwise the options are its rotations about the
     optical axis that the arm can reach. If the list is empty, the reason is counted in `refusals`.
 
-    - `answers`: function of a batch of poses that returns, for each, the score or the reason why it cannot be reached.
+    - `answers`: function of a batch of poses. For each pose it returns the score, or the reason why the arm cannot
+      reach the pose.
     """
     for start in range(0, len(values), _BATCH_SIZE):
         rows = range(start, min(start + _BATCH_SIZE, len(values)))
@@ -157,7 +158,7 @@ def _evaluated_poses(proposal: Proposal) -> tuple[Pose, Float[np.ndarray, " pose
 
 
 def _with_pose(proposal: Proposal, pose: Pose, value: float) -> Proposal:
-    """Return a copy with this pose and value, and the standard error of a candidate with this value."""
+    """Return a copy that proposes this pose and value, and the value's standard error if it is known."""
     error, errors, is_same = proposal.standard_error, proposal.standard_errors, proposal.values == value
     if value != float(proposal.value):
         error = errors[jnp.argmax(is_same)] if errors is not None and bool(is_same.any()) else None
@@ -174,7 +175,7 @@ def _rotations_about_axis(pose: Pose) -> Pose:
 
 
 def _reason_if_refused(pose: Pose, refused_poses: Sequence[RefusedPose]) -> str | None:
-    """Return why the user refused a pose or its rotation about the optical axis; None if not refused."""
+    """Return why the user refused this view, at any rotation about the optical axis; None if not refused."""
     return next((refused.reason for refused in refused_poses if is_same_view(pose, refused.pose)), None)
 
 

@@ -22,7 +22,7 @@ _RADIUS = 0.2
 
 
 class Rehearsal(NamedTuple):
-    """The number of programs that were compiled or read from the cache, and the duration of the rehearsal."""
+    """Result of a rehearsal: how many programs it compiled or read from the cache, and its duration."""
 
     programs: int
     seconds: float
@@ -57,7 +57,7 @@ def rehearse(intake: Intake, loop: Loop) -> Rehearsal:
 
 
 def slanted_poses(poses: Pose, count: int) -> Pose:
-    """Return the `count` poses that look down most nearly by 30 degrees, so that they see the table."""
+    """Return the `count` poses that look down most nearly at 30 degrees, so that they see the table."""
     down = -np.asarray(poses.forward)[:, 1]
     return poses[jnp.asarray(np.argsort(np.abs(down - 0.5), kind="stable")[:count])]
 

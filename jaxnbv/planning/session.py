@@ -264,8 +264,8 @@ class Session:
     def done(self) -> str | None:
         """Return the stop rule's reason to stop; None to continue.
 
-        The rule is evaluated once for each image. `next` reuses samples and proposals that the rule needs. Nothing is
-        stored in the folder.
+        The rule is evaluated once for each image. `next` reuses the samples and the proposal that the rule computed.
+        Nothing is stored in the folder.
 
         **Raises:** `ValueError` if the rule needs the next proposal and `next` raises it.
         """
@@ -327,8 +327,8 @@ class Session:
         """Propose the pose for the next image.
 
         The result is stored in the folder, and stays the same until an image is added. No pose is proposed twice, even
-        if its image was taken elsewhere. Warn if the value is at most three standard errors above the mean value
-        expected at visited poses, where nothing is new.
+        if its image was taken elsewhere. A warning says so if the pose may show nothing new: its value is at most three
+        standard errors above the mean value estimated at visited poses.
 
         - `seconds`: time limit for calls of `reachable`. After this time, the best reachable pose so far is used.
 
@@ -389,7 +389,7 @@ class Session:
         return self._next
 
     def _add(self, image: Image, on_accept: Callable[[], None] = lambda: None) -> None:
-        """Add a view, unless the image is blank."""
+        """Add an image as a view, unless it is blank. `on_accept`: see `Intake.add`."""
         if (loop := self._intake.add(self._loop, image, on_accept)) is not None:
             self._loop, self._next = loop, None
 
@@ -405,7 +405,7 @@ class Session:
             self._add(image)
 
     def _read(self, folder: SessionFolder) -> None:
-        """Add the images of the folder to the session, with their proposals and the latest proposal."""
+        """Add the folder's images and their proposals to the session. Restore the proposal for the next image."""
         self._refused_poses, count = folder.refused_poses(), folder.num_images
         for index in range(count + 1):
             if index and (proposal := folder.proposal(index)) is not None:

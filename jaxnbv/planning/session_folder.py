@@ -29,6 +29,8 @@ class SessionFolder:
     def writing(self, num_images: int) -> "Iterator[SessionFolder]":
         """Context manager: lock the folder for writing, and yield it.
 
+        - `num_images`: number of images that the session has.
+
         **Raises:** `ValueError` if a different process writes to the folder or has added images.
         """
         with self._folder.writing():

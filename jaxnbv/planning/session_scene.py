@@ -46,8 +46,8 @@ def in_scene(
 ) -> Planner:
     """Return a copy of a planner for a sensor and a box, in scene coordinates.
 
-    The arguments are those of `Session`, in world units. If `matrices` (the poses) or `obstacles` is None, the
-    planner's own candidates or obstacles are used.
+    The arguments are those of `Session`, in world units. `matrices` are the poses. If `matrices` is None, the planner's
+    own candidates are used, and only the upper half of a sphere. If `obstacles` is None, the planner's own are used.
     """
     search = planner.search.upper_half()
     if matrices is not None:

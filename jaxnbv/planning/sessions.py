@@ -103,8 +103,8 @@ class Sessions:
 
         - `depth`, `matrix`, `depth_scale`: as for `Session.add`.
         - `labels`: number of the object at each pixel, or zero for no object. An object must have the same number in
-          all images. By default, objects are clusters of points above the table. A cluster belongs to an earlier object
-          if it is within `gap` of the object's points, or of the surface of the object's probable parts.
+          all images. By default, objects are clusters of points above the table. A cluster is part of an earlier object
+          if it is within `gap` of this object's points, or of the surface that its probable parts would have.
 
         **Raises:** `ValueError` if no image so far shows an object, and whenever `Session.add` raises it.
         """
@@ -238,7 +238,7 @@ class Sessions:
     def _object_near(self, points: Float[np.ndarray, "n 3"]) -> int | None:
         """Return the number of the earlier object to which a cluster belongs; None for a new object.
 
-        The cluster belongs to the object with the smallest expected distance to the points, if that is below the gap.
+        The cluster belongs to the object with the smallest expected distance to it, if this distance is below the gap.
         """
         subset = points[np.linspace(0, len(points) - 1, _NUM_COMPARED).astype(int)]
         distances = {number: _expected_distance(session, subset) for number, session in self.objects.items()}
@@ -280,9 +280,9 @@ def _values(session: Session) -> Float[np.ndarray, " candidates"]:
 
 
 def _expected_distance(session: Session, points: Float[np.ndarray, "n 3"]) -> float:
-    """Return the median over points of the expected distance from the surface of a session's object.
+    """Return the expected distance of points from the surface of a session's object, in world units.
 
-    World units. The expectation is over the object's hypotheses except "none of these".
+    The expectation is over the object's hypotheses except "none of these". The result is the median over the points.
     """
     hypotheses, frame = hypotheses_of(session.observations), session.frame
     scene_points = jnp.asarray(frame.to_scene(points), hypotheses.weights.dtype)

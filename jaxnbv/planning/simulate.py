@@ -96,7 +96,7 @@ def simulate(
 
 
 def check_num_views(planner: Planner, views: int) -> None:
-    """Raise `ValueError` unless the planner has room for this number of views, at least one."""
+    """Raise `ValueError` unless `views` is at least one and at most the planner's `max_views`."""
     require(views >= 1, f"asked for {views} views; ask for at least one")
     require(
         views <= planner.max_views,
@@ -107,7 +107,7 @@ def check_num_views(planner: Planner, views: int) -> None:
 def observe_scene(
     scene: Surface, camera: Camera, pose: Pose, noise: Noise, key: PRNGKeyArray, obstacles: Obstacles | None = None
 ) -> PointCloud:
-    """Return a noisy scan of the true surface, which obstacles may hide. Compiled if `scene.in_jit`."""
+    """Return a noisy scan of the true surface, which obstacles may hide. It is compiled if `scene.in_jit`."""
     barrier = None if obstacles is None else _barrier(obstacles, camera, pose)
     observe = _noisy_scan_in_jit if scene.in_jit else _noisy_scan
     return observe(scene, camera, pose, barrier, noise, key)

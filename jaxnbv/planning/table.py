@@ -43,18 +43,19 @@ class _Points(NamedTuple):
 def table_under(cloud: PointCloud, box: Box) -> Obstacles | None:
     """Return the table under an object as an obstacle; None if no table is detected.
 
-    The obstacle is the half space below the table's plane. Its margin is the default margin or three standard
-    deviations of the table points' distances from the plane, whichever is larger. RANSAC (Fischler and Bolles 1981)
-    draws planes through random triples of points, mostly close to the box. Among the planes that can be a table, the
-    plane with the most points outside the box is used. A plane can be a table if it satisfies four conditions:
+    - `cloud`: points of the whole image, in scene coordinates with y up.
+    - `box`: box around the object, in scene coordinates.
+
+    The obstacle is the half space below the table's plane. Its margin is at least three standard deviations of the
+    distances between the table's points and the plane, and at least the default margin. RANSAC (Fischler and Bolles
+    1981) draws planes through random triples of points, mostly close to the box. Among the planes that can be a table,
+    the plane with the most points outside the box is used. A plane can be a table if it satisfies four conditions:
 
     - It is level to within 30 degrees, so it is not a wall.
     - At the middle of the box it is below the top, and at most a quarter of the box's longest side below the bottom.
     - At most 2 % of the points in the box are below the plane, so it is not the top of an object.
     - At least as many of the points in, under, above and close beside the box are on the plane as below it, so it is
       not the edge of something in the air.
-
-    The cloud of the whole image and the box around the object are in scene coordinates, with y up.
     """
     low, high = box.low, box.high
     side, middle = float((high - low).max()), 0.5 * (low + high)
@@ -89,7 +90,7 @@ def other_ups(cloud: PointCloud, box: Box, up: str) -> tuple[str, ...]:
 def _points_around(
     cloud: PointCloud, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], side: float
 ) -> _Points:
-    """Return points relative to the middle of a box with longest side `side`."""
+    """Return points relative to the middle of a box with corners `low` and `high` and longest side `side`."""
     points, normals = (rows.astype(np.float64) for rows in cloud.to_numpy())
     is_inside = np.all((points > low) & (points < high), axis=1)
     margin = np.array([_MAX_SIDE_DISTANCE * side, np.inf, _MAX_SIDE_DISTANCE * side])
@@ -145,7 +146,7 @@ def _best_plane(image: _Points, lowest: float, highest: float) -> tuple[Float[np
 def _on_and_below(
     image: _Points, normals: Float[np.ndarray, "k 3"], offsets: Float[np.ndarray, " k"]
 ) -> tuple[Bool[np.ndarray, "n k"], Bool[np.ndarray, "n k"]]:
-    """Return masks of the points on each plane, and below it."""
+    """Return two masks (points, planes): whether a point is on a plane, and whether it is below the plane."""
     height = image.points @ normals.T - offsets
     return (np.abs(height) <= _TOLERANCE) & (image.normals @ normals.T >= _MIN_NORMAL_COSINE), height < -_TOLERANCE
 
@@ -155,7 +156,7 @@ def _is_table(
 ) -> Bool[np.ndarray, " k"]:
     """Return, for each plane, whether so few points lie below it that it may be a table.
 
-    These are the last two conditions of `table_under`.
+    This tests the last two conditions of `table_under`.
     """
     is_clear = is_below[image.is_inside].sum(axis=0) <= _MAX_STRAY_FRACTION * image.is_inside.sum()
     return is_clear & (is_on[image.is_near_box].sum(axis=0) >= is_below[image.is_near_box].sum(axis=0))

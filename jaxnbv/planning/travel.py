@@ -54,7 +54,7 @@ arc_length = ArcLength()
 
 
 class WorldCost(eqx.Module):
-    """Cost function that converts scene poses to world poses, and passes them to the cost function `of`.
+    """Cost of a move between scene poses, which are converted to world poses for the cost function `of`.
 
     An `ArcLength` without a centre uses the middle of the scene.
     """
@@ -101,7 +101,7 @@ class ValuePerCost(eqx.Module):
         return values / (self.fixed + jnp.where(observations.num_views > 0, cost, 0.0))
 
     def in_world(self, frame: Frame) -> "ValuePerCost":
-        """Return a copy for scene poses, whose cost function gets the world poses."""
+        """Return a copy that takes scene poses, and converts them to world poses for the cost function `of`."""
         of = self.of.of if isinstance(self.of, WorldCost) else self.of
         return dataclasses.replace(self, of=WorldCost(of, frame))
 

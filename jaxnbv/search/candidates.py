@@ -56,7 +56,7 @@ class SphereCandidates(Candidates):
 
     - `count`: number of cameras. They are spaced evenly above `min_elevation` (a Fibonacci sphere).
     - `radius`: radius in scene units.
-    - `min_elevation`: smallest angle of a camera above the horizontal plane through the origin, in radians; 0 for a dome.
+    - `min_elevation`: smallest angle of a camera above the horizontal plane through the origin, in radians (0: a dome).
     - `up`: upward direction in the scene and in the images.
 
     **Raises:** `ValueError` for no cameras, a radius that is not positive and finite, an elevation outside

@@ -159,7 +159,7 @@ class ConstrainedPoses(PoseSpace):
         return Pose(_product(_product(rotation, rotation_between(target, to_origin)), roll_matrix), position)
 
     def check_camera(self, camera: Camera) -> None:
-        """Raise `ValueError` if the origin, up to `off_axis` from the optical axis, could be outside the image."""
+        """Raise `ValueError` if the origin, at most `off_axis` from the axis, could be outside the image."""
         left, top, right, bottom = camera.edges
         half = math.atan(min(-left, -top, right, bottom))
         require(
