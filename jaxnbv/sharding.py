@@ -73,7 +73,7 @@ def on_cpu() -> bool:
 
 
 def _axes() -> tuple[tuple[str, ...], int]:
-    """Return the names of the mesh axes along which rows are divided, and the number of devices on them."""
+    """Return the axes of JAX's device mesh that divide the rows, and the number of devices on these axes."""
     mesh = get_abstract_mesh()
     sizes = {
         name: size

@@ -16,9 +16,9 @@ _READABLE = str.maketrans(_LETTERS | {"±": "+-", "°": " deg", "…": "...", "�
 
 
 def _readable(error: UnicodeError) -> tuple[str, int]:
-    """Return a replacement for characters that an encoding lacks, and the position after the characters.
+    """Return a replacement for the characters that an encoding lacks, and the position after them.
 
-    The replacement is a similar text, such as "m2" for "m²", or else escape codes.
+    The replacement consists of similar characters, such as "m2" for "m²", or escape codes.
     """
     assert isinstance(error, UnicodeEncodeError)
     text = error.object[error.start : error.end].translate(_READABLE)

@@ -29,7 +29,9 @@ _EPSILON = 1e-5
 
 
 def published_network(tensors: Tensors) -> PointNet2Classifier | PointNet2PartSegmenter:
-    """Make the network with these tensors: a part segmenter if a name begins with fp, else a classifier.
+    """Make the network that has these tensors.
+
+    It is a part segmenter if the tensors include feature-propagation layers ("fp..."), else a classifier.
 
     **Raises:** `ValueError` if a tensor is missing, unexpected, of a wrong shape or not finite.
     """

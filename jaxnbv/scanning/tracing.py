@@ -273,7 +273,7 @@ def cell_at(rays: March, field: GridField) -> tuple[Triple, list[Int[Array, " n"
 
 
 def _t_leave(rays: March, cell: list[Int[Array, " n"]], cells) -> Float[Array, " n"]:
-    """Return the t at which each ray leaves the cube of all cells within `cells` cells of its own cell."""
+    """Return the t at which each ray leaves a cube: its `cell` and `cells` more cells to each side."""
     sides = [c + jnp.where(d > 0, cells + 1, -cells) for c, d in zip(cell, rays.direction, strict=True)]
     ends = [(side - x) / d for side, x, d in zip(sides, rays.entry, rays.direction, strict=True)]
     return functools.reduce(jnp.minimum, ends)

@@ -236,9 +236,10 @@ def flatten(rows_of_shapes: Any) -> Any:
 
 
 def refine(bank: ShapeBank, prior: Prior, starts: Hypotheses, targets: FitTargets, num_steps: int) -> Hypotheses:
-    """Refine each start by Gauss-Newton steps on the misfit E, while tau falls.
+    """Refine each start by Gauss-Newton steps on the misfit E.
 
-    For each start, the result is the iterate whose E at the last tau is smallest.
+    tau, the scale of the distances in E (see the module docstring), is lowered from step to step. For each start, the
+    result is the iterate whose E at the last tau is smallest.
     """
     taus = jnp.append(jnp.geomspace(_FIRST_TAU, _LAST_TAU, num_steps), _LAST_TAU)
     basis = jnp.asarray(prior.step_basis, targets.points.dtype)

@@ -139,7 +139,10 @@ class _ClassWords(Words):
         return name if p == 1.0 else f"{name}, probability {p:.2f}"
 
     def settled(self, answers: Sequence[Answer], holds: Holds) -> list[bool]:
-        """Return, for each view, whether `Sure` holds, unless it held for a different class one view earlier."""
+        """Return, for each view, whether the class is sure (the stop rule `Sure` holds).
+
+        A view does not count if the view before was sure of a different class.
+        """
         is_sure = [holds(self.rule, index) for index in range(len(answers))]
         best = [int(np.argmax(answer.values)) for answer in answers]
         is_contradicted = [False, *(was and a != b for was, (a, b) in zip(is_sure, pairwise(best), strict=False))]

@@ -132,8 +132,8 @@ class PartDiscoveryStudy(Study):
     It has the settings of `Study`, and:
 
     - `imagined_rays`: rays along each side of an imagined scan. True scans have 64 x 64 rays.
-    - `num_points`: number of points that the segmenter gets after an imagined scan has been added to the cloud. The
-      utility's N_target is scaled in proportion.
+    - `num_points`: number of points that the segmenter gets: the cloud and an imagined scan are joined and thinned to
+      this number. The utility's N_target is scaled in proportion.
     """
 
     title: ClassVar[str] = "Views until all parts are found"

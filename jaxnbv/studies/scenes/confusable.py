@@ -72,7 +72,7 @@ def _ribs() -> list[SignedDistance]:
 
 
 def _connectors() -> list[SignedDistance]:
-    """Make blocks with a pocket. The size and position of a connector on the pocket's floor differ."""
+    """Make blocks that differ only in the size and position of a connector on the floor of a pocket."""
     variants = [(half, deep, 0.0, 0.0) for half, deep in ((0.3, 0.1), (0.1, 0.22), (0.2, 0.2), (0.12, 0.12))]
     variants += [(0.16, 0.1, x, z) for z in (0.15, -0.15) for x in (-0.22, 0.22)]
     return [
