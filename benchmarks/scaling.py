@@ -2,10 +2,10 @@
 
     python benchmarks/scaling.py [--out runs/scaling]
 
-Changes one of the four at a time. The others have the settings of sessions: new surface, two views of a mug, 2,000
-points, 16 samples, 120 candidates, 50 x 50 rays, here by the full search. Times are the least of three, without
-compilation, for the samples (posterior, values on the grid) and for the search. Continues after the last time in the
-file, so give another file for another machine.
+Changes one of the four at a time. The others stay at 2,000 points, 16 samples, 120 candidates and 50 x 50 rays, for new
+surface by the full search after two views of a mug. Times are the least of three, without compilation, for the samples
+(posterior, values on the grid) and for the search. Continues after the last time in the file, so give another file for
+another machine.
 """
 
 import argparse

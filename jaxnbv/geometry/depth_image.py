@@ -155,7 +155,7 @@ def _depth_behind(box: Box, camera: Camera, pose: Pose) -> Float[Array, " n"]:
 def without_sentinels(
     depth: Real[np.ndarray, "height width"], camera: Camera, pose: Pose, scale: float, box: Box
 ) -> Real[np.ndarray, "height width"]:
-    """Return the depth image with zeros in place of sentinels: values, such as 65535, that mean "not measured".
+    """Return the depth image with zeros for sentinels, values such as 65535 that mean "not measured".
 
     A value much deeper than the box that fills many pixels counts as a sentinel (see `sentinel_pixels`).
 

@@ -131,7 +131,10 @@ class ClassAcquisition(Acquisition):
         return jnp.exp(context_of(self, cloud)[1])
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> "ClassAnswer | None":
-        """Return the scene's class as an answer; None if the scene has no class, or one that the classifier lacks."""
+        """Return the scene's class as an answer.
+
+        None if the scene has no class, or one that the classifier lacks.
+        """
         label = scene.class_label
         if label is None:
             return None
