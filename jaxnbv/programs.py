@@ -176,7 +176,7 @@ def _is_plain_context() -> bool:
 
 
 def _settings() -> tuple:
-    """Return JAX's settings, including those of context managers, but without those that change no program.
+    """Return JAX's settings (also those of context managers), without settings that change no program.
 
     `own_settings` allows all transfers, so a program may run with and without a transfer guard.
     """

@@ -35,7 +35,7 @@ class ViewRecord(NamedTuple):
 
 
 def answers_by_parts(planner: Planner) -> bool:
-    """Return whether `View.answer` gives the probability of each part, because the acquisition has no answer."""
+    """Return whether `View.answer` is the probability of each part, for an acquisition without an answer."""
     return type(planner.acquisition).answer is Acquisition.answer and planner.sampler.model.carries_hypotheses
 
 

@@ -107,7 +107,7 @@ def _batch_of_poses(first: Pose, count: int) -> Pose:
 
 
 def _devices(count: int) -> AbstractContextManager:
-    """Return a context in which JAX uses the user's mesh of devices, or else at most `count` local devices."""
+    """Context manager: use the user's mesh of devices, or else at most `count` local devices."""
     is_chosen = not get_abstract_mesh().empty or jax.config.jax_default_device is not None  # type: ignore[attr-defined]
     devices = jax.local_devices()[:count]
     return nullcontext() if is_chosen or len(devices) == 1 else jax.set_mesh(Mesh(np.array(devices), "devices"))

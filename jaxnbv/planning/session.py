@@ -327,8 +327,8 @@ class Session:
         """Propose the pose for the next image.
 
         The result is stored in the folder, and stays the same until an image is added. No pose is proposed twice, even
-        if its image was taken elsewhere. A warning says so if the pose may show nothing new: its value is at most three
-        standard errors above the mean value estimated at visited poses.
+        if its image was taken elsewhere. The method warns if the pose may show nothing new: if its value is at most
+        three standard errors above the mean value estimated at visited poses.
 
         - `seconds`: time limit for calls of `reachable`. After this time, the best reachable pose so far is used.
 

@@ -13,7 +13,8 @@ from jaxnbv.scanning.sdf import HalfSpace
 
 # A table is level to within 30 degrees. The noisy normals of its points differ from its normal by at most 40 degrees.
 _MIN_LEVEL_COSINE, _MIN_NORMAL_COSINE = np.cos(np.radians(30.0)), np.cos(np.radians(40.0))
-# Largest distances of a table below the box, and of points beside the box, as fractions of the box's longest side.
+# How far a table may be below the box, and how far a point beside the box still counts as near it, as fractions of the
+# box's longest side.
 _MAX_DEPTH_BELOW, _MAX_SIDE_DISTANCE = 0.25, 0.2
 # Largest fraction of the box's points below a table, and smallest number of points outside the box on a table.
 _MAX_STRAY_FRACTION, _MIN_POINTS = 0.02, 50
