@@ -193,10 +193,7 @@ class _Placeholder:
 
 
 def _tensor(storage: np.ndarray, offset: int, shape: tuple[int, ...], strides: tuple[int, ...], *_: Any) -> np.ndarray:
-    """Return a tensor as a view of a storage. `offset` and `strides` are in entries.
-
-    NumPy raises an error for a view beyond the storage's end.
-    """
+    """Return a view of a storage, or raise an error beyond its end. `offset` and `strides` are in entries."""
     size = storage.itemsize
     tensor = np.ndarray(shape, storage.dtype, storage, offset * size, tuple(stride * size for stride in strides))
     require(tensor.size <= storage.size, f"stretches {storage.size} numbers to a tensor of shape {shape}: save a copy")

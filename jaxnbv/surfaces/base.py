@@ -118,10 +118,7 @@ class SurfacePosterior(eqx.Module):
         return type(self).mean is not SurfacePosterior.mean
 
     def kinds(self) -> dict[str, float]:
-        """Return the probability of each kind of known shape, such as "chair", most likely first.
-
-        Empty by default.
-        """
+        """Return the probability of each kind of known shape, most likely first. By default there is none."""
         return {}
 
     def names_of_samples(self, key: PRNGKeyArray, num_samples: int) -> list[str]:

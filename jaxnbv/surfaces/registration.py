@@ -83,10 +83,7 @@ def _choose_empty_points(observations: Observations) -> tuple[Float[Array, "m 3"
 def _first_empty_nodes(
     empty_nodes: Bool[Array, "g g g"], order: Int[Array, " nodes"]
 ) -> tuple[Int[Array, "m 3"], Bool[Array, " m"]]:
-    """Return the grid indices of the first 512 empty nodes, and a mask of the filled rows.
-
-    - `order`: a permutation of the flat node indices, in which nodes are tried.
-    """
+    """Return grid indices of the first 512 empty nodes in this order of flat indices, and a mask of rows."""
     is_empty = empty_nodes.reshape(-1)[order]
     row = jnp.where(is_empty, jnp.cumsum(is_empty) - 1, _NUM_EMPTY)
     indices = jnp.zeros(_NUM_EMPTY, jnp.int32).at[row].set(order, mode="drop")

@@ -21,10 +21,7 @@ _FURNITURE = Upright(by_axis=True)
 
 
 class ShippedBank(NamedTuple):
-    """Description of a shipped bank: how to read its solids, and the possible placements of its shapes.
-
-    - `form`: returns a solid with the same PyTree structure as the bank's solids.
-    """
+    """Description of a shipped bank: `form()` has the PyTree structure of the bank's solids."""
 
     form: Callable[[], SignedDistance]
     poses: ShapePoses
