@@ -34,7 +34,10 @@ def is_working() -> bool:
 
 
 def end_process(code: int) -> NoReturn:
-    """End the process at once with this exit code. A normal exit crashes if a thread still runs compiled code."""
+    """End the process at once with this exit code.
+
+    A normal exit crashes if a thread still runs compiled code.
+    """
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(code)

@@ -119,7 +119,7 @@ def task_charts(data: ReportData) -> list[tuple[str, Figure]]:
 
 
 def other_charts(data: ReportData) -> list[tuple[str, Figure]]:
-    """Return title and figure of two more charts: surface seen (unless it is the task), and values of views."""
+    """Return titles and figures of charts: surface seen (unless that is the task), and values of views."""
     rival = None if data.task.rival is None else data.task.rival.coverage_chart
     charts = [] if data.task.is_coverage else [_labelled_figure(data, data.task.coverage_chart, rival, _LARGE)]
     if data.proposals:

@@ -78,7 +78,7 @@ def deviation_figure(
 def _two_eyes(
     scene: TriangleMesh, values_at: Values, positions: Float[np.ndarray, "k 3"], outward: Float[np.ndarray, "k 3"]
 ) -> Float[np.ndarray, "2 3"]:
-    """Return unit vectors toward two viewers, who together see most of the scan and of the numbered places.
+    """Return unit vectors toward two viewers who together see most of the scan and of the numbered places.
 
     - `positions`, `outward`: numbered places and the outward normals there, in scene coordinates.
     """

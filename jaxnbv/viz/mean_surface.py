@@ -134,7 +134,7 @@ def _farthest_rows(features: Float[np.ndarray, "n d"], count: int) -> Int[np.nda
 
 
 def _interpolate(features: np.ndarray, anchors: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Interpolate positive values from some rows of `features` to all rows, as weighted means of logarithms.
+    """Interpolate positive values from some rows of `features` to all, as weighted means of logarithms.
 
     - `anchors`, `values`: indices of rows, and the values there.
     """
