@@ -200,17 +200,10 @@ class KnownShapesPosterior(SurfacePosterior):
             weights[kind] = weights.get(kind, 0.0) + one.weight
         return dict(sorted(weights.items(), key=lambda item: -item[1]))
 
-    def given_likeliest(self) -> SurfacePosterior:
-        """Return the posterior given that the object is the likeliest shape of the likeliest kind.
-
-        It is `of_none` if the likeliest kind is "none of these".
-        """
-        kind, weights = next(iter(self.kinds())), np.asarray(self.weights)
-        if kind == NONE:
-            return self.of_none
-        is_of_kind = [kind_of(self.model.bank.names[index]) == kind for index in np.asarray(self.fits.shape)]
-        row = int(np.argmax(np.where(is_of_kind, weights[:-1], -1.0)))
-        return dataclasses.replace(self, weights=jnp.asarray(np.eye(len(weights), dtype=weights.dtype)[row]))
+    def given(self, row: int) -> "KnownShapesPosterior":
+        """Return the posterior given that the fit with this row is right."""
+        weights = np.eye(len(self.weights), dtype=self.weights.dtype)[row]
+        return dataclasses.replace(self, weights=jnp.asarray(weights))
 
     def names_of_samples(self, key: PRNGKeyArray, num_samples: int) -> list[str]:
         """Return the name of the shape of each sample that `sample` draws with this key."""

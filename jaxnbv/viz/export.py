@@ -10,15 +10,14 @@ from scipy.spatial import cKDTree
 
 from jaxnbv.checks import InputError, checked, require
 from jaxnbv.geometry.cloud import PointCloud
-from jaxnbv.observations import Observations
 from jaxnbv.planning.episode import Episode
-from jaxnbv.sampler import StepInputs, SurfaceSampler
+from jaxnbv.sampler import StepInputs
 from jaxnbv.storage.files import write_bytes
 from jaxnbv.storage.run_folder import ply_of
 from jaxnbv.surfaces.known_shapes import KnownShapesPosterior
 from jaxnbv.surfaces.part_hypotheses import PartHypotheses
 from jaxnbv.viz.mean_surface import MeanSurface, mean_surface, near_points
-from jaxnbv.viz.placed_shape import likeliest_part
+from jaxnbv.viz.placed_shape import likeliest_part, likely_kinds
 
 _CLOUD_FORMATS, _MESH_FORMATS = ("ply", "obj", "glb", "xyz"), ("ply", "obj", "glb", "stl", "off")
 
@@ -41,8 +40,8 @@ def scanned_cloud(episode: Episode) -> PointCloud:
 def surface_mesh(episode: Episode, imagined: bool = True) -> trimesh.Trimesh:
     """Return the surface after the last view, in world units.
 
-    It is the surface of the posterior mean. With known shapes, it is the mean given that the likeliest shape is right,
-    and for parts at true size the likeliest part.
+    It is the surface of the posterior mean. With known shapes, it is the mean given that the shape in the
+    report's picture is right, and for parts at true size the likeliest part.
 
     - `imagined`: whether to keep surface that no view measured.
 
@@ -53,7 +52,7 @@ def surface_mesh(episode: Episode, imagined: bool = True) -> trimesh.Trimesh:
     """
     cloud = scanned_cloud(episode)
     planner, frame = episode.planner, episode.frame
-    surface = _surface(planner.sampler, episode.observations_after(len(episode.views)))
+    surface = _surface(episode)
     if surface is None:
         raise InputError("the sampler's grid holds no surface with points: give a finer one, or another view")
     vertices = np.asarray(frame.to_world(surface.vertices), np.float64)
@@ -138,13 +137,16 @@ def save_mesh(episode: Episode, path: str | Path, imagined: bool = True) -> Path
     return _write(path, surface_mesh(episode, imagined).export(file_type=kind))
 
 
-def _surface(sampler: SurfaceSampler, observations: Observations) -> MeanSurface | None:
+def _surface(episode: Episode) -> MeanSurface | None:
+    sampler, observations = episode.planner.sampler, episode.observations_after(len(episode.views))
     if isinstance(observations.hypotheses, PartHypotheses):
         return likeliest_part(observations.hypotheses)
     posterior = sampler.posterior(observations)
     if isinstance(posterior, KnownShapesPosterior):
-        # The mean over several shapes looks like none of them.
-        posterior = posterior.given_likeliest()
+        # The mean over several shapes looks like none of them. Use the shape that pictures show.
+        answer = episode.views[-1].answer(episode.planner.acquisition)
+        kinds = likely_kinds(posterior.model.bank, posterior.fits, posterior.weights, answer)
+        posterior = posterior.given(kinds[0].row) if kinds else posterior.of_none
     return near_points(mean_surface(sampler, StepInputs(observations, posterior)), observations.cloud)
 
 

@@ -30,7 +30,7 @@ from jaxnbv.surfaces.part_hypotheses import PartHypotheses
 from jaxnbv.utility import Answer, Quantity
 from jaxnbv.viz import style
 from jaxnbv.viz.answers import capital, kinds_text, value_text, words_of
-from jaxnbv.viz.choice import colour_range, open_values
+from jaxnbv.viz.choice import candidate_values, colour_range
 from jaxnbv.viz.imagined import NUM_SHOWN, Triangles, sampled_surfaces
 from jaxnbv.viz.mean_surface import MeanSurface
 from jaxnbv.viz.placed_shape import PlacedShape, placed_parts
@@ -158,7 +158,7 @@ def _surfaces(
 
     With known parts, the imagined surfaces are the likeliest parts.
 
-    - `answer`: see `likeliest_shape`.
+    - `answer`: see `likely_kinds`.
     """
     if isinstance(observations.hypotheses, PartHypotheses):
         parts = placed_parts(observations.hypotheses, NUM_SHOWN)
@@ -242,11 +242,11 @@ def _depth_picture(depth: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"
 
 
 def _draw_choice(scene: Any, camera: Camera, proposal: Proposal, picture: np.ndarray | None) -> list[Any]:
-    values, handles = open_values(proposal), []
-    is_open = np.isfinite(values)
-    if is_open.any():
-        places = np.asarray(proposal.candidates.position)[is_open]
-        colours = style.VALUE(Normalize(*colour_range(values))(values[is_open]), bytes=True)[:, :3]
+    values, handles = candidate_values(proposal), []
+    has_value = np.isfinite(values)
+    if has_value.any():
+        places = np.asarray(proposal.candidates.position)[has_value]
+        colours = style.VALUE(Normalize(*colour_range(values))(values[has_value]), bytes=True)[:, :3]
         settings: dict[str, Any] = {"point_size": _CANDIDATE_SIZE, "point_shape": "circle"}
         handles.append(scene.add_point_cloud("/candidates", places, colours, **settings))
     return [*handles, _frustum(scene, "/next view", camera, proposal.pose, _NEXT_COLOUR, picture)]
@@ -268,7 +268,7 @@ def _legend(surface: MeanSurface | None, proposal: Proposal | None, quantity: Qu
         low, high = style.middle_range(frame.length_to_world(surface.deviation))
         rows.append(_bar(f"the surface is known to, in {frame.unit}", style.DEVIATION, f"{low:g}", f"{high:g}"))
     if proposal is not None and np.isfinite(proposal.values).any():
-        ends = (value_text(quantity, value, frame) for value in colour_range(open_values(proposal)))
+        ends = (value_text(quantity, value, frame) for value in colour_range(candidate_values(proposal)))
         rows.append(_bar(f"candidates: {quantity.name}", style.VALUE, *ends))
     return f'<div style="padding:0 1em 1em;font-size:.85em">{"".join(rows)}</div>'
 

@@ -1,7 +1,7 @@
 """The likeliest known shape at its placement, and where the other hypotheses differ from it."""
 
 import dataclasses
-from typing import TypeAlias, TypeVar
+from typing import NamedTuple, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -107,14 +107,21 @@ def likeliest_part(hypotheses: PartHypotheses, cloud: PointCloud | None = None) 
     return _with_hypotheses(part, hypotheses.bank, _select(hypotheses.placed, rows), weights[rows], cloud)
 
 
-def likeliest_shape(
+class LikelyKind(NamedTuple):
+    """A kind of known shape, its probability, and the row of its likeliest hypothesis."""
+
+    name: str
+    probability: float
+    row: int
+
+
+def likely_kinds(
     bank: ShapeBank,
     hypotheses: Hypotheses,
     weights: Float[AnyArray, " h_and_none"],
-    cloud: PointCloud,
     answer: Answer | None = None,
-) -> PlacedShape | None:
-    """Return the likeliest shape of the likeliest kind; None if "none of these" is nearly certain.
+) -> list[LikelyKind]:
+    """Return the kinds of the registered shapes, likeliest first; no kind if "none of these" is nearly certain.
 
     - `hypotheses`, `weights`: the registered shapes and their weights. The last weight is that of "none of these".
     - `answer`: probabilities of classes. If every kind is one of the classes, the weight of each kind is multiplied by
@@ -123,7 +130,7 @@ def likeliest_shape(
     """
     weights = np.asarray(weights, np.float64)
     if weights[-1] > _MAX_NONE_PROBABILITY:
-        return None
+        return []
     names = [kind_of(bank.names[shape]) for shape in np.asarray(hypotheses.shape)]
     rows, kinds = dict[str, int](), dict[str, float]()
     for row in np.argsort(-weights[:-1], kind="stable").tolist():
@@ -133,11 +140,23 @@ def likeliest_shape(
         chances = dict(zip(answer.names, answer.values.tolist(), strict=True))
         total = max(sum(kinds[kind] * chances[kind] for kind in kinds), 1e-30)
         kinds = {kind: weight * chances[kind] / total for kind, weight in kinds.items()}
-    likely = sorted(kinds, key=lambda kind: -kinds[kind])[:_MAX_HYPOTHESES]
-    first = _place_shape(bank, hypotheses, rows[likely[0]], kinds[likely[0]])
-    shape = dataclasses.replace(first, name=likely[0], is_part=False)
-    kind_weights = np.array([kinds[kind] for kind in likely])
-    return _with_hypotheses(shape, bank, _select(hypotheses, [rows[kind] for kind in likely]), kind_weights, cloud)
+    return [LikelyKind(kind, kinds[kind], rows[kind]) for kind in sorted(kinds, key=lambda kind: -kinds[kind])]
+
+
+def likeliest_shape(
+    bank: ShapeBank, hypotheses: Hypotheses, kinds: list[LikelyKind], cloud: PointCloud
+) -> PlacedShape | None:
+    """Return the likeliest shape of the first of `likely_kinds`; None if there are no kinds.
+
+    - `cloud`: the scanned points.
+    """
+    if not kinds:
+        return None
+    first, kinds = kinds[0], kinds[:_MAX_HYPOTHESES]
+    shape = _place_shape(bank, hypotheses, first.row, first.probability)
+    shape = dataclasses.replace(shape, name=first.name, is_part=False)
+    weights = np.array([kind.probability for kind in kinds])
+    return _with_hypotheses(shape, bank, _select(hypotheses, [kind.row for kind in kinds]), weights, cloud)
 
 
 def _place_shape(bank: ShapeBank, hypotheses: Hypotheses, row: int, probability: float) -> PlacedShape:

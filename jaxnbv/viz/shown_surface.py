@@ -8,7 +8,7 @@ from jaxnbv.surfaces.known_shapes import KnownShapes, KnownShapesPosterior
 from jaxnbv.surfaces.part_hypotheses import PartHypotheses
 from jaxnbv.utility import Answer
 from jaxnbv.viz.mean_surface import MeanSurface, mean_surface, near_points
-from jaxnbv.viz.placed_shape import likeliest_part, likeliest_shape
+from jaxnbv.viz.placed_shape import likeliest_part, likeliest_shape, likely_kinds
 
 
 def needs_no_posterior(sampler: SurfaceSampler) -> bool:
@@ -23,7 +23,7 @@ def shown_surface(sampler: SurfaceSampler, inputs: StepInputs, answer: Answer | 
     the bank, because a mean over several known shapes looks like none of them.
 
     - `inputs`: inputs of a step, with a posterior unless `needs_no_posterior`.
-    - `answer`: the acquisition's answer, see `likeliest_shape`.
+    - `answer`: the acquisition's answer, see `likely_kinds`.
     """
     observations, posterior, model = inputs.observations, inputs.posterior, sampler.model
     if isinstance(observations.hypotheses, PartHypotheses):
@@ -33,7 +33,8 @@ def shown_surface(sampler: SurfaceSampler, inputs: StepInputs, answer: Answer | 
             fits, weights = posterior.fits, posterior.weights
         else:
             fits, weights = model.fit(_within_volume(sampler, observations))
-        if (shape := likeliest_shape(model.bank, fits, weights, observations.cloud, answer)) is not None:
+        kinds = likely_kinds(model.bank, fits, weights, answer)
+        if (shape := likeliest_shape(model.bank, fits, kinds, observations.cloud)) is not None:
             return shape
         sampler = sampler.without_bank
         of_none = posterior.of_none if isinstance(posterior, KnownShapesPosterior) else sampler.posterior(observations)

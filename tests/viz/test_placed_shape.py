@@ -20,7 +20,7 @@ from jaxnbv.viz.answers import words_of
 from jaxnbv.viz.data import report_data
 from jaxnbv.viz.figures import overview_figure
 from jaxnbv.viz.notebook import html_of
-from jaxnbv.viz.placed_shape import likeliest_part, likeliest_shape, placed_parts
+from jaxnbv.viz.placed_shape import likeliest_part, likeliest_shape, likely_kinds, placed_parts
 from jaxnbv.viz.report import report_html
 from jaxnbv.viz.task import task_of
 
@@ -33,9 +33,8 @@ def hypotheses(*weights):
     """Hypotheses: the slab in two places, and the left cube."""
     shapes, shifts = jnp.array([1, 1, 0]), jnp.array([[0.2, 0.1, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     places = Placement(jnp.tile(jnp.asarray(TURN), (3, 1, 1)), shifts, jnp.ones((3, 3)))
-    return PartHypotheses(
-        BANK, Hypotheses(shapes, places, jnp.arange(3.0), jnp.ones(3, bool)), jnp.array(weights), jnp.asarray(0.03)
-    )
+    placed = Hypotheses(shapes, places, jnp.arange(3.0), jnp.ones(3, bool))
+    return PartHypotheses(BANK, placed, jnp.array(weights), *2 * [jnp.asarray(0.03)])
 
 
 SLAB = hypotheses(0.5, 0.25, 0.2, 0.05)
@@ -73,7 +72,7 @@ def test_a_shape_of_a_bank_is_drawn_as_registered_and_the_others_as_disputed_spa
     corner = [[0.5, 0.6, 0.2], [0.6, 0.6, 0.2]]
     cloud = nbv.PointCloud.from_arrays(corner, [[0.0, 1.0, 0.0]] * 2)
     weights = np.array([0.2, 0.3, 0.5])
-    shape = likeliest_shape(bank, placed, weights, cloud)
+    shape = likeliest_shape(bank, placed, likely_kinds(bank, placed, weights), cloud)
     assert (shape.name, shape.is_part) == ("slab", False)
     assert shape.probability == pytest.approx(0.3)
     np.testing.assert_allclose(np.abs(shape.vertices).max(axis=0), [0.9, 0.6, 0.5], atol=0.01)
@@ -81,11 +80,12 @@ def test_a_shape_of_a_bank_is_drawn_as_registered_and_the_others_as_disputed_spa
     assert shape.measured[near < 0.05].min() == 1.0
     assert shape.measured[near > 0.3].max() == 0.0
     np.testing.assert_allclose(np.abs(shape.disputed_space.vertices).max(axis=0), 0.7, atol=0.05)
-    assert likeliest_shape(bank, placed, np.array([0.02, 0.03, 0.95]), cloud) is None
+    assert likely_kinds(bank, placed, np.array([0.02, 0.03, 0.95])) == []
+    assert likeliest_shape(bank, placed, [], cloud) is None
     # A classifier that recognises a cube changes 0.2 : 0.3 to 0.18 : 0.03, of 0.5 in all. Other classes change nothing.
-    by_class = likeliest_shape(bank, placed, weights, cloud, Answer(("slab", "cube"), np.array([0.1, 0.9])))
-    assert (by_class.name, by_class.probability) == ("cube", pytest.approx(0.18 / 0.21))
-    assert likeliest_shape(bank, placed, weights, cloud, Answer(("ball",), np.ones(1))).name == "slab"
+    by_class = likely_kinds(bank, placed, weights, Answer(("slab", "cube"), np.array([0.1, 0.9])))
+    assert by_class[0] == ("cube", pytest.approx(0.18 / 0.21), 0)
+    assert likely_kinds(bank, placed, weights, Answer(("ball",), np.ones(1)))[0].name == "slab"
 
 
 def test_words_name_the_likeliest_or_its_group_and_none_of_these():
