@@ -121,7 +121,9 @@ def likely_kinds(
     weights: Float[AnyArray, " h_and_none"],
     answer: Answer | None = None,
 ) -> list[LikelyKind]:
-    """Return the kinds of the registered shapes, likeliest first; no kind if "none of these" is nearly certain.
+    """Return the kinds of the registered shapes, likeliest first.
+
+    The list is empty if "none of these" is nearly certain.
 
     - `hypotheses`, `weights`: the registered shapes and their weights. The last weight is that of "none of these".
     - `answer`: probabilities of classes. If every kind is one of the classes, the weight of each kind is multiplied by
