@@ -107,7 +107,7 @@ class Loop:
     - `camera`: the sensor's camera in scene units, by default the planner's.
     - `on_stage`: function that is called with a name from `STAGES` when this stage begins.
 
-    **Raises:** `ValueError` if the rule does not apply to the planner's acquisition.
+    **Raises:** `ValueError` if the rule does not apply to the planner.
     """
 
     @own_settings()
@@ -121,7 +121,7 @@ class Loop:
         on_stage: Callable[[str], None] = lambda stage: None,
     ):
         if until is not None:
-            until.check(planner.acquisition)
+            until.check(planner)
         self.planner, self.key, self.until, self.frame = planner, key, until, frame
         self.camera, self._on_stage = camera or planner.camera, on_stage
         self.views: tuple[View, ...] = ()

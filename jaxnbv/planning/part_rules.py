@@ -2,8 +2,9 @@
 
 import equinox as eqx
 
-from jaxnbv.acquisition import Acquisition, ExpectedUtilityImprovement
+from jaxnbv.acquisition import ExpectedUtilityImprovement
 from jaxnbv.checks import InputError, check_fields, require, short_text
+from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.stopping import StopContext, StopRule
 from jaxnbv.surfaces.part_hypotheses import hypotheses_of
 from jaxnbv.surfaces.part_pose import surface_error
@@ -29,7 +30,8 @@ class PartsFound(StopRule):
         are_names = isinstance(self.parts, tuple) and all(isinstance(name, str) for name in self.parts)
         require(self.parts is None or are_names, f"the parts are {short_text(self.parts)}; give a tuple of their names")
 
-    def check(self, acquisition: Acquisition) -> None:
+    def check(self, planner: Planner) -> None:
+        acquisition = planner.acquisition
         utility = acquisition.utility if isinstance(acquisition, ExpectedUtilityImprovement) else None
         if not isinstance(utility, SoftPartCount):
             raise InputError(
@@ -55,7 +57,18 @@ class PartsFound(StopRule):
         return f"all {len(names)} parts are found, each by {self.points} points or more"
 
 
-class Identified(StopRule):
+class _KnownPartRule(StopRule):
+    """Base class of rules that read the hypotheses about known parts."""
+
+    def check(self, planner: Planner) -> None:
+        require(
+            planner.sampler.model.carries_hypotheses,
+            f"{type(self).__name__} is about known parts, but the planner knows none: use Planner.for_parts(bank), or "
+            "another rule",
+        )
+
+
+class Identified(_KnownPartRule):
     """Stop once one of the known parts, or "none of these", has at least a given probability.
 
     - `probability`: smallest probability at which to stop, within (0, 1).
@@ -74,7 +87,7 @@ class Identified(StopRule):
         return f"it is {name} ({100 * probability:.0f} %)" if probability >= self.probability else None
 
 
-class Placed(StopRule):
+class Placed(_KnownPartRule):
     """Stop once the expected error of the most probable part's surface is at most a given length.
 
     The error is `surface_error`, a root mean square over the surface and over the hypotheses.

@@ -58,8 +58,8 @@ class StopRule(eqx.Module):
         """Whether the rule checks the proposed view, so that `before` must be called."""
         return type(self).before is not StopRule.before
 
-    def check(self, acquisition: Acquisition) -> None:
-        """Raise `ValueError` if the rule does not apply to this acquisition."""
+    def check(self, planner: Planner) -> None:
+        """Raise `ValueError` if the rule does not apply to this planner. Called before the first view."""
         return
 
     def after(self, context: StopContext) -> str | None:
@@ -87,9 +87,9 @@ class AnyOf(StopRule):
     def needs_proposal(self) -> bool:
         return any(rule.needs_proposal for rule in self.rules)
 
-    def check(self, acquisition: Acquisition) -> None:
+    def check(self, planner: Planner) -> None:
         for rule in self.rules:
-            rule.check(acquisition)
+            rule.check(planner)
 
     def after(self, context: StopContext) -> str | None:
         return next(filter(None, (checked_reason(rule, rule.after(context)) for rule in self.rules)), None)
@@ -134,8 +134,8 @@ class Sure(StopRule):
             self.num_resamplings >= 0, f"the number of resamplings is {self.num_resamplings}; it must not be negative"
         )
 
-    def check(self, acquisition: Acquisition) -> None:
-        _class_acquisition(acquisition)
+    def check(self, planner: Planner) -> None:
+        _class_acquisition(planner.acquisition)
 
     def after(self, context: StopContext) -> str | None:
         return self.reason(context.planner.acquisition, context.observations.cloud, context.key)

@@ -17,7 +17,7 @@ from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.pose import fibonacci_sphere, look_at
 from jaxnbv.observations import Observations
-from jaxnbv.planning.part_rules import PartsFound
+from jaxnbv.planning.part_rules import Identified, PartsFound, Placed
 from jaxnbv.planning.planner import Planner
 from jaxnbv.planning.simulate import simulate
 from jaxnbv.planning.stopping import Budget, Covered, StopContext, Sure, ValueBelow, expected_coverage
@@ -262,9 +262,11 @@ def test_a_view_below_the_value_is_not_taken():
         (lambda: Covered(size=0.0), "size is 0.0"),
         (lambda: Budget(), "has no limit: give seconds or cost"),
         (lambda: Budget(seconds=0.0), "must be positive"),
-        (lambda: Sure().check(Coverage()), "Sure is about a class, but Coverage has no classifier"),
-        (lambda: PartsFound().check(Coverage()), "PartsFound is about parts, but Coverage has no segmenter"),
-        (lambda: PartsFound().check(ExpectedUtilityImprovement(segmenter((3, 3)))), "has no names for its parts"),
+        (lambda: Sure().check(planner_of(Coverage())), "Sure is about a class, but Coverage has no classifier"),
+        (lambda: PartsFound().check(planner_of(Coverage())), "PartsFound is about parts, but Coverage has no"),
+        (lambda: PartsFound().check(planner_of(ExpectedUtilityImprovement(segmenter((3, 3))))), "has no names for"),
+        (lambda: Identified().check(planner_of(Coverage())), "Identified is about known parts, but the planner knows"),
+        (lambda: (Budget(1.0) | Placed(0.1)).check(planner_of(Coverage())), "Placed is about known parts"),
     ],
 )
 def test_bad_input_is_named(make, message):
