@@ -13,6 +13,7 @@ from jaxnbv.scanning.sdf import solid_of_mesh
 
 EYE, NOWHERE, SPHERE = np.eye(4), np.zeros((0, 3)), np.asarray(nbv.geometry.fibonacci_sphere(30), np.float64)
 TRIANGLE, FACE, TABLE = np.eye(3), np.array([[0, 1, 2]]), nbv.sdf.HalfSpace([0.0, -0.5, 0.0], [0.0, 1.0, 0.0])
+BESIDE = nbv.sdf.Sphere(0.5).translate((1.0, 0.0, 0.0))
 BANK = nbv.ShapeBank.of([nbv.sdf.Sphere(0.5)] * 4)
 SKEWED = [[100.0, 3.0, 30.0], [0.0, 100.0, 20.0], [0.0, 0.0, 1.0]]
 MIRRORED = [[-100.0, 0.0, 30.0], [0.0, 100.0, 20.0], [0.0, 0.0, 1.0]]
@@ -145,11 +146,16 @@ SURFACES = [
     (lambda: nbv.surfaces.EmptySpace(noise=-1.0), "noise of the values is -1.0"),
     (lambda: nbv.surfaces.OutsideBoundary(nbv.Box.cube(4.0)), "coordinate of 2"),
     (lambda: nbv.surfaces.OutsideBoundary(nbv.Box((1.0, 1.0, 1.0), (1.2, 1.2, 1.2))), "must enclose the origin"),
+    (lambda: nbv.surfaces.OutsideBoundary(BESIDE), "must enclose the origin, whose distance is 0.5"),
+    (
+        lambda: nbv.SurfaceSampler(carving=nbv.Carving(BESIDE)).with_bank(BANK, nbv.surfaces.FreeRotation()),
+        "must enclose the origin, whose distance is 0.5",
+    ),
     (lambda: nbv.surfaces.FreeRotation(scale=(0.0, 1.0)), "the scales are"),
     (lambda: nbv.surfaces.FreeRotation(scale=(2.0, 1.0)), "the scales are"),
     (lambda: nbv.surfaces.Upright((0.0, 0.0, 0.0)), "the vertical is zero"),
     (lambda: nbv.surfaces.Upright(within=4.0), "within 4.0 rad"),
-    (lambda: nbv.surfaces.KnownShapes(BANK, num_starts=0), "number of starts is 0"),
+    (lambda: nbv.surfaces.KnownShapes(BANK, num_starts=0), "num_starts is 0"),
     (lambda: nbv.surfaces.KnownShapes(BANK, inverse_temperature=-1.0), "inverse_temperature is -1.0"),
     (lambda: nbv.ShapeBank.of([nbv.sdf.Sphere(1.0), nbv.sdf.Cuboid([1.0, 1.0, 1.0])]), "of 2 kinds, such as numbers"),
     (lambda: nbv.ShapeBank.of([nbv.sdf.Sphere(1.0)], ["a", "b"]), "2 names for 1 solids"),

@@ -112,7 +112,8 @@ def ray_interval(
 def boundary_points(volume: Volume, count: int, level: float = 0.0) -> Float[Array, "count 3"]:
     """Return points where `count` evenly spread rays from the origin cross the boundary of a volume.
 
-    Bisection between the origin and a sphere beyond the scene finds one crossing per ray, even if there are more.
+    Bisection between the origin and a sphere beyond the scene finds one crossing per ray, even if there are more. The
+    volume must enclose the origin, see `check_encloses_origin`.
 
     - `level`: value of the volume's function at the returned points, in scene units; positive for points outside.
     """
@@ -130,8 +131,22 @@ def boundary_points(volume: Volume, count: int, level: float = 0.0) -> Float[Arr
 
 
 def bounding_box(volume: Volume) -> Box:
-    """Return the bounding box of a volume's boundary points along 1,000 rays, or a `Box` unchanged."""
+    """Return the bounding box of a volume's boundary points along 1,000 rays, or a `Box` unchanged.
+
+    **Raises:** `ValueError` if the volume is no `Box` and does not enclose the origin.
+    """
     if isinstance(volume, Box):
+def check_encloses_origin(volume: Volume) -> None:
+    """Raise `ValueError` if the origin is not inside the volume, as `boundary_points` needs it to be."""
+    distance = float(volume(jnp.zeros((1, 3)))[0])
+    require(
+        distance < 0,
+        f"the volume {volume} must enclose the origin, whose distance is {distance:.4g}: move the scene, so that the "
+        "origin lies inside",
+    )
+
+
         return volume
     points = np.asarray(boundary_points(volume, 1000), np.float64)
     return Box(np.min(points, axis=0), np.max(points, axis=0))
+    check_encloses_origin(volume)

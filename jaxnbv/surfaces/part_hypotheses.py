@@ -1,4 +1,6 @@
-"""Weighted hypotheses about which known part the object is, and where, carried from view to view."""
+"""Weighted hypotheses, carried from view to view: which known part the object is, and where it is."""
+
+import dataclasses
 
 import equinox as eqx
 import jax
@@ -28,16 +30,18 @@ class PartHypotheses(eqx.Module):
     """Parts of a bank, each with a placement, the most likely first.
 
     - `bank`: the parts at true size, in scene units.
-    - `placed`: part and placement of each hypothesis. If several placements give a part the same surface, only one of
-      them has a weight above zero.
+    - `placed`: part, placement and misfit of each hypothesis. If several placements give a part the same surface, only
+      one of them has a finite misfit, and a weight above zero.
     - `weights`: probability of each hypothesis, followed by the probability of "none of these".
     - `tau`: scale of the distances from measured points to the surface, in scene units, see `part_evidence`.
+    - `misfit_of_none`: misfit of "none of these", comparable with the misfits of `placed`.
     """
 
     bank: ShapeBank
     placed: Hypotheses
     weights: Float[Array, " h_and_none"]
     tau: Float[Array, ""]
+    misfit_of_none: Float[Array, ""]
 
     def surfaces(self, grid: Grid, count: int) -> GridSurface:
         """Return the first `count` placed parts as surfaces on a grid, along a leading axis."""
@@ -104,8 +108,8 @@ def _weigh(bank: ShapeBank, hypotheses: Hypotheses, rays: Rays | None) -> PartHy
     misfit = jnp.where(hypotheses.is_distinct, misfit, jnp.inf)
     weights = jax.nn.softmax(-jnp.append(misfit, misfit_of_none))
     order = jnp.argsort(misfit, stable=True)
-    hypotheses = jax.tree.map(lambda rows: rows[order], hypotheses)
-    return PartHypotheses(bank, hypotheses, jnp.append(weights[:-1][order], weights[-1]), tau)
+    placed = jax.tree.map(lambda rows: rows[order], dataclasses.replace(hypotheses, misfit=misfit))
+    return PartHypotheses(bank, placed, jnp.append(weights[:-1][order], weights[-1]), tau, misfit_of_none)
 
 
 @program

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 from jaxnbv.checks import InputError, check_fields, check_type, is_traced, native, own_settings, require, short_text
 from jaxnbv.geometry.cloud import farthest_point_subsample
 from jaxnbv.geometry.farthest_points import farthest_point_indices
-from jaxnbv.geometry.volume import Box, Volume, boundary_points, bounding_box
+from jaxnbv.geometry.volume import Box, Volume, boundary_points, bounding_box, check_encloses_origin
 from jaxnbv.observations import Observations
 from jaxnbv.surfaces.base import HALF_WIDTH
 
@@ -113,15 +113,16 @@ class OutsideBoundary(ValueSource):
             return
         with jax.ensure_compile_time_eval():
             try:
+                check_encloses_origin(self.volume)
                 bounds = bounding_box(self.volume)
                 largest = float(np.abs([bounds.low, bounds.high]).max())
-                distance = float(self.volume(jnp.zeros((1, 3)))[0])
+            except InputError:
+                raise
             except Exception as error:
                 raise InputError(
                     f"the volume {short_text(self.volume)} gives no signed distances of points (n, 3) ({error}): "
                     "give a Box or a solid of jaxnbv.sdf"
                 ) from error
-        require(distance < 0, f"the volume {self.volume} must enclose the origin, whose distance is {distance:.4g}")
         require(
             largest <= HALF_WIDTH,
             f"the boundary of {self.volume} has a coordinate of {largest:.4g}: it must lie within the scene, "

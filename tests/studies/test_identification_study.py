@@ -150,7 +150,7 @@ def hypotheses_of(task, part, turn=None, none=0.0):
     rotation = task.rotation if turn is None else task.rotation @ turn
     placement = Placement(*(jnp.asarray(row, jnp.float32)[None] for row in (rotation, task.shift, np.ones(3))))
     placed = Hypotheses(jnp.asarray([part]), placement, jnp.zeros(1), jnp.ones(1, bool))
-    return PartHypotheses(task.bank, placed, jnp.asarray([1.0 - none, none]), jnp.asarray(0.03))
+    return PartHypotheses(task.bank, placed, jnp.asarray([1.0 - none, none]), *2 * [jnp.asarray(0.03)])
 
 
 def test_the_measures_accept_only_the_truth_and_its_symmetries(folder):
@@ -187,7 +187,7 @@ def test_tied_names_share_the_right_answer(folder):
     both = jax.tree.map(lambda row: jnp.concatenate([row, row]), alone.placed)
     both = dataclasses.replace(both, shape=jnp.asarray([(task.part + 1) % 3, task.part]))
     for weights, right in (([0.45, 0.45], 0.5), ([0.4, 0.5], 1.0), ([0.5, 0.4], 0.0)):
-        hypotheses = PartHypotheses(task.bank, both, jnp.asarray([*weights, 0.1]), jnp.asarray(0.03))
+        hypotheses = PartHypotheses(task.bank, both, jnp.asarray([*weights, 0.1]), *2 * [jnp.asarray(0.03)])
         measures = study._view_record(truth, hypotheses)
         assert measures["right"] == right
 

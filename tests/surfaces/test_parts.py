@@ -204,6 +204,18 @@ def test_a_part_is_named_and_placed(seen):
     assert surface_error(backwards, seen[1]) == pytest.approx(error, rel=1e-5)
 
 
+def test_misfits_are_comparable_with_none_of_these(seen):
+    """Weights are proportional to exp(-misfit), with and without rays."""
+    bare = dataclasses.replace(seen[0], looks=None)
+    bare_hypotheses = identify(BANK, nbv.surfaces.FreeRotation(), nbv.Box(), bare, None)
+    sampler = nbv.SurfaceSampler(grid=GRID).with_bank(BANK, nbv.surfaces.FreeRotation())
+    for observations in (seen[0], dataclasses.replace(bare, hypotheses=bare_hypotheses)):
+        listed = sampler.posterior(observations).hypotheses
+        misfits = np.array([one.misfit for one in listed])
+        energy = np.exp(misfits.min() - misfits)
+        assert [one.weight for one in listed] == pytest.approx(energy / energy.sum(), abs=1e-4)
+
+
 def test_the_pose_is_of_the_world_and_of_the_mesh(seen):
     """In a rotated, shifted and scaled world the same matrix follows by composition."""
     frame = nbv.Frame(scale=5.0, center=(1.0, 2.0, 3.0), up="z")
@@ -286,7 +298,7 @@ def test_covariance_of_a_ball():
     """Nothing determines the rotation of a ball. Its position is determined by the points, each along its normal."""
     observations = observations_of(nbv.SDFSurface(Sphere(0.8)), [(0.0, 0.0, 3.0), (0.0, 0.0, -3.0)], noise=0.02)
     bank = nbv.ShapeBank.of([Sphere(0.8)], is_true_size=True)
-    hypotheses = PartHypotheses(bank, placed([0], [still()]), jnp.array([1.0, 0.0]), jnp.asarray(0.03))
+    hypotheses = PartHypotheses(bank, placed([0], [still()]), jnp.array([1.0, 0.0]), *2 * [jnp.asarray(0.03)])
     covariance = object_pose(hypotheses, observations, nbv.Frame()).covariance
     assert np.diag(covariance)[:3] == pytest.approx(np.pi**2 / 3.0, rel=1e-3)
     # Least squares by the normals of the points. Farthest point sampling prefers points with large errors.
