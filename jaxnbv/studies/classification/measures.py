@@ -16,7 +16,7 @@ from jaxnbv.studies.engine.measures import SECONDS, Measure, Record
 # A view shows the cue if at least this many of its rays hit the cue.
 CUE_PIXELS = 150
 # Methods that maximise expected cross-entropy, so that their values can be compared.
-_BY_CROSS_ENTROPY = ("cross-entropy", "halving", "gradient-2dof", "gradient-constrained", "hybrid")
+_BY_CROSS_ENTROPY = ("cross-entropy", "tie-break", "halving", "gradient-2dof", "gradient-constrained", "hybrid")
 
 
 def first_hits(correct: Bool[np.ndarray, "runs views"]) -> Bool[np.ndarray, "runs views"]:

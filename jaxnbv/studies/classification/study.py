@@ -19,6 +19,7 @@ from jaxnbv.planning.loop import Sensor, Step
 from jaxnbv.planning.planner import Planner
 from jaxnbv.programs import program
 from jaxnbv.readers import MeshFile, class_meshes
+from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning import Grid, SensorNoise
 from jaxnbv.search import CandidateSearch, Problem, Proposal, Search, TieBreakSearch
 from jaxnbv.search.base import Scores, best_unvisited
@@ -34,6 +35,8 @@ from jaxnbv.studies.scenes.class_object import ClassMesh, scan_cue, surface_of
 from jaxnbv.tasks import Coverage, CrossEntropy, EntropyReduction, MixedEntropy
 from jaxnbv.tasks.classification import AnyClassifier, ClassAcquisition, Classifier, as_classifier
 
+# Seed of the noise in the candidates' scans. It is not `Study.seed`, because published records were made with this one.
+_NOISE_SEED = 3
 # Number of runs of random search in each scene.
 _NUM_RANDOM_RUNS = 8
 OTHERS = ("coverage", *BASELINES)
@@ -76,7 +79,8 @@ class OracleView(CandidateSearch):
 class ClassificationStudy(Study):
     """Base class of studies that measure how many views a method needs to tell the class of an object.
 
-    It has the settings of `Study`, and:
+    The noise in scans from the candidates does not depend on `seed`. With the model `known`, the known shapes are those
+    of the shipped `bank`, also for scenes of `meshes`. The study has the settings of `Study`, and:
 
     - `classifier`: classifier of the cloud after each view, in scene coordinates.
     - `imagined_classifier`: classifier of the cloud joined with an imagined scan; default: `classifier`. A classifier
@@ -198,7 +202,7 @@ class ClassificationStudy(Study):
 
         **Raises:** `ValueError` if there is no mesh with this index, or if the mesh cannot be read.
         """
-        keys = jax.random.split(jax.random.fold_in(jax.random.key(3), index), self.num_candidates)
+        keys = jax.random.split(jax.random.fold_in(jax.random.key(_NOISE_SEED), index), self.num_candidates)
         file = self.mesh_file(index)
         class_object: ClassObject | ClassMesh
         if file is None:
@@ -228,6 +232,10 @@ class ClassificationStudy(Study):
         if self.first is FirstView.ANY or not is_enough:
             return is_enough
         return int(_classify(self.classifier, scan).argmax()) != scene.task.label
+
+    def sampler_of(self, scene: Scene) -> SurfaceSampler:
+        """Return the study's sampler. Its known shapes, if any, are not the study's meshes."""
+        return self.sampler
 
     def acquisition(self, method: str, scene: Scene) -> Acquisition:
         kind = _ACQUISITIONS.get(method, CrossEntropy)

@@ -130,11 +130,12 @@ class Study(eqx.Module):
         - `model`: name of the surface model. With the model `known` and `meshes`, the bank of each scene holds all
           meshes except the scene's own.
         - `quick`: whether to use the settings `Study.quick`.
-        - `options`: other settings, which override `Study.quick`. `meshes` is a folder, see `files_in`.
+        - `options`: other settings, which override `Study.quick`. `meshes` is a folder, see `files_in`, or the files.
 
         **Raises:** `ValueError` as `files_in` and `study_sampler` do.
         """
-        files = cls.files_in(options.pop("meshes")) if "meshes" in options else ()
+        meshes = options.pop("meshes", ())
+        files = meshes if isinstance(meshes, tuple) else cls.files_in(meshes)
         settings = {"sampler": study_sampler(model, cls.bank, files, quick=quick), "meshes": files}
         return {"": cls(views=views, **settings | (dict(cls.quick) if quick else {}) | options)}
 

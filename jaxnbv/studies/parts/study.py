@@ -58,8 +58,8 @@ class MeshPartStudy(PartDiscoveryStudy):
 
     @classmethod
     def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
-        room = max(len(read_nodes(file.path)) for file in cls.files_in(options["meshes"]))
-        return super().configured(model, views, quick, room=room, **options)
+        counts = _part_counts(options.pop("meshes"))
+        return super().configured(model, views, quick, meshes=tuple(counts), room=max(counts.values()), **options)
 
     @classmethod
     def files_in(cls, folder: str | Path) -> tuple[MeshFile, ...]:
@@ -69,13 +69,7 @@ class MeshPartStudy(PartDiscoveryStudy):
 
         **Raises:** `ValueError` if there is no such mesh, or if a mesh cannot be read.
         """
-        by_class: dict[str, list[MeshFile]] = {}
-        for file in mesh_files(folder):
-            if len(read_nodes(file.path)) > 1:
-                kind = Path(file.path).parent.name
-                by_class.setdefault(kind, []).append(file._replace(name=f"{kind} {file.name}"))
-        require(len(by_class) > 0, f"the folder {folder} holds no mesh of two nodes or more: each part must be a node")
-        return tuple(interleave(by_class.values()))
+        return tuple(_part_counts(folder))
 
     def scene(self, index: int) -> Scene:
         """Return the scene of a mesh file. Its `task` is a `PartMesh`."""
@@ -108,6 +102,17 @@ class MeshPartStudy(PartDiscoveryStudy):
         names = scene.task.parts.names
         category = Path(self.meshes[scene.index].path).parent.name
         return {"name": scene.name, "category": category, "parts": [names[part] for part in truth], "of": len(names)}
+
+
+def _part_counts(folder: str | Path) -> dict[MeshFile, int]:
+    """Return the number of nodes of each mesh of `MeshPartStudy.files_in`. Each file is read once."""
+    by_class: dict[str, list[tuple[MeshFile, int]]] = {}
+    for file in mesh_files(folder):
+        if (count := len(read_nodes(file.path))) > 1:
+            kind = Path(file.path).parent.name
+            by_class.setdefault(kind, []).append((file._replace(name=f"{kind} {file.name}"), count))
+    require(len(by_class) > 0, f"the folder {folder} holds no mesh of two nodes or more: each part must be a node")
+    return dict(interleave(by_class.values()))
 
 
 class PartStudy(PartDiscoveryStudy):

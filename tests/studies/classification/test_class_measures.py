@@ -48,9 +48,10 @@ def test_measures_of_a_hand_made_record():
     # The value of random search is no cross-entropy.
     assert measured(record, "value") == {}
     assert measured(record, "seconds") == {"median": pytest.approx(0.2)}
-    hybrid = made("hybrid", [run(0, 1, 1)], [])
-    assert measured(hybrid, "value") == {2: 2.0, 3: 1.0, 4: 1.0}
-    assert measured(hybrid, "seen") == []
+    for method in ("hybrid", "tie-break"):
+        whole = made(method, [run(0, 1, 1)], [])
+        assert measured(whole, "value") == {2: 2.0, 3: 1.0, 4: 1.0}
+        assert measured(whole, "seen") == []
 
 
 @pytest.mark.parametrize(("angle", "least"), [(80.0, "000"), (110.0, "110"), (139.9, "110"), (179.0, "140")])

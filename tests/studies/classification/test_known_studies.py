@@ -9,7 +9,7 @@ import jaxnbv as nbv
 from jaxnbv.cli.registry import STUDY_MODELS
 from jaxnbv.sampler import MODELS
 from jaxnbv.storage import describe
-from jaxnbv.studies.classification.objects import PyramidStudy
+from jaxnbv.studies.classification.objects import HouseholdStudy, PyramidStudy
 from jaxnbv.studies.engine.measures import KNOWN
 from jaxnbv.studies.engine.run import methods_of
 from jaxnbv.studies.heat import HeatStudy
@@ -63,6 +63,14 @@ def test_each_mesh_is_planned_with_a_bank_of_the_others(tmp_path, monkeypatch):
     assert study.planner("coverage", study.scene(1)).sampler.model.bank.names == ("box0 0", "box2 2")
     plain = configured(HeatStudy, "paper", meshes=tmp_path)
     assert plain.sampler_of(plain.scene(1)) == plain.sampler
+
+
+def test_classes_of_meshes_are_planned_with_the_whole_shipped_bank(tmp_path):
+    (tmp_path / "bathtub").mkdir()
+    trimesh.creation.box((1.0, 0.5, 0.4)).export(tmp_path / "bathtub" / "bathtub.ply")
+    study = configured(HouseholdStudy, KNOWN, meshes=tmp_path)
+    # With the index of its scene, the mesh has the name of a shape of the bank.
+    assert "bathtub 0" in study.planner("cross-entropy", study.scene(0)).sampler.model.bank.names
 
 
 def test_a_planner_without_its_bank_equals_one_that_had_none():

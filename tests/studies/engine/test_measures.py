@@ -10,7 +10,7 @@ from PIL import Image
 from toy import ToyStudy
 
 from jaxnbv.checks import InputError
-from jaxnbv.studies.engine.chart import chart
+from jaxnbv.studies.engine.chart import LOOKS, chart
 from jaxnbv.studies.engine.measures import Claim, Measure
 from jaxnbv.studies.engine.results import results, summary, tables, verdicts
 from jaxnbv.studies.registry import studies
@@ -99,6 +99,10 @@ def test_the_chart_shows_every_method(scenes):
     image = np.asarray(Image.open(io.BytesIO(chart(results(RECORDS[:scenes], ToyStudy), ToyStudy))).convert("RGB"))
     for colour in ([0x00, 0x72, 0xB2], [0x7A, 0x84, 0x94]):
         assert (np.abs(image.astype(int) - colour).sum(axis=-1) < 6).sum() > 200
+
+
+def test_each_main_method_has_a_look_of_its_own():
+    assert {entry.load().reference for entry in studies().values()} <= LOOKS.keys()
 
 
 COLUMNS = ["quantity", "method", "lead", "lead_low", "lead_high", "at", "group"]

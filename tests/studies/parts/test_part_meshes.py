@@ -11,8 +11,10 @@ from jaxnbv.geometry.camera import Camera
 from jaxnbv.geometry.cloud import PointCloud
 from jaxnbv.sampler import SurfaceSampler
 from jaxnbv.scanning import Grid, load_parts
+from jaxnbv.scanning.mesh_files import read_nodes
 from jaxnbv.studies.engine.pictures import write_pictures
 from jaxnbv.studies.engine.run import replay, run_scene
+from jaxnbv.studies.parts import study as parts_study
 from jaxnbv.studies.parts.discovery import NearestPart
 from jaxnbv.studies.parts.study import MeshPartStudy, PartStudy
 from jaxnbv.surfaces import GeometricSPSR
@@ -104,8 +106,11 @@ def test_it_asks_for_the_parts_that_can_be_seen_and_counts_their_points(folder, 
         study.scene(2)
 
 
-def test_the_command_takes_a_folder(folder, tmp_path):
+def test_the_command_takes_a_folder_and_reads_each_file_once(folder, monkeypatch):
+    paths = []
+    monkeypatch.setattr(parts_study, "read_nodes", lambda path: paths.append(path) or read_nodes(path))
     (study,) = PartStudy.configured("screened", 3, quick=True, meshes=folder).values()
+    assert len(paths) == len(set(paths)) == 3
     assert isinstance(study, MeshPartStudy)
     assert study.room == 3
     assert study.num_candidates == PartStudy.quick["num_candidates"]
