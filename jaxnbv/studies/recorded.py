@@ -139,11 +139,14 @@ class RecordedStudy(Study):
 
     @classmethod
     def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
-        """Return the study of one recording, under the name "". Voxels have 1/80 of the box's longest side.
+        """Return the study of one recording, under the name "".
+
+        By default, voxels have 1/80 of the box's longest side.
 
         - `options`: settings of `RecordedStudy`, except that `box` is two corners as six numbers; default: `bounds_of`.
 
-        **Raises:** `ValueError` if the model has known shapes, or if `options` holds `num_candidates`.
+        **Raises:** `ValueError` if the model has known shapes, or if `options` holds `num_candidates`. `TypeError` for
+        an option that is no setting.
         """
         require(
             "num_candidates" not in options,
@@ -151,14 +154,14 @@ class RecordedStudy(Study):
             "the recording: leave it out",
         )
         require(model in MODELS, f"a recording has no known shapes: give one of the models {', '.join(MODELS)}")
-        folder = str(Path(options["folder"]).resolve())
-        sensor: dict[str, Any] = {name: options.get(name) for name in ("up", "intrinsics", "depth_scale")}
+        folder = str(Path(options.pop("folder")).resolve())
+        sensor: dict[str, Any] = {name: options.pop(name, None) for name in ("up", "intrinsics", "depth_scale")}
         frames = RecordedFrames(folder, **sensor)
-        corners = options.get("box") or bounds_of(frames)
+        corners = options.pop("box", None) or bounds_of(frames)
         box = Box(corners[:3], corners[3:])
         longest = float(np.max(box.high - box.low))
-        settings = dict(cls.quick) if quick else {"num_samples": 8, "grid_resolution": 100, "capacity": 2000}
-        settings |= {name: options[name] for name in settings.keys() & options.keys()}
+        settings: dict[str, Any] = {"voxel": longest / _VOXELS_ALONG_BOX}
+        settings |= cls.quick if quick else {"num_samples": 8, "grid_resolution": 100, "capacity": 2000}
         study = cls(
             views=views,
             num_candidates=len(frames),
@@ -166,9 +169,8 @@ class RecordedStudy(Study):
             camera=frame_of_box(box).to_scene(frames.camera.strided(stride_of(frames.camera))),
             folder=folder,
             box=box,
-            voxel=longest / _VOXELS_ALONG_BOX,
             **sensor,
-            **settings,
+            **settings | options,
         )
         return {"": study}
 

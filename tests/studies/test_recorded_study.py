@@ -46,6 +46,12 @@ def test_the_default_box_is_around_what_was_seen(study):
     assert [*box.low, *box.high] == bounds_of(nbv.readers.RecordedFrames(study.folder))
 
 
+def test_settings_are_used_and_unknown_options_refused(study):
+    assert configured(study.folder, num_starts=7, voxel=0.05).num_starts == 7
+    with pytest.raises(TypeError, match="num_start"):
+        configured(study.folder, num_start=7)
+
+
 @pytest.fixture(scope="module")
 def record(study):
     # The other methods have searches of all studies, and each compiles its own planner.
