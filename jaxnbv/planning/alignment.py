@@ -92,18 +92,12 @@ class Alignment(eqx.Module):
         True if a view's disagreement exceeds three times the noise, and either poses were corrected or the views do not
         determine all of the mount's error.
         """
-        exceeds_noise = bool(np.any(self.disagreement > _DISAGREEMENT_RATIO * self.noise))
-        return exceeds_noise and (self.is_corrected or not self.is_determined)
+        return _exceeds(self.disagreement, self.noise) and (self.is_corrected or not self.is_determined)
 
     @property
     def is_corrected(self) -> bool:
         """Whether any pose is corrected."""
         return bool(np.any(self.corrections != np.eye(4)))
-
-    @property
-    def errors(self) -> tuple[Float[np.ndarray, " views"], Float[np.ndarray, " views"]]:
-        """Rotation angle (radians) and length of the shift of each view's correction."""
-        return errors_of(self.corrections)
 
     @property
     def motion(self) -> str:
@@ -170,11 +164,11 @@ def align_views(clouds: Sequence[PointCloud], poses: Sequence[Pose]) -> Alignmen
     is_determined = bool(values[0] > _MIN_EIGENVALUE_RATIO * values[-1])
     corrections, is_mount, corrected = identities, True, disagreement
     candidate, _ = _disagreement(views, pairs, mount, median_distance)
-    exceeds_noise = bool(np.any(disagreement > _DISAGREEMENT_RATIO * noise))
+    exceeds_noise = _exceeds(disagreement, noise)
     is_improved = _MIN_IMPROVEMENT * _median(candidate) < _median(disagreement)
     if exceeds_noise and is_improved and _is_plausible(mount, median_distance):
         corrections, corrected = mount, candidate
-    if exceeds_noise and len(views) > 2 and np.any(corrected > _DISAGREEMENT_RATIO * noise):
+    if exceeds_noise and len(views) > 2 and _exceeds(corrected, noise):
         separate = _solve_corrections(views, pairs, identities, median_distance, is_mount=False)
         candidate, _ = _disagreement(views, pairs, separate, median_distance)
         if _is_plausible(separate, median_distance) and _MIN_IMPROVEMENT * np.nanmax(candidate) < np.nanmax(corrected):
@@ -201,6 +195,10 @@ def _in_camera(cloud: PointCloud, pose: Pose) -> _View:
     """Return a view with a random subset of a cloud's points, in the coordinates of the camera."""
     points, normals = (rows.astype(np.float64) for rows in cloud.to_numpy())
     rows = np.random.default_rng(0).permutation(len(points))[:_MAX_POINTS]
+def _exceeds(disagreement: Float[np.ndarray, " views"], noise: float) -> bool:
+    return bool(np.any(disagreement > _DISAGREEMENT_RATIO * noise))
+
+
     matrix = np.asarray(pose.to_matrix(), np.float64)
     return _View((points[rows] - matrix[:3, 3]) @ matrix[:3, :3], normals[rows] @ matrix[:3, :3], matrix)
 

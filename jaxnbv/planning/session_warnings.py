@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from jaxnbv.geometry.frame import Frame
 from jaxnbv.geometry.volume import Box
-from jaxnbv.planning.alignment import Alignment
+from jaxnbv.planning.alignment import Alignment, errors_of
 from jaxnbv.planning.table import plane_of
 from jaxnbv.scanning import Obstacles
 
@@ -70,7 +70,7 @@ def warn_of_no_table(up: str, others: tuple[str, ...]) -> None:
 
 def warn_of_mount(alignment: Alignment) -> None:
     """Warn that views disagree. The alignment is in world units."""
-    angles, shifts = alignment.errors
+    angles, shifts = errors_of(alignment.corrections)
     worst = int(np.nanargmax(alignment.disagreement))
     error_text = f"off by {shifts.max():.2g} and {np.degrees(angles.max()):.2g} degrees"
     hint = "Session(correct_mount=True) uses the correction"

@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import LogNorm
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist
 
@@ -32,7 +31,7 @@ from jaxnbv.scanning.sdf import SignedDistance
 from jaxnbv.search import Search, SphereCandidates
 from jaxnbv.studies.engine.measures import KNOWN, SECONDS, Claim, Measure, Record
 from jaxnbv.studies.engine.study import Scene, Study
-from jaxnbv.studies.engine.tiles import ScenePicture, caption_tile, opposite_direction, render_mesh
+from jaxnbv.studies.engine.tiles import ERRORS, ScenePicture, caption_tile, opposite_direction, render_mesh
 from jaxnbv.studies.scenes.framing import Setup
 from jaxnbv.studies.scenes.placed_parts import PlacedPart, confusable_parts, parts_in, place_part
 from jaxnbv.surfaces.part_hypotheses import NONE, PartHypotheses
@@ -56,8 +55,6 @@ _NUM_POINTS, _NUM_DENSE_POINTS = 500, 20_000
 _MAX_POSE_ERROR = 0.01
 # Names count as tied if their weights are at least this fraction of the largest weight.
 _TIE_RATIO = 0.99
-# Colour scale of distances to the true part, in scene units.
-_ERRORS = LogNorm(0.01, 0.5)
 _Truth = tuple[PlacedPart, Float[np.ndarray, "n 3"], float]
 
 
@@ -257,10 +254,10 @@ class IdentificationStudy(Study):
             run = runs[method]
             part, rotation, shift = (run["most_likely"][view][name] for name in ("part", "rotation", "shift"))
             mesh = task.placed_mesh(part, np.asarray(rotation), np.asarray(shift))
-            axes.imshow(render_mesh(mesh, eye, pixels, lambda points: tree.query(points)[0], _ERRORS).image)
+            axes.imshow(render_mesh(mesh, eye, pixels, lambda points: tree.query(points)[0]).image)
             caption_tile(axes, f"{run['named'][view]}, {run['p_true'][view]:.2f}", is_correct=run["right"][view] == 1)
 
-        scale = ScalarMappable(_ERRORS, DEVIATION), "distance to the true part\n(scene units)"
+        scale = ScalarMappable(ERRORS, DEVIATION), "distance to the true part\n(scene units)"
         caption = "The likeliest part as placed, its name, and the probability of the true name."
         return ScenePicture(
             caption, tile, lambda axes: axes.imshow(render_mesh(true_mesh, eye, pixels).image), scale=scale

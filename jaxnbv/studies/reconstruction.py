@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import LogNorm
 from scipy.spatial import cKDTree
 
 from jaxnbv.acquisition import Acquisition
@@ -26,15 +25,13 @@ from jaxnbv.studies.engine.measures import Claim, Measure, Record
 from jaxnbv.studies.engine.run import replay
 from jaxnbv.studies.engine.searches import BASELINES
 from jaxnbv.studies.engine.study import Scene, Study
-from jaxnbv.studies.engine.tiles import ScenePicture, caption_tile, opposite_direction, render_mesh
+from jaxnbv.studies.engine.tiles import ERRORS, ScenePicture, caption_tile, opposite_direction, render_mesh
 from jaxnbv.studies.scenes import Split, part_scene
 from jaxnbv.tasks import Coverage, NewSurface
 from jaxnbv.viz.style import DEVIATION
 
 POISSON, MEAN = "screened Poisson", "posterior mean"
 RECONSTRUCTIONS = (POISSON, MEAN)
-# Colour scale of distances to the true surface (scene units), from the sensor noise to 1/5 of the object's size.
-_ERRORS = LogNorm(0.01, 0.5)
 # Number of points on the true surface to which pictures measure distances.
 _NUM_DENSE_POINTS = 200_000
 
@@ -148,12 +145,12 @@ class ReconstructionStudy(Study):
             mesh = reconstruct(sampler, last_observations[method], names[column])
             if mesh is None:
                 raise InputError(f"the records hold {names[column]}: to draw it again, {install('poisson')}")
-            rendering = render_mesh(mesh, eye, pixels, lambda points: tree.query(points)[0], _ERRORS)
+            rendering = render_mesh(mesh, eye, pixels, lambda points: tree.query(points)[0])
             axes.imshow(rendering.image, interpolation="antialiased")
             distances = results[method][names[column]]
             caption_tile(axes, f"CD {distances['chamfer']:.3f}, HD {distances['hausdorff']:.3f}")
 
-        scale = ScalarMappable(_ERRORS, DEVIATION), "distance to the true surface\n(scene units)"
+        scale = ScalarMappable(ERRORS, DEVIATION), "distance to the true surface\n(scene units)"
         return ScenePicture(
             "", tile, lambda axes: axes.imshow(render_mesh(truth, eye, pixels).image), names, scale=scale
         )

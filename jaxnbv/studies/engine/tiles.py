@@ -17,6 +17,8 @@ from jaxnbv.viz.render import Still
 from jaxnbv.viz.style import GREY
 
 _CORRECT_COLOUR = "#00734f"
+# Colour scale of distances to a true surface (scene units), from the sensor noise to 1/5 of the object's size.
+ERRORS = LogNorm(0.01, 0.5)
 # In scene units: longest edge of the triangles in a rendered image (short, because colours are given at vertices), and
 # radius of the ball that the image shows.
 _MAX_EDGE, _IMAGE_RADIUS = 0.05, 1.6
@@ -62,18 +64,17 @@ def render_mesh(
     eye: Float[np.ndarray, "3"],
     size: int,
     value: Callable[[np.ndarray], Float[np.ndarray, " n"]] | None = None,
-    norm: LogNorm | None = None,
 ) -> Still:
     """Render a mesh, seen from the direction `eye`, in an image of `size` x `size` pixels.
 
-    - `value`: function from points to values, which colour the surface on the scale `norm`; default: one colour. Values
-      below 1e-6 count as 1e-6.
+    - `value`: function from points to values, which colour the surface on the scale `ERRORS`; default: one colour.
+      Values below 1e-6 count as 1e-6.
     """
     vertices, faces = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, _MAX_EDGE, max_iter=12)
     fine = trimesh.Trimesh(vertices, faces)
     values = np.ones(len(fine.vertices)) if value is None else np.maximum(value(fine.vertices), 1e-6)
     surface = MeanSurface(np.asarray(fine.vertices), np.asarray(fine.faces), np.asarray(fine.vertex_normals), values)
-    return Still(eye, surface, size, _IMAGE_RADIUS, norm)
+    return Still(eye, surface, size, _IMAGE_RADIUS, None if value is None else ERRORS)
 
 
 def draw_on(
