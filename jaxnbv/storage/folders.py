@@ -14,7 +14,7 @@ import filelock
 import jax
 import numpy as np
 
-from jaxnbv.checks import InputError, require
+from jaxnbv.checks import InputError, require, short_text
 from jaxnbv.scanning.triangle_rays import tracer
 from jaxnbv.storage.files import PARTS, make_folder, write_text, write_whole
 
@@ -23,7 +23,6 @@ _LOCK = ".lock"
 ARRAYS = "arrays.npz"
 # Largest size of a file of arrays after unpacking, in bytes. Sixteen million rays fit, far more than a camera has.
 MAX_ARRAY_BYTES = 2**29
-_MAX_TEXT_LENGTH = 60
 
 
 def software() -> dict[str, str]:
@@ -50,13 +49,7 @@ def differences(stored: Any, current: Any, name: str = "") -> list[str]:
         keys = list(dict.fromkeys([*stored, *current]))
         nested = (differences(stored.get(key), current.get(key), f"{name}.{key}".lstrip(".")) for key in keys)
         return [difference for group in nested for difference in group]
-    return [] if stored == current else [f"{name}: {_short(stored)} there, {_short(current)} now"]
-
-
-def _short(value: Any) -> str:
-    """Return the beginning of a value's text, which may be the source of a function."""
-    text = str(value)
-    return text if len(text) <= _MAX_TEXT_LENGTH else f"{text[:_MAX_TEXT_LENGTH]}..."
+    return [] if stored == current else [f"{name}: {short_text(stored)} there, {short_text(current)} now"]
 
 
 def check_format(format: Any, supported: int, file: Path) -> None:
@@ -159,7 +152,7 @@ class ResultFolder:
     - `arrays`: contents of the configuration's large arrays, keyed by hash. They are stored in arrays.npz.
 
     Subclasses define the `kind` of results (the record is the file `kind`.json), the `pattern` of the names of result
-    files, and the number of the `format`.
+    files, the number of the `format`, and whether a folder without a record may hold other files (`is_shared`).
 
     **Raises:** `ValueError` if the folder cannot be created, holds results of a different configuration, or holds other
     files.
@@ -168,6 +161,7 @@ class ResultFolder:
     kind: str
     pattern: str
     format: int
+    is_shared: bool = False
 
     def __init__(
         self, path: str | Path, config: dict[str, Any], arrays: Mapping[str, np.ndarray] = MappingProxyType({})
@@ -215,7 +209,7 @@ class ResultFolder:
             names = sorted(entry.name for entry in self.path.iterdir())
             others = [name for name in names if name != _LOCK and not name.endswith(".partial")]
             require(
-                not others or self.kind == "study",
+                not others or self.is_shared,
                 f"the output folder {self.path} holds other files ({', '.join(others[:3])}): choose an empty folder",
             )
             return

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnbv.checks import InputError, require
-from jaxnbv.storage.description import describe, fields_of, is_installed, is_record, lookup, name_of
+from jaxnbv.storage.code import is_installed, lookup, name_of
+from jaxnbv.storage.description import describe, fields_of, is_record
 from jaxnbv.storage.folders import ARRAYS, check_format, differences, read_arrays, read_record
 
 # Modules of installed packages whose functions have no side effects. Functions of other packages might do anything.

@@ -40,7 +40,7 @@ def test_images_keep_their_pixels_and_only_for_their_session(tmp_path):
         np.testing.assert_array_equal(saved["matrix"], FIRST)
     config = json.loads((tmp_path / "session.json").read_text())["config"]
     assert config["box"]["low"]["values"] == list(BOX[0])
-    with pytest.raises(InputError, match=r"belongs to another session; it differs in up: z there, y now"):
+    with pytest.raises(InputError, match=r"belongs to another session; it differs in up: 'z' there, 'y' now"):
         session_of(tmp_path, up="y")
     file.write_bytes(file.read_bytes()[:-40])
     with pytest.raises(InputError, match=r"image_00\.npz is damaged .*restore it, or delete it and those after it"):

@@ -99,7 +99,7 @@ def test_a_finished_run_is_read_not_computed(finished, monkeypatch):
         ({"planner": planner_of(num_samples=4)}, r"planner\.sampler\.num_samples: 3 there, 4 now"),
         (
             {"planner": planner_of(FarthestView(12))},
-            r"planner\.search\.type: jaxnbv\.search\.discrete:DiscreteSearch there",
+            r"planner\.search\.type: 'jaxnbv\.search\.discrete:DiscreteSearch' there",
         ),
         ({"noise": SensorNoise(0.03)}, r"noise\.points: 0\.01 there, 0\.03 now"),
         ({"key": jax.random.key(9)}, r"key\.data: \[0, 0\] there, \[0, 9\] now"),
@@ -142,7 +142,7 @@ def test_a_folder_of_another_version_warns(finished, tmp_path):
     record = json.loads((folder / "episode.json").read_text())
     record["versions"]["jax"] = "0.0.1"
     (folder / "episode.json").write_text(json.dumps(record))
-    with pytest.warns(UserWarning, match=r"other versions \(jax: 0.0.1 there"):
+    with pytest.warns(UserWarning, match=r"other versions \(jax: '0.0.1' there"):
         run(folder, views=5)
 
 

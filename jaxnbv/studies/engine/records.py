@@ -35,7 +35,7 @@ class RecordFolder(ResultFolder):
     **Raises:** `ValueError` if the folder cannot be made, or if it holds records of a different configuration.
     """
 
-    kind, pattern, format = "study", "scene_*.json", _FORMAT
+    kind, pattern, format, is_shared = "study", "scene_*.json", _FORMAT, True
 
     def __init__(
         self,

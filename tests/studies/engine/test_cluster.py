@@ -139,7 +139,7 @@ def test_calls_are_made_and_errors_are_those_of_the_call(threads):
 def test_workers_that_differ_are_refused(threads, monkeypatch):
     monkeypatch.setattr(module, "_prepare", lambda: module.versions() | {"jax": "0.0.1", "cores": 77})
     with pytest.raises(
-        InputError, match=r"worker \w+://.* is unlike this process \(jax: 0.0.1 there, .*cores: 77 there"
+        InputError, match=r"worker \w+://.* is unlike this process \(jax: '0.0.1' there, .*cores: 77 there"
     ):
         Cluster(threads().scheduler_address)
     monkeypatch.undo()
