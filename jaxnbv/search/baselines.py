@@ -28,7 +28,7 @@ class RandomView(Baseline):
     """Baseline that proposes a candidate uniformly at random among those that are not excluded."""
 
     def quantity(self, acquisition: Acquisition) -> Quantity:
-        meaning = "a random number for each open candidate, whatever the surface."
+        meaning = "a random number for each candidate that is left, whatever the surface."
         return Quantity("lot drawn", "uniform on [0, 1)", meaning, smooth=False)
 
     def values(self, problem: Problem, candidates: Pose, key: PRNGKeyArray) -> Float[Array, " candidates"]:

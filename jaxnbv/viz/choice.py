@@ -25,7 +25,7 @@ _MIN_CANDIDATES = 12
 _MAX_LETTERS = 56
 
 
-def open_values(proposal: Proposal) -> Float[np.ndarray, " c"]:
+def candidate_values(proposal: Proposal) -> Float[np.ndarray, " c"]:
     """Return the values of a proposal's candidates, NaN for those that were excluded."""
     values = np.asarray(proposal.values, dtype=np.float64)
     return np.where(np.isfinite(values), values, np.nan)
@@ -33,7 +33,7 @@ def open_values(proposal: Proposal) -> Float[np.ndarray, " c"]:
 
 def descending_values(proposal: Proposal) -> Float[np.ndarray, " o"]:
     """Return the values of the candidates that were not excluded, the highest first."""
-    values = open_values(proposal)
+    values = candidate_values(proposal)
     return np.sort(values[~np.isnan(values)])[::-1]
 
 
@@ -52,9 +52,9 @@ def has_rings(proposal: Proposal) -> bool:
 
 
 def marks(*proposals: Proposal) -> list[str]:
-    """Return legend entries for the optional marks (visited, tied, ascent) on the maps of these proposals."""
-    has_visited = any(np.isnan(open_values(proposal)).any() for proposal in proposals)
-    entries = ["× visited"] * has_visited + ["◯ tied with the best"] * any(map(has_rings, proposals))
+    """Return the legend entries that the maps of these proposals need: excluded, tied, ascents."""
+    has_excluded = any(np.isnan(candidate_values(proposal)).any() for proposal in proposals)
+    entries = ["× excluded"] * has_excluded + ["◯ tied with the best"] * any(map(has_rings, proposals))
     has_ascents = any(proposal.trajectories is not None for proposal in proposals)
     return entries + ["○ start, ● end of an ascent"] * has_ascents
 
@@ -81,7 +81,7 @@ def draw_choice(figure: Figure, proposal: Proposal | None, quantity: Quantity, f
 def draw_candidates(axes: Axes, proposal: Proposal) -> None:
     """Draw each candidate's value and standard error in its own row, below a star for the chosen pose."""
     best = descending_values(proposal)
-    order = np.argsort(-open_values(proposal))[: len(best)]
+    order = np.argsort(-candidate_values(proposal))[: len(best)]
     rows = -np.arange(len(best))
     if proposal.standard_errors is not None:
         errors = np.asarray(proposal.standard_errors, np.float64)[order]
@@ -113,18 +113,18 @@ def draw_acquisition(
     if proposal is None:
         globe.text(0.0, 0.0, "given", ha="center", va="center", color=GREY, fontsize=11 * weight)
         return None
-    values, directions = open_values(proposal), directions_of(proposal.candidates)
-    colours, is_open = ScalarMappable(Normalize(*colour_range(values)), VALUE), ~np.isnan(values)
-    if quantity.smooth and np.sum(is_open) >= _MIN_CANDIDATES:
+    values, directions = candidate_values(proposal), directions_of(proposal.candidates)
+    colours, has_value = ScalarMappable(Normalize(*colour_range(values)), VALUE), ~np.isnan(values)
+    if quantity.smooth and np.sum(has_value) >= _MIN_CANDIDATES:
         globe.pcolormesh(*sphere.smooth_map(directions, values), cmap=VALUE, norm=colours.norm)
     places = sphere.on_map(directions)
     dots: dict[str, Any] = {"s": 14 * weight, "edgecolors": GREY, "linewidths": 0.6 * weight, "clip_on": False}
-    globe.scatter(*places[is_open].T, c=colours.to_rgba(values[is_open]), **dots, zorder=3)
+    globe.scatter(*places[has_value].T, c=colours.to_rgba(values[has_value]), **dots, zorder=3)
     if has_rings(proposal):
-        is_tied = np.asarray(proposal.tied_with_best()) & is_open
+        is_tied = np.asarray(proposal.tied_with_best()) & has_value
         rings: dict[str, Any] = {"s": 52 * weight, "facecolors": "none", "edgecolors": INK, "clip_on": False}
         globe.scatter(*places[is_tied].T, linewidths=1.0 * weight, **rings, zorder=4)
-    globe.scatter(*places[~is_open].T, marker="x", c=INK, s=26 * weight, linewidths=1.2 * weight, zorder=4)
+    globe.scatter(*places[~has_value].T, marker="x", c=INK, s=26 * weight, linewidths=1.2 * weight, zorder=4)
     if proposal.trajectories is not None:
         _draw_ascents(globe, directions_of(proposal.trajectories.poses), weight)
     size = 14 if proposal.trajectories is None else 11

@@ -89,8 +89,7 @@ class ReportData(eqx.Module):
     @property
     def has_deviations(self) -> bool:
         """Whether any surface is coloured by its standard deviation. Known shapes are not."""
-        is_mean = [view.surface is not None and not view.has_shape for view in self.views]
-        return any(is_mean) or (self.samples_surfaces and not self.has_shapes)
+        return any(view.surface is not None and not view.has_shape for view in self.views)
 
     @property
     def samples_surfaces(self) -> bool:

@@ -51,10 +51,10 @@ def _reason(quantity: Quantity, proposal: Proposal, frame: Frame) -> dict[str, s
     """Return sentences, keyed by heading, about the value of a view and the values of the other candidates."""
     value, others, num_tied = float(proposal.value), descending_values(proposal).tolist(), proposal.num_tied
     if not quantity.smooth:
-        return {"Why this view": f"It was drawn at random from {len(others)} open candidates."}
+        return {"Why this view": f"It was drawn at random from {len(others)} candidates that are left."}
     is_ascent = proposal.trajectories is not None and (not others or value > others[0])
     rank = 1 + sum(other > value for other in others)
-    reason = f"{'the highest' if rank == 1 else f'rank {rank}'} of {len(others)} open candidates"
+    reason = f"{'the highest' if rank == 1 else f'rank {rank}'} of {len(others)} candidates that are left"
     if rank > 1 and proposal.value_at_visited is not None:
         reason += ", and of those tied with the best the farthest from the cameras so far"
     if is_ascent and proposal.trajectories is not None:

@@ -91,7 +91,9 @@ LONG = Quantity(
 
 
 @pytest.mark.parametrize(("count", "changes"), [(1, {"quantity": LONG}), (2, {}), (3, {"quantity": LONG}), (7, {})])
-def test_letters_neither_collide_nor_are_cut(data, count, changes):
+def test_letters_neither_collide_nor_are_cut(data, count, changes, monkeypatch):
+    assert not data.has_deviations
+    monkeypatch.setattr(ReportData, "has_deviations", True)
     subset = of_views(data, count, **changes)
     charts = [figure for _, figure in (*task_charts(subset), *other_charts(subset))]
     for figure in (overview_figure(subset), *charts, *([why(subset, count - 1)] if count <= 3 else [])):
@@ -101,6 +103,7 @@ def test_letters_neither_collide_nor_are_cut(data, count, changes):
 @pytest.mark.parametrize("low", [1e-4, 2e-3, 0.04])
 def test_the_ticks_of_any_range_have_room(data, low, monkeypatch):
     monkeypatch.setattr(ReportData, "deviations", (low, 1.0))
+    monkeypatch.setattr(ReportData, "has_deviations", True)
     check_letters(overview_figure(of_views(data, 2)))
 
 

@@ -14,7 +14,7 @@ import jaxnbv as nbv
 from jaxnbv.scanning.sdf import Sphere
 from jaxnbv.viz import report_data, write_report
 from jaxnbv.viz.answers import number_text
-from jaxnbv.viz.choice import descending_values, marks, open_values
+from jaxnbv.viz.choice import candidate_values, descending_values, marks
 from jaxnbv.viz.report import report_html
 from jaxnbv.viz.space import figures_in_space
 from jaxnbv.viz.sphere import on_map, smooth_map
@@ -112,7 +112,7 @@ def test_the_sentence_tells_the_numbers_of_the_step(episode, data):
     values = values[np.isfinite(values)]
     before, after = (data.views[i].coverage.values[0] for i in (0, 1))
     for heading, words in (
-        ("Why this view", f"the highest of {len(values)} open candidates"),
+        ("Why this view", f"the highest of {len(values)} candidates that are left"),
         ("Other candidates", f"Best other {number_text(values[1])}, median {number_text(np.median(values))}"),
         ("Other candidates", "two standard errors"),
         ("Result", f"added {int(view.scan.count):,} points"),
@@ -155,9 +155,9 @@ def test_excluded_candidates_have_no_value():
     poses = nbv.look_at(nbv.geometry.fibonacci_sphere(5, 2.5))
     values = jnp.array([3.0, -jnp.inf, 5.0, 1.0, 4.0])
     proposal = nbv.search.Proposal(poses[0], values[0], poses, values)
-    np.testing.assert_array_equal(open_values(proposal), [3.0, np.nan, 5.0, 1.0, 4.0])
+    np.testing.assert_array_equal(candidate_values(proposal), [3.0, np.nan, 5.0, 1.0, 4.0])
     np.testing.assert_array_equal(descending_values(proposal), [5.0, 4.0, 3.0, 1.0])
-    assert marks(proposal) == ["× visited"]
+    assert marks(proposal) == ["× excluded"]
 
 
 def test_the_map_keeps_values():

@@ -72,10 +72,10 @@ def said_of(value, others, starts=0, pose=None, standard_error=None, quantity=CO
     [
         (4570.0, (4040.0, 2000.0, 1000.0), 6, None, "4,570 scene units², was found by gradient ascent from 6 starts"),
         (2.0, (), 1, None, "was found by gradient ascent from 1 start. It"),
-        (3.0, (3.0, 2.0, 1.0), 6, None, "was the highest of 3 open candidates. Best other 2, median 2. It"),
+        (3.0, (3.0, 2.0, 1.0), 6, None, "was the highest of 3 candidates that are left. Best other 2, median 2. It"),
         (3.0, (3.0, 2.0, 1.0), 0, 0.4, "Best other 2, median 2; no others within two standard errors. It"),
         (3.0, (3.0, 2.0, 1.0), 0, 0.6, "median 2; 1 other within two standard errors. It added 3 points"),
-        (2.0, (3.0, 2.0, 1.0), 0, 1.1, "was rank 2 of 3 open candidates. Best other 3, median 2; 2 others within"),
+        (2.0, (3.0, 2.0, 1.0), 0, 1.1, "was rank 2 of 3 candidates that are left. Best other 3, median 2; 2 others"),
     ],
 )
 def test_words_say_how_a_view_stands_among_the_others(value, others, starts, error, words):
@@ -87,7 +87,7 @@ def test_words_say_how_a_view_stands_among_the_others(value, others, starts, err
 
 
 def test_words_tell_no_value_of_a_lot_and_where_a_camera_looks_past_the_centre():
-    assert "It was drawn at random from 2 open candidates. It added" in said_of(0.9, (0.9, 0.5), quantity=LOTS)
+    assert "It was drawn at random from 2 candidates that are left. It added" in said_of(0.9, (0.9, 0.5), quantity=LOTS)
     pose = look_at((0.0, 0.0, 2.0), target=(2.0 * np.tan(np.radians(7.0)), 0.0, 0.0))
     assert "the horizon, 2.00 from the centre and aimed 7° off it, 90° from" in said_of(2.0, (1.0,), 1, pose)
 
