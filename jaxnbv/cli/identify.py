@@ -175,12 +175,12 @@ def _print_answer(name: str, session: "nbv.Session", unit: str | None) -> dict[s
     for part, p in _likely_names(session):
         typer.echo(f"{'█' * round(_BAR_WIDTH * p):{_BAR_WIDTH}} {100 * p:3.0f} %  {part}")
     pose, is_none = session.object_pose, next(iter(session.identity)) == NONE
-    typer.echo("It is most likely none of these." if is_none else pose_text(pose, unit or session.frame.unit))
+    typer.echo("It is most likely none of these." if is_none else object_pose_text(pose, unit or session.frame.unit))
     arrays = {field: getattr(pose, field).tolist() for field in ("matrix", "covariance", "alternatives")}
     return {"names": session.identity, "name": NONE if is_none else pose.name, **arrays}
 
 
-def pose_text(pose: "ObjectPose", unit: str) -> str:
+def object_pose_text(pose: "ObjectPose", unit: str) -> str:
     """Return the pose of a part and its standard deviations as text. `unit`: the world's unit of length."""
     import numpy as np
 

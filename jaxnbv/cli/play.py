@@ -167,8 +167,8 @@ def run_episode(
         typer.echo(subject.note)
     bank = "none" if options.model == "paper" else options.known or subject.bank
     sampler = dataclasses.replace(sampler_of(options.model, options.quick, bank), grid=subject.grid or Grid())
-    searches = options.search, "farthest"
-    planner, rival = (planner_of(setting, subject.acquisition, search, sampler, sizes) for search in searches)
+    names = options.search, "farthest"
+    planner, rival = (planner_of(setting, subject.acquisition, name, sampler, sizes) for name in names)
     folder = options.out or Path("runs") / _folder_name(options, subject)
     has_rival = has_rival and stop_rule is not None and options.search != "farthest"
     key, noise = jax.random.key(options.seed), SensorNoise(options.noise, options.noise)

@@ -23,11 +23,12 @@ class Segmentation:
     - a mask for each object, nonzero where the object is seen, with the names of frame and object: `000012.cup.png` or
       `000012_cup.png`.
 
-    **Raises:** `ValueError` if there is no such folder, or if the folder has no image for any frame.
+    **Raises:** `ValueError` if there is no such folder, if there are no frames, or if no frame has an image.
     """
 
     def __init__(self, folder: str | Path, frames: tuple[Path, ...]):
         folder = Path(folder)
+        require(len(frames) > 0, "there are no frames: give the files of a recording's depth images")
         require(folder.is_dir(), f"there is no folder {folder}: give the one that holds the masks")
         stems = [_stem(frame) for frame in frames]
         files = {_stem(file): file for file in sorted(folder.iterdir()) if file.name != _stem(file)}

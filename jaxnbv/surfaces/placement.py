@@ -14,8 +14,8 @@ from jaxnbv.checks import AnyArray, check_fields, require
 from jaxnbv.geometry.rotations import rotation_from_vector
 from jaxnbv.scanning.sdf import SignedDistance
 
-_GOLDEN = 1.0 / 1.533751168755204288118041
-_SILVER = 1.0 / math.sqrt(2.0)
+# 1 / phi and 1 / psi of super-Fibonacci sampling (Alexa 2022): phi^2 = 2, and psi^4 = psi + 4.
+_INVERSE_PHI, _INVERSE_PSI = 1.0 / math.sqrt(2.0), 1.0 / 1.533751168755204288118041
 
 
 class Placement(eqx.Module):
@@ -111,7 +111,7 @@ class FreeRotation(ShapePoses):
         """Return `count` rotations on a super-Fibonacci spiral of unit quaternions (Alexa 2022)."""
         index = np.arange(count) + 0.5
         inner, outer = np.sqrt(index / count), np.sqrt(1.0 - index / count)
-        a, b = 2.0 * np.pi * index * _SILVER, 2.0 * np.pi * index * _GOLDEN
+        a, b = 2.0 * np.pi * index * _INVERSE_PHI, 2.0 * np.pi * index * _INVERSE_PSI
         x, y, z, w = inner * np.sin(a), inner * np.cos(a), outer * np.sin(b), outer * np.cos(b)
         return Rotation.from_quat(np.stack([x, y, z, w], axis=1)).as_matrix()
 

@@ -164,8 +164,8 @@ def _information(images: _Image, context: ImaginedParts, camera: Camera) -> Floa
     all_weights_after = jax.lax.map(weights_after, images)
 
     def information(classes):
-        entropies = entropy(jnp.matmul(all_weights_after, classes, precision="highest"))
-        return entropy(weights @ classes) - jnp.sum(weights * entropies)
+        entropies = entropy_of_weights(jnp.matmul(all_weights_after, classes, precision="highest"))
+        return entropy_of_weights(weights @ classes) - jnp.sum(weights * entropies)
 
     class_information = information(context.classes)
     return class_information + context.pose_weight * (information(jnp.eye(len(weights))) - class_information)
@@ -183,7 +183,7 @@ def _misfits(image: _Image, others: _Image, tau: Float[Array, ""]) -> Float[Arra
     return jnp.where(both, misfits, jnp.where(hits ^ are_expected, MAX_MISFIT, 0.0))
 
 
-def entropy(weights: Float[Array, "*n c"]) -> Float[Array, "*n"]:
+def entropy_of_weights(weights: Float[Array, "*n c"]) -> Float[Array, "*n"]:
     """Return the entropy -sum_c w_c log w_c in nats, over the last axis."""
     return -jnp.sum(jax.scipy.special.xlogy(weights, jnp.maximum(weights, 1e-30)), axis=-1)
 

@@ -10,7 +10,7 @@ from PIL import Image
 
 import jaxnbv as nbv
 from jaxnbv.checks import InputError
-from jaxnbv.cli.identify import identify, pose_text
+from jaxnbv.cli.identify import identify, object_pose_text
 from jaxnbv.cli.tasks.identification import bank_of
 from jaxnbv.geometry.rotations import rotation_about
 from jaxnbv.surfaces.part_pose import ObjectPose
@@ -107,9 +107,9 @@ def test_a_pose_is_printed_in_the_unit_of_the_world():
     """Deviations of three degrees about one axis, and of four thousandths along one."""
     deviations = np.array([0.01, np.radians(3.0), 0.0, 0.0, 0.004, 0.001])
     pose = ObjectPose("rod", np.eye(4), np.diag(deviations**2), np.eye(4)[None])
-    assert "least certain axes: 4 mm, 3 degrees.\nNo other pose is as right." in pose_text(pose, "m")
+    assert "least certain axes: 4 mm, 3 degrees.\nNo other pose is as right." in object_pose_text(pose, "m")
     round_one = dataclasses.replace(pose, alternatives=np.tile(np.eye(4), (72, 1, 1)))
-    assert "least certain axes: 0.004 world units, 3 degrees.\n72 poses are equally right" in pose_text(
+    assert "least certain axes: 0.004 world units, 3 degrees.\n72 poses are equally right" in object_pose_text(
         round_one, "world units"
     )
 

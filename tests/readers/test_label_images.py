@@ -40,6 +40,8 @@ def test_what_is_no_segmentation_is_refused(tmp_path):
         Segmentation(tmp_path / "none", FRAMES)
     with pytest.raises(InputError, match=r"such as 0001\.png: name them 0001\.png, .* or 0001\.OBJECT\.png"):
         Segmentation(tmp_path, FRAMES)
+    with pytest.raises(InputError, match="there are no frames: give the files"):
+        Segmentation(tmp_path, ())
     write(tmp_path / "0001.png", np.zeros((2, 2, 3)))
     with pytest.raises(InputError, match=r"shape \(2, 2, 3\): give an image of one channel"):
         Segmentation(tmp_path, FRAMES).labels(0)

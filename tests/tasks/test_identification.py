@@ -14,7 +14,7 @@ from jaxnbv.surfaces.part_hypotheses import PartHypotheses
 from jaxnbv.surfaces.part_pose import surface_error
 from jaxnbv.surfaces.placement import Placement
 from jaxnbv.surfaces.registration import Hypotheses
-from jaxnbv.tasks.identification import entropy
+from jaxnbv.tasks.identification import entropy_of_weights
 
 CAMERA = nbv.Camera(height=24, width=24, fov=1.0)
 GRID = nbv.Grid(48)
@@ -39,7 +39,7 @@ def step(weights, shapes=(0, 1, 2), turns=None):
     placement = Placement(jnp.asarray(turns, jnp.float32), jnp.zeros((count, 3)), jnp.ones((count, 3)))
     placed = Hypotheses(jnp.asarray(shapes), placement, jnp.zeros(count), jnp.ones(count, bool))
     cloud = nbv.PointCloud(jnp.zeros((4, 3)), jnp.ones((4, 3)), jnp.ones(4, bool))
-    hypotheses = PartHypotheses(BANK, placed, jnp.asarray([*weights, 0.0]), TAU)
+    hypotheses = PartHypotheses(BANK, placed, jnp.asarray([*weights, 0.0]), TAU, TAU)
     observations = Observations.start(cloud, 2, GRID, camera=CAMERA)
     observations = Observations(
         *(getattr(observations, name) for name in ("cloud", "poses", "grid", "looks", "empty_nodes", "obstacle_nodes")),
@@ -76,9 +76,9 @@ def test_names_poses_and_groups():
             nbv.Identify(group=["block", "block", "other"]),
         )
     )
-    names = float(entropy(jnp.array([0.8, 0.2])))
+    names = float(entropy_of_weights(jnp.array([0.8, 0.2])))
     # Information about the pose beyond the name counts a tenth.
-    assert by_pose == pytest.approx(names + 0.1 * (float(entropy(jnp.array(weights))) - names), rel=0.02)
+    assert by_pose == pytest.approx(names + 0.1 * (float(entropy_of_weights(jnp.array(weights))) - names), rel=0.02)
     assert by_name == pytest.approx(names, rel=0.02)
     assert by_group == pytest.approx(0.0, abs=1e-3)
 
