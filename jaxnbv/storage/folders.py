@@ -155,7 +155,7 @@ class ResultFolder:
     files, the number of the `format`, and whether a folder without a record may hold other files (`is_shared`).
 
     **Raises:** `ValueError` if the folder cannot be created, holds results of a different configuration, or holds other
-    files.
+    files although it is not shared.
     """
 
     kind: str
