@@ -44,7 +44,7 @@ class View(eqx.Module):
 
     - `scan`: the scan, with noise and one row for each pixel.
     - `cloud`: the cloud D after this view.
-    - `proposal`: None if the view was not proposed, such as the first view.
+    - `proposal`: the proposal of this view; None if the view was not proposed, such as the first view.
     - `camera`: the camera that took the scan, in scene units.
     - `hypotheses`: hypotheses of the model after this view, see `Observations`.
     """
@@ -57,7 +57,10 @@ class View(eqx.Module):
     hypotheses: eqx.Module | None = None
 
     def answer(self, acquisition: Acquisition) -> Answer | None:
-        """Return the acquisition's answer after this view; without one, the probability of each known part."""
+        """Return the acquisition's answer after this view, or else the probability of each known part.
+
+        Return None if the acquisition has no answer and the model has no known parts.
+        """
         answer = acquisition.answer(self.cloud)
         if answer is None and isinstance(self.hypotheses, PartHypotheses):
             return identity_answer(self.hypotheses, acquisition)
@@ -83,7 +86,8 @@ class _StepState:
     """Intermediate results for the next view.
 
     - `is_proposed`: whether a caller received the proposal. False if it was computed for the stop rule only.
-    - `stop`: the stop rule's reason to stop; None to continue, or if the rule is not `is_evaluated` yet.
+    - `stop`: the stop rule's reason to stop; None to continue.
+    - `is_evaluated`: whether the stop rule was evaluated, so that `stop` is valid.
     """
 
     inputs: StepInputs | None = None
@@ -131,7 +135,7 @@ class Loop:
         self._next = _StepState()
 
     def without_views(self, planner: Planner) -> "Loop":
-        """Return a copy without views that uses `planner`, after a change of obstacles or of earlier poses.
+        """Return a copy without views that uses `planner`, for when obstacles or earlier poses have changed.
 
         The copy keeps the time of the first view, from which stop rules count seconds.
         """

@@ -55,7 +55,7 @@ def warn_of_blank() -> None:
 
 
 def warn_of_no_table(up: str, others: tuple[str, ...]) -> None:
-    """Warn that no table was detected with the axis `up`, and name the axes `others` that would give one."""
+    """Warn that no table was detected with the axis `up`. Name `others`, the axes that would give one."""
     if others:
         axes = " or ".join(f'up="{axis}"' for axis in others)
         problem = f'no table is found with up="{up}", but a plane would be one with {axes}: give that if it is upward'
@@ -89,7 +89,10 @@ def warn_of_mount(alignment: Alignment) -> None:
 
 
 def warn_of_inside(box: Box, cameras: Float[np.ndarray, "n 3"], candidates: Float[np.ndarray, "m 3"]) -> None:
-    """Warn if the last camera is the first inside the box, and all candidates are outside (world units)."""
+    """Warn when a camera is inside the box for the first time, but all candidates are outside.
+
+    - `cameras`, `candidates`: positions of the cameras so far and of the candidates, in world units.
+    """
     low, high = box.low, box.high
     is_inside, any_inside = (np.all((x > low) & (x < high), axis=1) for x in (cameras, candidates))
     if is_inside[-1] and is_inside.sum() == 1 and not any_inside.any():

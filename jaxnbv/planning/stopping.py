@@ -46,7 +46,7 @@ class StopContext:
     frame: Frame
 
     def cost(self, poses: tuple[Pose, ...], cost: CostFunction) -> float:
-        """Return the cost of the path through scene poses. `cost` gets poses in world coordinates."""
+        """Return the cost of the path through scene poses. `cost` is called with poses in world coordinates."""
         return total_cost(poses, WorldCost(cost, self.frame))
 
 
@@ -100,7 +100,7 @@ class AnyOf(StopRule):
 
 
 def checked_reason(rule: StopRule, reason: str | None) -> str | None:
-    """Return the `reason` that a rule returned, after a check.
+    """Check the `reason` that a rule returned, and return the reason.
 
     **Raises:** `ValueError` unless the reason is a non-empty string or None.
     """

@@ -14,7 +14,7 @@ from jaxnbv.utility import Quantity
 
 
 class FarthestView(Baseline):
-    """Farthest point sampling: proposes the candidate that is farthest from its nearest earlier camera."""
+    """Baseline that proposes the candidate farthest from its nearest earlier camera."""
 
     def quantity(self, acquisition: Acquisition) -> Quantity:
         meaning = "distance from a candidate to the nearest camera so far, whatever the surface."
@@ -50,11 +50,12 @@ class UncertaintyView(Baseline):
 
 
 def uncertain_length(problem: Problem, poses: Pose) -> Float[Array, " poses"]:
-    """Return, for each pose, the length of its principal ray on which the hit is uncertain (scene units).
+    """Return, for each pose, the distance between the first and the last likely hit of its principal ray.
 
-    The transmittance T(t) is the fraction of sampled surfaces that the ray has not entered before distance t. It is
-    evaluated every half cell within the samples' grid. The length is from the first t with T(t) < 1 to the last t with
-    T(t) > 0.05. It is zero for a ray that hits no sampled surface or misses the grid.
+    The principal ray starts at the camera and follows the optical axis. The transmittance T(t) is the fraction of
+    sampled surfaces that the ray has not entered before distance t. It is evaluated every half cell within the samples'
+    grid. The result is the distance from the first t with T(t) < 1 to the last t with T(t) > 0.05, in scene units. It
+    is zero for a ray that hits no sampled surface or misses the grid.
     """
     surfaces = problem.surfaces
     grid = surfaces.grid
