@@ -15,13 +15,12 @@ _SEPARATORS = "._-"
 class Segmentation:
     """A folder of label images or masks, which say which object each pixel of a recording shows.
 
-    `frames` are the files of the recording's depth images. For each frame that shows an object, the folder has one of
-    these:
+    `frames` are the files of the recording's depth images. For each frame that shows an object, such as `000012.png`,
+    the folder has one of these:
 
-    - a label image with the frame's name and an object number in each pixel, zero for none: `000012.png` for
-      `000012.png`;
-    - a mask for each object, nonzero where the object is seen, with the names of frame and object: `000012.cup.png` or
-      `000012_cup.png`.
+    - a label image with the frame's name, `000012.png`. Each pixel holds an object number, or zero for no object;
+    - one mask per object, named after frame and object, such as `000012.cup.png` or `000012_cup.png`. It is nonzero
+      where the object is seen.
 
     **Raises:** `ValueError` if there is no such folder, if there are no frames, or if no frame has an image.
     """
@@ -73,7 +72,8 @@ def _stem(file: Path) -> str:
 def _frame_files(stem: str, files: dict[str, Path]) -> dict[str, Path]:
     """Return the masks of a frame, keyed by object name, or its label image with the key "".
 
-    - `stem`, `files`: the frame's file name without ending, and all image files, keyed by such names.
+    - `stem`: name of the frame's file without ending.
+    - `files`: all image files in the folder of masks, keyed by their names without endings.
     """
     if stem in files:
         return {"": files[stem]}

@@ -1,4 +1,4 @@
-"""Folders of results with the same configuration. One process at a time writes to a folder."""
+"""Folders of results. All results in a folder have one configuration. One process at a time writes to a folder."""
 
 import importlib.metadata
 import json
@@ -26,7 +26,7 @@ MAX_ARRAY_BYTES = 2**29
 
 
 def software() -> dict[str, str]:
-    """Return the versions of the packages on which results depend."""
+    """Return the versions of the packages on which results depend, keyed by package name."""
     names = ("jaxnbv", "jax", "jaxlib", "equinox", "optax", "optimistix", "numpy", "trimesh", tracer())
     return {name: importlib.metadata.version(name) for name in names}
 
@@ -39,12 +39,15 @@ def num_threads() -> int:
 
 
 def versions() -> dict[str, Any]:
-    """Return the software, device and threads of this process, on which the last bits of results depend."""
+    """Return package versions, device and number of threads, on which the last bits of results depend."""
     return software() | {"device": jax.devices()[0].device_kind, "cores": num_threads()}
 
 
 def differences(stored: Any, current: Any, name: str = "") -> list[str]:
-    """Return a text for each entry that differs between two descriptions. It begins with the entry's path."""
+    """Return a text, which begins with the entry's path, for each entry in which two descriptions differ.
+
+    - `name`: path of the two descriptions, with which the paths of their entries begin.
+    """
     if isinstance(stored, dict) and isinstance(current, dict):
         keys = list(dict.fromkeys([*stored, *current]))
         nested = (differences(stored.get(key), current.get(key), f"{name}.{key}".lstrip(".")) for key in keys)
@@ -62,7 +65,7 @@ def check_format(format: Any, supported: int, file: Path) -> None:
 
 
 def read_json(file: Path, problem: str, remedy: str) -> dict[str, Any]:
-    """Read the object in a JSON file.
+    """Read a JSON file that holds an object (a dictionary).
 
     **Raises:** `ValueError` with the texts `problem` and `remedy`, if the file cannot be read or holds no JSON object.
     """
@@ -146,16 +149,20 @@ def writing_in(path: Path) -> Iterator[None]:
 
 
 class ResultFolder:
-    """A folder of results with the same configuration. The record is written before the first result.
+    """A folder of results that all have one configuration, and the record of the configuration.
 
     - `config`: the configuration as JSON, see `jaxnbv.storage.describe`.
     - `arrays`: contents of the configuration's large arrays, keyed by hash. They are stored in arrays.npz.
 
-    Subclasses define the `kind` of results (the record is the file `kind`.json), the `pattern` of the names of result
-    files, the number of the `format`, and whether a folder without a record may hold other files (`is_shared`).
+    The record is the file `kind`.json, which is written before the first result. Subclasses define:
 
-    **Raises:** `ValueError` if the folder cannot be created, holds results of a different configuration, or holds other
-    files although it is not shared.
+    - `kind`: kind of results, such as "study".
+    - `pattern`: pattern of the names of result files.
+    - `format`: version number of the file format.
+    - `is_shared`: whether a folder without a record may hold other files.
+
+    **Raises:** `ValueError` if the folder cannot be created, holds results of a different configuration, or has no
+    record but other files (unless `is_shared`).
     """
 
     kind: str

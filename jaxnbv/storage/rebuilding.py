@@ -37,8 +37,8 @@ def rebuild(description: Any, arrays: Mapping[str, np.ndarray], path: str) -> An
     constructor is called.
 
     - `arrays`: contents of the large arrays, keyed by hash, from `describe`.
-    - `path`: path of the configuration for error messages, such as "planner". Its first name is also the argument with
-      which a caller of `load` can replace the configuration.
+    - `path`: path of the configuration for error messages, such as "planner". The name before the first dot is the
+      argument of `load` that replaces the configuration.
 
     **Raises:** `ValueError` if a part cannot be rebuilt, or has changed since it was described. The error names the
     part's path.
@@ -57,10 +57,11 @@ def rebuild(description: Any, arrays: Mapping[str, np.ndarray], path: str) -> An
 
 
 def read_config(path: str | Path, kind: str, format: int, replacements: Mapping[str, Any]) -> dict[str, Any]:
-    """Rebuild the configuration of an existing folder from its record of this kind and format.
+    """Rebuild the configuration that the record of an existing folder describes, as parts keyed by name.
 
-    - `replacements`: parts that replace those of the record, keyed by name. When `RunFolder` then opens the folder with
-      these parts, it checks that they agree with the record.
+    - `kind`, `format`: kind and format of the record, see `ResultFolder`.
+    - `replacements`: parts to return as they are instead of rebuilding them, keyed by name. When `RunFolder` opens the
+      folder, it checks that they agree with the record.
 
     **Raises:** `ValueError` if the folder holds no record or a damaged record, or if a part cannot be rebuilt and has
     no replacement.
@@ -157,9 +158,10 @@ class _Rebuilder:
         return obj
 
     def _lookup_code(self, name: str, path: str) -> Any:
-        """Look up by its name a function, or the class of a dataclass, named tuple or NumPy scalar.
+        """Return the function or class with this name, if it is harmless.
 
-        **Raises:** `ValueError` for other classes, and for functions of packages that may have side effects.
+        **Raises:** `ValueError` for a class that is not a dataclass, a named tuple or a NumPy scalar, and for a
+        function of an installed package that may have side effects.
         """
         obj = self._lookup(name, path)
         module = name.partition(":")[0]
@@ -168,7 +170,7 @@ class _Rebuilder:
             if isinstance(obj, type)
             else not is_installed(module)
             or any(module == prefix or module.startswith(f"{prefix}.") for prefix in _HARMLESS)
-            # These are the ufuncs of NumPy, and the functions of jax.numpy with the same names.
+            # Ufuncs of NumPy, and the functions of jax.numpy with the same names, have no side effects.
             or (module in ("numpy", "jax.numpy") and isinstance(getattr(np, name.partition(":")[2], None), np.ufunc))
         )
         require(

@@ -92,7 +92,7 @@ class ReconstructionStudy(Study):
         return NewSurface() if method == "new-surface" else Coverage()
 
     def mesher(self, scene: Scene) -> Planner:
-        """Return the planner whose sampler reconstructs the surface for every method, also the user's."""
+        """Return the planner whose sampler reconstructs the surface for all methods, including the user's own."""
         return self.planner("farthest", scene)
 
     def truth(self, scene: Scene) -> Float[np.ndarray, "n 3"]:
@@ -157,7 +157,10 @@ class ReconstructionStudy(Study):
 
 
 def reconstruct(sampler: SurfaceSampler, observations: Observations, name: str) -> TriangleMesh | None:
-    """Return one of `RECONSTRUCTIONS`; None for screened Poisson if `pymeshlab` is not installed."""
+    """Return the reconstruction with this name, one of `RECONSTRUCTIONS`.
+
+    Returns None for screened Poisson if `pymeshlab` is not installed.
+    """
     if name == MEAN:
         return sampler.mean_mesh(observations)
     return screened_poisson(observations.cloud) if has_poisson() else None

@@ -63,7 +63,7 @@ class FixedOrder(Baseline):
 
 
 class MostNewVoxels(Baseline):
-    """Greedy oracle that chooses the frame with the most new voxels, those that no earlier frame shows.
+    """Greedy oracle that chooses the frame with the most voxels that no frame chosen before shows.
 
     - `is_shown`: entry (i, j) is True if candidate i shows voxel j.
     """
@@ -141,7 +141,7 @@ class RecordedStudy(Study):
     def configured(cls, model: str, views: int, quick: bool, **options: Any) -> dict[str, Study]:
         """Return the study of one recording, under the name "".
 
-        By default, voxels have 1/80 of the box's longest side.
+        By default, the side of a voxel is 1/80 of the box's longest side.
 
         - `options`: settings of `RecordedStudy`, except that `box` is two corners as six numbers; default: `bounds_of`.
 

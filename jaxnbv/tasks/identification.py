@@ -33,9 +33,11 @@ _Image: TypeAlias = tuple[Float[Array, "..."], Float[Array, "..."], Bool[Array, 
 class ImaginedParts(eqx.Module):
     """Context of the acquisition `Identify`: the hypotheses of a step, ready to be scanned.
 
-    - `weights`: probabilities of the hypotheses other than "none of these", scaled to sum to one.
+    - `surfaces`: surface of the part in each of the h hypotheses.
+    - `weights`: probabilities of the hypotheses without "none of these", scaled to sum to one.
     - `classes`: for each hypothesis, the name or group of its part as a one-hot row.
     - `tau`: scale of the distance between a measured point and the surface, in scene units, see `part_evidence`.
+    - `pose_weight`: factor of I(h | c) in the formula of `Identify`.
     """
 
     surfaces: GridSurface
@@ -103,7 +105,7 @@ class Identify(Acquisition):
         poses: Pose,
         barrier: Float[Array, "poses rays"] | None = None,
     ) -> Float[Array, "1 poses"]:
-        """Return the expected information of each pose. Ignores `surfaces`, and scans those in `context`."""
+        """Return the expected information of each pose, from scans of `context.surfaces`. Ignores `surfaces`."""
         at_once = samples_at_once(camera, poses)
         images = shared_map(_image, context.surfaces, camera, poses, barrier, at_once=at_once)
         by_pose = jax.tree.map(lambda rows: jnp.moveaxis(rows, 1, 0), images)
@@ -132,10 +134,11 @@ def weights_by_name(
 ) -> tuple[list[str], Float[np.ndarray, "*batch n"]]:
     """Return the names of a bank's parts in alphabetical order, and the weights in this order.
 
-    The last weight, without a name, is that of "none of these". For `Identify(group=...)` the names are those of the
-    groups, and the weights of each group are added.
+    There is one weight more than names: the last is that of "none of these". For `Identify(group=...)`, the names are
+    those of the groups, and the weights of the parts in a group are added.
 
-    - `weights`: `PartHypotheses.part_weights`, with any leading axes.
+    - `weights`: weights of the parts in the order of the bank, then that of "none of these", as in
+      `PartHypotheses.part_weights`, with any leading axes.
     """
     group = acquisition.group if isinstance(acquisition, Identify) else None
     names, numbers = np.unique(bank.names if group is None else group, return_inverse=True)
@@ -172,10 +175,10 @@ def _information(images: _Image, context: ImaginedParts, camera: Camera) -> Floa
 
 
 def _misfits(image: _Image, others: _Image, tau: Float[Array, ""]) -> Float[Array, "h rays"]:
-    """Return each ray's misfit between the image of one hypothesis and the images of all hypotheses.
+    """Return each ray's misfit between the image of one hypothesis and the image of each hypothesis.
 
-    The misfit grows with the distance between the two surfaces along the ray. It is at most `MAX_MISFIT`, and equal to
-    it if the ray hits only one of the surfaces.
+    The misfit grows with the distance between the two surfaces, measured along the ray and multiplied by the cosine of
+    the angle of incidence. It is `MAX_MISFIT`, its largest value, if the ray hits only one of the two surfaces.
     """
     (reach, _, hits), (expected, cosine, are_expected) = image, others
     both = hits & are_expected

@@ -249,7 +249,7 @@ class ClassificationStudy(Study):
         return super().search(method, scene)
 
     def sensor(self, scene: Scene) -> Sensor:
-        """Return a sensor that gives the same scan from a candidate in all methods and at all views."""
+        """Return a sensor whose scan from a candidate is the same for all methods and at all views."""
         base_sensor, poses = super().sensor(scene), self.candidates.poses()
 
         def look(pose, key):
@@ -272,8 +272,8 @@ class ClassificationStudy(Study):
         """Record the classifier's predictions after each view, and measures of each view.
 
         - Each view: the log probabilities of the classes, and the number of the view's rays that hit the cue.
-        - Each proposed view: the `roughness` of the samples from which it was chosen, and the rank correlation between
-          the values of the candidates and how many of their rays hit the cue.
+        - Each proposed view: the `roughness` of the samples by which it was chosen, and the rank correlation, over the
+          candidates, between the values and the numbers of rays that hit the cue.
         """
         lists: dict[str, list] = {name: [] for name in ("log_p", "pixels", "rank_correlation", "roughness")}
         for view, _, inputs, _ in episode:

@@ -26,7 +26,7 @@ _NO_ARRAYS: Mapping[str, np.ndarray] = MappingProxyType({})
 
 
 class RecordFolder(ResultFolder):
-    """A folder with one record per scene, all with the same configuration, which study.json holds.
+    """A folder with one record per scene of a study. study.json holds their common configuration.
 
     - `config`, `arrays`: the configuration as JSON, and its large arrays, see `jaxnbv.storage.describe`.
     - `executor`: an executor with the interface of `concurrent.futures`, such as `Processes(8)` or a `Cluster`, that

@@ -49,13 +49,14 @@ class Study(eqx.Module):
     A new study defines the abstract members. Settings:
 
     - `views`: number of views, including the first.
-    - `num_candidates`: number of candidate poses on the sphere of `radius` (scene units). Gradient searches start from
-      the best poses among half of this number.
+    - `num_candidates`: number of candidate poses, on the sphere of `radius` (scene units). A gradient search evaluates
+      half as many poses, spread over its own pose space, and starts from the best `num_starts` of these.
     - `sampler`, `capacity`: sampler of surfaces, and largest number of points of the cloud, as in `Planner`.
     - `num_samples`, `grid_resolution`: number of samples, and of the grid's nodes along each axis. Both replace the
       sampler's own settings.
     - `camera`: camera of the sensor. Imagined scans may have fewer rays, see `imagined_camera`.
-    - `num_starts`, `iterations`, `learning_rate`: starting poses, steps and learning rate of gradient searches.
+    - `num_starts`, `iterations`, `learning_rate`: number of starts, number of steps from each start, and learning rate
+      of gradient searches.
     - `meshes`: mesh files, one per scene. Without mesh files, the scenes are procedural.
 
     Class attributes:
@@ -66,7 +67,8 @@ class Study(eqx.Module):
     - `pictured`: methods in pictures; if empty, all methods.
     - `measures`: quantities in the tables and the chart; `claims`: claims to check, such as the paper's.
     - `quick`: settings of a quick run; `quick_scenes`: number of scenes of a quick run.
-    - `paper`: settings of the paper and its code, which may include `views`.
+    - `paper`: settings of the paper and its code. An entry `views` replaces the default number of views in the study's
+      `Entry`.
     - `seed`: seed of first views, noise and samples.
     - `bank`: name of the bank of known shapes, see `shape_bank`; "" for none.
     - `without_bank`: methods that run a second time without known shapes, under the name "METHOD-screened".
@@ -173,7 +175,7 @@ class Study(eqx.Module):
 
     @abstractmethod
     def acquisition(self, method: str, scene: Scene) -> Acquisition:
-        """Return a method's acquisition. Give it the same pytree structure for all scenes to compile it once."""
+        """Return a method's acquisition. It compiles only once if all scenes give the same pytree structure."""
 
     def search(self, method: str, scene: Scene) -> Search:
         """Return the search of a method, see `search_of`."""
@@ -262,11 +264,11 @@ class Study(eqx.Module):
         return jax.random.fold_in(scene_key, _PURPOSES.index(purpose))
 
     def episode_keys(self, method: str, scene: Scene) -> list[PRNGKeyArray]:
-        """Return one random key per episode of a method. By default all methods have one episode with one key."""
+        """Return one random key per episode of a method; by default one key, which all methods share."""
         return [self.key(scene.index, "episode")]
 
     def merge_runs(self, runs: Sequence[Record]) -> Record:
-        """Merge the records of the episodes of `episode_keys` into one record."""
+        """Merge the records of a method's episodes, one per key of `episode_keys`, into one record."""
         return runs[0]
 
     def first_view(self, scene: Scene) -> int:

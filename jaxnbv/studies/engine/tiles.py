@@ -50,7 +50,7 @@ def caption_tile(axes: Axes, text: str, is_correct: bool = False) -> None:
 
 
 def opposite_direction(record: Record) -> Float[np.ndarray, "3"]:
-    """Return a direction horizontally opposite to the first view's camera, and upwards (not normalised)."""
+    """Return the direction (any length) of an eye above the object, on the side that the first view hides."""
     run = next(iter(record["methods"].values()))
     position = np.asarray(run["views"][0]["position"])
     direction = -position[[0, 2]]
@@ -67,8 +67,8 @@ def render_mesh(
 ) -> Still:
     """Render a mesh, seen from the direction `eye`, in an image of `size` x `size` pixels.
 
-    - `value`: function from points to values, which colour the surface on the scale `ERRORS`; default: one colour.
-      Values below 1e-6 count as 1e-6.
+    - `value`: function from points to values. The values, at least 1e-6, colour the surface on the scale `ERRORS`. By
+      default the surface has one colour.
     """
     vertices, faces = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, _MAX_EDGE, max_iter=12)
     fine = trimesh.Trimesh(vertices, faces)
