@@ -28,7 +28,7 @@ def own_parts(
     camera: Camera,
     scale: float,
 ) -> Float[np.ndarray, "h w"]:
-    """Return for each pixel the largest depth that counts as the camera's mount; zero where there is no mount.
+    """Return, for each pixel, the largest depth that counts as the camera's mount; zero for other pixels.
 
     Depths are in units of the images. A mount has the same depth at the same pixels in most frames, and moves with the
     camera. So where the mount was in the world during one frame, frames from other poses see something deeper. A vase
@@ -58,7 +58,7 @@ def own_parts(
 
 
 def _block_minima(image: UInt16[np.ndarray, "h w"], side: int) -> Float[np.ndarray, "k l"]:
-    """Return the least depth in each block of `side` x `side` pixels; zero in blocks without a measurement."""
+    """Return the least depth in each block of `side` x `side` pixels; zero where nothing was measured."""
     image = np.pad(image, [(0, -size % side) for size in image.shape]).astype(float)
     blocks = np.where(image > 0, image, np.inf).reshape(image.shape[0] // side, side, image.shape[1] // side, side)
     least = blocks.min(axis=(1, 3))
@@ -72,9 +72,7 @@ def _is_mount(
     camera: Camera,
     side: int,
 ) -> Bool[np.ndarray, "k l"]:
-    """Return a mask of the blocks that show the mount.
-
-    These are the connected components of `candidate_depth` whose place in the world other frames see through.
+    """Return a mask of the connected components of `candidate_depth` whose place other frames see through.
 
     - `candidate_depth`: depth of each block that has the same depth in most frames, in world units; zero elsewhere.
     - `depths`: least depth of each block in each frame, in world units; zero where nothing was measured.
@@ -114,7 +112,7 @@ def _is_mount(
 
 
 def _components(candidate_depth: Float[np.ndarray, "k l"]) -> tuple[Int[np.ndarray, " blocks"], int]:
-    """Return the index of the component of each block with positive depth, and the number of components.
+    """Return the component of each block with positive depth, and the number of components.
 
     Neighbouring blocks at about the same depth belong to the same component.
     """

@@ -39,7 +39,7 @@ _ASK_UNIT = (
 
 
 class _StoredRecording(NamedTuple):
-    """Depth image files of a recording, their camera-to-world matrices, and, if stored, intrinsics and unit."""
+    """Depth image files, camera-to-world matrices, and, if the recording has them, intrinsics and unit."""
 
     files: list[Path]
     matrices: Float[np.ndarray, "n 4 4"]

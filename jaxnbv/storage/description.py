@@ -183,10 +183,7 @@ class _Describer:
         return source | self._without_arrays(parts, path)
 
     def _without_arrays(self, parts: dict[str, Any], path: str) -> dict[str, Any]:
-        """Describe the parts of a function or class, without storing arrays.
-
-        `rebuild` does not need the arrays, because it looks up the function or class by its name.
-        """
+        """Describe the parts of a function or class without storing arrays, which `rebuild` does not need."""
         arrays, self.arrays = self.arrays, {}
         try:
             return self._describe_values(parts, path)

@@ -90,7 +90,7 @@ class RunFolder(ResultFolder):
         return self.path / f"{name}_{index:02d}.npz"
 
     def write(self, name: str, index: int, **parts: Any) -> None:
-        """Write the file with this name and index, as `write_arrays` does. The first call also writes the record.
+        """Write a file, as `write_arrays` does. The first call also writes the record of the folder.
 
         - `parts`: Equinox modules, arrays or None, keyed by name.
 
@@ -104,7 +104,7 @@ class RunFolder(ResultFolder):
         write_arrays(self.file(name, index), contents)
 
     def read(self, name: str, index: int) -> dict[str, Any]:
-        """Read the parts in the file with this name and index, keyed by part. Parts that were None are absent.
+        """Read the parts in a file, keyed by name. Parts that were None are absent.
 
         **Raises:** `ValueError` if the file is missing or damaged, or if its stored checksum or index is wrong.
         """
@@ -141,7 +141,7 @@ def _checksum(arrays: dict[str, np.ndarray]) -> str:
 
 
 def _parts(arrays: dict[str, Any]) -> dict[str, Any]:
-    """Join arrays with keys such as "scan.points" and "scan.normals" to modules, here "scan"; keyed by name."""
+    """Join arrays with keys such as "scan.points" to modules. Returns modules and other arrays by name."""
     parts: dict[str, Any] = {}
     for name, array in arrays.items():
         part, _, rest = name.partition(".")

@@ -157,10 +157,7 @@ class ReconstructionStudy(Study):
 
 
 def reconstruct(sampler: SurfaceSampler, observations: Observations, name: str) -> TriangleMesh | None:
-    """Return the reconstruction with this name, one of `RECONSTRUCTIONS`.
-
-    Returns None for screened Poisson if `pymeshlab` is not installed.
-    """
+    """Return a reconstruction of `RECONSTRUCTIONS`; None for `POISSON` if `pymeshlab` is not installed."""
     if name == MEAN:
         return sampler.mean_mesh(observations)
     return screened_poisson(observations.cloud) if has_poisson() else None

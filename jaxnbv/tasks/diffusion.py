@@ -101,10 +101,7 @@ class Temperature(NamedTuple):
     reached: Bool[np.ndarray, " n"]
 
     def coldest(self, reached_only: bool) -> int | None:
-        """Return the index of the coldest point; None if there is none.
-
-        - `reached_only`: whether to consider only `reached` points.
-        """
+        """Return the index of the coldest point, or of the coldest `reached` point; None if there is none."""
         candidates = np.flatnonzero(self.reached) if reached_only else np.arange(len(self.values))
         return int(candidates[np.argmin(self.values[candidates])]) if len(candidates) else None
 

@@ -170,9 +170,6 @@ def _counts(segmenter: Segmenter, cloud: PointCloud) -> Int[Array, " parts"]:
 
 
 def part_counts(p: Float[Array, "points parts"]) -> Int[Array, " parts"]:
-    """Return, for each part, the number of points whose most probable part it is.
-
-    Rows of zeros hold no point, and do not count.
-    """
+    """Return the number of points for which each part is the most probable. Rows of zeros do not count."""
     predicted = jax.nn.one_hot(jnp.argmax(p, axis=1), p.shape[1], dtype=jnp.int32)
     return jnp.sum(jnp.where(jnp.any(p > 0, axis=1)[:, None], predicted, 0), axis=0)

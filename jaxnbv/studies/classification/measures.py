@@ -20,27 +20,19 @@ _BY_CROSS_ENTROPY = ("cross-entropy", "tie-break", "halving", "gradient-2dof", "
 
 
 def first_hits(correct: Bool[np.ndarray, "runs views"]) -> Bool[np.ndarray, "runs views"]:
-    """Return, for each run and view, whether any prediction up to this view is correct.
-
-    This is true from the paper's T_first on.
-    """
+    """Return whether any prediction up to each view is correct: true from the paper's T_first on."""
     return np.logical_or.accumulate(correct, axis=1)
 
 
 def stable_hits(correct: Bool[np.ndarray, "runs views"]) -> Bool[np.ndarray, "runs views"]:
-    """Return, for each run and view, whether all predictions from this view on are correct.
-
-    This is true from the paper's T_stable on.
-    """
+    """Return whether all predictions from each view on are correct: true from the paper's T_stable on."""
     return np.logical_and.accumulate(correct[:, ::-1], axis=1)[:, ::-1]
 
 
 def _hit_fraction(hits: Callable) -> Callable[[Record, str], Float[np.ndarray, " views"]]:
     """Return a function from record and method to the fraction of runs with a hit at each view.
 
-    Only "random" has several runs.
-
-    - `hits`: `first_hits` or `stable_hits`.
+    Only "random" has several runs. `hits` is `first_hits` or `stable_hits`.
     """
 
     def compute(record: Record, method: str) -> Float[np.ndarray, " views"]:
@@ -89,10 +81,7 @@ def crossed_cells(values: Float[np.ndarray, "g g g"]) -> int:
 def rank_correlation(
     values: Float[AnyArray, " c"], true_values: Real[AnyArray, " c"], is_compared: Bool[np.ndarray, " c"]
 ) -> float | None:
-    """Return Spearman's rank correlation of two arrays; None if either is constant.
-
-    - `values`, `true_values`: one entry per candidate. Only candidates where `is_compared` is True count.
-    """
+    """Return Spearman's rank correlation over the candidates of a mask; None if either array is constant."""
     a, b = np.asarray(values)[is_compared], np.asarray(true_values)[is_compared]
     return None if np.ptp(a) == 0 or np.ptp(b) == 0 else float(spearmanr(a, b).statistic)
 

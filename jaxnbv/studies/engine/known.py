@@ -42,10 +42,7 @@ def study_sampler(
 
 
 def keep_shapes(sampler: SurfaceSampler, is_selected: Callable[[str], bool]) -> SurfaceSampler:
-    """Return the sampler with only the known shapes whose names `is_selected` accepts.
-
-    A sampler without known shapes is returned unchanged.
-    """
+    """Return the sampler with only those of its known shapes, if any, whose names `is_selected` accepts."""
     model = sampler.model
     if not isinstance(model, KnownShapes):
         return sampler

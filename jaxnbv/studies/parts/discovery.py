@@ -99,11 +99,9 @@ PartSegmenter: TypeAlias = CloudSegmenter | NearestPart
 
 
 def discovery_time(counts: Int[np.ndarray, "views parts"], target: int) -> int | None:
-    """Return the paper's T_discovery: the first view (from 1) after which all parts have `target` points.
+    """Return the paper's T_discovery: the first view, from 1, after which all parts have `target` points.
 
-    Returns None if there is no such view.
-
-    - `counts`: number of points assigned to each part after each view.
+    Returns None if there is no such view. `counts` are the numbers of points assigned to each part after each view.
     """
     is_complete: Bool[np.ndarray, " views"] = np.all(np.asarray(counts) >= target, axis=1)
     return int(np.argmax(is_complete)) + 1 if is_complete.any() else None
