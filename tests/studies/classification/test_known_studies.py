@@ -69,7 +69,7 @@ def test_classes_of_meshes_are_planned_with_the_whole_shipped_bank(tmp_path):
     (tmp_path / "bathtub").mkdir()
     trimesh.creation.box((1.0, 0.5, 0.4)).export(tmp_path / "bathtub" / "bathtub.ply")
     study = configured(HouseholdStudy, KNOWN, meshes=tmp_path)
-    # With the index of its scene, the mesh has the name of a shape of the bank.
+    # Mesh name and scene index together are the name of a shape of the bank.
     assert "bathtub 0" in study.planner("cross-entropy", study.scene(0)).sampler.model.bank.names
 
 
