@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from jaxnbv.surfaces.part_pose import ObjectPose
 
 _NUM_NAMES, _BAR_WIDTH = 4, 24
-# A frame shows no object if fewer of its points than this are in the box.
+# A frame counts as showing no object if fewer than this many of its points are in the box.
 _MIN_POINTS = 20
 _NO_FOLDER = (
     "is a file: identify needs depth images with the poses of the camera, since the empty space along rays also tells "
@@ -143,7 +143,10 @@ def identify(options: IdentifyOptions, box: Any, intrinsics: Any, depth_scale: A
 
 
 def _shows(frames: "nbv.readers.RecordedFrames", index: int, corners: "np.ndarray") -> bool:
-    """Return whether a frame shows at least `_MIN_POINTS` points in a box, given two corners in world coordinates."""
+    """Return whether frame `index` shows at least `_MIN_POINTS` points in the box.
+
+    - `corners`: lowest and highest corner of the box, in world coordinates.
+    """
     import numpy as np
 
     from jaxnbv.planning.images import Image
@@ -155,7 +158,11 @@ def _shows(frames: "nbv.readers.RecordedFrames", index: int, corners: "np.ndarra
 
 
 def _objects(sessions: Any, names: dict[int, str]) -> "dict[str, nbv.Session]":
-    """Return the session of each object, keyed by the object's name. The name is "" if there is only one object."""
+    """Return the session of each object, keyed by the object's name. A single `Session` has the key "".
+
+    - `sessions`: a `Session`, or `Sessions` with numbered objects.
+    - `names`: names of some objects, keyed by number. The number is the name of the other objects.
+    """
     objects = getattr(sessions, "objects", None)
     if objects is None:
         return {"": sessions}
@@ -167,7 +174,11 @@ def _likely_names(session: "nbv.Session") -> list[tuple[str, float]]:
 
 
 def _print_answer(name: str, session: "nbv.Session", unit: str | None) -> dict[str, Any]:
-    """Print which part an object is and where it lies, and return both for a JSON file."""
+    """Print which part an object is and where it lies, and return both for a JSON file.
+
+    - `name`: name of the object, "" for a single object.
+    - `unit`: the world's unit of length; None for that of the session's frame.
+    """
     from jaxnbv.surfaces.part_hypotheses import NONE
 
     if name:

@@ -43,10 +43,13 @@ from jaxnbv.viz.task import rival_text
 
 
 class Sizes(NamedTuple):
-    """Sizes of a planner. The task decides a size that is None.
+    """Settings of a planner that decide how long a step takes.
 
+    - `samples`: number of imagined surfaces.
+    - `candidates`: number of candidate poses; None for that of the task's `Setting`.
     - `capacity`: number of points to keep in the cloud.
-    - `rays`: number of rays along each side of an image.
+    - `grid`: grid of the imagined surfaces; None for the sampler's.
+    - `rays`: number of rays along each side of an image; None for those of the task's camera.
     """
 
     samples: int
@@ -63,7 +66,9 @@ _MAX_RIVAL_VIEWS = 10
 
 
 def stop_rule_of(texts: Sequence[str]) -> StopRule | None:
-    """Return a rule that holds once any of `texts`, such as "sure=0.95", holds. None for "never".
+    """Return the stop rule for the values of `--until`, such as "sure=0.95"; None for "never" or no value.
+
+    The rule holds as soon as one of the values does.
 
     **Raises:** `ValueError` if a name is unknown, or if a value is not a number or out of range.
     """
@@ -91,6 +96,7 @@ def search_of(name: str, radius: float, count: int) -> Search:
 def sampler_of(model: str, quick: bool, bank: str | ShapeBank | None) -> SurfaceSampler:
     """Make the sampler of imagined surfaces, with or without a bank of known shapes.
 
+    - `model`, `quick`: as in `SurfaceSampler.preset`.
     - `bank`: name of a shipped bank, a folder of upright meshes, or a bank of parts in any rotation. None or "none"
       for no bank.
 
@@ -156,8 +162,10 @@ def run_episode(
 ) -> None:
     """Simulate an episode, print each view when it is finished, and write the episode and a report.
 
-    - `sizes`: sizes of the planner. With `--quick`, `QUICK` replaces them.
-    - `has_rival`: whether to also run farthest view, a baseline, from the same first view. It needs a stop rule.
+    - `setting`: the camera, and distance and number of the candidates.
+    - `sizes`: numbers of samples, candidates, points and rays. With `--quick`, `QUICK` replaces them.
+    - `has_rival`: whether to run the baseline farthest view too, from the same first view, until the stop rule holds.
+      Without a stop rule the baseline is not run.
     """
     start_time = time.perf_counter()
     if options.quick:

@@ -16,9 +16,10 @@ from jaxnbv.geometry.pose import fibonacci_sphere
 from jaxnbv.programs import program
 
 Volume = Callable[[Float[Array, "n 3"]], Float[Array, " n"]]
-"""Signed distance of a volume, as a function of points in scene coordinates: a `Box` or a solid of `jaxnbv.sdf`.
+"""A volume, given as a function of points in scene coordinates, such as a `Box` or a solid of `jaxnbv.sdf`.
 
-It is negative inside the volume and positive outside, and its magnitude is at most the distance to the boundary.
+The function returns a signed distance: negative inside the volume, positive outside, and of a magnitude that is at most
+the distance to the boundary.
 """
 
 _BISECTIONS = 40
@@ -34,7 +35,7 @@ def _corner(values) -> Float[np.ndarray, " 3"]:
 
 
 class Box(eqx.Module):
-    """The box between two opposite corners. The default holds every scene that `Frame.fit` scales.
+    """The box between two opposite corners. The default holds every object that `Frame.fit` scales.
 
     - `low`, `high`: the corners, three numbers each, in scene coordinates unless stated otherwise. The numbers become
       arrays (3,), so that a program compiled for one box runs for any box.
@@ -99,7 +100,9 @@ def ray_interval(
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
     """Return the t at which rays origin + t direction enter and leave a box (Kay and Kajiya 1986).
 
-    A ray misses the box if its entering t is larger than its leaving t.
+    A ray misses the box if the t at which it enters is larger than the t at which it leaves.
+
+    - `origin`, `direction`: x, y and z components of all rays, as three arrays each.
     """
     safe = [jnp.where(jnp.abs(d) < 1e-9, 1e-9, d) for d in direction]
     sides = [((a - x) / d, (b - x) / d) for x, d, a, b in zip(origin, safe, low, high, strict=True)]
@@ -130,12 +133,6 @@ def boundary_points(volume: Volume, count: int, level: float = 0.0) -> Float[Arr
     return 0.5 * (near + far)[:, None] * directions
 
 
-def bounding_box(volume: Volume) -> Box:
-    """Return the bounding box of a volume's boundary points along 1,000 rays, or a `Box` unchanged.
-
-    **Raises:** `ValueError` if the volume is no `Box` and does not enclose the origin.
-    """
-    if isinstance(volume, Box):
 def check_encloses_origin(volume: Volume) -> None:
     """Raise `ValueError` if the origin is not inside the volume, as `boundary_points` needs it to be."""
     distance = float(volume(jnp.zeros((1, 3)))[0])
@@ -146,7 +143,13 @@ def check_encloses_origin(volume: Volume) -> None:
     )
 
 
+def bounding_box(volume: Volume) -> Box:
+    """Return the bounding box of a volume's boundary points along 1,000 rays, or a `Box` unchanged.
+
+    **Raises:** `ValueError` if the volume is no `Box` and does not enclose the origin.
+    """
+    if isinstance(volume, Box):
         return volume
+    check_encloses_origin(volume)
     points = np.asarray(boundary_points(volume, 1000), np.float64)
     return Box(np.min(points, axis=0), np.max(points, axis=0))
-    check_encloses_origin(volume)

@@ -48,7 +48,8 @@ _PRIOR_DEVIATION, _POINTS_PER_SAMPLE = 0.03, 50
 _MIN_EIGENVALUE_RATIO = 3e-4
 # A correction is rejected if it moves points by more than this fraction of their distance from the cameras.
 _MAX_CORRECTION = 0.15
-# Factor by which the disagreement must exceed the noise to matter, and factor by which a correction must reduce it.
+# The disagreement matters if it exceeds the noise times the first number. A correction is used if it divides the
+# disagreement by more than the second number.
 _DISAGREEMENT_RATIO, _MIN_IMPROVEMENT = 3.0, 1.5
 _Corrections: TypeAlias = Float[np.ndarray, "views 4 4"]
 
@@ -58,9 +59,9 @@ class Alignment(eqx.Module):
 
     Lengths are in the units of the poses.
 
-    - `disagreement`: for each view the median point-to-plane distance between its points and the nearest points of
+    - `disagreement`: for each view, the median point-to-plane distance between its points and the nearest points of
       overlapping views, with uncorrected poses. NaN for a view that overlaps no other view.
-    - `angle`: for each view the median angle between the normals of the same pairs of points, in radians.
+    - `angle`: for each view, the median angle between the normals of the same pairs of points, in radians.
     - `noise`: median point-to-plane distance between neighbouring points of the same view.
     - `corrected`: the disagreement with corrected poses.
     - `corrections`: the correction X of each view. The true pose of the camera is `matrix @ X`, where `matrix` is the
@@ -68,7 +69,7 @@ class Alignment(eqx.Module):
     - `is_mount`: whether all views have the same X, which is then an error of the mount.
     - `covariance`: covariance of the mount's error, a rotation vector (radians) and a shift, in the camera's axes.
     - `is_determined`: whether the views determine all of the mount's error. Undetermined components stay close to zero.
-    - `weakest`: direction in which the views determine the mount's error least, in the same six components.
+    - `weakest`: direction in which the views determine the mount's error least, in the components of `covariance`.
     - `num_pairs`: number of compared pairs of views. Each view is compared with up to four others of similar direction.
     - `distance`: median distance of points from the camera that measured them.
     """
@@ -124,7 +125,10 @@ class _View(NamedTuple):
 
 
 class _Matches(NamedTuple):
-    """Pairs of matched points from two views, each in its own camera's coordinates, and the views' indices."""
+    """Pairs of matched points from two views, in the coordinates of each point's camera.
+
+    - `views`: for each pair, the indices of the first and the second view.
+    """
 
     views: Int[np.ndarray, "n 2"]
     first_points: Float[np.ndarray, "n 3"]
@@ -191,20 +195,20 @@ def align_views(clouds: Sequence[PointCloud], poses: Sequence[Pose]) -> Alignmen
     )
 
 
-def _in_camera(cloud: PointCloud, pose: Pose) -> _View:
-    """Return a view with a random subset of a cloud's points, in the coordinates of the camera."""
-    points, normals = (rows.astype(np.float64) for rows in cloud.to_numpy())
-    rows = np.random.default_rng(0).permutation(len(points))[:_MAX_POINTS]
 def _exceeds(disagreement: Float[np.ndarray, " views"], noise: float) -> bool:
     return bool(np.any(disagreement > _DISAGREEMENT_RATIO * noise))
 
 
+def _in_camera(cloud: PointCloud, pose: Pose) -> _View:
+    """Return a view with a random subset of a cloud's points, in the coordinates of the camera."""
+    points, normals = (rows.astype(np.float64) for rows in cloud.to_numpy())
+    rows = np.random.default_rng(0).permutation(len(points))[:_MAX_POINTS]
     matrix = np.asarray(pose.to_matrix(), np.float64)
     return _View((points[rows] - matrix[:3, 3]) @ matrix[:3, :3], normals[rows] @ matrix[:3, :3], matrix)
 
 
 def _pairs(views: Sequence[_View]) -> list[tuple[int, int]]:
-    """Pair each view with the few views of most similar direction, which may show the same surface."""
+    """Return index pairs of views that may show the same surface: up to four with similar direction each."""
     forward = np.stack([view.matrix[:3, 2] for view in views])
     angles = np.arccos(np.clip(forward @ forward.T, -1.0, 1.0))
     np.fill_diagonal(angles, np.inf)
@@ -297,11 +301,12 @@ def _robust_step(
 def _linearise(
     views: Sequence[_View], matches: _Matches, corrections: _Corrections, is_mount: bool
 ) -> tuple[Float[np.ndarray, " n"], csr_array]:
-    """Return the signed point-to-plane distance of each match, and its derivative.
+    """Return the signed point-to-plane distance of each match, and the derivative of each distance.
 
-    The derivative is with respect to steps of six entries, X <- X exp(step): one step for the mount, or one for each
-    view except the first. With respect to the step of a view it is, up to sign, (p x m, m), where the point p and the
-    normal m = n_q are in the coordinates of this view's camera.
+    The derivative has a row for each match. Its columns are the entries of steps X <- X exp(step), where a step is a
+    rotation vector and a shift: one step for the mount, or one for each view except the first. The six entries for the
+    step of a view are, up to sign, (p x m, m). The point p and the normal m = n_q are in the coordinates of this view's
+    camera.
     """
     poses = np.stack([view.matrix for view in views]) @ corrections
     (first, second), count = matches.views.T, len(matches.views)

@@ -58,7 +58,7 @@ class PartHypotheses(eqx.Module):
         return jnp.append(self.shape_weights, self.weights[-1])
 
     def names(self) -> dict[str, float]:
-        """Return the probability of each part with a hypothesis and of "none of these", most likely first."""
+        """Return the probability of "none of these" and the nonzero probabilities of parts, largest first."""
         weights = np.asarray(self.shape_weights, np.float64)
         probability = {name: float(weight) for name, weight in zip(self.bank.names, weights, strict=True) if weight > 0}
         probability[NONE] = float(self.weights[-1])
@@ -74,7 +74,7 @@ class PartHypotheses(eqx.Module):
 
 
 def hypotheses_of(observations: Observations) -> PartHypotheses:
-    """Return the hypotheses about known parts in the observations.
+    """Return the hypotheses about known parts that the observations carry.
 
     **Raises:** `ValueError` if the observations have no hypotheses.
     """
@@ -89,6 +89,7 @@ def identify(
     """Return the weighted hypotheses given the observations.
 
     - `bank`: the parts at true size, in scene units.
+    - `poses`, `box`: the possible placements, and a box around the object.
     - `previous`: the hypotheses after the previous view, or None at the first view. They are kept while they fit.
     """
     targets = FitTargets.of(observations)

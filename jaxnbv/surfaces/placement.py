@@ -32,7 +32,7 @@ class Placement(eqx.Module):
 
     @property
     def factor(self) -> Float[Array, "*batch"]:
-        """Factor on a shape's distances: the geometric mean of `scale`. It is exact if all scales are equal."""
+        """Factor on distances: the geometric mean of `scale`, which is exact if all scales are equal."""
         return jnp.exp(jnp.mean(jnp.log(self.scale), axis=-1))
 
     def to_shape(self, x: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
@@ -86,7 +86,7 @@ class ShapePoses(eqx.Module):
 
     @property
     def rigid_basis(self) -> Float[np.ndarray, "9 k"]:
-        """`step_basis` without changes of scale."""
+        """Basis, as columns, of the steps of `Placement.moved` that do not change the scale."""
         return scipy.linalg.block_diag(self.rotation_axes(), np.eye(3), np.zeros((3, 0)))
 
     @property

@@ -77,16 +77,16 @@ class ValueSource(eqx.Module):
     def rows(self, observations: Observations) -> ValueRows:
         """Return the observed values that this source adds.
 
-        The method is called under `jit`, so the number of rows may depend only on the capacity of the cloud. Filled
-        rows must lie in [-pi/2, pi/2]^3. Otherwise `condition` of the model raises `ValueError`, or under `jit` the
-        posterior is NaN.
+        The method is called under `jit`, so the number of rows may depend only on the capacity of the cloud. The points
+        of filled rows must lie in [-pi/2, pi/2]^3. Otherwise the model's `condition` raises `ValueError`, or under
+        `jit` the posterior is NaN.
         """
 
 
 class OutsideBoundary(ValueSource):
     """Positive values of f minus its level on the boundary of the volume that holds the object.
 
-    They tell the model that the boundary is outside the object, like the "envelope" of Kazhdan et al. (2020).
+    These values place the boundary outside the object, like the "envelope" of Kazhdan et al. (2020).
 
     - `volume`: see `jaxnbv.geometry.volume`; by default the box to which scenes are scaled.
     - `num_points`: number of points, spread evenly as seen from the origin.

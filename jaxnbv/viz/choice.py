@@ -47,7 +47,7 @@ def colour_range(values: Float[np.ndarray, "*n"]) -> tuple[float, float]:
 
 
 def has_rings(proposal: Proposal) -> bool:
-    """Return whether to mark tied candidates: if there are any, but at most a third of all candidates."""
+    """Return whether to ring the tied candidates: true if some are tied, but no more than a third of all."""
     return 0 < (proposal.num_tied or 0) <= len(proposal.values) // 3
 
 

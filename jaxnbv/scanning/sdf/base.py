@@ -222,7 +222,9 @@ class Translated(SignedDistance):
 
 
 class Rotated(SignedDistance):
-    """A solid rotated about the origin by a matrix. The distance is exact if `solid` has an exact distance.
+    """A solid rotated about the origin by a matrix.
+
+    The distance is exact if `solid` has an exact distance.
 
     **Raises:** `ValueError` if the matrix is not a rotation, or for the same reasons as `SignedDistance`.
     """

@@ -57,9 +57,9 @@ _OTHERS = (("#8c564b", "-", "p"), ("#7f3fbf", "-", "h"), ("#b8860b", "--", "d"))
 
 
 def chart(table: pd.DataFrame, study: type[Study]) -> bytes:
-    """Draw a table of `results` over all scenes, with one panel per measure, and return a PNG file.
+    """Draw a chart of a table that `results` returned, with one panel per measure, and return a PNG file.
 
-    Error bars show the bootstrap intervals, because bands of this many methods would overlap.
+    It shows means over all scenes, with bootstrap intervals as error bars: bands of this many methods would overlap.
     """
     (group, scenes), *_ = groups_of(table).items()
     rows = table[table["group"] == group]
