@@ -26,14 +26,15 @@ from jaxnbv.storage.folders import versions, writing_in
 from jaxnbv.viz.answers import capital, kinds_text, label_of, number_text
 from jaxnbv.viz.charts import other_charts, task_charts
 from jaxnbv.viz.choice import draw_choice, marks
-from jaxnbv.viz.data import ReportData, report_data
+from jaxnbv.viz.data import ReportData, ViewData, report_data
 from jaxnbv.viz.figures import STYLE
 from jaxnbv.viz.html import render
 from jaxnbv.viz.imagined import image_tiles
+from jaxnbv.viz.placed_shape import PlacedShape
 from jaxnbv.viz.render import draw_scene, draw_truth, render_view
 from jaxnbv.viz.sketches import Sketches
 from jaxnbv.viz.space import figures_in_space
-from jaxnbv.viz.style import DEVIATION, DISPUTED, IMAGINED, OPEN, PART, bar_ticks, gradient
+from jaxnbv.viz.style import BEFORE, DEVIATION, DISPUTED, IMAGINED, NEW, OPEN, PART, bar_ticks, gradient
 
 # Sizes in inches: small, so that letters are legible on a phone.
 _SCENE, _SCENE_DPI = (5.2, 4.5), 131
@@ -88,7 +89,7 @@ def report_html(data: ReportData, title: str, question: str | None = None) -> st
         units=_world_of(data.episode)[1],
         length=data.episode.frame.unit,
         gradient=gradient(DEVIATION),
-        shapes={"scanned": PART, "imagined": IMAGINED, "imagined, but others disagree": OPEN, "other shapes": DISPUTED},
+        legends=[_legend(view) for view in data.views],
         truth=_truth_picture(data),
         question=data.task.question if question is None else question,
         ticks=_deviation_ticks(data),
@@ -129,6 +130,20 @@ def _deviation_ticks(data: ReportData) -> list[tuple[float, str]]:
 
 def _zip(text: str) -> bytes:
     return gzip.compress(text.encode(), mtime=0)
+
+
+def _legend(view: ViewData) -> dict[str, str]:
+    """Return the colours in the picture of a view, keyed by what they show."""
+    colours, surface = {}, view.surface
+    if isinstance(surface, PlacedShape):
+        colours = {"scanned": PART, "imagined": IMAGINED}
+        if surface.agreed.min() < 0.5:
+            colours["imagined, but others disagree"] = OPEN
+        if surface.disputed_space is not None:
+            colours["other shapes"] = DISPUTED
+    if len(view.before) > 0:
+        colours["points before"] = BEFORE
+    return colours | {"new points and camera": NEW}
 
 
 def _scene_picture(data: ReportData, index: int) -> str:

@@ -80,6 +80,15 @@ def test_the_page_holds_every_view_and_escapes_its_title(report, episode):
         np.testing.assert_allclose(matrix, view.pose.to_matrix(), atol=1e-5)
 
 
+def test_a_legend_names_only_what_its_picture_shows(report):
+    """The first view has no points before it, and no view shows a known shape."""
+    text = report[0].read_text(encoding="utf-8")
+    legend = text[text.index('<div id="legend">') : text.index('<button id="turn"')]
+    names = [re.findall(r"</span> ([^<]+)</span>", part) for part in legend.split('class="of"')[1:]]
+    later = ["points before", "new points and camera"]
+    assert names == [later[1:], later, later]
+
+
 def test_what_is_drawn_in_space_stands_where_it_is(episode, data):
     """Plotly's z is the scene's y. Coordinates are rounded to 1 / 256."""
     figure = figures_in_space(data)[2]
