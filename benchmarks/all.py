@@ -52,7 +52,7 @@ class Bench:
 
     def note(self, stage: str, seconds: float, **comparisons: float) -> float:
         self.rows[stage] = {"seconds": seconds} | {name: seconds / other for name, other in comparisons.items()}
-        print(f"{stage}: {seconds:.3g} s", flush=True)
+        print(f"{stage}: {seconds:.3g} s; {peak_memory():.1f} GB at most so far", flush=True)
         return seconds
 
     def observations(self, planner: nbv.Planner, views: int = 1) -> nbv.Observations:
@@ -232,6 +232,12 @@ def episodes(bench: Bench) -> None:
         bench.note("64 episodes as a program", least_time(program(64), repeats=1), one=one_episode)
 
 
+def peak_memory() -> float:
+    """Return the largest memory of the process so far, in GB."""
+    # Linux gives KiB, macOS bytes.
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e9
+
+
 def yardstick() -> float:
     matrix = jax.random.normal(jax.random.key(0), (2000, 2000))
     product = jax.jit(lambda a: jnp.matmul(a, a, precision="highest"))
@@ -263,14 +269,12 @@ def main() -> None:
     for stage in STAGES:
         if stage.__name__ in options.only:
             stage(bench)
-    # Linux gives kilobytes, macOS bytes.
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e9 if sys.platform == "darwin" else 1e6)
     record = {
         "device": jax.devices()[0].device_kind,
         "devices": len(jax.devices()),
         "versions": versions(),
         "yardstick": yardstick(),
-        "peak_memory_gb": peak,
+        "peak_memory_gb": peak_memory(),
         "stages": bench.rows,
     }
     options.out.parent.mkdir(parents=True, exist_ok=True)
