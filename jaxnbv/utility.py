@@ -95,9 +95,9 @@ class Utility(eqx.Module):
         return None
 
     def true_answer(self, scene: Surface, cloud: PointCloud) -> Answer | None:
-        """Return the correct answer for the true surface `scene`; None if `answer(cloud)` is correct.
+        """Return the correct answer for the true surface `scene`.
 
-        - `cloud`: points on the whole surface.
+        None means that `answer(cloud)`, computed from points on the whole surface, is taken as the correct answer.
         """
         return None
 

@@ -115,9 +115,9 @@ def _points_and_normals(
 def _in_box(
     points: Float[Array, "n 3"], nearest: Float[Array, " n"], box: Box, camera: Camera, pose: Pose, stride: int
 ) -> tuple[Bool[Array, " n"], Bool[Array, " n"]]:
-    """Return whether each point lies in a box, and whether each ray hit something behind or beside it.
+    """Return whether each point lies in the box, and whether each ray hit something behind or beside the box.
 
-    - `points`, `nearest`: point of each ray, and lower bound on the depth near it, see `_points_and_normals`.
+    - `points`, `nearest`: point of each ray, and lower bound on the depth in the pixels around the point.
     """
     is_beyond = (nearest > -jnp.inf) & (nearest >= _depth_behind(box, camera.strided(stride), pose))
     return box(points) <= 0, is_beyond

@@ -29,8 +29,8 @@ def depth_noise(
     The noise is estimated from the median magnitude of third differences of depth along rows and columns, which are
     mostly noise on a smooth surface. The median is over differences near the pixel at a similar depth. If there are
     fewer than 16, it is over the whole image at a similar depth or, if there are still fewer than 16, at any depth. If
-    between half and three quarters of the differences are zero, the depths must be rounded to steps, and the median is
-    over the other differences. The result is at least `min_noise`.
+    between half and three quarters of the differences are zero, depths are assumed to be rounded to steps, and the median
+    is over the other differences. If more are zero, it is nearly zero. The result is at least `min_noise`.
     """
     tile = max(-(-max(depth.shape) // _MAX_TILES), _MIN_TILE_SIZE)
     tiles = tuple(-(-size // tile) for size in depth.shape)
@@ -69,8 +69,8 @@ def _group_member(image: Shaped[Array, "h w"], axis: int, index: int) -> Shaped[
 def _median(counts: Float[Array, "*n levels"]) -> Float[Array, "*n"]:
     """Return the median of a histogram whose bins are powers of two; zero for an empty histogram.
 
-    The median is interpolated linearly within its bin. The first bin counts numbers that are nearly zero. If it has
-    between half and three quarters of all numbers, the depths must be rounded to steps, and this bin is left out.
+    The median is interpolated linearly within its bin. The first bin counts numbers that are nearly zero. It is left
+    out if it has between half and three quarters of all numbers, see `depth_noise`.
     """
     zeros = counts[..., 0] / jnp.maximum(jnp.sum(counts, axis=-1), 1.0)
     counts = counts.at[..., 0].multiply((zeros < 0.5) | (zeros > 0.75))

@@ -48,11 +48,11 @@ class Intake:
         return intake
 
     def add(self, loop: Loop, image: Image, on_accept: Callable[[], None] = lambda: None) -> Loop | None:
-        """Add an image to the loop as a view, and return the loop; None for a blank image after the first.
+        """Add an image to the loop as a view, and return the loop, or None if the image is blank.
 
         - `on_accept`: function that is called after all checks and before the view is added.
 
-        **Raises:** `ValueError` in the cases that `Session.add` lists. The intake and the loop do not change then.
+        **Raises:** `ValueError` as in `Session.add`, also for a blank first image. Intake and loop then stay unchanged.
         """
         index = len(self.images)
         image.check_not_stale(self.images)

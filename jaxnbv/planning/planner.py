@@ -107,8 +107,8 @@ class Planner(eqx.Module):
     def for_parts(cls, bank: ShapeBank, poses: ShapePoses = FreeRotation(), acquisition: Any = Identify()) -> "Planner":  # noqa: B008
         """Return a planner that identifies which part of a bank the object is, and estimates the part's pose.
 
-        - `bank`: parts at true size, from `ShapeBank.from_meshes(folder, scale="m")`, in world units (in a simulation,
-          scene units).
+        - `bank`: parts at true size, in world units (in a simulation, in scene units), for example from
+          `ShapeBank.from_meshes(folder, scale="m")` if the world is in metres.
         - `poses`: prior of the part's pose. The default allows every rotation.
 
         **Raises:** `ValueError` for a bank without parts, or not at true size.

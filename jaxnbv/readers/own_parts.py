@@ -32,8 +32,7 @@ def own_parts(
 
     Depths are in units of the images. A mount has the same depth at the same pixels in most frames, and moves with the
     camera. So where the mount was in the world during one frame, frames from other poses see something deeper. A vase
-    in the middle of an orbit also has nearly the same depth in all frames, but every frame sees the vase at the same
-    place in the world.
+    in the middle of an orbit also has nearly the same depth in all frames, but stays at one place in the world.
 
     - `image`, `matrices`: as in `depth_unit`.
     - `scale`: length of a unit of the images in world units.
@@ -72,7 +71,10 @@ def _is_mount(
     camera: Camera,
     side: int,
 ) -> Bool[np.ndarray, "k l"]:
-    """Return a mask of the connected components of `candidate_depth` whose place other frames see through.
+    """Return a mask of the blocks that show the camera's mount.
+
+    These are the connected components of `candidate_depth` where other frames see empty space at the component's place
+    in the world.
 
     - `candidate_depth`: depth of each block that has the same depth in most frames, in world units; zero elsewhere.
     - `depths`: least depth of each block in each frame, in world units; zero where nothing was measured.

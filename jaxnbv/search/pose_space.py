@@ -159,7 +159,10 @@ class ConstrainedPoses(PoseSpace):
         return Pose(_product(_product(rotation, rotation_between(target, to_origin)), roll_matrix), position)
 
     def check_camera(self, camera: Camera) -> None:
-        """Raise `ValueError` if the origin, at most `off_axis` from the axis, could be outside the image."""
+        """Raise `ValueError` if these poses could leave the origin outside the image.
+
+        They keep it within `off_axis` (radians) of the optical axis.
+        """
         left, top, right, bottom = camera.edges
         half = math.atan(min(-left, -top, right, bottom))
         require(

@@ -37,8 +37,8 @@ def rebuild(description: Any, arrays: Mapping[str, np.ndarray], path: str) -> An
     constructor is called.
 
     - `arrays`: contents of the large arrays, keyed by hash, from `describe`.
-    - `path`: path of the configuration for error messages, such as "planner". The name before the first dot is the
-      argument of `load` that replaces the configuration.
+    - `path`: path of the configuration for error messages, such as "planner". Errors advise the user to pass a
+      replacement to `load` under the name before the first dot.
 
     **Raises:** `ValueError` if a part cannot be rebuilt, or has changed since it was described. The error names the
     part's path.

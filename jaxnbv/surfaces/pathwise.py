@@ -152,7 +152,7 @@ class TrigonometricPosterior(SurfacePosterior):
 
     @abstractmethod
     def level_shift(self, means: MeansAtData) -> Float[Array, " s"]:
-        """Return, for each mean function, the level of samples about it minus `level`."""
+        """Return, for each mean function, the level of samples with this mean minus `level`."""
 
     @abstractmethod
     def prior_draws(self, key: PRNGKeyArray, num_samples: int) -> Any:

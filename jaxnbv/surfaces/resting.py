@@ -46,7 +46,7 @@ class Resting(ShapePoses):
         return cls(jnp.asarray(np.stack(rows), jnp.result_type(float)))
 
     def rotations(self, count: int) -> Float[AnyArray, "m 3 3"]:
-        """Return at most `count` start rotations of the first part."""
+        """Return the start rotations of the first part. Other parts rest differently, see `rotations_of`."""
         return self.rotations_of(1, count)[0]
 
     def rotations_of(self, num_shapes: int, count: int) -> Float[AnyArray, "k m 3 3"]:

@@ -79,7 +79,7 @@ def draw_choice(figure: Figure, proposal: Proposal | None, quantity: Quantity, f
 
 
 def draw_candidates(axes: Axes, proposal: Proposal) -> None:
-    """Draw each candidate's value and standard error in its own row, below a star for the chosen pose."""
+    """Draw one row per candidate (value, standard error). A star on top marks the chosen pose's value."""
     best = descending_values(proposal)
     order = np.argsort(-candidate_values(proposal))[: len(best)]
     rows = -np.arange(len(best))

@@ -28,7 +28,9 @@ class Sketch(NamedTuple):
 
 
 class Sketches:
-    """Sketches of a running episode. Pass `add` to `simulate(each=...)`, and the object to `write_report`.
+    """Sketches of a running episode.
+
+    Pass its method `add` to `simulate(each=...)`, and the `Sketches` itself to `write_report`.
 
     - `episode`: the episode so far, at first without views.
     - `held`: sketches keyed by the index of the view, from 0. The first view and views from a file have no sketch.

@@ -175,7 +175,7 @@ def confusable_meshes(name: str) -> tuple[TriangleMesh, ...]:
 def confusable_bank(name: str) -> ShapeBank:
     """Return the parts of a set of `CONFUSABLE_SETS` as a bank at true size.
 
-    The bank stores signed distances on a grid. With solids made by set operations, a search takes minutes to compile.
+    It is stored on a grid, because a search over the solids themselves (set operations) takes minutes to compile.
     """
     nodes = _nodes(_BANK_GRID)
     low, spacing = np.full(3, -_BANK_GRID.half_extent), _BANK_GRID.spacing
