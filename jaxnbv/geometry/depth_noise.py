@@ -29,8 +29,8 @@ def depth_noise(
     The noise is estimated from the median magnitude of third differences of depth along rows and columns, which are
     mostly noise on a smooth surface. The median is over differences near the pixel at a similar depth. If there are
     fewer than 16, it is over the whole image at a similar depth or, if there are still fewer than 16, at any depth. If
-    between half and three quarters of the differences are zero, depths are assumed to be rounded to steps, and the median
-    is over the other differences. If more are zero, it is nearly zero. The result is at least `min_noise`.
+    between half and three quarters of the differences are zero, depths are assumed to be rounded, and the median is
+    over the other differences. If more are zero, the median is nearly zero. The result is at least `min_noise`.
     """
     tile = max(-(-max(depth.shape) // _MAX_TILES), _MIN_TILE_SIZE)
     tiles = tuple(-(-size // tile) for size in depth.shape)

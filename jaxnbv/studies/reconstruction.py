@@ -131,7 +131,7 @@ class ReconstructionStudy(Study):
     def scene_picture(self, record: Record, methods: Sequence[str], pixels: int) -> ScenePicture:
         """Return a picture of each reconstruction after the last view, coloured by distance to the truth.
 
-        **Raises:** `ValueError` if the record includes reconstructions by screened Poisson, but `pymeshlab` is not installed.
+        **Raises:** `ValueError` if the record has results of screened Poisson, but `pymeshlab` is not installed.
         """
         scene, runs = self.scene(record["scene"]), record["methods"]
         truth = cast(TriangleMesh, true_mesh(scene.surface))
