@@ -10,8 +10,7 @@ from scipy.sparse.csgraph import connected_components
 
 from jaxnbv.geometry.camera import Camera
 
-# Images are compared in square blocks of pixels.
-# Number of frames to compare, smallest number of them that must measure a depth, and blocks along the longer side.
+# Number of frames to compare, smallest number that must measure a depth, and square blocks along the longer side.
 _NUM_FRAMES, _MIN_FRAMES, _NUM_BLOCKS = 16, 4, 80
 # Relative differences up to which depths count as equal: for a block in all frames, and for a point in two frames.
 _BLOCK_TOLERANCE, _POINT_TOLERANCE = 0.02, 0.05
@@ -73,8 +72,7 @@ def _is_mount(
 ) -> Bool[np.ndarray, "k l"]:
     """Return a mask of the blocks that show the camera's mount.
 
-    These are the connected components of `candidate_depth` where other frames see empty space at the component's place
-    in the world.
+    These are the connected components of `candidate_depth` at whose place in the world other frames see empty space.
 
     - `candidate_depth`: depth of each block that has the same depth in most frames, in world units; zero elsewhere.
     - `depths`: least depth of each block in each frame, in world units; zero where nothing was measured.

@@ -39,8 +39,7 @@ class PoseSpace(eqx.Module):
     def check_camera(self, camera: Camera) -> None:
         """Raise `ValueError` if the camera's field of view is too narrow to show the origin from every pose.
 
-        The default accepts every camera. `ConstrainedPoses` needs the check, because its cameras may look past the
-        origin.
+        The default accepts every camera.
         """
         return
 

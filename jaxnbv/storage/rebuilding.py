@@ -40,8 +40,7 @@ def rebuild(description: Any, arrays: Mapping[str, np.ndarray], path: str) -> An
     - `path`: path of the configuration for error messages, such as "planner". Errors advise the user to pass a
       replacement to `load` under the name before the first dot.
 
-    **Raises:** `ValueError` if a part cannot be rebuilt, or has changed since it was described. The error names the
-    part's path.
+    **Raises:** `ValueError` if a part cannot be rebuilt, or has changed since it was described.
     """
     remedy = f"import its module first, or give it again: load(..., {path.partition('.')[0] or 'planner'}=...)"
     try:
