@@ -115,7 +115,7 @@ def _points_and_normals(
 def _in_box(
     points: Float[Array, "n 3"], nearest: Float[Array, " n"], box: Box, camera: Camera, pose: Pose, stride: int
 ) -> tuple[Bool[Array, " n"], Bool[Array, " n"]]:
-    """Return whether each point lies in the box, and whether each ray hit something behind or beside the box.
+    """Return which points lie in the box, and which rays hit something behind or beside the box.
 
     - `points`, `nearest`: point of each ray, and lower bound on the depth in the pixels around the point.
     """

@@ -197,7 +197,7 @@ class ScreenedSPSRPosterior(TrigonometricPosterior):
         return jax.lax.map(at_point, x, batch_size=points_per_batch(len(x), self.base.cloud.capacity))
 
     def data_points(self) -> DataPoints:
-        """Return the points where a mean function is evaluated: its gradient at the cloud, its value at `rows`."""
+        """Return where a mean function is evaluated: its gradient at the cloud's points, its value at `rows`."""
         return DataPoints(self.base.data_points().gradient_points, fill_rows(self.rows.points, self.rows.mask))
 
     def level_shift(self, means: MeansAtData) -> Float[Array, " s"]:
