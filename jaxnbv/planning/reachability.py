@@ -137,9 +137,9 @@ def _rolled_options(
 ) -> list[_Option]:
     rolls = _rotations_about_axis(pose)
     scores = {index: score for index, score in enumerate(answers(rolls)) if not isinstance(score, str)}
-    values, camera = np.full(len(_ROLLS), value), loop.planner.camera
-    # A rotation changes the value only if the search simulates images that are not square.
-    if scores and loop.planner.search.uses_samples and camera.height != camera.width:
+    values = np.full(len(_ROLLS), value)
+    if scores and loop.planner.search.uses_samples:
+        # A rotated image shows other surface at its corners.
         values = np.asarray(loop.planner.values_at(loop.inputs(), rolls), float)
     return [_Option(rolls[index], float(values[index]), score) for index, score in scores.items()]
 

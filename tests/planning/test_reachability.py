@@ -139,13 +139,16 @@ def test_a_score_is_multiplied_by_the_value(free, values):
     assert len(set(calls)) <= 8 * (can_win // 8 + 1)
 
 
-def test_a_turned_image_that_is_not_square_is_imagined_again(free):
-    """The value of the wide image after a rotation by a right angle is the planner's value of that pose."""
+@pytest.mark.parametrize(("height", "width", "low", "high"), [(8, 24, 0.9, 1.1), (16, 16, 0.6, 0.8)])
+def test_the_value_of_a_rolled_camera_is_imagined_again(free, height, width, low, high):
+    """A wide image rolled by a right angle and a square image rolled by 45 degrees both show something else."""
 
     def reachable(matrices):
-        return np.abs(matrices[:, 2, 0]) > 0.9
+        across = np.abs(matrices[:, 2, 0])
+        return (low < across) & (across < high)
 
-    session = begun(planner=dataclasses.replace(planner_of(), camera=Camera(height=8, width=24)), reachable=reachable)
+    camera = Camera(height=height, width=width)
+    session = begun(planner=dataclasses.replace(planner_of(), camera=camera), reachable=reachable)
     view = session.next()
     pose = view.proposal.pose
     assert float(session.planner.values_at(session._loop.inputs(), pose[None])[0]) == pytest.approx(
