@@ -3,7 +3,6 @@
 import ast
 import io
 import os
-import subprocess
 import sys
 from pathlib import Path
 from unittest import mock
@@ -12,6 +11,7 @@ import pytest
 from commands import TERMINAL
 
 import jaxnbv
+from jaxnbv.cli import main
 from jaxnbv.cli.streams import write_readable
 
 ENCODINGS = ("ascii", "cp1251", "cp932", "cp437", "latin-1", "gbk", "utf-8")
@@ -59,23 +59,12 @@ def test_a_path_that_is_no_text_is_written_by_its_codes():
     assert written("runs/\udcff", "utf-8") == "runs/\\udcff"
 
 
-def test_commands_answer_in_every_encoding():
-    """The commands run one after the other in one process, through its entry point."""
-    script = f"""
-import sys
-from jaxnbv.cli import main
-
-for encoding in {ENCODINGS}:
-    for words, code in {{"demo --help": 0, "run no.obj": 2}}.items():
-        for stream in (sys.stdout, sys.stderr):
-            stream.reconfigure(encoding=encoding, errors="strict")
-        sys.argv, found = ["jaxnbv", *words.split()], 0
-        try:
-            main()
-        except SystemExit as leaving:
-            found = leaving.code or 0
-        assert found == code, (encoding, words)
-"""
-    environment = {**os.environ, **TERMINAL}
-    result = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True)
-    assert result.returncode == 0, result.stderr
+@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize(("words", "code"), [("demo --help", 0), ("run no.obj", 2)])
+def test_commands_answer_in_every_encoding(words, code, encoding, monkeypatch):
+    for name in ("stdout", "stderr"):
+        monkeypatch.setattr(sys, name, io.TextIOWrapper(io.BytesIO(), encoding, errors="strict"))
+    monkeypatch.setattr(sys, "argv", ["jaxnbv", *words.split()])
+    with mock.patch.dict(os.environ, TERMINAL), pytest.raises(SystemExit) as leaving:
+        main()
+    assert leaving.value.code == code

@@ -208,8 +208,8 @@ def test_misfits_are_comparable_with_none_of_these(seen):
     """Weights are proportional to exp(-misfit), with and without rays."""
     bare = dataclasses.replace(seen[0], looks=None)
     bare_hypotheses = identify(BANK, nbv.surfaces.FreeRotation(), nbv.Box(), bare, None)
-    sampler = nbv.SurfaceSampler(grid=GRID).with_bank(BANK, nbv.surfaces.FreeRotation())
-    for observations in (seen[0], dataclasses.replace(bare, hypotheses=bare_hypotheses)):
+    sampler = nbv.SurfaceSampler(nbv.GeometricSPSR(truncation=8), GRID).with_bank(BANK, nbv.surfaces.FreeRotation())
+    for observations in (seen[0], dataclasses.replace(seen[0], hypotheses=bare_hypotheses)):
         listed = sampler.posterior(observations).hypotheses
         misfits = np.array([one.misfit for one in listed])
         energy = np.exp(misfits.min() - misfits)
