@@ -144,11 +144,12 @@ FINE, EYE = Grid(64), Camera(height=50, width=50)
 
 
 def looking(poses, candidates, radii):
-    """The state after scans of the ball from poses, with balls as posterior samples."""
+    """The state after scans of the ball from poses, with two balls as posterior samples, from which no cell is cut."""
     planner = planner_of(NewSurface(), DiscreteSearch(candidates))
     planner = dataclasses.replace(planner, camera=EYE, sampler=dataclasses.replace(planner.sampler, grid=FINE))
     *_, observations = planner.replay((pose, scan(SCENE, EYE, pose)) for pose in poses)
-    context = after(planner, observations.cloud, surfaces=balls(FINE, radii))
+    surfaces = balls(FINE, radii).without_cells(jnp.zeros((2, 63, 63, 63), bool))
+    context = after(planner, observations.cloud, surfaces=surfaces)
     return dataclasses.replace(context, observations=observations)
 
 
@@ -161,14 +162,16 @@ def test_surface_that_faces_no_view_is_unseen():
     share = np.mean((5.0 * heights - 0.8) / np.sqrt(25.0 - 8.0 * heights + 0.64) >= 0.2)
     assert 0.3 < share < 0.4
     for count in (1, 2):
-        context = looking(poses[:count], 24, [0.8])
+        context = looking(poses[:count], 24, [0.8, 0.8])
         assert expected_coverage(context, NewSurface()) == pytest.approx(count * share, abs=0.02)
 
 
 def test_surface_that_views_looked_through_need_not_be_covered():
     """Two samples: the ball that was measured, and a larger ball that every view looked through."""
     poses = look_at([(0.0, 0.0, 5.0), (5.0, 0.0, 0.0)])
-    context = looking(poses, poses, [0.8, 1.1])
+    # As many candidates as above, so that both tests share a program.
+    candidates = jax.tree.map(lambda rows: jnp.repeat(rows, 12, axis=0), poses)
+    context = looking(poses, candidates, [0.8, 1.1])
     planner, observations, surfaces = context.planner, context.observations, context.surfaces()
     assert expected_coverage(context, NewSurface()) < 0.45
     measurable = observations.looks.without_unmeasured(surfaces, observations.poses)
