@@ -27,7 +27,7 @@ def surface_of(sampler, observations):
 @pytest.fixture(scope="module")
 def spheres():
     """A planner whose surfaces are spheres, and its observations."""
-    planner = small_planner(nbv.RandomView(), model=SphereModel(), grid=nbv.Grid(40), num_samples=64)
+    planner = small_planner(nbv.RandomView(), model=SphereModel(), grid=nbv.Grid(28), num_samples=64)
     return planner.sampler, planner.init(None, POINT)
 
 
@@ -40,7 +40,7 @@ def test_any_posterior_has_a_surface_with_a_standard_deviation(spheres):
     np.testing.assert_allclose(surface.deviation, 0.03, rtol=4 / np.sqrt(2 * 64))
     np.testing.assert_allclose(np.sum(surface.normals * surface.vertices, axis=1) / radius, 1.0, atol=1e-2)
     sampler, observations = spheres
-    assert surface_of(dataclasses.replace(sampler, grid=nbv.Grid(40, 0.2), carving=None), observations) is None
+    assert surface_of(dataclasses.replace(sampler, grid=nbv.Grid(28, 0.2), carving=None), observations) is None
 
 
 def test_the_surface_of_the_mean_is_carved(spheres):
