@@ -172,19 +172,14 @@ def value_of(acquisition, surfaces, cloud):
 
 
 def test_every_acquisition_has_a_gradient_under_vmap_but_heat_says_that_it_has_none(surfaces, cloud):
-    """In the pose, in the cloud, and in both."""
-    x = jnp.asarray([0.5, 0.2])
-    points = jnp.broadcast_to(cloud.points, (2, *cloud.points.shape))
-    for acquisition in (ALL, HEAT):
-        values = value_of(acquisition, surfaces, cloud)
-        value = lambda *at, values=values: jnp.sum(values(*at))  # noqa: E731
-        jax.make_jaxpr(jax.vmap(value))(x, points)
-        for slope, at in ((jax.grad(value), (x,)), (jax.grad(value, (0, 1)), (x, points))):
-            if acquisition is HEAT:
-                with pytest.raises(nbv.InputError, match="ColdestPoint has no derivative"):
-                    jax.make_jaxpr(jax.vmap(slope))(*at)
-            else:
-                jax.make_jaxpr(jax.vmap(slope))(*at)
+    """In the pose and in the cloud."""
+    at = jnp.asarray([0.5, 0.2]), jnp.broadcast_to(cloud.points, (2, *cloud.points.shape))
+    values, heat = (value_of(acquisition, surfaces, cloud) for acquisition in (ALL, HEAT))
+    jax.make_jaxpr(jax.vmap(jax.grad(lambda *at: jnp.sum(values(*at)), (0, 1))))(*at)
+    jax.make_jaxpr(jax.vmap(heat))(*at)
+    for by in (0, (0, 1)):
+        with pytest.raises(nbv.InputError, match="ColdestPoint has no derivative"):
+            jax.make_jaxpr(jax.vmap(jax.grad(heat, by)))(*at)
 
 
 @pytest.mark.slow
@@ -223,11 +218,12 @@ def test_only_heat_is_computed_by_the_host(surfaces, cloud):
 def test_samples_that_a_gpu_takes_together_have_the_same_scores(surfaces, cloud, monkeypatch):
     on_host = nbv.CrossEntropy(nbv.HostClassifier(linear_of_batch, 4))
     acquisition = nbv.AcquisitionList((nbv.Coverage(), nbv.NewSurface(), nbv.CrossEntropy(linear), on_host))
-    alone = nbv.expected_value(acquisition, cloud, surfaces, CAMERA, POSES)
+    values = lambda *data: nbv.expected_value(acquisition, *data, CAMERA, POSES)  # noqa: E731
+    alone = jax.jit(values)(cloud, surfaces)
     for module in ("utility", "scanning.grid", "tasks.coverage"):
         monkeypatch.setattr(f"jaxnbv.{module}.on_cpu", lambda: False)
     assert samples_at_once(CAMERA, POSES) > 3
-    together = nbv.expected_value(acquisition, cloud, surfaces, CAMERA, POSES)
+    together = jax.jit(lambda *data: values(*data))(cloud, surfaces)
     assert float(jnp.ptp(alone, axis=0).min()) > 1e-3
     np.testing.assert_allclose(together, alone, rtol=1e-4, atol=1e-5)
 

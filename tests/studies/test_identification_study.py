@@ -13,6 +13,7 @@ from PIL import Image
 
 import jaxnbv as nbv
 from jaxnbv.checks import InputError
+from jaxnbv.geometry.pose_list import PoseList
 from jaxnbv.scanning import barrier_of
 from jaxnbv.studies.engine.pictures import write_pictures
 from jaxnbv.studies.engine.results import results, summary, verdicts
@@ -212,7 +213,8 @@ def test_the_choice_is_that_of_the_planner_with_the_same_key(record, folder):
     """All studies have this loop (`test_a_study_takes_the_views_of_a_simulation`). Here it carries hypotheses."""
     study, run = small_study(folder, Setup.HIDDEN), record["methods"][IDENTIFY]
     key = jax.random.split(jax.random.fold_in(study.key(1, "episode"), 1))[0]
-    proposal = study.planner(IDENTIFY, study.scene(1)).propose(Keeping.steps[0].observations, key)
+    planner = study.planner(IDENTIFY, study.scene(1))
+    proposal = planner.propose(Keeping.steps[0].observations, key, PoseList.empty(planner.max_views))
     np.testing.assert_allclose(proposal.pose.position, run["views"][1]["position"], atol=1e-5)
 
 

@@ -79,7 +79,7 @@ def test_every_method_is_measured_by_what_its_frames_show(study, record):
 
 
 def test_its_pictures_show_every_method(study, record, tmp_path):
-    (path,) = write_pictures([record], study, tmp_path, pixels=80)
+    (path,) = write_pictures([record], study, tmp_path, pixels=40)
     assert path.name == "scene_0001.png"
     pixels = np.asarray(Image.open(path).convert("RGB")).reshape(-1, 3)
     assert len(np.unique(pixels, axis=0)) > 20

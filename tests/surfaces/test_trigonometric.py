@@ -39,11 +39,15 @@ def test_grid_point_and_default_slab_evaluation_agree(x64):
 
 def test_ways_to_the_gradient_agree(x64):
     fields = TrigonometricFields(jnp.asarray(COEFFICIENTS[0]))
-    automatic = jax.vmap(jax.jacobian(lambda x: fields(x[None])[:, 0]))(jnp.asarray(POINTS))
-    np.testing.assert_allclose(fields.gradient(POINTS), automatic.transpose(1, 0, 2), atol=1e-10)
-    np.testing.assert_allclose(nbv.surfaces.Fields.gradient(fields, POINTS), automatic.transpose(1, 0, 2), atol=1e-10)
-    for axis in range(3):
-        derivative = TrigonometricFields(differentiate(fields.coefficients, axis))(POINTS)
+    ways = fields.gradient, lambda x: nbv.surfaces.Fields.gradient(fields, x), jax.jacobian(fields)
+    own, default, jacobian = jax.jit(lambda x: [way(x) for way in ways])(jnp.asarray(POINTS))
+    automatic = np.einsum("snnd->nsd", jacobian)
+    np.testing.assert_allclose(own, automatic.transpose(1, 0, 2), atol=1e-10)
+    np.testing.assert_allclose(default, automatic.transpose(1, 0, 2), atol=1e-10)
+    derivatives = jax.jit(
+        lambda x: [TrigonometricFields(differentiate(fields.coefficients, axis))(x) for axis in range(3)]
+    )(POINTS)
+    for axis, derivative in enumerate(derivatives):
         np.testing.assert_allclose(derivative, automatic[..., axis].T, atol=1e-10)
         step = 1e-5 * np.eye(3)[axis]
         central = (direct(COEFFICIENTS[0], POINTS + step) - direct(COEFFICIENTS[0], POINTS - step)) / 2e-5
@@ -116,22 +120,29 @@ def test_the_transform_beyond_the_scene_is_exact_or_nan(x64):
     places = np.array([-3.1, -2.4, -1.6, -1.5, 0.3, 1.5, 1.7, 2.2, 3.1, np.nan, np.inf])
     points = np.stack([places, np.full(11, 0.2), np.full(11, -0.4)], axis=1)
     points = np.concatenate([np.roll(points, axis, axis=1) for axis in range(3)])
-    transform = NonuniformTransform(jnp.asarray(points), L)
-    actual = np.asarray(transform.evaluate(jnp.asarray(COEFFICIENTS[0]))).T
+
+    @jax.jit
+    def both(points):
+        transform = NonuniformTransform(points, L)
+        return transform.evaluate(jnp.asarray(COEFFICIENTS[0])), transform.adjoint(jnp.ones((33, 1)))
+
+    evaluated, spread = map(np.asarray, both(jnp.asarray(points)))
+    actual = evaluated.T
     furthest = np.abs(points).max(axis=1)
     with np.errstate(invalid="ignore"):
         exact = direct(COEFFICIENTS[0], points)
     np.testing.assert_array_equal(np.isnan(actual).all(axis=0), ~(furthest < 2.0))
     np.testing.assert_allclose(actual[:, furthest < 2.0], exact[:, furthest < 2.0], atol=1e-10)
-    assert np.isnan(transform.adjoint(jnp.ones((33, 1)))).all()
+    assert np.isnan(spread).all()
 
 
 def test_a_gpu_spreads_as_a_cpu_does(monkeypatch):
     points, values = jnp.asarray(points_with_borders(60)), jnp.asarray(RNG.standard_normal((60, 2)))
-    transform = NonuniformTransform(points, 4)
-    on_cpu = transform.adjoint(values)
+    spread = lambda points, values: NonuniformTransform(points, 4).adjoint(values)  # noqa: E731
+    on_cpu = jax.jit(spread)(points, values)
     monkeypatch.setattr("jaxnbv.surfaces.trigonometric.on_cpu", lambda: False)
-    assert relative(np.asarray(transform.adjoint(values)), np.asarray(on_cpu)) < 1e-6
+    # Another function, which is traced again.
+    assert relative(jax.jit(lambda *data: spread(*data))(points, values), on_cpu) < 1e-6
 
 
 def test_gradients_on_nodes_and_borders_are_those_of_the_function():
