@@ -71,7 +71,7 @@ def surface_error(hypotheses: PartHypotheses, observations: Observations) -> flo
     points = np.asarray(placement.rotation) @ np.asarray(shape.extremes).T + np.asarray(placement.shift)[:, None]
     surface = jnp.asarray(points.T, jnp.float32)
     distances = np.asarray(distances_to(hypotheses, surface), np.float64)
-    _, gradient = values_and_gradients(lambda x: placement.distance(shape.solid, x), surface)
+    _, gradient = _distances(shape, placement, surface)
     # Only motion along the normal counts. Motion along the surface leaves the surface in place.
     normals = np.asarray(gradient, np.float64)
     rows = np.concatenate([np.cross(normals, points.T - np.asarray(placement.shift)), -normals], axis=1)
@@ -85,6 +85,14 @@ def distances_to(hypotheses: PartHypotheses, points: Float[Array, "p 3"]) -> Flo
     """Return the signed distances of points to the placed part of each hypothesis."""
     solids = hypotheses.bank.shape(hypotheses.placed.shape).solid
     return jax.lax.map(lambda part: part[1].distance(part[0], points), (solids, hypotheses.placed.placement))
+
+
+@program
+def _distances(
+    shape: Shape, placement: Placement, points: Float[Array, "p 3"]
+) -> tuple[Float[Array, " p"], Float[Array, "p 3"]]:
+    """Return the signed distances of points to a placed shape, and their gradients."""
+    return values_and_gradients(lambda x: placement.distance(shape.solid, x), points)
 
 
 def symmetries(shape: Shape) -> Float[np.ndarray, "n 3 3"]:
@@ -123,7 +131,7 @@ def _covariance(shape: Shape, placement: Placement, targets: FitTargets) -> Floa
     It is (J^T J / s^2 + P)^-1, where J is the derivative of the distances from the points to the part, s the standard
     deviation of these distances, and P the precision of a broad prior.
     """
-    distance, gradient = values_and_gradients(lambda x: placement.distance(shape.solid, x), targets.points)
+    distance, gradient = _distances(shape, placement, targets.points)
     mask = np.asarray(targets.mask)
     distance, gradient = np.asarray(distance, np.float64)[mask], np.asarray(gradient, np.float64)[mask]
     arms = np.asarray(targets.points, np.float64)[mask] - np.asarray(placement.shift, np.float64)
