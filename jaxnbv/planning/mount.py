@@ -20,7 +20,9 @@ _MIN_CHANGE = 0.5
 
 
 class MountError:
-    """Alignment of a session's images, and the pose corrections that the session currently uses.
+    """Errors of a session's poses, such as a wrong transform from the robot's hand to the camera (the mount).
+
+    They are estimated by aligning the images. The session decides whether to use the corrections.
 
     - `camera`, `convention`: as in the session.
     - `corrections`: (views, 4, 4), the correction X of each image. The true pose of the camera is `matrix @ X`, in
@@ -36,7 +38,10 @@ class MountError:
         self._has_warned = False
 
     def add(self, image: Image, index: int) -> None:
-        """Add the image (after `Image.without_sentinels`) with this index, unless it was added before."""
+        """Add the image with this index, unless it was added before.
+
+        - `image`: a result of `Image.without_sentinels`.
+        """
         if index == len(self._images):
             self._images.append(image)
 

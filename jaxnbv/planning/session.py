@@ -326,9 +326,10 @@ class Session:
     def next(self, seconds: float = math.inf) -> NextView:
         """Propose the pose for the next image.
 
-        The result is stored in the folder, and stays the same until an image is added. No pose is proposed twice, even
-        if its image was taken elsewhere. The method warns if the pose may show nothing new: if its value is at most
-        three standard errors above the mean value estimated at visited poses.
+        The result is stored in the folder, and stays the same until an image is added. After that the pose is not
+        proposed again, even if the image was taken from a different pose. The method warns if the pose may show nothing
+        new: if its value is at most three standard errors above the mean value of the visited poses, which can show
+        nothing new.
 
         - `seconds`: time limit for calls of `reachable`. After this time, the best reachable pose so far is used.
 

@@ -19,7 +19,7 @@ KIND = "session"
 class SessionFolder:
     """The stored images, proposals and refused poses of a session, in order.
 
-    **Raises:** `ValueError` for a folder of a session with different arguments (`config`).
+    **Raises:** `ValueError` if the folder belongs to a session with a different `config`, the arguments of the session.
     """
 
     def __init__(self, path: str | Path, config: dict[str, Any]):

@@ -59,11 +59,10 @@ def object_pose(hypotheses: PartHypotheses, observations: Observations, frame: F
 
 
 def surface_error(hypotheses: PartHypotheses, observations: Observations) -> float:
-    """Return the expected distance (scene units) of the most likely part's surface from the true surface.
+    """Return the expected error (root mean square, scene units) of the surface of the most likely part.
 
-    It is a root mean square over points of the part's surface. The mean square is the sum of two terms: the variance
-    due to errors of the scanned points, and the squared distance to the surface of each hypothesis, weighted by the
-    hypothesis's probability.
+    The mean square over points of the surface has two terms: the variance due to errors of the scanned points, and the
+    squared distance to the surfaces of the hypotheses, averaged with their probabilities.
     """
     part, placement = hypotheses.most_likely
     shape = hypotheses.bank.shape(jnp.asarray(part))

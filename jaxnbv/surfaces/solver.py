@@ -203,10 +203,10 @@ def _apply_to_leading_rows(
     cloud: PointCloud,
     matrices: Float[Array, "s n k"],
 ) -> Float[Array, "s n k"]:
-    """Apply a method of `CholeskyFactor` to each column of each matrix, on as few rows as hold the cloud.
+    """Apply a method of `CholeskyFactor` to each column of each matrix, using only the rows that hold points.
 
-    Row i of a matrix belongs to row i of the cloud, and must be zero if the cloud's row i is unfilled. The leading rows
-    that hold all points are passed on, and the other rows of the result are zero.
+    Row i of a matrix belongs to row i of the cloud, and must be zero if the cloud's row i is unfilled. The other rows of
+    the result are zero.
 
     - `function`: called as `function(factor, columns)`, with the factor of the leading rows.
     - `factor`: the factor for all rows.

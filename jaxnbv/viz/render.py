@@ -48,8 +48,9 @@ def eye_beside(pose: Pose) -> Float[np.ndarray, "3"]:
 class Still:
     """A perspective picture of a surface, transparent where there is no surface.
 
-    The light comes from beside the viewer, and hollows are darker. Colours of a known shape say whether it is measured,
-    imagined, or different in other hypotheses. Other surfaces are coloured by their standard deviation.
+    The light comes from beside the viewer, and hollows are darker. On a known shape, colours show which places are
+    measured, which are imagined, and which differ in other hypotheses. Other surfaces are coloured by their standard
+    deviation.
 
     - `eye`: direction from the origin to the viewer.
     - `size`: pixels along each side.

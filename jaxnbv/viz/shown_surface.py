@@ -43,7 +43,7 @@ def shown_surface(sampler: SurfaceSampler, inputs: StepInputs, answer: Answer | 
 
 
 def _within_volume(sampler: SurfaceSampler, observations: Observations) -> Observations:
-    """Return the observations for conditioning the model. Empty nodes outside the carving volume are left out."""
+    """Return the observations without the empty nodes outside the carving volume, which the model must not use."""
     observations = sampler.adapt(observations)
     if sampler.carving is None or observations.empty_nodes is None:
         return observations

@@ -43,8 +43,9 @@ class TaskReport(NamedTuple):
     """The task of an episode, with its answers after each view.
 
     - `amounts`, `coverage_chart`: amount of surface seen after each view, and its chart.
-    - `answers`, `charts`: answers after each view, and their charts. If the acquisition has no answers, these are the
-      amounts.
+    - `answers`, `charts`: answers after each view, and their charts. If the acquisition has no answers, they are the
+      amounts and their chart.
+    - `rival`: the comparison with a baseline, if one was run.
     - `choice_text`, `reliability_text`: how views were chosen, and from which view on the answer is reliable.
     """
 
