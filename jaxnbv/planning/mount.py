@@ -20,7 +20,7 @@ _MIN_CHANGE = 0.5
 
 
 class MountError:
-    """Errors of a session's poses, such as a wrong transform from the robot's hand to the camera (the mount).
+    """Errors of a session's poses, such as an error of the camera's mount on the robot's hand.
 
     They are estimated by aligning the images. The session decides whether to use the corrections.
 

@@ -205,8 +205,8 @@ def _apply_to_leading_rows(
 ) -> Float[Array, "s n k"]:
     """Apply a method of `CholeskyFactor` to each column of each matrix, using only the rows that hold points.
 
-    Row i of a matrix belongs to row i of the cloud, and must be zero if the cloud's row i is unfilled. The other rows of
-    the result are zero.
+    Row i of a matrix belongs to row i of the cloud, and must be zero if the cloud's row i is unfilled. The other rows
+    of the result are zero.
 
     - `function`: called as `function(factor, columns)`, with the factor of the leading rows.
     - `factor`: the factor for all rows.

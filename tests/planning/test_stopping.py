@@ -169,7 +169,7 @@ def test_surface_that_faces_no_view_is_unseen():
 def test_surface_that_views_looked_through_need_not_be_covered():
     """Two samples: the ball that was measured, and a larger ball that every view looked through."""
     poses = look_at([(0.0, 0.0, 5.0), (5.0, 0.0, 0.0)])
-    # As many candidates as above, so that both tests share a program.
+    # The test above has as many candidates, so that both tests share a program.
     candidates = jax.tree.map(lambda rows: jnp.repeat(rows, 12, axis=0), poses)
     context = looking(poses, candidates, [0.8, 1.1])
     planner, observations, surfaces = context.planner, context.observations, context.surfaces()

@@ -133,7 +133,7 @@ class PartStudy(PartDiscoveryStudy):
     def configured(
         cls, model: str, views: int, quick: bool, meshes: str | Path | None = None, **options: Any
     ) -> dict[str, Study]:
-        """Return a dictionary with one study, under the key "". It is a `MeshPartStudy` if `meshes` is a folder."""
+        """Return one study, under the key "". It is a `MeshPartStudy` if `meshes` is a folder."""
         if meshes is not None:
             return MeshPartStudy.configured(model, views, quick, meshes=meshes, **options)
         return super().configured(model, views, quick, segmenter=part_segmenter(category=0), **options)
