@@ -129,7 +129,7 @@ class Acquisition(eqx.Module):
     def check(self, cloud: PointCloud) -> None:
         """Raise `ValueError` if a network or function of the acquisition returns an invalid result.
 
-        - `cloud`: the cloud D, or the union of D and a scan whose score is not finite.
+        - `cloud`: the cloud D; or, to explain a score that is not finite, D with the scan that got it.
         """
         return
 

@@ -53,7 +53,7 @@ def fit_planes(
     - `depth`: depths, positive and finite where `valid`.
     - `camera`: the camera of the whole image.
     - `min_noise`: lower bound on the standard deviation of the noise, such as that of rounding.
-    - `block_side`: side of the blocks of pixels that give one sample each. Windows consist of such blocks.
+    - `block_side`: side, in pixels, of the blocks that make up a window. Each is reduced to one point of the fit.
     """
     focal = jnp.asarray(camera.focal_lengths, depth.dtype)
     strided = slice(stride // 2, None, stride)

@@ -26,7 +26,7 @@ class PairLevel(eqx.Module):
     the arc cosines, so derivatives exist everywhere.
 
     - `radius`: radius of a group, in units of the points.
-    - `groups`: intended number of centres. The caller chooses the centres.
+    - `groups`: number of centres that the caller should choose. This class does not use it.
     - `neighbours`: maximum number of points in a group. If more are within the radius, the first rows are used.
     """
 

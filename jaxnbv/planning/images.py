@@ -94,7 +94,7 @@ class Image(NamedTuple):
         return self._replace(robot=robot)
 
     def cloud(self, camera: Camera, pose: Pose, stride: int, box: Box | None = None) -> PointCloud:
-        """Return `PointCloud.from_depth` of the image, without points of the robot. The `mask` is not applied."""
+        """Return the image's cloud without the points at `robot` pixels. The object's `mask` is not applied."""
         cloud = PointCloud.from_depth(self.depth, camera, pose, self.scale, stride, box)
         return cloud if self.robot is None else only_where(cloud, ~self.robot, camera, stride)
 

@@ -106,7 +106,7 @@ class ValuePerCost(eqx.Module):
         return dataclasses.replace(self, of=WorldCost(of, frame))
 
     def quantity(self, value: Quantity) -> Quantity:
-        """Return the quantity of values per cost, given the quantity of the values."""
+        """Return the name, unit and meaning of value per cost, given those of the value."""
         meaning = f"{value.meaning.rstrip('.')}, over the cost of going there."
         unit = f"{value.unit or ('' if value.length_power else value.name)} per unit of cost".lstrip()
         return dataclasses.replace(value, name=f"{value.name} per cost", unit=unit, meaning=meaning)

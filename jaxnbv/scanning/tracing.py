@@ -63,7 +63,7 @@ class GridField(eqx.Module):
 
     @property
     def offset(self) -> float:
-        """Distance, in cells along every axis, by which a position moves forward before its cell is computed.
+        """How far a position is moved with the ray, in cells along each axis, before its cell is looked up.
 
         The offset exceeds the rounding of coordinates, so a ray on the border of two cells is always assigned to the
         cell that it enters, and the march cannot stall. A zero in the skipped sliver is still detected, because the

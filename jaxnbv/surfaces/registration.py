@@ -83,7 +83,7 @@ def _choose_empty_points(observations: Observations) -> tuple[Float[Array, "m 3"
 def _first_empty_nodes(
     empty_nodes: Bool[Array, "g g g"], order: Int[Array, " nodes"]
 ) -> tuple[Int[Array, "m 3"], Bool[Array, " m"]]:
-    """Return grid indices of the first 512 empty nodes in this order of flat indices, and a mask of rows."""
+    """Return grid indices of the first 512 empty nodes by `order` (flat indices), and a mask of filled rows."""
     is_empty = empty_nodes.reshape(-1)[order]
     row = jnp.where(is_empty, jnp.cumsum(is_empty) - 1, _NUM_EMPTY)
     indices = jnp.zeros(_NUM_EMPTY, jnp.int32).at[row].set(order, mode="drop")
@@ -190,9 +190,10 @@ def _rotated_starts(bank: ShapeBank, prior: Prior, targets: FitTargets, num_star
 
 
 def _swap_shapes(bank: ShapeBank, prior: Prior, hypotheses: Hypotheses, targets: FitTargets) -> Hypotheses:
-    """Compute the misfit of each shape in the placements of the best hypotheses with distinct rotations.
+    """Place each shape as in each of the best hypotheses with distinct rotations, and compute its misfit.
 
-    A shape takes the rotation of the hypothesis, and the hypothesis's shift and scale relative to `Prior.fill_box`.
+    The shape gets the hypothesis's rotation. Its shift and scale differ from those with which it would fill the box
+    (`Prior.fill_box`) by as much as the hypothesis's do for the hypothesis's own shape.
     """
     hypotheses = hypotheses.best(len(hypotheses.misfit))
     is_distinct = _find_distinct(jnp.zeros_like(hypotheses.shape), hypotheses.placement.rotation)

@@ -199,7 +199,9 @@ def render_view(data: ReportData, index: int, size: int | None = None) -> Still:
 def draw_scene(
     axes: Axes, data: ReportData, index: int, still: Still, weight: float = 1.0, inset: bool = True, aspect: float = 1.0
 ) -> None:
-    """Draw surface, points and cameras after view `index` (from 0), and a part's name, into empty axes.
+    """Draw surface, points and cameras after view `index` (from 0) into empty axes.
+
+    If the surface is a known part, its name and probability are added.
 
     - `still`: see `render_view`.
     - `weight`: factor for the sizes of lines, dots and letters.
@@ -240,7 +242,7 @@ def _free_corner(axes: Axes, content: list[Float[np.ndarray, "_ 2"]]) -> tuple[i
 
 
 def _content_pixels(data: ReportData, still: Still) -> list[Float[np.ndarray, "_ 2"]]:
-    """Return the pixels of the content of all views, so that all pictures can be cropped in the same way."""
+    """Return the pixel coordinates of everything drawn in any view, so that all pictures share one crop."""
     surfaces = [view.surface.vertices for view in data.views if view.surface is not None]
     content = [still.project(rows)[0] for rows in (*surfaces, *(view.new for view in data.views)) if len(rows)]
     for view in data.views:

@@ -120,8 +120,8 @@ def coverage_answers(
     """Return how much of the surface was seen after each view.
 
     Given points of the true surface (`truth`), this is the percentage of these points that was seen. Otherwise it is
-    the total new area in the scans, in squared world units. New area is computed as in the acquisition if this is a
-    `NewSurface`, else as in `NewSurface()`. But the cosine in a pixel's area is clipped to at least 0.2, not 0.5.
+    the total new area in the scans, in squared world units. New area is computed as in the planner's acquisition if
+    that is a `NewSurface`, else as in `NewSurface()`. But the cosine of incidence is clipped to at least 0.2, not 0.5.
     """
     views, acquisition = episode.views, episode.planner.acquisition
     if truth is not None:

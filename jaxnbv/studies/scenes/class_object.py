@@ -31,7 +31,7 @@ class ClassObject(SignedDistance):
         return self.label
 
     def on_cue(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[Array, "*n"]:
-        """Return whether each point of the surface lies on the cue. The base class always returns True.
+        """Return whether each point lies on the cue, the part that tells the class. True if not overridden.
 
         - `x`: points on the surface without noise; `tolerance`: largest distance from the cue; both in scene units.
         """
@@ -75,7 +75,7 @@ class ClassMesh(eqx.Module):
     cue: TriangleMesh | None = None
 
     def on_cue(self, x: Float[AnyArray, "*n 3"], tolerance: float = 2e-3) -> Bool[np.ndarray, "*n"]:
-        """Return whether each point lies on the cue, see `ClassObject.on_cue`."""
+        """Return whether each point lies on the cue, the part that tells the class, see `ClassObject.on_cue`."""
         if self.cue is None:
             return np.ones(x.shape[:-1], bool)
         points = np.asarray(x, np.float64).reshape(-1, 3)
