@@ -195,8 +195,7 @@ PROGRAM = """
 """
 
 
-@pytest.mark.as_users
-@pytest.mark.parametrize("batch_size", ["1", "2"])
+@pytest.mark.parametrize("batch_size", [pytest.param("1", marks=pytest.mark.as_users), "2"])
 def test_episodes_on_two_devices_are_those_of_simulate(batch_size, tmp_path):
     """In a process of its own, because JAX counts devices once. Two at once are equal up to rounding."""
     program = tmp_path / "program.py"
