@@ -27,6 +27,7 @@ def test_posterior_equals_regression_in_weight_space(x64, changes):
     oracle, posterior = WeightSpace(**settings), nbv.GeometricSPSR(**settings).condition(cloud(POINTS, NORMALS, 37))
     mean, covariance = oracle.posterior(POINTS, NORMALS, QUERIES)
     np.testing.assert_allclose(posterior.mean(QUERIES), mean, atol=1e-9 * np.abs(mean).max())
+    np.testing.assert_allclose(posterior.covariance(QUERIES, QUERIES), covariance, atol=1e-9 * covariance.max())
     np.testing.assert_allclose(posterior.covariance(QUERIES[:5], QUERIES), covariance[:5], atol=1e-9 * covariance.max())
     np.testing.assert_allclose(posterior.variance(QUERIES), np.diag(covariance), atol=1e-9 * covariance.max())
     at_data, _ = oracle.posterior(POINTS, NORMALS, POINTS)
@@ -45,7 +46,7 @@ def test_the_order_and_the_values_of_masked_rows_change_nothing(x64):
     for data in (cloud(POINTS, NORMALS, 37), scattered):
         posterior = model.condition(data)
         likelihood, level = posterior.log_marginal_likelihood(), posterior.level
-        results.append((posterior.mean(QUERIES), posterior.covariance(QUERIES[:5], QUERIES), likelihood, level))
+        results.append((posterior.mean(QUERIES), posterior.covariance(QUERIES, QUERIES), likelihood, level))
     for first, second in zip(*results, strict=True):
         np.testing.assert_allclose(first, second, rtol=1e-9, atol=1e-11)
 
@@ -183,4 +184,4 @@ def test_a_large_capacity_gives_what_its_filled_rows_give(x64, monkeypatch, coun
     oracle, posterior = WeightSpace(**SETTINGS), nbv.GeometricSPSR(**SETTINGS).condition(cloud(points, normals, 40))
     mean, covariance = oracle.posterior(points, normals, QUERIES)
     np.testing.assert_allclose(posterior.mean(QUERIES), mean, atol=1e-9 * np.abs(mean).max())
-    np.testing.assert_allclose(posterior.variance(QUERIES), np.diag(covariance), atol=1e-9 * covariance.max())
+    np.testing.assert_allclose(posterior.covariance(QUERIES, QUERIES), covariance, atol=1e-9 * covariance.max())

@@ -2,6 +2,7 @@
 
 import itertools
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
@@ -9,6 +10,10 @@ from small_session import BOX, FIRST, POSES, planner_of, session_of, shot
 
 import jaxnbv as nbv
 from jaxnbv.checks import InputError
+from jaxnbv.surfaces.known_shapes import KnownShapesPosterior
+from jaxnbv.surfaces.placement import Placement
+from jaxnbv.surfaces.registration import Hypotheses
+from jaxnbv.viz import export
 from jaxnbv.viz.export import missing_regions, save_cloud, save_mesh, scanned_cloud, surface_mesh
 
 CENTER, EYES = np.array([0.3, 0.2, 0.101]), np.stack([FIRST[:3, 3], POSES[2][:3, 3]])
@@ -49,6 +54,24 @@ def test_the_surface_is_marked_where_it_was_measured(episode):
     alone = surface_mesh(episode, imagined=False)
     assert len(alone.faces) == measured.sum()
     assert alone.face_attributes["measured"].all()
+
+
+def test_of_known_shapes_the_one_in_the_pictures_is_exported(episode, monkeypatch):
+    """The likelier of two balls, or the surface of no known shape if "none of these" is nearly certain."""
+    base = nbv.GeometricSPSR(0.05, truncation=8)
+    plain = nbv.ScreenedSPSR(base, (nbv.surfaces.OnSurface(),)).condition(nbv.PointCloud.from_arrays(EYES, np.eye(3)[:2]))
+    bank = nbv.ShapeBank.of([nbv.sdf.Sphere(0.8), nbv.sdf.Sphere(0.5)], ["ball 1", "pea 1"])
+    places = Placement(jnp.tile(jnp.eye(3), (2, 1, 1)), jnp.zeros((2, 3)), jnp.ones((2, 3)))
+    fits, posteriors = Hypotheses(jnp.arange(2), places, jnp.zeros(2), jnp.ones(2, bool)), []
+    monkeypatch.setattr(export, "mean_surface", lambda sampler, inputs: posteriors.append(inputs.posterior))
+    for weights in ([0.2, 0.3, 0.5], [0.02, 0.03, 0.95]):
+        zero, model = jnp.zeros(()), nbv.surfaces.KnownShapes(bank)
+        known = KnownShapesPosterior(zero, model, fits, jnp.array(weights), zero, plain, plain)
+        monkeypatch.setattr(nbv.SurfaceSampler, "posterior", lambda self, observations, known=known: known)
+        with pytest.raises(InputError, match="holds no surface"):
+            surface_mesh(episode)
+    np.testing.assert_array_equal(posteriors[0].weights, [0.0, 1.0, 0.0])
+    assert posteriors[1] is plain
 
 
 def test_what_is_missing_is_the_far_side_in_metres(episode):
