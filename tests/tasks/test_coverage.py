@@ -18,7 +18,7 @@ from jaxnbv.geometry.cloud import limit_capacity
 from jaxnbv.scanning import pixel_area
 from jaxnbv.scanning.sdf import Cuboid, Sphere
 
-POSE = nbv.look_at((0.4, 1.1, 2.2))
+SMALL, POSE = nbv.Camera(height=8, width=8), nbv.look_at((0.4, 1.1, 2.2))
 RADIUS, AWAY = 0.5, math.dist((0, 0, 0), (0.4, 1.1, 2.2))
 
 
@@ -157,6 +157,24 @@ def test_a_scan_that_sees_nothing_or_nothing_new_is_worth_nothing(score):
     assert float(score_of_view(score, ball, ImaginedView(ball, camera, POSE))) == pytest.approx(0.0, abs=1e-5)
     assert float(score_of_view(score, far, ImaginedView(empty, camera, POSE))) == 0.0
     assert float(score_of_view(score, far, ImaginedView(ball, camera, POSE))) > 0.1
+
+
+def chamfer(points, data):
+    squared = ((points[:, None].astype(np.float64) - data[None].astype(np.float64)) ** 2).sum(-1)
+    return squared.min(axis=1).sum() if len(points) else 0.0
+
+
+def test_the_acquisition_against_brute_force_over_all_scans():
+    rng = np.random.default_rng(2)
+    surfaces = balls(nbv.Grid(20), (0.8, 0.6), rng.uniform(-0.3, 0.3, (2, 3)))
+    data, poses = drawn_cloud(rng, 60, 64), nbv.look_at(nbv.geometry.fibonacci_sphere(3, 2.5))
+    expected = np.zeros((2, 3))
+    for s, p in np.ndindex(2, 3):
+        surface = jax.tree.map(lambda leaf, s=s: leaf[s], surfaces)
+        expected[s, p] = chamfer(nbv.scan(surface, SMALL, poses[p]).to_numpy()[0], data.to_numpy()[0])
+    assert expected.min() > 0
+    values = nbv.expected_value(nbv.Coverage(), data, surfaces, SMALL, poses)
+    np.testing.assert_allclose(values, expected.mean(axis=0), rtol=1e-4)
 
 
 def test_coverage_and_its_gradient_in_the_scan_against_brute_force(x64):

@@ -59,7 +59,9 @@ def test_the_surface_is_marked_where_it_was_measured(episode):
 def test_of_known_shapes_the_one_in_the_pictures_is_exported(episode, monkeypatch):
     """The likelier of two balls, or the surface of no known shape if "none of these" is nearly certain."""
     base = nbv.GeometricSPSR(0.05, truncation=8)
-    plain = nbv.ScreenedSPSR(base, (nbv.surfaces.OnSurface(),)).condition(nbv.PointCloud.from_arrays(EYES, np.eye(3)[:2]))
+    plain = nbv.ScreenedSPSR(base, (nbv.surfaces.OnSurface(),)).condition(
+        nbv.PointCloud.from_arrays(EYES, np.eye(3)[:2])
+    )
     bank = nbv.ShapeBank.of([nbv.sdf.Sphere(0.8), nbv.sdf.Sphere(0.5)], ["ball 1", "pea 1"])
     places = Placement(jnp.tile(jnp.eye(3), (2, 1, 1)), jnp.zeros((2, 3)), jnp.ones((2, 3)))
     fits, posteriors = Hypotheses(jnp.arange(2), places, jnp.zeros(2), jnp.ones(2, bool)), []
