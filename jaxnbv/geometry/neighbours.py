@@ -1,8 +1,11 @@
-"""Distances from many points to a cloud, either exact or interpolated on a grid."""
+"""Distances from many points to a cloud, either exact or with a grid that stores nearest points."""
+
+import itertools
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnbv.geometry.cloud import PointCloud, some_rows
@@ -38,39 +41,61 @@ def distance_to_others(cloud: PointCloud, rows: Int[Array, " r"]) -> Float[Array
     return jnp.sqrt(jnp.min(jnp.where(is_other, jnp.sum(offsets**2, axis=-1), jnp.inf), axis=1))
 
 
-class DistanceField(eqx.Module):
-    """Distances to a cloud, interpolated linearly between the nodes of a cubic grid. Fast for many points.
+class NearestPoints(eqx.Module):
+    """The points of a cloud, with a cubic grid to look up the nearest of them. Fast for many queries.
 
+    Each node of the grid stores its nearest point. The distance from x is the distance to the nearest of the points
+    that the eight nodes around x store. So it is never too small, and too large only if no node stores the nearest
+    point of x. That happens where the cloud is denser than the grid, and then the distance is small.
+
+    - `index`: row of the nearest point of each node.
     - `low`, `spacing`: position of the first node, and distance between neighbouring nodes.
     """
 
-    values: Float[Array, "n n n"]
+    cloud: PointCloud
+    index: Int[Array, "n n n"]
     low: Float[Array, "3"]
     spacing: Float[Array, ""]
 
     @classmethod
-    def of(cls, cloud: PointCloud, margin: Float[Array, ""] | float, resolution: int = 64) -> "DistanceField":
-        """Compute the distance field of a cloud, which must not be empty.
+    def of(cls, cloud: PointCloud, resolution: int = 64) -> "NearestPoints":
+        """Find the nearest point of each node.
 
-        - `margin`: least distance from the cloud to the sides of the grid's cube, and so to any point outside.
-        - `resolution`: number of nodes along each side of the cube.
+        - `resolution`: number of nodes along each side of the grid. The grid is a cube about the centre of the cloud,
+          with sides 1.5 times as long as the longest side of the cloud's bounding box.
         """
-        rows = cloud.mask[:, None]
-        low = jnp.min(jnp.where(rows, cloud.points, jnp.inf), axis=0) - margin
-        high = jnp.max(jnp.where(rows, cloud.points, -jnp.inf), axis=0) + margin
-        spacing = jnp.max(high - low) / (resolution - 1)
-        steps = spacing * jnp.arange(resolution)
-        nodes = low + jnp.stack(jnp.meshgrid(steps, steps, steps, indexing="ij"), axis=-1)
-        squared = nearest_squared_distance(nodes.reshape(-1, 3), cloud)
-        return cls(jnp.sqrt(squared).reshape(nodes.shape[:-1]), low, spacing)
+        filled = cloud.mask[:, None] | (cloud.count == 0)
+        low = jnp.min(jnp.where(filled, cloud.points, jnp.inf), axis=0)
+        high = jnp.max(jnp.where(filled, cloud.points, -jnp.inf), axis=0)
+        half_side = jnp.maximum(0.75 * jnp.max(high - low), jnp.finfo(low.dtype).eps)
+        first, spacing = 0.5 * (low + high) - half_side, 2.0 * half_side / (resolution - 1)
+        nodes = first + spacing * jnp.stack(jnp.meshgrid(*[jnp.arange(resolution)] * 3, indexing="ij"), axis=-1)
+        index = _nearest_index(nodes.reshape(-1, 3), cloud.points, cloud.mask)
+        return cls(cloud, index.reshape(nodes.shape[:-1]), first, spacing)
 
     def __call__(self, x: Float[Array, "n 3"]) -> Float[Array, " n"]:
-        """Return the interpolated distance from each point x to the cloud. Differentiable in x.
+        """Return the distance from each point x to the cloud, see `squared_distance`."""
+        # The derivative of the square root is infinite at zero.
+        squared = self.squared_distance(x)
+        return jnp.sqrt(jnp.maximum(squared, jnp.finfo(squared.dtype).tiny))
 
-        A point outside the cube of the grid has the value of the nearest point of the cube.
+    def squared_distance(self, x: Float[Array, "n 3"]) -> Float[Array, " n"]:
+        """Return the squared distance from each point x to the cloud; infinite if the cloud is empty.
+
+        A point outside the grid gets the nearest of the points that the nearest cell stores. The result can be
+        differentiated any number of times, in x and in the cloud's points.
         """
-        coordinates = jnp.moveaxis((x - self.low) / self.spacing, -1, 0)
-        return jax.scipy.ndimage.map_coordinates(self.values, list(coordinates), order=1, mode="nearest")
+        resolution = len(self.index)
+        cell = jnp.clip((x - self.low) / self.spacing, 0.0, resolution - 2).astype(jnp.int32)
+        index, squared = self.index.ravel(), jnp.full(len(x), jnp.inf, x.dtype)
+        nearest = jnp.zeros(len(x), jnp.int32)
+        for corner in itertools.product(range(2), repeat=3):
+            i, j, k = (cell + np.array(corner)).T
+            row = index[(i * resolution + j) * resolution + k]
+            candidate = jnp.sum((x - self.cloud.points[row]) ** 2, axis=-1)
+            squared, nearest = jnp.minimum(squared, candidate), jnp.where(candidate < squared, row, nearest)
+        offset = x - self.cloud.points[jax.lax.stop_gradient(nearest)]
+        return jnp.where(self.cloud.count > 0, jnp.sum(offset**2, axis=-1), jnp.inf)
 
 
 @jax.custom_jvp

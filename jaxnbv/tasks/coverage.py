@@ -9,8 +9,7 @@ from jaxtyping import Array, Float
 from jaxnbv.acquisition import Acquisition, ImaginedView
 from jaxnbv.checks import check_fields, require
 from jaxnbv.geometry.camera import Camera
-from jaxnbv.geometry.cloud import PointCloud
-from jaxnbv.geometry.neighbours import DistanceField, nearest_squared_distance, spacing
+from jaxnbv.geometry.neighbours import NearestPoints, spacing
 from jaxnbv.geometry.pose import Pose
 from jaxnbv.geometry.pose_list import PoseList
 from jaxnbv.programs import program
@@ -18,7 +17,7 @@ from jaxnbv.sampler import StepInputs
 from jaxnbv.scanning import GridSurface, Looks, pixel_area
 from jaxnbv.scanning.looks import STEEP
 from jaxnbv.scanning.visibility import is_visible, spread_points
-from jaxnbv.sharding import on_cpu, shared_map
+from jaxnbv.sharding import shared_map
 from jaxnbv.utility import Quantity
 
 # Default size s of `NewSurface` in scene units, for observations without `Looks`.
@@ -27,34 +26,24 @@ _SIZE = 0.05
 _POINTS = 1024
 
 
-def _large_batch() -> int:
-    # The scores of `Coverage` and `NewSurface` are cheap to compute.
-    return 128 if on_cpu() else 2048
-
-
 class Coverage(Acquisition):
     """Chamfer distance from a simulated scan to the cloud D, sum_{x in scan} min_{y in D} |x - y|^2.
 
-    This is the paper's alpha^(CD), in squared scene units.
+    This is the paper's alpha^(CD), in squared scene units. Distances are looked up on a grid, see `NearestPoints`.
     """
 
-    def context(self, step: StepInputs) -> PointCloud:
-        """Return the cloud D."""
-        return step.observations.cloud
+    def context(self, step: StepInputs) -> NearestPoints:
+        """Return the cloud D, with a grid that makes distances to it fast."""
+        return NearestPoints.of(step.observations.cloud)
 
-    def score(self, context: PointCloud, view: ImaginedView) -> Float[Array, ""]:
+    def score(self, context: NearestPoints, view: ImaginedView) -> Float[Array, ""]:
         """Return the unidirectional Chamfer distance from the scan to D, which is zero for an empty scan."""
-        return jnp.sum(jnp.where(view.scan.mask, nearest_squared_distance(view.scan.points, context), 0.0))
+        return jnp.sum(jnp.where(view.scan.mask, context.squared_distance(view.scan.points), 0.0))
 
     @property
     def quantity(self) -> Quantity:
         meaning = "squared distances to the cloud, summed over an imagined scan, mean over posterior samples."
         return Quantity("expected coverage gain", "", meaning, length_power=2)
-
-    @property
-    def batch_size(self) -> int:
-        """Number of scans to score together: large, because one loop over D computes the scores of all scans."""
-        return _large_batch()
 
 
 class Newness(eqx.Module):
@@ -65,7 +54,7 @@ class Newness(eqx.Module):
     - `size`: the length s, in scene units.
     """
 
-    distances: Looks | DistanceField
+    distances: Looks | NearestPoints
     size: Float[Array, ""]
 
     def __call__(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
@@ -111,7 +100,7 @@ class NewSurface(Acquisition):
         if looks is not None and 2.0 * (self.size or 0.0) <= looks.reach:
             return Newness(looks, jnp.asarray(max(looks.grid.spacing, self.size or 0.0), cloud.points.dtype))
         size = jnp.maximum(_SIZE if self.size is None else self.size, spacing(cloud))
-        return Newness(DistanceField.of(cloud, 2.0 * size), size)
+        return Newness(NearestPoints.of(cloud), size)
 
     def score(self, context: Newness, view: ImaginedView) -> Float[Array, ""]:
         """Return the new area in one scan, in squared scene units."""
@@ -121,10 +110,6 @@ class NewSurface(Acquisition):
     def quantity(self) -> Quantity:
         meaning = "area that an imagined scan shows and no scan has shown before, mean over posterior samples."
         return Quantity("expected new area", "", meaning, length_power=2)
-
-    @property
-    def batch_size(self) -> int:
-        return _large_batch()
 
 
 def new_surface_of(acquisition: Acquisition) -> NewSurface:

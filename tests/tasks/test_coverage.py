@@ -15,6 +15,7 @@ from scipy.integrate import quad
 import jaxnbv as nbv
 from jaxnbv.acquisition import ImaginedView
 from jaxnbv.geometry.cloud import limit_capacity
+from jaxnbv.geometry.neighbours import NearestPoints
 from jaxnbv.scanning import pixel_area
 from jaxnbv.scanning.sdf import Cuboid, Sphere
 
@@ -182,7 +183,7 @@ def test_coverage_and_its_gradient_in_the_scan_against_brute_force(x64):
     rng = np.random.default_rng(3)
     data, scan = drawn_cloud(rng, 15, 20), drawn_cloud(rng, 6, 9)
     of_points = lambda points: score_of(  # noqa: E731
-        nbv.Coverage(), data, nbv.PointCloud(points, scan.normals, scan.mask)
+        nbv.Coverage(), NearestPoints.of(data), nbv.PointCloud(points, scan.normals, scan.mask)
     )
     value, gradient = jax.value_and_grad(of_points)(scan.points)
     points, cloud_points = np.asarray(scan.points)[:6], np.asarray(data.points)[:15]
