@@ -182,22 +182,23 @@ PROGRAM = """
     first, keys, batch_size = nbv.look_at((0.8, 0.9, 2.2)), jax.random.split(jax.random.key(0), 3), int(sys.argv[1])
     shared = nbv.episodes(planner, scenes, first, 3, keys, batch_size=batch_size)
     assert len(shared.values.sharding.device_set) == 2
-    runs = [nbv.simulate(planner, scene, first, 3, key, progress=False) for scene, key in zip(scenes, keys)]
-    values = [[view.proposal.value for view in run.views[1:]] for run in runs]
-    error = 1e-5 if batch_size > 1 else 0.0
-    np.testing.assert_allclose(shared.values[:, 1:], np.asarray(values), rtol=10 * error)
-    np.testing.assert_allclose(shared.clouds.points, np.stack([run.cloud.points for run in runs]), rtol=0, atol=error)
     if batch_size == 1:
         with jax.default_device(jax.devices()[0]):
             alone = nbv.episodes(planner, scenes, first, 3, keys)
         assert len(alone.values.sharding.device_set) == 1
         jax.tree.map(np.testing.assert_array_equal, shared, alone)
+    else:
+        runs = [nbv.simulate(planner, scene, first, 3, key, progress=False) for scene, key in zip(scenes, keys)]
+        values = [[view.proposal.value for view in run.views[1:]] for run in runs]
+        np.testing.assert_allclose(shared.values[:, 1:], np.asarray(values), rtol=1e-4)
+        points = np.stack([run.cloud.points for run in runs])
+        np.testing.assert_allclose(shared.clouds.points, points, rtol=0, atol=1e-5)
 """
 
 
 @pytest.mark.parametrize("batch_size", [pytest.param("1", marks=pytest.mark.as_users), "2"])
-def test_episodes_on_two_devices_are_those_of_simulate(batch_size, tmp_path):
-    """In a process of its own, because JAX counts devices once. Two at once are equal up to rounding."""
+def test_episodes_on_two_devices_are_those_on_one(batch_size, tmp_path):
+    """In a process of its own, because JAX counts devices once. Two at once are those of `simulate` up to rounding."""
     program = tmp_path / "program.py"
     program.write_text(textwrap.dedent(PROGRAM))
     ended = subprocess.run([sys.executable, program, batch_size], capture_output=True, text=True, timeout=600)
