@@ -254,6 +254,23 @@ def test_parts_are_the_nodes_where_the_whole_has_them_with_their_distances(tmp_p
         )
 
 
+def test_the_distance_of_a_flat_part_is_continuous_and_a_lower_bound_beyond_its_grid():
+    """A cubic grid is far from the large faces of a flat part. Near its sides the distance is still exact."""
+    extents = np.array([1.4, 0.4, 1.2])
+    box = trimesh.creation.box(extents)
+    solid = nbv.sdf.solid_of_mesh(box.vertices, box.faces, 48, cubic=True)
+    side = 0.7 + float(solid.padding)
+    rng = np.random.default_rng(0)
+    x = rng.uniform(-2.0, 2.0, (4000, 3))
+    on_side = rng.uniform(-side, side, (1500, 3))
+    on_side[np.arange(1500), np.arange(1500) % 3] = side * rng.choice([-1.0, 1.0], 1500)
+    cell = float(solid.spacing)
+    assert (np.asarray(solid(x)) <= box_distance(x, 0.0, extents) + 0.5 * cell).all()
+    np.testing.assert_allclose(solid(1.001 * on_side), solid(0.999 * on_side), atol=0.1 * cell)
+    np.testing.assert_allclose(solid(1.001 * on_side), box_distance(on_side, 0.0, extents), atol=0.5 * cell)
+    assert (np.asarray(solid(x)) > 0)[(np.abs(x) > 0.5 * extents + cell).any(axis=1)].all()
+
+
 def test_a_file_of_one_node_has_no_parts(tmp_path):
     path = saved(tmp_path / "slab.glb", {"slab": BOXES["slab"]})
     with pytest.raises(ValueError, match=r"slab\.glb has one node"):

@@ -19,7 +19,8 @@ _PADDING = 0.1
 class Sampled(SignedDistance):
     """A solid whose signed distance is interpolated linearly between the nodes of a grid.
 
-    The distance is accurate to about a cell inside the grid, and a lower bound outside the grid.
+    The distance is accurate to about a cell inside the grid. Outside the grid it is a lower bound, which is continuous
+    at the grid's sides.
 
     - `values`: signed distances at the nodes.
     - `low`, `spacing`: position of the first node, and the distance between neighbouring nodes.
@@ -37,7 +38,10 @@ class Sampled(SignedDistance):
         coordinates = jnp.moveaxis((nearest - self.low) / self.spacing, -1, 0)
         inside = jax.scipy.ndimage.map_coordinates(self.values, list(coordinates), order=1, mode="nearest")
         beyond = safe_norm(*split(x - nearest))
-        return jnp.where(beyond > 0, beyond + self.padding, inside)
+        # The grid is convex. So from a point of the solid, x is at least as far as the hypotenuse over the distance to
+        # `nearest` and the distance from there to x.
+        bound = jnp.maximum(beyond + self.padding, safe_norm(beyond, inside))
+        return jnp.where(beyond > 0, bound, inside)
 
 
 @checked
