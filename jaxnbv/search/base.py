@@ -155,23 +155,6 @@ def best_unvisited(
     )
 
 
-def best_or_farthest(problem: Problem, candidates: Pose, scores: Float[Array, "samples candidates"]) -> Proposal:
-    """Propose the candidate farthest from earlier cameras among those tied with the best.
-
-    Propose the best candidate itself if a second view from the same pose may gain something (see
-    `Acquisition.gains_once`), or if there is a cost, because a cost favours near candidates.
-
-    - `scores`: scores of the acquisition. Their means over the samples are the values of the candidates.
-    """
-    proposal = best_unvisited(problem, candidates, jnp.mean(scores, axis=0), scores=scores)
-    if not problem.acquisition.gains_once or problem.cost is not None:
-        return proposal
-    proposal = dataclasses.replace(proposal, value_at_visited=problem.value_at_visited())
-    visited_poses = problem.observations.poses
-    # Without earlier cameras all distances are infinite, so the candidate of the highest value is preferred.
-    return preferred(proposal, jnp.where(visited_poses.count > 0, visited_poses.distance(candidates), proposal.values))
-
-
 def preferred(proposal: Proposal, preference: Float[Array, " candidates"]) -> Proposal:
     """Return a copy that proposes the candidate of highest `preference` among those tied with the best."""
     is_tied, errors = proposal.tied_with_best(), proposal.standard_errors

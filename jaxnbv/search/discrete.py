@@ -1,15 +1,17 @@
 """Discrete search over candidates (the paper's Algorithm 1), and a variant with two acquisitions."""
 
+import dataclasses
 from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
 
 from jaxnbv.acquisition import Acquisition
 from jaxnbv.checks import check_fields
 from jaxnbv.geometry.pose import Pose
-from jaxnbv.search.base import CandidateSearch, Scores, best_or_farthest, best_unvisited, preferred
+from jaxnbv.search.base import CandidateSearch, Scores, best_unvisited, preferred
 from jaxnbv.search.problem import Problem
 from jaxnbv.search.proposal import Proposal
 
@@ -19,14 +21,33 @@ class DiscreteSearch(CandidateSearch):
 
     If a second view from the same pose gains nothing (`Acquisition.gains_once`, as for `NewSurface`), and moves have no
     cost, it proposes the tied candidate that is farthest from the earlier cameras. A candidate is tied if its value
-    differs from the best by at most two standard errors of the difference, plus the mean value estimated at visited
-    poses. The true value at visited poses is zero, so this mean shows how large errors may be at other poses.
+    differs from the best by at most two standard errors of the difference, plus the mean value estimated at the poses
+    of the latest eight views. The true value at visited poses is zero, so this mean shows how large errors may be at
+    other poses.
     """
 
     uses_samples: ClassVar[bool] = True
 
+    def score(self, problem: Problem, candidates: Pose) -> Scores:
+        """Return the scores of the candidates and, if the distance breaks ties, those of the latest poses after them.
+
+        The latest poses are scanned with the candidates, because separate scans would be compiled separately.
+        """
+        if problem.distance_breaks_ties:
+            candidates = jax.tree.map(lambda *rows: jnp.concatenate(rows), candidates, problem.latest_poses)
+        return super().score(problem, candidates)
+
     def pick(self, problem: Problem, candidates: Pose, scores: Scores, key: PRNGKeyArray) -> Proposal:
-        return best_or_farthest(problem, candidates, scores[0])
+        count = len(candidates.position)
+        scores, at_latest = scores[0, :, :count], scores[0, :, count:]
+        proposal = best_unvisited(problem, candidates, jnp.mean(scores, axis=0), scores=scores)
+        if not problem.distance_breaks_ties:
+            return proposal
+        proposal = dataclasses.replace(proposal, value_at_visited=problem.value_at_visited(at_latest))
+        visited_poses = problem.observations.poses
+        # Without earlier cameras all distances are infinite, so the candidate of the highest value is preferred.
+        preference = jnp.where(visited_poses.count > 0, visited_poses.distance(candidates), proposal.values)
+        return preferred(proposal, preference)
 
 
 class TieBreakSearch(CandidateSearch):

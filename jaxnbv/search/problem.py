@@ -25,6 +25,10 @@ Its arguments are the values, the observations and the poses. It returns the new
 """
 
 
+# Largest number of visited poses that are scored together with the candidates.
+_NUM_LATEST = 8
+
+
 class Problem(eqx.Module):
     """The problem of finding the next pose.
 
@@ -78,21 +82,38 @@ class Problem(eqx.Module):
         """Return the values after `cost` is applied, or the values themselves without a cost."""
         return values if self.cost is None else self.cost(values, self.observations, poses)
 
-    def value_at_visited(self) -> Float[Array, ""]:
-        """Return the mean value that the acquisition expects at the visited poses, without the cost of moves.
+    @property
+    def distance_breaks_ties(self) -> bool:
+        """Whether `DiscreteSearch` proposes the tied candidate that is farthest from the earlier cameras.
+
+        It does if a second view from the same pose gains nothing (`Acquisition.gains_once`), unless moves have a cost,
+        because a cost favours near candidates.
+        """
+        return self.acquisition.gains_once and self.cost is None
+
+    @property
+    def latest_poses(self) -> Pose:
+        """The poses of the latest views, eight at most, latest first. With fewer views, the first fills the batch."""
+        index = self.observations.poses.count - 1 - jnp.arange(self.num_latest)
+        return self.observations.poses.rows[jnp.maximum(index, 0)]
+
+    @property
+    def num_latest(self) -> int:
+        """Number of rows of `latest_poses`."""
+        return min(_NUM_LATEST, self.observations.poses.capacity)
+
+    def value_at_visited(self, scores: Float[Array, "samples rows"]) -> Float[Array, ""]:
+        """Return the mean value that the acquisition expects at the latest poses.
 
         If a second view from the same pose gains nothing, the true value is zero. The result then shows how large
         errors may be at other poses. After a single view the result is 0, because the value at its pose is no error: it
         comes from surface that the view saw only at a steep angle.
+
+        - `scores`: scores of `latest_poses`.
         """
-        visited_poses = self.observations.poses
-        without_cost = dataclasses.replace(self, cost=None)
-
-        def add(index, total):
-            return total + without_cost.values(visited_poses.rows[index][None])[0]
-
-        total = jax.lax.fori_loop(0, visited_poses.count, add, jnp.zeros((), visited_poses.rows.position.dtype))
-        return jnp.where(visited_poses.count > 1, total / jnp.maximum(visited_poses.count, 1), 0.0)
+        count = self.observations.poses.count
+        values = jnp.where(jnp.arange(self.num_latest) < count, jnp.mean(scores, axis=0), 0.0)
+        return jnp.where(count > 1, jnp.sum(values) / jnp.clip(count, 1, self.num_latest), 0.0)
 
     @property
     def num_samples(self) -> int:

@@ -11,6 +11,7 @@ import pytest
 from small_problem import KEY, POSES, Constant, Height, propose, sample_by_sample, three_balls, visit, with_samples
 
 import jaxnbv as nbv
+from jaxnbv.geometry.pose_list import PoseList
 from jaxnbv.sampler import StepInputs
 from jaxnbv.search.base import best_unvisited
 
@@ -115,6 +116,16 @@ def test_tied_gains_choose_the_farthest_candidate(taken):
     np.testing.assert_array_equal(proposal.pose.position, proposal.candidates.position[expected])
     assert float(proposal.value) == pytest.approx(values[expected], rel=1e-5)
     assert float(proposal.standard_error) == pytest.approx(float(proposal.standard_errors[expected]))
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 8, 11])
+def test_errors_are_those_at_the_latest_eight_poses(count):
+    """Of a list with room for twelve. Rows after the last view do not count."""
+    poses = PoseList(POSES, jnp.asarray(count))
+    problem = eqx.tree_at(lambda p: p.inputs.observations.poses, PROBLEM.with_acquisition(Once()), poses)
+    means = sample_by_sample(PROBLEM).mean(axis=0)
+    expected = means[max(0, count - 8) : count].mean() if count > 1 else 0.0
+    assert float(propose(SEARCH, problem).value_at_visited) == pytest.approx(expected, rel=1e-4)
 
 
 def test_travel_counts_among_tied_gains():
