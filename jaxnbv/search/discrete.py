@@ -29,9 +29,9 @@ class DiscreteSearch(CandidateSearch):
     uses_samples: ClassVar[bool] = True
 
     def score(self, problem: Problem, candidates: Pose) -> Scores:
-        """Return the scores of the candidates and, if the distance breaks ties, those of the latest poses after them.
+        """Return the scores of the candidates, followed by those of the latest poses if `pick` needs them.
 
-        The latest poses are scanned with the candidates, because separate scans would be compiled separately.
+        The latest poses are scanned together with the candidates, because a scan of their own would be compiled too.
         """
         if problem.distance_breaks_ties:
             candidates = jax.tree.map(lambda *rows: jnp.concatenate(rows), candidates, problem.latest_poses)

@@ -93,7 +93,10 @@ class Problem(eqx.Module):
 
     @property
     def latest_poses(self) -> Pose:
-        """The poses of the latest views, eight at most, latest first. With fewer views, the first fills the batch."""
+        """The poses of the latest views, eight at most, latest first.
+
+        With fewer views, the pose of the first view fills the remaining rows.
+        """
         index = self.observations.poses.count - 1 - jnp.arange(self.num_latest)
         return self.observations.poses.rows[jnp.maximum(index, 0)]
 

@@ -120,7 +120,7 @@ def test_tied_gains_choose_the_farthest_candidate(taken):
 
 @pytest.mark.parametrize("count", [0, 1, 2, 8, 11])
 def test_errors_are_those_at_the_latest_eight_poses(count):
-    """Of a list with room for twelve. Rows after the last view do not count."""
+    """The list has room for twelve poses. Rows after the last view do not count."""
     poses = PoseList(POSES, jnp.asarray(count))
     problem = eqx.tree_at(lambda p: p.inputs.observations.poses, PROBLEM.with_acquisition(Once()), poses)
     means = sample_by_sample(PROBLEM).mean(axis=0)
