@@ -8,8 +8,9 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxnbv import Coverage, DiscreteSearch, Planner, PointCloud
+from jaxnbv import Coverage, DiscreteSearch, Planner
 from jaxnbv.acquisition import ImaginedView
+from jaxnbv.geometry import NearestPoints
 from jaxnbv.studies.engine.study import Scene
 from jaxnbv.studies.reconstruction import ReconstructionStudy
 
@@ -17,7 +18,7 @@ from jaxnbv.studies.reconstruction import ReconstructionStudy
 class MeanCoverage(Coverage):
     """Squared distances to the cloud, averaged over the points of a scan. The paper sums them."""
 
-    def score(self, context: PointCloud, view: ImaginedView) -> Float[Array, ""]:
+    def score(self, context: NearestPoints, view: ImaginedView) -> Float[Array, ""]:
         """Return the mean squared distance from the scan to D, which is zero for an empty scan."""
         return super().score(context, view) / jnp.maximum(view.scan.count, 1)
 

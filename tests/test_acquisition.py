@@ -220,7 +220,7 @@ def test_samples_that_a_gpu_takes_together_have_the_same_scores(surfaces, cloud,
     acquisition = nbv.AcquisitionList((nbv.Coverage(), nbv.NewSurface(), nbv.CrossEntropy(linear), on_host))
     values = lambda *data: nbv.expected_value(acquisition, *data, CAMERA, POSES)  # noqa: E731
     alone = jax.jit(values)(cloud, surfaces)
-    for module in ("utility", "scanning.grid", "tasks.coverage"):
+    for module in ("utility", "scanning.grid"):
         monkeypatch.setattr(f"jaxnbv.{module}.on_cpu", lambda: False)
     assert samples_at_once(CAMERA, POSES) > 3
     together = jax.jit(lambda *data: values(*data))(cloud, surfaces)
