@@ -45,11 +45,11 @@ class NearestPoints(eqx.Module):
     """The points of a cloud, with a cubic grid to look up the nearest of them. Fast for many queries.
 
     Each node of the grid stores its nearest point. The distance from x is the distance to the nearest of the points
-    that the eight nodes around x store. So it is never too small, and too large only if no node stores the nearest
-    point of x. That happens where the cloud is denser than the grid, and then the distance is small.
+    that the eight nodes around x store. So it is never too small. It is too large only if none of these nodes stores
+    the nearest point of x, and then by at most twice the distance from x to the nearest node.
 
     - `index`: row of the nearest point of each node.
-    - `low`, `spacing`: position of the first node, and distance between neighbouring nodes.
+    - `low`, `spacing`: position of the first node, and distance between neighbouring nodes, in the cloud's units.
     """
 
     cloud: PointCloud

@@ -97,13 +97,9 @@ class Problem(eqx.Module):
 
         With fewer views, the pose of the first view fills the remaining rows.
         """
-        index = self.observations.poses.count - 1 - jnp.arange(self.num_latest)
-        return self.observations.poses.rows[jnp.maximum(index, 0)]
-
-    @property
-    def num_latest(self) -> int:
-        """Number of rows of `latest_poses`."""
-        return min(_NUM_LATEST, self.observations.poses.capacity)
+        poses = self.observations.poses
+        index = poses.count - 1 - jnp.arange(min(_NUM_LATEST, poses.capacity))
+        return poses.rows[jnp.maximum(index, 0)]
 
     def value_at_visited(self, scores: Float[Array, "samples rows"]) -> Float[Array, ""]:
         """Return the mean value that the acquisition expects at the latest poses.
@@ -114,9 +110,9 @@ class Problem(eqx.Module):
 
         - `scores`: scores of `latest_poses`.
         """
-        count = self.observations.poses.count
-        values = jnp.where(jnp.arange(self.num_latest) < count, jnp.mean(scores, axis=0), 0.0)
-        return jnp.where(count > 1, jnp.sum(values) / jnp.clip(count, 1, self.num_latest), 0.0)
+        count, rows = self.observations.poses.count, scores.shape[1]
+        values = jnp.where(jnp.arange(rows) < count, jnp.mean(scores, axis=0), 0.0)
+        return jnp.where(count > 1, jnp.sum(values) / jnp.clip(count, 1, rows), 0.0)
 
     @property
     def num_samples(self) -> int:
